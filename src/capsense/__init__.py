@@ -1,0 +1,1 @@
+"""CapSense: real-time simulation of capacitive proximity sensors for robots."""

@@ -1,0 +1,33 @@
+"""The exceptions CapSense raises on purpose. All derive from :class:`CapSenseError`."""
+
+
+class CapSenseError(Exception):
+    """Base of every error that CapSense raises on purpose."""
+
+
+class DesignError(CapSenseError, ValueError):
+    """A sensor design is wrong; the message names the item, the value and the mend."""
+
+
+class SceneError(CapSenseError, ValueError):
+    """A scene, body, shape, pose or material is wrong."""
+
+
+class ScenarioError(CapSenseError, ValueError):
+    """A scenario file is wrong."""
+
+
+class MeshError(CapSenseError, ValueError):
+    """A mesh or mesh file is wrong."""
+
+
+class FieldError(CapSenseError, RuntimeError):
+    """The background field could not be built."""
+
+
+class SolveError(CapSenseError, RuntimeError):
+    """A step did not reach its tolerance."""
+
+
+class MissingDependencyError(CapSenseError, ImportError):
+    """An optional dependency is missing; the message gives the command that installs it."""
