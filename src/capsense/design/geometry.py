@@ -58,10 +58,24 @@ class Surface:
     @cached_property
     def bounds(self) -> Array:
         """Lower and upper corner of the bounding box [m], shape (2, 3)."""
-        points = self.triangles.reshape(-1, 3)
+        points = np.concatenate(
+            [f.to_sensor(shapely.get_coordinates(f.polygon.exterior)) for f in self.facets]
+        )
         return np.array([points.min(axis=0), points.max(axis=0)])
 
     @cached_property
     def area(self) -> float:
         """Area [m²] of one side of the sheet."""
         return float(sum(f.polygon.area for f in self.facets))
+
+
+def ring_vertices(facet: Facet) -> list[Array]:
+    """Vertices [m] of a facet's outline and of each hole in the sensor frame, each (k, 3)."""
+    rings = (facet.polygon.exterior, *facet.polygon.interiors)
+    return [facet.to_sensor(shapely.get_coordinates(ring)[:-1]) for ring in rings]
+
+
+def boundary_segments(facet: Facet) -> Array:
+    """Edges [m] of a facet's outline and holes in the sensor frame, shape (k, 2, 3)."""
+    rings = ring_vertices(facet)
+    return np.concatenate([np.stack([r, np.roll(r, -1, axis=0)], axis=1) for r in rings])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.geometry import Surface
+from capsense.design.geometry import Surface, ring_vertices
 
 Array = NDArray[np.float64]
 
@@ -73,7 +75,7 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A sensor as it is built: geometry and materials, no numerical settings."""
+    """A sensor as it is built: geometry and materials."""
 
     name: str
     domain: Domain
@@ -81,8 +83,53 @@ class Design:
     layers: tuple[Layer, ...] = ()
     conductors: tuple[Conductor, ...] = ()
     description: str = ""
+    build: Mapping[str, float] = field(default_factory=dict)
+    """Numerical settings of the ``[build]`` table; ``resolution`` is the only one."""
+
+    def content_hash(self) -> str:
+        """SHA-256 (hex) over the geometry, materials and domain.
+
+        Names, description, file formatting and ``build`` do not enter; the order of electrodes
+        does, since it is the order of matrix rows. Coordinates count to a nanometre.
+        """
+        return design_hash(self)
 
     @property
     def electrode_names(self) -> tuple[str, ...]:
         """Electrode names in matrix order."""
         return tuple(e.name for e in self.electrodes)
+
+
+def design_hash(design: Design) -> str:
+    """SHA-256 (hex) over everything of a design that its fields depend on."""
+    lines = ["capsense design 1"]
+    lines.append(f"domain {_nanometres(np.array([*design.domain.size, design.domain.backplane]))}")
+    for electrode in design.electrodes:
+        lines += ["electrode", *_surface_lines(electrode.surface)]
+    others = [
+        "\n".join([f"conductor {c.role.value}", *_surface_lines(c.surface)])
+        for c in design.conductors
+    ]
+    others += [
+        f"layer {float(k.eps_r)!r} {_nanometres(np.concatenate([k.lower, k.upper]))}"
+        for k in design.layers
+    ]
+    return hashlib.sha256("\n".join(lines + sorted(others)).encode()).hexdigest()
+
+
+def _nanometres(values: Array) -> list[int]:
+    return np.rint(np.asarray(values, dtype=float) * 1e9).astype(np.int64).ravel().tolist()
+
+
+def _surface_lines(surface: Surface) -> list[str]:
+    """One line per facet, the same whatever vertex a ring starts at and whichever way it runs."""
+    lines = []
+    for facet in surface.facets:
+        rings = []
+        for points in ring_vertices(facet):
+            ring = [tuple(_nanometres(p)) for p in points]
+            start = ring.index(min(ring))
+            forward = ring[start:] + ring[:start]
+            rings.append(min(forward, forward[:1] + forward[:0:-1]))
+        lines.append(f"facet {rings[0]} {sorted(rings[1:])}")
+    return sorted(lines)

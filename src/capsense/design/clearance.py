@@ -1,0 +1,66 @@
+"""The free gap that is cut into a pour around electrodes in its plane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from shapely.geometry import Polygon
+
+from capsense.design.geometry import Facet, Surface, boundary_segments, ring_vertices
+from capsense.design.model import Electrode
+from capsense.design.schema import Table
+
+PLANE_TOLERANCE = 1e-6
+"""Sheets whose heights differ by less than this [m] lie in one plane."""
+SLIVER = 1e-5
+"""Remainders narrower than this [m] are dropped: no board house would etch them."""
+GRID = 1e-9
+"""Coordinates of cut outlines are snapped to this grid [m]."""
+
+
+def in_plane_of(facet: Facet, other: Facet) -> Polygon | None:
+    """The outline of ``other`` in the (u, v) of ``facet`` [m], or None if not in its plane."""
+    rings = [r - facet.origin for r in ring_vertices(other)]
+    if np.abs(rings[0] @ facet.axes[2]).max() > PLANE_TOLERANCE:
+        return None
+    flat = [r @ facet.axes[:2].T for r in rings]
+    return Polygon(flat[0], flat[1:])
+
+
+def cut_clearance(table: Table, surface: Surface, electrodes: Sequence[Electrode]) -> Surface:
+    """Cut ``clearance`` [m] around every electrode that lies in a facet's plane.
+
+    The gap's outline is the electrode's, offset with mitred corners. What remains may be several
+    pieces with holes; they stay one conductor, as a pour stitched by vias is. A pour in another
+    plane than the electrodes' keeps its outline.
+
+    Raises
+    ------
+    DesignError
+        If ``clearance`` is no positive length, or if nothing of the conductor remains.
+    """
+    clearance = table.length("clearance")
+    facets: list[Facet] = []
+    for facet in surface.facets:
+        gaps = []
+        for electrode in electrodes:
+            for other in electrode.surface.facets:
+                outline = in_plane_of(facet, other)
+                if outline is not None:
+                    gaps.append(outline.buffer(clearance, join_style="mitre", mitre_limit=2.0))
+        if not gaps:
+            facets.append(facet)
+            continue
+        rest = shapely.difference(
+            facet.polygon, shapely.union_all(gaps, grid_size=GRID), grid_size=GRID
+        )
+        for piece in shapely.get_parts(rest):
+            if isinstance(piece, Polygon) and not piece.buffer(-SLIVER / 2).is_empty:
+                facets.append(Facet(piece, facet.origin, facet.axes))
+    if not facets:
+        raise table.error(
+            f"clearance = {clearance:g} leaves nothing of it; make it larger or reduce clearance"
+        )
+    return Surface(tuple(facets), np.concatenate([boundary_segments(f) for f in facets]))

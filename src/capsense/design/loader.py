@@ -1,0 +1,228 @@
+"""From a design file to a checked :class:`Design`."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capsense.design.checks import check_design
+from capsense.design.clearance import cut_clearance
+from capsense.design.geometry import Surface
+from capsense.design.materials import LAYER_EPS_R
+from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
+from capsense.design.placement import PLACEMENT_KEYS, read_placement
+from capsense.design.schema import Table, nearest, suggest
+from capsense.design.shapes import SHAPES, box_surface, planar_surface
+from capsense.errors import DesignError
+
+STL_KEYS = ("file", "unit", "scale", "part", "closed")
+TOP_KEYS = (
+    "name",
+    "description",
+    "domain",
+    "electrode",
+    "electrodes_from_stl",
+    "layer",
+    "conductor",
+    "build",
+)
+
+
+def available_designs() -> tuple[str, ...]:
+    """Names of the designs that come with the package, sorted."""
+    folder = resources.files("capsense.design") / "library"
+    return tuple(
+        sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml"))
+    )
+
+
+def load_design(name_or_path: str | Path) -> Design:
+    """Load a sensor design.
+
+    Parameters
+    ----------
+    name_or_path
+        Name of a packaged design, see :func:`available_designs`, or path to a design ``.toml``.
+
+    Returns
+    -------
+    Design
+        The checked design; lengths in metres, in the sensor frame (origin at the centre of the
+        electrode plane, z out of the sensor).
+
+    Raises
+    ------
+    DesignError
+        If there is no such design, or if anything in its file is wrong; the message names the
+        file, the item, the value and the mend.
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, str) and not text.endswith(".toml") and not set("/\\") & set(text):
+        names = available_designs()
+        if text not in names:
+            close = nearest(text, names)
+            hint = f"did you mean {close!r}? " if close else ""
+            raise DesignError(
+                f"no packaged design is named {text!r}; {hint}valid names are {', '.join(names)}; "
+                "a design of your own is loaded by the path of its .toml file"
+            )
+        with resources.as_file(resources.files("capsense.design") / "library") as folder:
+            return _load_file(folder / f"{text}.toml")
+    return _load_file(Path(name_or_path))
+
+
+def _load_file(path: Path) -> Design:
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DesignError(
+            f"there is no design file {path}; check the path, or give one of the packaged names "
+            f"{', '.join(available_designs())}"
+        ) from None
+    except OSError as error:
+        raise DesignError(f"{path} cannot be read: {error.strerror}; give a .toml file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DesignError(f"{path} is not valid TOML: {error}; mend the line it names") from None
+    return parse_design(data, source=path.name, folder=path.parent)
+
+
+def parse_design(
+    data: Mapping[str, Any], *, source: str = "design", folder: Path | None = None
+) -> Design:
+    """Build a checked design from the content of a design file, given as nested dicts.
+
+    Parameters
+    ----------
+    data
+        What ``tomllib`` makes of a design file.
+    source
+        Name of the file, for messages.
+    folder
+        Folder that STL files are relative to; the current one by default.
+
+    Raises
+    ------
+    DesignError
+        If anything is wrong; the message names the item, the value and the mend.
+    """
+    top = Table(data, source, "design")
+    top.only(TOP_KEYS)
+    name = top.string("name")
+    description = top.string("description", "") if top.data.get("description") else ""
+    domain = _read_domain(Table(top.raw("domain", "a [domain] table"), source, "domain"))
+    limit = max(domain.size)
+    where = folder if folder is not None else Path()
+
+    def items(key: str) -> list[Table]:
+        out = []
+        for number, raw in enumerate(top.tables(key), start=1):
+            label = raw.get("name") if isinstance(raw, Mapping) else None
+            tag = f'{key} "{label}"' if isinstance(label, str) and label else f"{key} {number}"
+            out.append(Table(raw, source, tag, limit))
+        return out
+
+    electrodes = [_read_electrode(t, where, domain) for t in items("electrode")]
+    for table in items("electrodes_from_stl"):
+        electrodes += _read_stl_group(table, where, domain)
+    layers = [_read_layer(t) for t in items("layer")]
+    conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
+    build = _read_build(Table(data.get("build", {}), source, "build"))
+    design = Design(
+        name=name,
+        domain=domain,
+        electrodes=tuple(electrodes),
+        layers=tuple(layers),
+        conductors=tuple(conductors),
+        description=description,
+        build=build,
+    )
+    check_design(design, source=source)
+    return design
+
+
+def _read_domain(table: Table) -> Domain:
+    table.only(("size", "backplane"))
+    sx, sy, sz = table.sizes("size", 3, "[x, y, z] in metres")
+    backplane = table.length("backplane")
+    if backplane >= sz:
+        raise table.error(
+            f"backplane = {backplane:g} must be smaller than the box's height, {sz:g}; it is the "
+            "distance from the electrode plane z = 0 down to the box's floor"
+        )
+    return Domain((sx, sy, sz), backplane)
+
+
+def _read_build(table: Table) -> dict[str, float]:
+    table.only(("resolution",))
+    return {"resolution": table.number("resolution", 0.25, 4.0, 1.0)}
+
+
+def _read_surface(table: Table, folder: Path, domain: Domain, extra: tuple[str, ...]) -> Surface:
+    """Read ``shape``, where it sits, and its own keys; ``extra`` are keys of the item itself."""
+    names = [*SHAPES, "box", "stl"]
+    shape = table.choice("shape", names)
+    common = ("name", "shape", *extra, *PLACEMENT_KEYS)
+    if shape == "stl":
+        from capsense.design.stl_shape import read_stl_surface
+
+        table.only((*common, *STL_KEYS))
+        return read_stl_surface(table, folder, domain)
+    if shape == "box":
+        table.only((*common, "size"))
+        return box_surface(table, read_placement(table))
+    table.only((*common, *SHAPES[shape].keys, "leads"))
+    return planar_surface(table, shape, read_placement(table))
+
+
+def _read_electrode(table: Table, folder: Path, domain: Domain) -> Electrode:
+    return Electrode(table.string("name"), _read_surface(table, folder, domain, ()))
+
+
+def _read_stl_group(table: Table, folder: Path, domain: Domain) -> list[Electrode]:
+    from capsense.design.stl_shape import read_imprint_group
+
+    return read_imprint_group(table, folder, domain)
+
+
+def _read_conductor(
+    table: Table, folder: Path, domain: Domain, electrodes: list[Electrode]
+) -> Conductor:
+    name = table.string("name")
+    surface = _read_surface(table, folder, domain, ("role", "clearance"))
+    role = Role(table.choice("role", [r.value for r in Role]))
+    if "clearance" in table:
+        surface = cut_clearance(table, surface, electrodes)
+    return Conductor(name, role, surface)
+
+
+def _read_layer(table: Table) -> Layer:
+    table.only(("name", "material", "eps_r", "size", "center", "z"))
+    name = table.string("name")
+    if "material" in table and "eps_r" in table:
+        raise table.error(
+            f"material = {table.data['material']!r} and eps_r = {table.data['eps_r']!r} both set "
+            "the permittivity; keep one of them"
+        )
+    if "material" in table:
+        material = table.string("material")
+        if material.lower() not in LAYER_EPS_R:
+            raise table.error(
+                f"material = {material!r} is not known; {suggest(material, LAYER_EPS_R)}; "
+                "or give eps_r = a number instead"
+            )
+        eps_r = LAYER_EPS_R[material.lower()]
+    elif "eps_r" in table:
+        material, eps_r = "custom", table.number("eps_r", 1.0, 1000.0)
+    else:
+        raise table.error('missing key: give material = "…" or eps_r = a number')
+    sx, sy = table.sizes("size", 2, "[x, y] in metres")
+    cx, cy = table.coordinates("center", (2,), (0.0, 0.0))
+    z0, z1 = table.interval("z")
+    lower = np.array([cx - sx / 2, cy - sy / 2, z0])
+    upper = np.array([cx + sx / 2, cy + sy / 2, z1])
+    return Layer(name, material, eps_r, lower, upper)
