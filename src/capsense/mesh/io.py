@@ -1,0 +1,300 @@
+"""Import and export of meshes: Gmsh `.msh`, VTK `.vtu` and the published `.mat` files."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import MeshError, MissingDependencyError
+from capsense.mesh.msh_writer import MshVersion, write_msh
+from capsense.mesh.tetmesh import GROUND, IntArray, TetMesh
+
+Unit = Literal["m", "mm", "cm"]
+
+METRES_PER: dict[str, float] = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+"""Metres in one unit of length of a file."""
+
+SUFFIXES = (".msh", ".vtu", ".mat")
+"""File types that meshes are read from and written to."""
+
+_NODE_PREFIX, _CELL_PREFIX = "node_group:", "cell_group:"
+
+
+def load_mesh(path: str | Path, unit: Unit | None = None) -> TetMesh:
+    """Read a mesh from a `.msh`, `.vtu` or `.mat` file.
+
+    Parameters
+    ----------
+    path
+        The file. Physical groups of a `.msh` become groups of the mesh: those of volumes cell
+        groups, those of surfaces, curves and points node groups; a group without a name is
+        called ``physical_<dimension>_<number>``. Nodes outside every tetrahedron are dropped,
+        and only the corners of quadratic tetrahedra are kept.
+    unit
+        Unit of length of the file: "m" (the default for `.msh` and `.vtu`), "mm" or "cm" (the
+        default for `.mat`).
+
+    Raises
+    ------
+    MeshError
+        If the suffix is not one of `SUFFIXES`, or the file is missing, unreadable, holds no
+        tetrahedra or is inconsistent.
+    MissingDependencyError
+        If meshio is needed and not installed.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    if unit is not None and unit not in METRES_PER:
+        raise MeshError(f"unknown unit {unit!r}; known: {', '.join(METRES_PER)}")
+    scale = METRES_PER[unit or ("cm" if suffix == ".mat" else "m")]
+    if not path.is_file():
+        raise MeshError(f"there is no mesh file {path}")
+    if suffix == ".mat":
+        return _load_mat(path, scale)
+    meshio = _meshio()
+    try:
+        data = meshio.read(path)
+    except (meshio.ReadError, ValueError, KeyError, IndexError, AttributeError, OSError) as error:
+        raise MeshError(f"{path} is not a readable {suffix} file: {error}") from error
+    except SystemExit as error:  # meshio leaves the interpreter on some malformed files
+        raise MeshError(f"{path} is not a readable {suffix} file") from error
+    return _from_msh(data, path, scale) if suffix == ".msh" else _from_vtu(data, path, scale)
+
+
+def save_mesh(
+    mesh: TetMesh,
+    path: str | Path,
+    *,
+    point_data: Mapping[str, ArrayLike] | None = None,
+    cell_data: Mapping[str, ArrayLike] | None = None,
+    msh_version: MshVersion = "4.1",
+) -> None:
+    """Write a mesh to a `.msh` (metres), `.vtu` (metres) or `.mat` (centimetres) file.
+
+    Parameters
+    ----------
+    mesh
+        The mesh, groups included. In `.mat` files the group "ground" joins the electrodes in
+        the list of Dirichlet nodes, every other node group is an electrode, and neither names
+        nor cell groups are kept.
+    path
+        The file to write.
+    point_data, cell_data
+        Only for `.vtu`: named arrays of shape (n, …) or (k, …) stored with the mesh.
+    msh_version
+        Only for `.msh`: format "4.1" or "2.2", both as text.
+
+    Raises
+    ------
+    MeshError
+        If the suffix is not one of `SUFFIXES`, data does not fit the mesh or the file type, or
+        the file cannot be written.
+    MissingDependencyError
+        If meshio is needed and not installed.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    if suffix != ".vtu" and (point_data or cell_data):
+        raise MeshError(f"point and cell data can be stored in .vtu files only, not {suffix}")
+    try:
+        if suffix == ".msh":
+            write_msh(mesh, path, msh_version)
+        elif suffix == ".mat":
+            _save_mat(mesh, path)
+        else:
+            _save_vtu(mesh, path, point_data or {}, cell_data or {})
+    except OSError as error:
+        raise MeshError(f"cannot write {path}: {error}") from error
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise MeshError(
+            f"{path.name}: unknown mesh file type {suffix or '(no suffix)'!r}; "
+            f"known: {', '.join(SUFFIXES)}"
+        )
+    return suffix
+
+
+def _meshio() -> ModuleType:
+    try:
+        return importlib.import_module("meshio")
+    except ImportError as error:
+        raise MissingDependencyError(
+            "reading .msh and using .vtu files needs meshio; install it with: "
+            'pip install "capsense[mesh]"'
+        ) from error
+
+
+def _compact(
+    points: NDArray[np.float64],
+    tets: NDArray[np.integer],
+    nodes: Mapping[str, NDArray[np.integer]],
+    cells: Mapping[str, NDArray[np.integer]],
+) -> TetMesh:
+    """Build a mesh without the points that no tetrahedron uses."""
+    if tets.size and (tets.min() < 0 or tets.max() >= len(points)):
+        return TetMesh(points, tets.astype(np.int32))  # refuses the mesh and counts the indices
+    used = np.unique(tets)
+    number = np.full(len(points), -1, dtype=np.int32)
+    number[used] = np.arange(len(used), dtype=np.int32)
+    groups = {name: number[members] for name, members in nodes.items()}
+    return TetMesh(
+        points[used],
+        number[tets],
+        {name: members[members >= 0] for name, members in groups.items()},
+        {name: members.astype(np.int32) for name, members in cells.items()},
+    )
+
+
+def _tetrahedra(data: Any, path: Path) -> NDArray[np.integer]:
+    blocks = [b.data[:, :4] for b in data.cells if b.type in ("tetra", "tetra10")]
+    if not blocks:
+        kinds = ", ".join(sorted({b.type for b in data.cells})) or "nothing"
+        raise MeshError(f"{path} holds no tetrahedra (it holds: {kinds})")
+    return np.concatenate(blocks)
+
+
+def _from_msh(data: Any, path: Path, scale: float) -> TetMesh:
+    tets = _tetrahedra(data, path)
+    names = {(int(dim), int(tag)): name for name, (tag, dim) in data.field_data.items()}
+    tags = data.cell_data.get("gmsh:physical", [None] * len(data.cells))
+    nodes: dict[str, list[NDArray[np.integer]]] = {}
+    cells: dict[str, list[NDArray[np.integer]]] = {}
+    first = 0
+    for block, block_tags in zip(data.cells, tags, strict=True):
+        is_tet = block.type in ("tetra", "tetra10")
+        if block_tags is not None and (is_tet or block.dim < 3):
+            for tag in np.unique(block_tags[block_tags > 0]):
+                name = names.get((block.dim, int(tag)), f"physical_{block.dim}_{tag}")
+                members = np.flatnonzero(block_tags == tag)
+                if is_tet:
+                    cells.setdefault(name, []).append(first + members)
+                else:
+                    nodes.setdefault(name, []).append(block.data[members].ravel())
+        first += len(block.data) if is_tet else 0
+    return _compact(
+        np.asarray(data.points, dtype=float)[:, :3] * scale,
+        tets,
+        {name: np.concatenate(parts) for name, parts in nodes.items()},
+        {name: np.concatenate(parts) for name, parts in cells.items()},
+    )
+
+
+def _from_vtu(data: Any, path: Path, scale: float) -> TetMesh:
+    tets = _tetrahedra(data, path)
+    kept = [i for i, block in enumerate(data.cells) if block.type in ("tetra", "tetra10")]
+    return _compact(
+        np.asarray(data.points, dtype=float) * scale,
+        tets,
+        {
+            name.removeprefix(_NODE_PREFIX): np.flatnonzero(values)
+            for name, values in data.point_data.items()
+            if name.startswith(_NODE_PREFIX)
+        },
+        {
+            name.removeprefix(_CELL_PREFIX): np.flatnonzero(
+                np.concatenate([values[i] for i in kept])
+            )
+            for name, values in data.cell_data.items()
+            if name.startswith(_CELL_PREFIX)
+        },
+    )
+
+
+def _save_vtu(
+    mesh: TetMesh,
+    path: Path,
+    point_data: Mapping[str, ArrayLike],
+    cell_data: Mapping[str, ArrayLike],
+) -> None:
+    meshio = _meshio()
+    stored: dict[str, dict[str, NDArray[Any]]] = {}
+    for kind, prefix, groups, extra, count in (
+        ("point", _NODE_PREFIX, mesh.node_groups, point_data, mesh.n_points),
+        ("cell", _CELL_PREFIX, mesh.cell_groups, cell_data, mesh.n_tets),
+    ):
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, members in groups.items():
+            arrays[prefix + name] = np.isin(np.arange(count), members).astype(np.int8)
+        for name, values in extra.items():
+            array = np.asarray(values)
+            if array.ndim == 0 or len(array) != count:
+                raise MeshError(
+                    f"{kind} data {name!r} has shape {array.shape}; {count} rows are needed"
+                )
+            arrays[name] = array
+        stored[kind] = arrays
+    meshio.Mesh(
+        mesh.points,
+        [("tetra", mesh.tets)],
+        point_data=stored["point"],
+        cell_data={name: [values] for name, values in stored["cell"].items()},
+    ).write(path)
+
+
+def _load_mat(path: Path, scale: float) -> TetMesh:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        data = loadmat(path)
+    except (MatReadError, ValueError, TypeError, NotImplementedError, OSError) as error:
+        raise MeshError(f"{path} is not a readable .mat file: {error}") from error
+    needed = ("node", "inzid", "AllNodes", "elecNodes")
+    if missing := [name for name in needed if name not in data]:
+        raise MeshError(f"{path} lacks the variables {', '.join(missing)}")
+    points = np.asarray(data["node"], dtype=float)
+    tets = _zero_based(data["inzid"])
+    if tets.ndim != 2 or tets.shape[1] != 4 or points.ndim != 2 or points.shape[1] != 3:
+        raise MeshError(f"{path}: inzid must have shape (k, 4) and node (n, 3)")
+    for name, count in (("NrElements", len(tets)), ("NrNodes", len(points))):
+        if name in data and int(data[name].ravel()[0]) != count:
+            raise MeshError(f"{path}: {name} says {data[name].ravel()[0]}, but there are {count}")
+    electrodes = {
+        f"E{number}": _zero_based(members).ravel()
+        for number, members in enumerate(data["elecNodes"].ravel(), start=1)
+    }
+    driven = np.concatenate([np.empty(0, np.int64), *electrodes.values()])
+    nodes = {GROUND: np.setdiff1d(_zero_based(data["AllNodes"]).ravel(), driven), **electrodes}
+    for name, members in nodes.items():
+        if members.size and (members.min() < 0 or members.max() >= len(points)):
+            raise MeshError(f"{path}: nodes of {name} outside 1…{len(points)}")
+    return _compact(points * scale, tets, nodes, {})
+
+
+def _zero_based(values: ArrayLike) -> NDArray[np.int64]:
+    return np.asarray(values).astype(np.int64) - 1
+
+
+def _save_mat(mesh: TetMesh, path: Path) -> None:
+    from scipy.io import savemat
+
+    def one_based(values: IntArray) -> NDArray[np.uint32]:
+        return values.astype(np.uint32) + np.uint32(1)
+
+    names = [name for name in mesh.node_groups if name != GROUND]
+    electrodes = np.empty((1, len(names)), dtype=object)
+    for column, name in enumerate(names):
+        electrodes[0, column] = one_based(mesh.node_groups[name])[None, :]
+    with path.open("wb") as file:
+        savemat(
+            file,
+            {
+                "NrElements": np.uint32(mesh.n_tets),
+                "NrNodes": np.uint32(mesh.n_points),
+                "inzid": one_based(mesh.tets),
+                "node": mesh.points / METRES_PER["cm"],
+                "s": mesh.centroids / METRES_PER["cm"],
+                "AllNodes": one_based(mesh.group_nodes(mesh.node_groups))[None, :],
+                "elecNodes": electrodes,
+            },
+            do_compression=True,
+        )

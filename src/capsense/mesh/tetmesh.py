@@ -1,0 +1,221 @@
+"""The tetrahedral mesh {P, E, T} that fields are solved on, with its named groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import MeshError
+
+if TYPE_CHECKING:
+    from capsense.mesh.quality import MeshQuality
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+GROUND = "ground"
+"""Name of the node group of the grounded outer box."""
+
+LOCAL_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+"""The six links of a tetrahedron as pairs of its local nodes, in the order of `tet_edges`."""
+
+_FLATTEST = 1e-12
+"""A tetrahedron whose 6·volume / (longest link)³ is below this counts as degenerate."""
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """A conforming mesh of linear tetrahedra in the sensor frame.
+
+    Indices count from 0. Tetrahedra given with negative volume are reoriented. The arrays are
+    copied and made read-only.
+
+    Raises
+    ------
+    MeshError
+        If a coordinate is not finite, an index is out of range, a tetrahedron is degenerate,
+        two cell groups share a cell, or an array has the wrong shape.
+    """
+
+    points: Array
+    """Node positions [m], shape (n, 3)."""
+    tets: IntArray
+    """Corner nodes of each tetrahedron, positively oriented, shape (k, 4)."""
+    node_groups: Mapping[str, IntArray] = field(default_factory=dict)
+    """Sorted nodes of each named conductor; "ground" is the outer box. Groups may overlap."""
+    cell_groups: Mapping[str, IntArray] = field(default_factory=dict)
+    """Sorted tetrahedra of each named region. A cell is in one group at most."""
+
+    def __post_init__(self) -> None:
+        points = np.array(self.points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise MeshError(f"points must have shape (n, 3), not {points.shape}")
+        if not_finite := int((~np.isfinite(points).all(axis=1)).sum()):
+            raise MeshError(f"{not_finite} of {len(points)} points have a NaN or infinite entry")
+        tets = _indices(self.tets, len(points), "tets", "points")
+        if tets.ndim != 2 or tets.shape[1] != 4 or len(tets) == 0:
+            raise MeshError(f"tets must have shape (k, 4) with k > 0, not {tets.shape}")
+        six_volumes = _six_volumes(points, tets)
+        longest = np.linalg.norm(
+            points[tets[:, LOCAL_EDGES[:, 0]]] - points[tets[:, LOCAL_EDGES[:, 1]]], axis=2
+        ).max(axis=1)
+        degenerate = np.abs(six_volumes) <= _FLATTEST * longest**3
+        if degenerate.any():
+            raise MeshError(
+                f"{int(degenerate.sum())} of {len(tets)} tetrahedra are degenerate (no volume); "
+                f"the first is number {int(np.argmax(degenerate))}"
+            )
+        inverted = six_volumes < 0
+        tets[inverted] = tets[inverted][:, [0, 1, 3, 2]]
+
+        node_groups = {
+            name: _group(members, len(points), f"node group {name!r}", "points")
+            for name, members in self.node_groups.items()
+        }
+        cell_groups = {
+            name: _group(members, len(tets), f"cell group {name!r}", "tets")
+            for name, members in self.cell_groups.items()
+        }
+        owners = np.zeros(len(tets), dtype=np.int32)
+        for members in cell_groups.values():
+            owners[members] += 1
+        if shared := int((owners > 1).sum()):
+            raise MeshError(f"{shared} tetrahedra are in more than one cell group")
+        for array in (points, tets):
+            array.flags.writeable = False
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "tets", tets)
+        object.__setattr__(self, "node_groups", MappingProxyType(node_groups))
+        object.__setattr__(self, "cell_groups", MappingProxyType(cell_groups))
+
+    @property
+    def n_points(self) -> int:
+        """Number of nodes n."""
+        return len(self.points)
+
+    @property
+    def n_tets(self) -> int:
+        """Number of tetrahedra k."""
+        return len(self.tets)
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """The unique links as node pairs a < b in lexicographic order, shape (m, 2)."""
+        return self._links[0]
+
+    @cached_property
+    def tet_edges(self) -> IntArray:
+        """Link index of each tetrahedron's links, in the order of `LOCAL_EDGES`, shape (k, 6)."""
+        return self._links[1]
+
+    @cached_property
+    def _links(self) -> tuple[IntArray, IntArray]:
+        pairs = np.sort(self.tets[:, LOCAL_EDGES], axis=2).astype(np.int64)
+        keys, inverse = np.unique(
+            pairs[..., 0] * self.n_points + pairs[..., 1], return_inverse=True
+        )
+        edges = np.stack([keys // self.n_points, keys % self.n_points], axis=1).astype(np.int32)
+        tet_edges = inverse.reshape(self.n_tets, 6).astype(np.int32)
+        edges.flags.writeable = tet_edges.flags.writeable = False
+        return edges, tet_edges
+
+    @cached_property
+    def volumes(self) -> Array:
+        """Volume of each tetrahedron [m³], positive, shape (k,)."""
+        return _six_volumes(self.points, self.tets) / 6.0
+
+    @cached_property
+    def centroids(self) -> Array:
+        """Centroid of each tetrahedron [m], shape (k, 3)."""
+        return self.points[self.tets].mean(axis=1)
+
+    @cached_property
+    def boundary_faces(self) -> IntArray:
+        """Triangles that belong to one tetrahedron only, shape (b, 3), unordered."""
+        faces = np.sort(self.tets[:, [(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)]].reshape(-1, 3))
+        unique, counts = np.unique(faces, axis=0, return_counts=True)
+        return unique[counts == 1]
+
+    def group_nodes(self, names: Iterable[str]) -> IntArray:
+        """The sorted union of node groups, shape (g,).
+
+        Raises
+        ------
+        MeshError
+            If a name is not a node group of this mesh.
+        """
+        names = tuple(names)
+        for name in names:
+            if name not in self.node_groups:
+                known = ", ".join(self.node_groups) or "none"
+                raise MeshError(f"the mesh has no node group {name!r}; it has: {known}")
+        members = [self.node_groups[name] for name in names]
+        return np.unique(np.concatenate([np.empty(0, np.int32), *members])).astype(np.int32)
+
+    def cell_values(self, values: Mapping[str, float], default: float = 1.0) -> Array:
+        """One number per tetrahedron, shape (k,): `values` of its cell group, else `default`.
+
+        Raises
+        ------
+        MeshError
+            If a name is not a cell group of this mesh.
+        """
+        out = np.full(self.n_tets, default, dtype=np.float64)
+        for name, value in values.items():
+            if name not in self.cell_groups:
+                known = ", ".join(self.cell_groups) or "none"
+                raise MeshError(f"the mesh has no cell group {name!r}; it has: {known}")
+            out[self.cell_groups[name]] = value
+        return out
+
+    def with_groups(
+        self,
+        *,
+        node_groups: Mapping[str, ArrayLike] | None = None,
+        cell_groups: Mapping[str, ArrayLike] | None = None,
+    ) -> TetMesh:
+        """A copy with these groups added, or put in place of those of the same name."""
+        return replace(
+            self,
+            node_groups={**self.node_groups, **(node_groups or {})},  # type: ignore[dict-item]
+            cell_groups={**self.cell_groups, **(cell_groups or {})},  # type: ignore[dict-item]
+        )
+
+    def moved(self, offset: ArrayLike) -> TetMesh:
+        """A copy shifted by `offset` [m], shape (3,), for instance into the sensor frame."""
+        return replace(self, points=self.points + np.asarray(offset, dtype=np.float64))
+
+    def quality(self) -> MeshQuality:
+        """Figures of merit of the mesh; printable."""
+        from capsense.mesh.quality import mesh_quality
+
+        return mesh_quality(self)
+
+
+def _six_volumes(points: Array, tets: IntArray) -> Array:
+    p0, p1, p2, p3 = (points[tets[:, i]] for i in range(4))
+    return np.einsum("ij,ij->i", np.cross(p1 - p0, p2 - p0), p3 - p0)
+
+
+def _indices(values: ArrayLike, count: int, what: str, of: str) -> IntArray:
+    """Copy integer indices below `count` into an int32 array."""
+    array = np.asarray(values)
+    if array.size == 0:
+        return np.empty(array.shape, dtype=np.int32)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise MeshError(f"{what} must hold integers, not {array.dtype}")
+    if outside := int(((array < 0) | (array >= count)).sum()):
+        raise MeshError(f"{what}: {outside} indices outside 0…{count - 1} (there are {count} {of})")
+    return array.astype(np.int32)
+
+
+def _group(values: ArrayLike, count: int, what: str, of: str) -> IntArray:
+    members = np.unique(_indices(values, count, what, of))
+    members.flags.writeable = False
+    return members
