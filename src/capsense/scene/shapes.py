@@ -1,0 +1,340 @@
+"""Convex primitives: exact signed distance and line intersection, in the body's own frame.
+
+Full sizes, metres; capsule and cylinder lie along local z. Shapes are closed sets: a line that
+only touches a shape, or lies in one of its faces, meets it. The methods here are the readable
+reference; :mod:`capsense.scene.kernels` holds the compiled counterparts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import SceneError
+from capsense.scene.pose import Vec3, checked_floats
+from capsense.scene.shape import Shape, ShapeKind, as_lines, as_points
+
+if TYPE_CHECKING:
+    import trimesh
+
+Array = NDArray[np.float64]
+
+PARALLEL = 1e-24
+"""Squared slope to the axis below which a line counts as parallel to it."""
+
+
+def _size(shape: str, name: str, value: object) -> float:
+    """Check one length [m]: finite and positive."""
+    (number,) = checked_floats((value,), 1, f"{shape}: {name}", "give one length in metres")
+    if number <= 0:
+        raise SceneError(f"{shape}: {name} is {number:g} m; give a length above zero")
+    return number
+
+
+def _sizes(shape: str, name: str, values: object) -> Vec3:
+    """Check three lengths [m]: finite and positive."""
+    a, b, c = checked_floats(values, 3, f"{shape}: {name}", "give three lengths in metres")
+    if min(a, b, c) <= 0:
+        raise SceneError(f"{shape}: {name} is {(a, b, c)} m; every length must be above zero")
+    return a, b, c
+
+
+def _frozen(*values: float) -> Array:
+    out = np.array(values)
+    out.setflags(write=False)
+    return out
+
+
+# ---- line intersections; all return (lower, upper), with lower > upper for a miss ----
+
+
+def _slab(o: Array, d: Array, half: float) -> tuple[Array, Array]:
+    """Lines against −half <= x <= half, one coordinate, shapes (n,)."""
+    moving = d != 0
+    step = np.where(moving, d, 1.0)
+    with np.errstate(over="ignore"):
+        t0, t1 = (-half - o) / step, (half - o) / step
+    always = np.where(np.abs(o) <= half, -np.inf, np.inf)
+    lower = np.where(moving, np.minimum(t0, t1), always)
+    return lower, np.where(moving, np.maximum(t0, t1), -always)
+
+
+def _ball(o: Array, d: Array, radius: float) -> tuple[Array, Array]:
+    """Lines against a ball, or a disc: shapes (n, dim).
+
+    The discriminant is taken at the foot of the perpendicular, where nothing cancels.
+    """
+    a = np.einsum("ij,ij->i", d, d)
+    middle = -np.einsum("ij,ij->i", o, d) / a
+    foot = o + middle[:, None] * d
+    square = radius**2 - np.einsum("ij,ij->i", foot, foot)
+    half = np.sqrt(np.maximum(square, 0.0) / a)
+    hit = square >= 0
+    return np.where(hit, middle - half, np.inf), np.where(hit, middle + half, -np.inf)
+
+
+def _tube(o: Array, d: Array, radius: float) -> tuple[Array, Array]:
+    """Lines against an infinite cylinder along z, shapes (n, 3)."""
+    d2 = d[:, 0] ** 2 + d[:, 1] ** 2
+    along = d2 <= PARALLEL * (d2 + d[:, 2] ** 2)
+    lower, upper = _ball(o[:, :2], np.where(along[:, None], 1.0, d[:, :2]), radius)
+    always = np.where(np.hypot(o[:, 0], o[:, 1]) <= radius, -np.inf, np.inf)
+    return np.where(along, always, lower), np.where(along, -always, upper)
+
+
+def _meet(*intervals: tuple[Array, Array]) -> Array:
+    """Intersect intervals; shape (n, 2), misses as [inf, −inf]."""
+    lower = np.maximum.reduce([i[0] for i in intervals])
+    upper = np.minimum.reduce([i[1] for i in intervals])
+    hit = lower <= upper
+    return np.stack([np.where(hit, lower, np.inf), np.where(hit, upper, -np.inf)], axis=1)
+
+
+@dataclass(frozen=True)
+class Box(Shape):
+    """A box of full edge lengths ``size`` [m], centred on its origin.
+
+    Raises:
+        SceneError: A length is not a positive finite number.
+    """
+
+    size: Vec3
+
+    kind = ShapeKind.BOX
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", _sizes("Box", "size", self.size))
+
+    @cached_property
+    def params(self) -> Array:
+        return _frozen(*(0.5 * s for s in self.size))
+
+    @property
+    def volume(self) -> float:
+        return math.prod(self.size)
+
+    def bounds(self) -> Array:
+        return np.array([-self.params, self.params])
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        q = np.abs(as_points(points)) - self.params
+        return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
+
+    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
+        o, d = as_lines(origins, direction)
+        return _meet(*(_slab(o[:, k], d[:, k], self.params[k]) for k in range(3)))
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        import trimesh
+
+        return trimesh.creation.box(extents=self.size)
+
+
+@dataclass(frozen=True)
+class Sphere(Shape):
+    """A ball of ``radius`` [m].
+
+    Raises:
+        SceneError: The radius is not a positive finite number.
+    """
+
+    radius: float
+
+    kind = ShapeKind.SPHERE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "radius", _size("Sphere", "radius", self.radius))
+
+    @cached_property
+    def params(self) -> Array:
+        return _frozen(self.radius, 0.0, 0.0)
+
+    @property
+    def volume(self) -> float:
+        return 4 / 3 * math.pi * self.radius**3
+
+    def bounds(self) -> Array:
+        return np.array([[-self.radius] * 3, [self.radius] * 3])
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        return np.linalg.norm(as_points(points), axis=1) - self.radius
+
+    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
+        return _meet(_ball(*as_lines(origins, direction), self.radius))
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        import trimesh
+
+        return trimesh.creation.icosphere(subdivisions=4, radius=self.radius)
+
+
+@dataclass(frozen=True)
+class Capsule(Shape):
+    """A cylinder along z with half balls on both ends: ``length`` [m] is without the caps.
+
+    Raises:
+        SceneError: A length is not a positive finite number.
+    """
+
+    radius: float
+    length: float
+
+    kind = ShapeKind.CAPSULE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "radius", _size("Capsule", "radius", self.radius))
+        object.__setattr__(self, "length", _size("Capsule", "length", self.length))
+
+    @cached_property
+    def params(self) -> Array:
+        return _frozen(self.radius, 0.5 * self.length, 0.0)
+
+    @property
+    def volume(self) -> float:
+        return math.pi * self.radius**2 * (self.length + 4 / 3 * self.radius)
+
+    def bounds(self) -> Array:
+        top = np.array([self.radius, self.radius, 0.5 * self.length + self.radius])
+        return np.array([-top, top])
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        p = as_points(points).copy()
+        half = 0.5 * self.length
+        p[:, 2] -= np.clip(p[:, 2], -half, half)
+        return np.linalg.norm(p, axis=1) - self.radius
+
+    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
+        o, d = as_lines(origins, direction)
+        half = 0.5 * self.length
+        # The capsule is the union of three convex sets and convex itself, so the line's stretch
+        # inside it is the hull of the three stretches.
+        cap = np.array([0.0, 0.0, half])
+        parts = np.stack(
+            [
+                _meet(_tube(o, d, self.radius), _slab(o[:, 2], d[:, 2], half)),
+                _meet(_ball(o - cap, d, self.radius)),
+                _meet(_ball(o + cap, d, self.radius)),
+            ]
+        )
+        return np.stack([parts[..., 0].min(axis=0), parts[..., 1].max(axis=0)], axis=1)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        import trimesh
+
+        mesh = trimesh.creation.capsule(height=self.length, radius=self.radius, count=(64, 64))
+        mesh.apply_translation(-mesh.bounds.mean(axis=0))
+        return mesh
+
+
+@dataclass(frozen=True)
+class Cylinder(Shape):
+    """A cylinder of ``radius`` and full ``length`` [m] along z.
+
+    Raises:
+        SceneError: A length is not a positive finite number.
+    """
+
+    radius: float
+    length: float
+
+    kind = ShapeKind.CYLINDER
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "radius", _size("Cylinder", "radius", self.radius))
+        object.__setattr__(self, "length", _size("Cylinder", "length", self.length))
+
+    @cached_property
+    def params(self) -> Array:
+        return _frozen(self.radius, 0.5 * self.length, 0.0)
+
+    @property
+    def volume(self) -> float:
+        return math.pi * self.radius**2 * self.length
+
+    def bounds(self) -> Array:
+        top = np.array([self.radius, self.radius, 0.5 * self.length])
+        return np.array([-top, top])
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        p = as_points(points)
+        side = np.hypot(p[:, 0], p[:, 1]) - self.radius
+        end = np.abs(p[:, 2]) - 0.5 * self.length
+        outside = np.hypot(np.maximum(side, 0.0), np.maximum(end, 0.0))
+        return outside + np.minimum(np.maximum(side, end), 0.0)
+
+    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
+        o, d = as_lines(origins, direction)
+        return _meet(_tube(o, d, self.radius), _slab(o[:, 2], d[:, 2], 0.5 * self.length))
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        import trimesh
+
+        return trimesh.creation.cylinder(radius=self.radius, height=self.length, sections=128)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Shape):
+    """An ellipsoid of the three half axes ``radii`` [m] along x, y, z.
+
+    Raises:
+        SceneError: A length is not a positive finite number.
+    """
+
+    radii: Vec3
+
+    kind = ShapeKind.ELLIPSOID
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "radii", _sizes("Ellipsoid", "radii", self.radii))
+
+    @cached_property
+    def params(self) -> Array:
+        return _frozen(*self.radii)
+
+    @property
+    def volume(self) -> float:
+        return 4 / 3 * math.pi * math.prod(self.radii)
+
+    def bounds(self) -> Array:
+        return np.array([-self.params, self.params])
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Distance to the surface, exact to about 1e-9 of the smallest radius.
+
+        With y = |p|, the nearest surface point is x_i = r_i² y_i / (r_i² + t), t being the
+        largest root of F(t) = Σ (r_i y_i / (r_i² + t))² − 1 (Eberly, "Distance from a point to
+        an ellipse, an ellipsoid, or a hyperellipsoid"). F is convex and falling there, so
+        Newton's method, started where 0 <= F <= 2, approaches the root from one side. In terms
+        of s = t + min r² no digits are lost. Coordinates are kept 1e-9 off the planes of
+        symmetry, where the root is not simple.
+        """
+        r = self.params
+        y = np.maximum(np.abs(as_points(points)), 1e-9 * r.min())
+        gap = r**2 - r.min() ** 2
+        s = (r * y - gap).max(axis=1, keepdims=True)
+        for _ in range(50):
+            ratio = (r * y / (s + gap)) ** 2
+            step = (ratio.sum(axis=1, keepdims=True) - 1) / (2 * ratio / (s + gap)).sum(
+                axis=1, keepdims=True
+            )
+            s = s + np.maximum(step, 0.0)
+            if np.all(step <= 1e-14 * s):
+                break
+        distance = np.linalg.norm(y - r**2 * y / (s + gap), axis=1)
+        return np.where(((y / r) ** 2).sum(axis=1) < 1.0, -distance, distance)
+
+    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
+        o, d = as_lines(origins, direction)
+        return _meet(_ball(o / self.params, d / self.params, 1.0))
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        import trimesh
+
+        mesh = trimesh.creation.icosphere(subdivisions=4)
+        mesh.apply_scale(self.radii)
+        return mesh
