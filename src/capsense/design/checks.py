@@ -1,12 +1,159 @@
-"""Checks on a whole design."""
+"""Checks on a whole design: short circuits, things that leave the box, layers cut by sheets."""
 
 from __future__ import annotations
 
-from capsense.design.model import Design
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.design.contact import TOUCH, coplanar_overlap, enters_box, find_contact
+from capsense.design.geometry import Facet, Surface
+from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.errors import DesignError
+
+Array = NDArray[np.float64]
 
 
 def check_design(design: Design, *, source: str = "design") -> None:
-    """Refuse a design without electrodes."""
+    """Refuse a design that could not be built, or that the field solver could not treat.
+
+    Raises
+    ------
+    DesignError
+        If there is no electrode; if a name is used twice; if an electrode touches another, or a
+        conductor; if anything leaves the domain; if layers overlap; if a sheet crosses a layer's
+        surface. The message names ``source``, the item, the value and the mend.
+    """
     if not design.electrodes:
         raise DesignError(f"{source}: design has no electrode; add an [[electrode]] table")
+    sheets: list[Electrode | Conductor] = [*design.electrodes, *design.conductors]
+    _unique_names([_label(s) for s in sheets], [s.name for s in sheets], source)
+    _unique_names([_label(k) for k in design.layers], [k.name for k in design.layers], source)
+    for sheet in sheets:
+        _inside_domain(sheet, design.domain, source)
+    for layer in design.layers:
+        _layer_inside_domain(layer, design.domain, source)
+    for lower, upper in combinations(design.layers, 2):
+        _apart(lower, upper, source)
+    for one, other in combinations(sheets, 2):
+        _no_short(one, other, source)
+    for sheet in sheets:
+        for layer in design.layers:
+            _not_crossing(sheet, layer, source)
+
+
+def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
+    """Move horizontal facets that lie within a micrometre of a layer's face exactly onto it."""
+    levels = [float(z) for layer in layers for z in (layer.lower[2], layer.upper[2])]
+    facets, moved = [], 0.0
+    for facet in surface.facets:
+        z = float(facet.origin[2])
+        near = [level for level in levels if 0.0 < abs(level - z) <= TOUCH]
+        if near and bool(np.all(facet.axes[:2, 2] == 0.0)):
+            moved = near[0] - z
+            facet = Facet(facet.polygon, facet.origin + np.array([0.0, 0.0, moved]), facet.axes)
+        facets.append(facet)
+    flat = np.ptp(surface.rims[:, :, 2]) <= TOUCH
+    if moved == 0.0 or not flat:
+        return surface
+    return Surface(tuple(facets), surface.rims + np.array([0.0, 0.0, moved]))
+
+
+def _label(item: Electrode | Conductor | Layer) -> str:
+    return f'{type(item).__name__.lower()} "{item.name}"'
+
+
+def _unique_names(labels: list[str], names: list[str], source: str) -> None:
+    seen: dict[str, str] = {}
+    for label, name in zip(labels, names, strict=True):
+        if name in seen:
+            raise DesignError(
+                f"{source}: {label}: the name {name!r} is already that of {seen[name]}; "
+                "give each its own name"
+            )
+        seen[name] = label
+
+
+def _at(point: Array) -> str:
+    return "(" + ", ".join(f"{x:.6g}" for x in np.round(point, 9) + 0.0) + ") m"
+
+
+def _inside_domain(sheet: Electrode | Conductor, domain: Domain, source: str) -> None:
+    for axis, name in enumerate("xyz"):
+        low, high = sheet.surface.bounds[:, axis]
+        wall_low, wall_high = float(domain.lower[axis]), float(domain.upper[axis])
+        for value, wall, out in (
+            (low, wall_low, low - wall_low < TOUCH),
+            (high, wall_high, wall_high - high < TOUCH),
+        ):
+            if out:
+                kind = "touches" if abs(value - wall) < TOUCH else "leaves"
+                raise DesignError(
+                    f"{source}: {_label(sheet)}: {kind} the grounded box: it reaches "
+                    f"{name} = {value:.6g} m and the wall is at {name} = {wall:.6g} m; move it "
+                    "inside (center, z, size) or enlarge domain size or backplane; "
+                    "lengths are metres"
+                )
+
+
+def _layer_inside_domain(layer: Layer, domain: Domain, source: str) -> None:
+    for axis, name in enumerate("xyz"):
+        for value, wall, out in (
+            (layer.lower[axis], domain.lower[axis], layer.lower[axis] < domain.lower[axis] - TOUCH),
+            (layer.upper[axis], domain.upper[axis], layer.upper[axis] > domain.upper[axis] + TOUCH),
+        ):
+            if out:
+                raise DesignError(
+                    f"{source}: {_label(layer)}: leaves the domain: it reaches {name} = "
+                    f"{value:.6g} m and the wall is at {name} = {wall:.6g} m; reduce its size or "
+                    "z, or enlarge domain size or backplane; lengths are metres"
+                )
+
+
+def _apart(one: Layer, other: Layer, source: str) -> None:
+    low, high = np.maximum(one.lower, other.lower), np.minimum(one.upper, other.upper)
+    if np.all(high - low > TOUCH):
+        raise DesignError(
+            f"{source}: {_label(other)}: overlaps {_label(one)} over {_at(high - low)} at "
+            f"{_at((low + high) / 2)}; change z, size or center so that they only share a face"
+        )
+
+
+def _no_short(one: Electrode | Conductor, other: Electrode | Conductor, source: str) -> None:
+    alike = (
+        isinstance(one, Conductor)
+        and isinstance(other, Conductor)
+        and one.role == other.role
+        and one.role is not Role.FLOATING
+    )
+    point = find_contact(one.surface, other.surface)
+    if point is None:
+        return
+    if alike:
+        area = coplanar_overlap(one.surface, other.surface)
+        if area > TOUCH**2:
+            raise DesignError(
+                f"{source}: {_label(other)}: lies on {_label(one)} over {area * 1e6:.6g} mm² "
+                f"at {_at(point)}; cut one of them back, they may only share edges"
+            )
+        return
+    mend = "move them apart (center, z) or reduce their size"
+    if isinstance(one, Electrode) and isinstance(other, Conductor):
+        mend = f"set clearance = 0.0005 on {_label(other)} or move it to another z"
+    raise DesignError(
+        f"{source}: {_label(one)}: touches or overlaps {_label(other)} at {_at(point)}, a short "
+        f"circuit; {mend}"
+    )
+
+
+def _not_crossing(sheet: Electrode | Conductor, layer: Layer, source: str) -> None:
+    low, high = sheet.surface.bounds
+    within = np.all(low >= layer.lower - TOUCH) and np.all(high <= layer.upper + TOUCH)
+    if within or not enters_box(sheet.surface, layer.lower, layer.upper):
+        return
+    raise DesignError(
+        f"{source}: {_label(sheet)}: crosses the surface of {_label(layer)}: it spans {_at(low)} "
+        f"to {_at(high)}, the layer {_at(layer.lower)} to {_at(layer.upper)}; put it on a face of "
+        f"the layer (such as z = {layer.upper[2]:g}), or wholly inside or outside"
+    )

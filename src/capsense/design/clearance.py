@@ -8,25 +8,15 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from capsense.design.geometry import Facet, Surface, boundary_segments, ring_vertices
+from capsense.design.contact import in_plane_of
+from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Electrode
 from capsense.design.schema import Table
 
-PLANE_TOLERANCE = 1e-6
-"""Sheets whose heights differ by less than this [m] lie in one plane."""
 SLIVER = 1e-5
 """Remainders narrower than this [m] are dropped: no board house would etch them."""
 GRID = 1e-9
 """Coordinates of cut outlines are snapped to this grid [m]."""
-
-
-def in_plane_of(facet: Facet, other: Facet) -> Polygon | None:
-    """The outline of ``other`` in the (u, v) of ``facet`` [m], or None if not in its plane."""
-    rings = [r - facet.origin for r in ring_vertices(other)]
-    if np.abs(rings[0] @ facet.axes[2]).max() > PLANE_TOLERANCE:
-        return None
-    flat = [r @ facet.axes[:2].T for r in rings]
-    return Polygon(flat[0], flat[1:])
 
 
 def cut_clearance(table: Table, surface: Surface, electrodes: Sequence[Electrode]) -> Surface:

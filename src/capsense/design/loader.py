@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from capsense.design.checks import check_design
+from capsense.design.checks import check_design, snap_to_layers
 from capsense.design.clearance import cut_clearance
 from capsense.design.geometry import Surface
 from capsense.design.materials import LAYER_EPS_R
@@ -113,7 +113,7 @@ def parse_design(
     top = Table(data, source, "design")
     top.only(TOP_KEYS)
     name = top.string("name")
-    description = top.string("description", "") if top.data.get("description") else ""
+    description = top.text("description")
     domain = _read_domain(Table(top.raw("domain", "a [domain] table"), source, "domain"))
     limit = max(domain.size)
     where = folder if folder is not None else Path()
@@ -130,13 +130,16 @@ def parse_design(
     for table in items("electrodes_from_stl"):
         electrodes += _read_stl_group(table, where, domain)
     layers = [_read_layer(t) for t in items("layer")]
+    stack = tuple(layers)
+    electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack)) for e in electrodes]
     conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
+    conductors = [Conductor(c.name, c.role, snap_to_layers(c.surface, stack)) for c in conductors]
     build = _read_build(Table(data.get("build", {}), source, "build"))
     design = Design(
         name=name,
         domain=domain,
         electrodes=tuple(electrodes),
-        layers=tuple(layers),
+        layers=stack,
         conductors=tuple(conductors),
         description=description,
         build=build,

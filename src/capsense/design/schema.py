@@ -81,6 +81,13 @@ class Table:
             raise self.error(f"{key} = {value!r} must be a non-empty string in quotes")
         return value
 
+    def text(self, key: str) -> str:
+        """An optional string, empty by default."""
+        value = self.data.get(key, "")
+        if not isinstance(value, str):
+            raise self.error(f"{key} = {_short(value)} must be a string in quotes")
+        return value.strip()
+
     def choice(self, key: str, options: Sequence[str], default: str | None = None) -> str:
         """A string that is one of ``options``."""
         if default is not None and key not in self.data:

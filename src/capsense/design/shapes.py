@@ -119,7 +119,7 @@ def _slot(sx: float, sy: float) -> Polygon:
 
 
 def stripes(table: Table) -> list[Polygon]:
-    """``count`` stripes of ``size`` = [x, y] [m], ``pitch`` apart in x; optional ``rounded`` ends."""
+    """``count`` stripes of ``size`` = [x, y] [m] at ``pitch`` along x; optional ``rounded``."""
     count = table.integer("count", 1, 1000)
     sx, sy = table.sizes("size", 2, "[x, y] in metres, of one stripe")
     rounded = table.boolean("rounded", False)

@@ -1,0 +1,171 @@
+"""Electrodes and conductors from STL files, and from a box with imprinted electrodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from shapely.affinity import translate
+
+from capsense.design.geometry import Facet, Surface, boundary_segments
+from capsense.design.model import Domain, Electrode
+from capsense.design.placement import PLACEMENT_KEYS, read_placement
+from capsense.design.schema import Table
+from capsense.design.stl import SheetMesh, read_stl, sheet_surface, weld
+from capsense.errors import DesignError
+
+Array = NDArray[np.float64]
+
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+"""Metres to the unit of an STL file."""
+SIZE_TOLERANCE = 1e-5
+"""By how much [m] an imprinted box may differ from the domain."""
+
+
+def _read_triangles(table: Table, folder: Path) -> Array:
+    """Triangles [m] of the item's file, shape (n, 3, 3)."""
+    file = table.string("file")
+    unit = table.choice("unit", list(UNITS))
+    scale = table.number("scale", 1e-3, 1e3, 1.0)
+    try:
+        triangles = read_stl(folder / file) * (UNITS[unit] * scale)
+    except DesignError as error:
+        raise table.error(f'file = "{file}": {error}') from None
+    extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    if extent > table.limit * (1 + 1e-6):
+        smaller = [f'"{u}"' for u, f in UNITS.items() if f < UNITS[unit]]
+        mend = f"did you mean unit = {' or '.join(smaller)}?" if smaller else "give a smaller scale"
+        raise table.error(
+            f'file = "{file}" is {extent:g} m across with unit = "{unit}", larger than '
+            f"{table.limit:g} m; {mend}"
+        )
+    return triangles
+
+
+def _weld(table: Table, triangles: Array) -> SheetMesh:
+    try:
+        return weld(triangles)
+    except DesignError as error:
+        raise table.error(f'file = "{table.data["file"]}": {error}') from None
+
+
+def _require_closed(table: Table, mesh: SheetMesh, why: str) -> None:
+    if not mesh.closed:
+        raise table.error(
+            f'file = "{table.data["file"]}" is open: it has {len(mesh.boundary)} boundary edges, '
+            f"but {why} needs a closed (watertight) surface; close the gaps in CAD"
+        )
+
+
+def read_stl_surface(table: Table, folder: Path, domain: Domain) -> Surface:
+    """Read an item of shape "stl": an open sheet, a closed shell, or one part of an imprinted box.
+
+    Raises
+    ------
+    DesignError
+        If the file, its unit or its content is wrong.
+    """
+    if "part" in table:
+        return _read_part(table, folder, domain)
+    triangles = _read_triangles(table, folder)
+    placement = read_placement(table)
+    mesh = _weld(table, placement.apply(triangles))
+    if "closed" in table:
+        if table.boolean("closed", True):
+            _require_closed(table, mesh, "closed = true")
+        elif mesh.closed:
+            raise table.error(
+                f'file = "{table.data["file"]}" is a closed shell, but closed = false asks for an '
+                "open sheet; export the sheet alone, or drop closed"
+            )
+    extents = np.ptp(mesh.vertices, axis=0)
+    if mesh.closed and np.allclose(extents, domain.size, atol=SIZE_TOLERANCE):
+        raise table.error(
+            f'file = "{table.data["file"]}" is a box as large as the domain; if electrodes are '
+            "imprinted on its floor, pick one with part = 1, or take all by [[electrodes_from_stl]]"
+        )
+    return sheet_surface(mesh)
+
+
+def _read_part(table: Table, folder: Path, domain: Domain) -> Surface:
+    for key in ("scale", "closed", *PLACEMENT_KEYS):
+        if key in table:
+            raise table.error(
+                f"{key} = {table.data[key]!r} cannot go with part: an imprinted box is placed so "
+                "that it becomes the domain; remove it"
+            )
+    if table.data["part"] == "all":
+        raise table.error(
+            'part = "all" would join all electrodes to one; give part = 1, 2, … or use '
+            "[[electrodes_from_stl]]"
+        )
+    parts = imprinted_parts(table, folder, domain)
+    return parts[table.integer("part", 1, len(parts)) - 1]
+
+
+def read_imprint_group(table: Table, folder: Path, domain: Domain) -> list[Electrode]:
+    """Read an ``[[electrodes_from_stl]]`` item: every part of an imprinted box.
+
+    Keys are ``file``, ``unit`` and ``name``, in which "{}" becomes the part's number from 1.
+
+    Raises
+    ------
+    DesignError
+        If the file, its unit or its content is wrong, or if ``name`` has no "{}".
+    """
+    table.only(("file", "unit", "name"))
+    name = table.string("name", "E{}")
+    if name.count("{}") != 1:
+        raise table.error(f'name = {name!r} must contain {{}} once, such as "E{{}}"')
+    parts = imprinted_parts(table, folder, domain)
+    return [Electrode(name.replace("{}", str(k)), p) for k, p in enumerate(parts, start=1)]
+
+
+def imprinted_parts(table: Table, folder: Path, domain: Domain) -> list[Surface]:
+    """Electrodes imprinted on the floor of a box, sorted by centre y, then x.
+
+    The file holds a watertight solid, a box whose floor is pushed in by flat-topped mesas. Every
+    mesa's top is one electrode. The side walls are dropped: they meet the grounded floor and
+    would short the electrode. The box is moved so that its floor's centre comes to x = y = 0 and
+    the floor to z = −backplane; a mesa of height h then is an electrode at z = h − backplane.
+
+    Raises
+    ------
+    DesignError
+        If the surface is not closed, differs in size from the domain, or has no mesas.
+    """
+    file = table.string("file")
+    mesh = _weld(table, _read_triangles(table, folder))
+    _require_closed(table, mesh, "a box with imprinted electrodes")
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    size = high - low
+    if not np.allclose(size, domain.size, atol=SIZE_TOLERANCE):
+        text = "[" + ", ".join(f"{s:.6g}" for s in size) + "]"
+        raise table.error(
+            f'file = "{file}" holds a box of {text} m, but the domain is {list(domain.size)} m; '
+            f"set domain size = {text}, or mend unit"
+        )
+    shift = np.array([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2] - domain.backplane])
+    parts = []
+    for facet in sheet_surface(mesh).facets:
+        z = float(facet.origin[2])
+        level = bool(np.all(facet.axes[:2, 2] == 0.0))
+        if level and low[2] + mesh.flatness < z < high[2] - mesh.flatness:
+            moved = Facet(
+                translate(facet.polygon, *shift[:2]),
+                facet.origin + np.array([0.0, 0.0, shift[2]]),
+                facet.axes,
+            )
+            parts.append(Surface((moved,), boundary_segments(moved)))
+    if not parts:
+        raise table.error(
+            f'file = "{file}" has no flat-topped mesas on its floor; give a box with imprinted '
+            'electrodes, or use shape = "stl" without part'
+        )
+    return sorted(parts, key=_row_order)
+
+
+def _row_order(surface: Surface) -> tuple[float, float]:
+    center = surface.bounds.mean(axis=0)
+    return round(float(center[1]), 6), round(float(center[0]), 6)
