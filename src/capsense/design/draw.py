@@ -1,0 +1,217 @@
+"""Drawings of a design: a top view of the sensor with a side view of its stack under it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+import shapely.geometry
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from capsense.design.geometry import Surface, ring_vertices
+from capsense.design.model import Design, Role
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+ELECTRODES = ("#d9822b", "#eab676")  # neighbours in matrix order differ
+ROLE_COLOURS = {Role.GROUND: "#8fa3ad", Role.SHIELD: "#7fb59a", Role.FLOATING: "#b59ac4"}
+LAYER_COLOUR = "#eef0e4"
+INK = "#2b2b2b"
+
+
+def draw_design(design: Design, ax: Axes | None = None) -> Axes:
+    """Draw a design seen from the world (along −z), in millimetres.
+
+    Without ``ax`` a figure is made with a side view under the top view, its heights stretched
+    and not to scale; with ``ax`` only the top view is drawn into it.
+
+    Parameters
+    ----------
+    design
+        The design to draw.
+    ax
+        Matplotlib axes to draw into; by default those of a new figure.
+
+    Returns
+    -------
+    Axes
+        The axes of the top view; ``axes.figure`` is the figure.
+    """
+    side: Axes | None = None
+    if ax is None:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(7.0, 7.2), layout="constrained")
+        top_axes, side = figure.subplots(2, 1, height_ratios=[4.2, 1.0])
+        ax = top_axes
+    _top_view(design, ax)
+    if side is not None:
+        _side_view(design, side)
+    return ax
+
+
+def _outlines(surface: Surface) -> list[Polygon]:
+    """Shadows [mm] of the facets on the xy plane; facets on edge leave none."""
+    out = []
+    for facet in surface.facets:
+        rings = [r[:, :2] * 1e3 for r in ring_vertices(facet)]
+        shadow = Polygon(rings[0], rings[1:]).buffer(0)
+        out += [p for p in shapely.get_parts(shadow) if isinstance(p, Polygon) and p.area > 1e-9]
+    return out
+
+
+def _patch(polygon: Polygon, **style: Any) -> Any:
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    rings = [shapely.get_coordinates(r) for r in (polygon.exterior, *polygon.interiors)]
+    codes = [[Path.MOVETO, *[Path.LINETO] * (len(r) - 2), Path.CLOSEPOLY] for r in rings]
+    return PathPatch(Path(np.concatenate(rings), np.concatenate(codes)), **style)
+
+
+def _top_view(design: Design, ax: Axes) -> None:
+    reach: list[Array] = []
+    for layer in sorted(design.layers, key=lambda k: float(k.upper[2])):
+        low, high = layer.lower[:2] * 1e3, layer.upper[:2] * 1e3
+        outline = shapely.geometry.box(*low, *high)
+        label = f"{layer.name} ({layer.material}, εr {layer.eps_r:g})"
+        if layer.material == "custom":
+            label = f"{layer.name} (εr {layer.eps_r:g})"
+        ax.add_patch(
+            _patch(outline, fc=LAYER_COLOUR, ec="#9a9c86", lw=1.0, ls="--", label=label, zorder=0)
+        )
+        reach += [low, high]
+    conductors = sorted(design.conductors, key=lambda c: float(c.surface.bounds[1, 2]))
+    top = max(float(e.surface.bounds[1, 2]) for e in design.electrodes)
+    for order, conductor in enumerate(conductors, start=1):
+        buried = float(conductor.surface.bounds[1, 2]) < top - 1e-5 and bool(design.layers)
+        style: dict[str, Any] = {
+            "fc": "none" if buried else ROLE_COLOURS[conductor.role],
+            "ec": ROLE_COLOURS[conductor.role] if buried else "#5d6b73",
+            "lw": 1.6 if buried else 0.6,
+            "ls": ":" if buried else "-",
+        }
+        label = f"{conductor.name} ({conductor.role.value}{', below' if buried else ''})"
+        for number, outline in enumerate(_outlines(conductor.surface)):
+            ax.add_patch(
+                _patch(outline, label="" if number else label, zorder=order / 100 + 1, **style)
+            )
+        reach += list(conductor.surface.bounds[:, :2] * 1e3)
+    for number, electrode in enumerate(design.electrodes):
+        outlines = _outlines(electrode.surface)
+        for part, outline in enumerate(outlines):
+            label = "" if number or part else "electrodes"
+            fill = ELECTRODES[number % 2]
+            ax.add_patch(_patch(outline, fc=fill, ec="#7d4510", lw=0.8, label=label, zorder=2))
+        reach += list(electrode.surface.bounds[:, :2] * 1e3)
+        x, y, room = _label_place(electrode.surface, outlines)
+        ax.annotate(
+            electrode.name,
+            (x, y),
+            ha="center",
+            va="center",
+            fontsize=9,
+            color=INK,
+            zorder=3,
+            fontweight="bold",
+            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": room},
+        )
+    points = np.array(reach)
+    margin = 0.06 * float(np.ptp(points, axis=0).max())
+    ax.set_xlim(points[:, 0].min() - margin, points[:, 0].max() + margin)
+    ax.set_ylim(points[:, 1].min() - margin, points[:, 1].max() + margin)
+    ax.set_aspect("equal")
+    ax.set(xlabel="x [mm]", ylabel="y [mm]", title=design.name)
+    ax.tick_params(labelsize=8)
+    ax.grid(color="#d8d8d8", lw=0.4)
+    ax.set_axisbelow(True)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, fontsize=8, frameon=False)
+
+
+def _label_place(surface: Surface, outlines: list[Polygon]) -> tuple[float, float, float]:
+    """Where a name goes [mm], and how opaque its background must be."""
+    if not outlines:
+        x, y = surface.bounds.mean(axis=0)[:2] * 1e3
+        return float(x), float(y), 0.8
+    largest = max(outlines, key=lambda p: p.area)
+    spot = largest.centroid if largest.contains(largest.centroid) else None
+    if spot is None or len(largest.exterior.coords) > 24:
+        spot = shapely.maximum_inscribed_circle(largest).interpolate(0.0)
+        spot = largest.centroid if largest.convex_hull.area < 1.1 * largest.area else spot
+    return float(spot.x), float(spot.y), 0.75
+
+
+def _side_view(design: Design, ax: Axes) -> None:
+    """The stack seen along +y: every level of the design at equal steps, with its z in mm."""
+    backplane = -design.domain.backplane
+    values = [backplane]
+    for layer in design.layers:
+        values += [float(layer.lower[2]), float(layer.upper[2])]
+    sheets = [e.surface for e in design.electrodes] + [c.surface for c in design.conductors]
+    values += [float(z) for s in sheets for z in s.bounds[:, 2]]
+    levels = sorted({round(v * 1e3, 4) for v in values})
+
+    def height(z: float) -> float:
+        return float(np.interp(z * 1e3, levels, np.arange(len(levels))))
+
+    ax.axhline(height(backplane), color=INK, lw=1.5)
+    ax.annotate(
+        "grounded floor of the domain",
+        (0.01, height(backplane)),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 3),
+        textcoords="offset points",
+        fontsize=8,
+        color=INK,
+    )
+    for layer in design.layers:
+        x, width = layer.lower[0] * 1e3, (layer.upper[0] - layer.lower[0]) * 1e3
+        bottom, top = height(layer.lower[2]), height(layer.upper[2])
+        ax.bar(x, top - bottom, width, bottom, align="edge", fc=LAYER_COLOUR, ec="#9a9c86", lw=0.8)
+        ax.annotate(
+            f"{layer.name}, {(layer.upper[2] - layer.lower[2]) * 1e3:g} mm",
+            (x + width / 2, (bottom + top) / 2),
+            ha="center",
+            va="center",
+            fontsize=8,
+            color=INK,
+        )
+    for conductor in design.conductors:
+        _edge_on(ax, conductor.surface, height, ROLE_COLOURS[conductor.role])
+    for number, electrode in enumerate(design.electrodes):
+        _edge_on(ax, electrode.surface, height, ELECTRODES[number % 2])
+    top_axes = ax.figure.axes[0]
+    ax.set_xlim(top_axes.get_xlim())
+    ax.set_ylim(-0.35, len(levels) - 0.4)
+    ax.set_yticks(np.arange(len(levels)), [f"{v:.4g}" for v in levels], fontsize=8)
+    ax.tick_params(labelsize=8)
+    ax.set(xlabel="x [mm]", ylabel="z [mm]")
+    ax.set_title("side view, heights not to scale", fontsize=9)
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _edge_on(ax: Axes, surface: Surface, height: Any, colour: str) -> None:
+    """Draw each facet's extent in x and z."""
+    for facet in surface.facets:
+        points = ring_vertices(facet)[0]
+        x, z = points[:, 0] * 1e3, points[:, 2]
+        if np.ptp(z) < 1e-6:
+            for low, high in _runs(facet, float(points[:, 1].mean())):
+                ax.plot([low, high], [height(z[0])] * 2, color=colour, lw=4, solid_capstyle="butt")
+        else:
+            ax.fill(x, [height(v) for v in z], color=colour, alpha=0.5, lw=0.8)
+
+
+def _runs(facet: Any, y: float) -> list[tuple[float, float]]:
+    """Where a horizontal line at y [m] through a horizontal facet meets it: x [mm] from, to."""
+    rings = ring_vertices(facet)
+    outline = Polygon(rings[0][:, :2], [r[:, :2] for r in rings[1:]])
+    x0, _, x1, _ = outline.bounds
+    cut = outline.intersection(shapely.geometry.LineString([(x0 - 1, y), (x1 + 1, y)]))
+    parts = [p.bounds for p in shapely.get_parts(cut) if p.length > 0]
+    return [(b[0] * 1e3, b[2] * 1e3) for b in parts]
