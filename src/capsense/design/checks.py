@@ -44,8 +44,10 @@ def check_design(design: Design, *, source: str = "design") -> None:
 
 
 def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
-    """Move horizontal facets that lie within a micrometre of a layer's face exactly onto it."""
+    """Move a horizontal sheet that lies within a micrometre of a layer's face exactly onto it."""
     levels = [float(z) for layer in layers for z in (layer.lower[2], layer.upper[2])]
+    if np.ptp(surface.bounds[:, 2]) > TOUCH:
+        return surface
     facets, moved = [], 0.0
     for facet in surface.facets:
         z = float(facet.origin[2])
@@ -54,8 +56,7 @@ def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
             moved = near[0] - z
             facet = Facet(facet.polygon, facet.origin + np.array([0.0, 0.0, moved]), facet.axes)
         facets.append(facet)
-    flat = np.ptp(surface.rims[:, :, 2]) <= TOUCH
-    if moved == 0.0 or not flat:
+    if moved == 0.0:
         return surface
     return Surface(tuple(facets), surface.rims + np.array([0.0, 0.0, moved]))
 

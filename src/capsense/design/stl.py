@@ -182,15 +182,18 @@ def sheet_surface(mesh: SheetMesh) -> Surface:
 
 
 def flat_regions(mesh: SheetMesh) -> list[list[int]]:
-    """Face numbers of each connected flat region, grown from its largest face."""
+    """Face numbers of each connected flat region, grown from its largest face.
+
+    A region grows over the neighbours that lie in its plane; then the plane is fitted anew to the
+    whole region and growth goes on, so that single precision in one small face does not end it.
+    """
     neighbours: dict[int, list[tuple[int, float]]] = defaultdict(list)
     for (a, b), opposed in zip(mesh.pairs.tolist(), mesh.opposed.tolist(), strict=True):
         neighbours[a].append((b, 1.0 if opposed else -1.0))
         neighbours[b].append((a, 1.0 if opposed else -1.0))
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    edges = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     taken = np.zeros(len(mesh.faces), dtype=bool)
     regions = []
     for seed in np.argsort(-area, kind="stable").tolist():
@@ -198,31 +201,42 @@ def flat_regions(mesh: SheetMesh) -> list[list[int]]:
             continue
         taken[seed] = True
         normal, point = mesh.normals[seed], corners[seed, 0]
-        region, queue = [seed], deque([(seed, 1.0)])
-        while queue:
-            face, sense = queue.popleft()
-            for other, relative in neighbours[face]:
-                turned = sense * relative
-                if taken[other] or turned * float(mesh.normals[other] @ normal) < 0.999:
-                    continue
-                if np.abs((corners[other] - point) @ normal).max() <= mesh.flatness:
-                    taken[other] = True
-                    region.append(other)
-                    queue.append((other, turned))
-        regions.append(region)
+        senses, grown = {seed: 1.0}, 0
+        while len(senses) > max(grown, 1) or grown == 0:
+            grown = len(senses)
+            queue = deque(senses)
+            while queue:
+                face = queue.popleft()
+                for other, relative in neighbours[face]:
+                    sense = senses[face] * relative
+                    if taken[other] or sense * float(mesh.normals[other] @ normal) < 0.999:
+                        continue
+                    if np.abs((corners[other] - point) @ normal).max() <= mesh.flatness:
+                        taken[other] = True
+                        senses[other] = sense
+                        queue.append(other)
+            normal, point = _fitted_plane(corners[list(senses)].reshape(-1, 3), normal)
+        regions.append(list(senses))
     return regions
+
+
+def _fitted_plane(points: Array, normal: Array) -> tuple[Array, Array]:
+    """Unit normal, on the side of ``normal``, and centre of the plane nearest to the points."""
+    center = points.mean(axis=0)
+    fitted = np.linalg.svd(points - center, full_matrices=False)[2][2]
+    return fitted * np.sign(fitted @ normal), center
 
 
 def _region_facets(mesh: SheetMesh, region: list[int]) -> list[Facet]:
     corners = mesh.vertices[mesh.faces[region]]
-    normal = mesh.normals[region[0]]
+    normal, center = _fitted_plane(corners.reshape(-1, 3), mesh.normals[region[0]])
     if np.ptp(corners[..., 2]) <= mesh.flatness:
         axes, origin = np.eye(3), np.array([0.0, 0.0, float(np.median(corners[..., 2]))])
     else:
         helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
         u = np.cross(helper, normal)
         u /= np.linalg.norm(u)
-        axes, origin = np.array([u, np.cross(normal, u), normal]), corners[0, 0]
+        axes, origin = np.array([u, np.cross(normal, u), normal]), center
     flat = (corners - origin) @ axes[:2].T
     if len(region) == 1:
         return [Facet(shapely.geometry.polygon.orient(Polygon(flat[0])), origin, axes)]
