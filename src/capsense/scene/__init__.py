@@ -2,6 +2,7 @@
 
 from capsense.scene.body import Body
 from capsense.scene.materials import MATERIALS, Material, material
+from capsense.scene.mesh_shape import DistanceGrid, TriMesh
 from capsense.scene.pose import Pose
 from capsense.scene.scene import PackedScene, Scene
 from capsense.scene.shape import Shape, ShapeKind
@@ -13,6 +14,7 @@ __all__ = [
     "Box",
     "Capsule",
     "Cylinder",
+    "DistanceGrid",
     "Ellipsoid",
     "Material",
     "PackedScene",
@@ -21,5 +23,6 @@ __all__ = [
     "Shape",
     "ShapeKind",
     "Sphere",
+    "TriMesh",
     "material",
 ]

@@ -1,8 +1,8 @@
-"""Compiled line intersections, called from the solver's kernels. Numba is imported here only.
-
+"""Compiled line intersections, called from the solver's kernels.
 All functions are free of allocations and never return NaN for finite lines of non-zero
 direction. Misses are ``(inf, -inf)``, so ``t0 <= t1`` tells a hit. The readable references are
-the ``line_intervals`` methods of :mod:`capsense.scene.shapes`.
+the ``line_intervals`` methods of :mod:`capsense.scene.shapes`. Numba is imported by the kernel
+modules only.
 """
 
 from __future__ import annotations
@@ -180,56 +180,174 @@ def body_line_interval(
 
 
 @njit(cache=True, error_model="numpy")
-def place_bodies(
-    kinds: NDArray[np.int64],
-    params: Array,
-    centre: Array,
-    quaternion: Array,
-    position: Array,
-    rotation: Array,
-    bounds: Array,
-) -> None:
-    """Fill rotation matrices and sensor-frame bounding boxes of all bodies.
+def grid_value(grid: NDArray[np.float32], x: float, y: float, z: float) -> float:
+    """Trilinear interpolation at (x, y, z) in cells; points outside are drawn to the edge."""
+    x = min(max(x, 0.0), grid.shape[0] - 1.0)
+    y = min(max(y, 0.0), grid.shape[1] - 1.0)
+    z = min(max(z, 0.0), grid.shape[2] - 1.0)
+    i = min(int(x), grid.shape[0] - 2)
+    j = min(int(y), grid.shape[1] - 2)
+    k = min(int(z), grid.shape[2] - 2)
+    x -= i
+    y -= j
+    z -= k
+    a = grid[i, j, k] * (1.0 - z) + grid[i, j, k + 1] * z
+    b = grid[i, j + 1, k] * (1.0 - z) + grid[i, j + 1, k + 1] * z
+    c = grid[i + 1, j, k] * (1.0 - z) + grid[i + 1, j, k + 1] * z
+    d = grid[i + 1, j + 1, k] * (1.0 - z) + grid[i + 1, j + 1, k + 1] * z
+    a = a * (1.0 - y) + b * y
+    c = c * (1.0 - y) + d * y
+    return a * (1.0 - x) + c * x
+
+
+@njit(cache=True, error_model="numpy")
+def _crossing(
+    grid: NDArray[np.float32],
+    px: float,
+    py: float,
+    pz: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    a: float,
+    fa: float,
+    b: float,
+    fb: float,
+) -> float:
+    """Zero of the interpolated distance between two points of a line, by Ridders' method.
+
+    The bracket at least halves in every round, so an end that happens to touch zero does no
+    harm; on a linear stretch the first round is exact and the second confirms it.
+    """
+    last = _INF
+    s = a
+    for _ in range(30):
+        m = 0.5 * (a + b)
+        fm = grid_value(grid, px + m * ux, py + m * uy, pz + m * uz)
+        root = math.sqrt(fm * fm - fa * fb)
+        if root == 0.0:
+            return m
+        s = m + (m - a) * (fm / root if fa > fb else -fm / root)
+        if b - a < 1e-7 or abs(s - last) < 1e-7:
+            break
+        last = s
+        f = grid_value(grid, px + s * ux, py + s * uy, pz + s * uz)
+        if (fm <= 0.0) != (f <= 0.0):
+            if s < m:
+                a, fa, b, fb = s, f, m, fm
+            else:
+                a, fa, b, fb = m, fm, s, f
+        elif (fa <= 0.0) != (f <= 0.0):
+            b, fb = min(s, m), f if s < m else fm
+        else:
+            a, fa = max(s, m), f if s > m else fm
+    return s
+
+
+@njit(cache=True, error_model="numpy")
+def mesh_line_intervals(
+    grid: NDArray[np.float32],
+    origin: Array,
+    inv_h: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    out: Array,
+) -> int:
+    """Stretches of the line o + t d inside a signed-distance grid, all in the body's frame.
+
+    The line is followed in steps of the distance less half a cell, and of half a cell at least;
+    crossings are then found to 1e-7 of a cell on the trilinear interpolant. Where three samples
+    show a nearest approach, their parabola's extremum is probed, so that a grazing
+    line does not flicker.
 
     Args:
-        kinds: Shape kinds, shape (n,).
-        params: Sizes [m], shape (n, 3).
-        centre: Centres of the local bounding boxes [m], shape (n, 3).
-        quaternion: Unit quaternions (x, y, z, w), shape (n, 4).
-        position: Origins of the bodies' frames [m], shape (n, 3).
-        rotation: Receives the rotation matrices, shape (n, 3, 3).
-        bounds: Receives lower and upper corners [m], shape (n, 2, 3).
+        grid: Signed distances [m], shape (nx, ny, nz), positive all over its boundary.
+        origin: First node [m], shape (3,).
+        inv_h: Reciprocal of the node spacing [1/m].
+        ox, oy, oz: A point [m] on the line.
+        dx, dy, dz: Direction, of any non-zero length.
+        out: Receives entry and exit of each stretch in ascending order, shape (K, 2). Rows that
+            are not used are left alone. If there are more than K stretches, the last row ends
+            at the last exit.
+
+    Returns:
+        The number of rows written.
     """
-    for i in range(kinds.shape[0]):
-        x, y, z, w = quaternion[i, 0], quaternion[i, 1], quaternion[i, 2], quaternion[i, 3]
-        r = rotation[i]
-        r[0, 0] = 1 - 2 * (y * y + z * z)
-        r[0, 1] = 2 * (x * y - z * w)
-        r[0, 2] = 2 * (x * z + y * w)
-        r[1, 0] = 2 * (x * y + z * w)
-        r[1, 1] = 1 - 2 * (x * x + z * z)
-        r[1, 2] = 2 * (y * z - x * w)
-        r[2, 0] = 2 * (x * z - y * w)
-        r[2, 1] = 2 * (y * z + x * w)
-        r[2, 2] = 1 - 2 * (x * x + y * y)
-        a, b, c = params[i, 0], params[i, 1], params[i, 2]
-        kind = kinds[i]
-        for k in range(3):
-            if kind == _SPHERE:
-                half = a
-            elif kind == _CAPSULE:
-                half = a + b * abs(r[k, 2])
-            elif kind == _CYLINDER:
-                half = b * abs(r[k, 2]) + a * math.sqrt(max(0.0, 1.0 - r[k, 2] * r[k, 2]))
-            elif kind == _ELLIPSOID:
-                half = math.sqrt((a * r[k, 0]) ** 2 + (b * r[k, 1]) ** 2 + (c * r[k, 2]) ** 2)
+    speed = math.sqrt(dx * dx + dy * dy + dz * dz) * inv_h
+    scale = inv_h / speed
+    ux, uy, uz = dx * scale, dy * scale, dz * scale
+    px, py, pz = (ox - origin[0]) * inv_h, (oy - origin[1]) * inv_h, (oz - origin[2]) * inv_h
+    hx, hy, hz = 0.5 * (grid.shape[0] - 1), 0.5 * (grid.shape[1] - 1), 0.5 * (grid.shape[2] - 1)
+    x0, x1 = slab(px - hx, ux, hx)
+    y0, y1 = slab(py - hy, uy, hy)
+    z0, z1 = slab(pz - hz, uz, hz)
+    s = max(x0, max(y0, z0))
+    end = min(x1, min(y1, z1))
+    n = 0
+    if s >= end:
+        return n
+    v = grid_value(grid, px + s * ux, py + s * uy, pz + s * uz)
+    before_s = s
+    before_v = v
+    entry = s
+    inside = v <= 0.0
+    while s < end:
+        step = max(0.5, abs(v) * inv_h - 0.5)
+        next_s = min(s + step, end)
+        next_v = grid_value(grid, px + next_s * ux, py + next_s * uy, pz + next_s * uz)
+        next_inside = next_v <= 0.0
+        if next_inside != inside:
+            t = _crossing(grid, px, py, pz, ux, uy, uz, s, v, next_s, next_v) / speed
+            if next_inside:
+                entry = t
             else:
-                half = a * abs(r[k, 0]) + b * abs(r[k, 1]) + c * abs(r[k, 2])
-            middle = (
-                position[i, k]
-                + r[k, 0] * centre[i, 0]
-                + r[k, 1] * centre[i, 1]
-                + r[k, 2] * centre[i, 2]
-            )
-            bounds[i, 0, k] = middle - half
-            bounds[i, 1, k] = middle + half
+                row = min(n, out.shape[0] - 1)
+                if row == n:
+                    out[row, 0] = entry
+                    n += 1
+                out[row, 1] = t
+            inside = next_inside
+        elif (
+            (before_v <= 0.0) == inside
+            and abs(v) <= abs(before_v)
+            and abs(v) < abs(next_v)
+            and abs(v) * inv_h < 1.0
+        ):
+            # All three on one side, nearest in the middle: does the line touch in between?
+            l0 = s - before_s
+            l1 = next_s - s
+            if l0 > 0.0 and l1 > 0.0:
+                g0 = (v - before_v) / l0
+                g1 = (next_v - v) / l1
+                probe = s - 0.5 * (g0 * l1 + g1 * l0) / (g1 - g0)
+                f = grid_value(grid, px + probe * ux, py + probe * uy, pz + probe * uz)
+                if (f <= 0.0) != inside:
+                    a = _crossing(grid, px, py, pz, ux, uy, uz, before_s, before_v, probe, f)
+                    b = _crossing(grid, px, py, pz, ux, uy, uz, probe, f, next_s, next_v)
+                    row = min(n, out.shape[0] - 1)
+                    if inside:
+                        if row == n:
+                            out[row, 0] = entry
+                            n += 1
+                        out[row, 1] = a / speed
+                        entry = b / speed
+                    else:
+                        if row == n:
+                            out[row, 0] = a / speed
+                            n += 1
+                        out[row, 1] = b / speed
+        before_s = s
+        before_v = v
+        s = next_s
+        v = next_v
+    if inside:
+        row = min(n, out.shape[0] - 1)
+        if row == n:
+            out[row, 0] = entry
+            n += 1
+        out[row, 1] = end / speed
+    return n

@@ -90,7 +90,7 @@ class Scene:
 
     def pack(self) -> PackedScene:
         """Lay the geometry out as flat arrays for the solver's kernels."""
-        from capsense.scene.kernels import place_bodies
+        from capsense.scene.batch_kernels import place_bodies
 
         n = len(self.bodies)
         shapes = tuple([b.shape for b in self.bodies])

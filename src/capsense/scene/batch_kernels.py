@@ -1,0 +1,113 @@
+"""Compiled loops over bodies, lines and points, around :mod:`capsense.scene.kernels`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from capsense.scene.kernels import grid_value, mesh_line_intervals
+from capsense.scene.shape import ShapeKind
+
+Array = NDArray[np.float64]
+
+_SPHERE = int(ShapeKind.SPHERE)
+_CAPSULE = int(ShapeKind.CAPSULE)
+_CYLINDER = int(ShapeKind.CYLINDER)
+_ELLIPSOID = int(ShapeKind.ELLIPSOID)
+_INF = math.inf
+
+
+@njit(cache=True, error_model="numpy")
+def place_bodies(
+    kinds: NDArray[np.int64],
+    params: Array,
+    centre: Array,
+    quaternion: Array,
+    position: Array,
+    rotation: Array,
+    bounds: Array,
+) -> None:
+    """Fill rotation matrices and sensor-frame bounding boxes of all bodies.
+
+    Args:
+        kinds: Shape kinds, shape (n,).
+        params: Sizes [m], shape (n, 3).
+        centre: Centres of the local bounding boxes [m], shape (n, 3).
+        quaternion: Unit quaternions (x, y, z, w), shape (n, 4).
+        position: Origins of the bodies' frames [m], shape (n, 3).
+        rotation: Receives the rotation matrices, shape (n, 3, 3).
+        bounds: Receives lower and upper corners [m], shape (n, 2, 3).
+    """
+    for i in range(kinds.shape[0]):
+        x, y, z, w = quaternion[i, 0], quaternion[i, 1], quaternion[i, 2], quaternion[i, 3]
+        r = rotation[i]
+        r[0, 0] = 1 - 2 * (y * y + z * z)
+        r[0, 1] = 2 * (x * y - z * w)
+        r[0, 2] = 2 * (x * z + y * w)
+        r[1, 0] = 2 * (x * y + z * w)
+        r[1, 1] = 1 - 2 * (x * x + z * z)
+        r[1, 2] = 2 * (y * z - x * w)
+        r[2, 0] = 2 * (x * z - y * w)
+        r[2, 1] = 2 * (y * z + x * w)
+        r[2, 2] = 1 - 2 * (x * x + y * y)
+        a, b, c = params[i, 0], params[i, 1], params[i, 2]
+        kind = kinds[i]
+        for k in range(3):
+            if kind == _SPHERE:
+                half = a
+            elif kind == _CAPSULE:
+                half = a + b * abs(r[k, 2])
+            elif kind == _CYLINDER:
+                half = b * abs(r[k, 2]) + a * math.sqrt(max(0.0, 1.0 - r[k, 2] * r[k, 2]))
+            elif kind == _ELLIPSOID:
+                half = math.sqrt((a * r[k, 0]) ** 2 + (b * r[k, 1]) ** 2 + (c * r[k, 2]) ** 2)
+            else:
+                half = a * abs(r[k, 0]) + b * abs(r[k, 1]) + c * abs(r[k, 2])
+            middle = (
+                position[i, k]
+                + r[k, 0] * centre[i, 0]
+                + r[k, 1] * centre[i, 1]
+                + r[k, 2] * centre[i, 2]
+            )
+            bounds[i, 0, k] = middle - half
+            bounds[i, 1, k] = middle + half
+
+
+@njit(cache=True, error_model="numpy")
+def mesh_intervals_of_lines(
+    grid: NDArray[np.float32], origin: Array, inv_h: float, o: Array, d: Array, out: Array
+) -> None:
+    """Apply :func:`mesh_line_intervals` to lines of shape (n, 3); ``out`` has shape (n, K, 2)."""
+    for i in range(o.shape[0]):
+        for row in range(out.shape[1]):
+            out[i, row, 0] = _INF
+            out[i, row, 1] = -_INF
+        mesh_line_intervals(
+            grid,
+            origin,
+            inv_h,
+            o[i, 0],
+            o[i, 1],
+            o[i, 2],
+            d[i, 0],
+            d[i, 1],
+            d[i, 2],
+            out[i],
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def grid_distances(
+    grid: NDArray[np.float32], origin: Array, inv_h: float, points: Array, out: Array
+) -> None:
+    """Interpolate distances [m] at points [m] of shape (n, 3); ``out`` has shape (n,)."""
+    for i in range(points.shape[0]):
+        out[i] = grid_value(
+            grid,
+            (points[i, 0] - origin[0]) * inv_h,
+            (points[i, 1] - origin[1]) * inv_h,
+            (points[i, 2] - origin[2]) * inv_h,
+        )
