@@ -40,6 +40,11 @@ def test_loads_fast_and_the_same_again(name: str) -> None:
     assert load_design(name).content_hash() == first.content_hash()
     assert first.domain.size == (0.5, 0.5, 0.5)
     assert first.description
+    for item in (*first.electrodes, *first.conductors):
+        for facet in item.surface.facets:
+            assert facet.polygon.is_valid
+            assert facet.polygon.exterior.is_ccw
+            assert not any(hole.is_ccw for hole in facet.polygon.interiors)
 
 
 def test_six_patch() -> None:

@@ -213,6 +213,15 @@ BAD: dict[str, tuple[tuple[tuple[str, Any], ...], tuple[str, ...]]] = {
         (("conductor.+", {**POUR, "clearance": 0.0}),),
         ('conductor "pour"', "clearance = 0", "positive"),
     ),
+    "clearance on a box": (
+        (
+            (
+                "conductor.+",
+                {**POUR, "shape": "box", "size": [0.09, 0.07, 0.02], "clearance": 0.001, "z": 0.01},
+            ),
+        ),
+        ('conductor "pour"', "0.001", "flat"),
+    ),
     "roles touch": (
         (("conductor.+", {**POUR, "role": "shield", "z": -0.001}),),
         ('conductor "back"', 'conductor "pour"', "short circuit", "apart"),

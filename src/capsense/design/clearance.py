@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from shapely.geometry import Polygon
+from shapely.geometry.polygon import orient
 
 from capsense.design.contact import in_plane_of
 from capsense.design.geometry import Facet, Surface, boundary_segments
@@ -29,10 +30,12 @@ def cut_clearance(table: Table, surface: Surface, electrodes: Sequence[Electrode
     Raises
     ------
     DesignError
-        If ``clearance`` is no positive length, or if nothing of the conductor remains.
+        If ``clearance`` is no positive length, if the conductor is not flat, or if nothing of it
+        remains.
     """
     clearance = table.length("clearance")
     facets: list[Facet] = []
+    cut = False
     for facet in surface.facets:
         gaps = []
         for electrode in electrodes:
@@ -43,12 +46,20 @@ def cut_clearance(table: Table, surface: Surface, electrodes: Sequence[Electrode
         if not gaps:
             facets.append(facet)
             continue
+        cut = True
         rest = shapely.difference(
             facet.polygon, shapely.union_all(gaps, grid_size=GRID), grid_size=GRID
         )
         for piece in shapely.get_parts(rest):
             if isinstance(piece, Polygon) and not piece.buffer(-SLIVER / 2).is_empty:
-                facets.append(Facet(piece, facet.origin, facet.axes))
+                facets.append(Facet(orient(piece), facet.origin, facet.axes))
+    if not cut:
+        return surface
+    if any(in_plane_of(surface.facets[0], f) is None for f in surface.facets):
+        raise table.error(
+            f"clearance = {clearance:g} needs a flat conductor; give the pour as a planar shape of "
+            "its own"
+        )
     if not facets:
         raise table.error(
             f"clearance = {clearance:g} leaves nothing of it; make it larger or reduce clearance"

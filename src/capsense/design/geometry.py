@@ -18,11 +18,12 @@ class Facet:
     """A planar polygon, possibly with holes, placed in the sensor frame.
 
     A point (u, v) of the polygon lies at ``origin + u * axes[0] + v * axes[1]``; ``axes[2]`` is
-    the facet's normal. Lengths in metres.
+    the facet's normal. Lengths in metres. Horizontal facets of a loaded design have the sensor
+    frame's axes and the origin (0, 0, z), so that (u, v) are sensor coordinates (x, y).
     """
 
     polygon: Polygon
-    """Outline in the facet's own plane, (u, v) [m]."""
+    """Outline in the facet's own plane, (u, v) [m], counterclockwise; holes run clockwise."""
     origin: Array
     """Origin of the facet's plane [m] in the sensor frame, shape (3,)."""
     axes: Array

@@ -10,6 +10,7 @@ import numpy as np
 import shapely.affinity
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
+from shapely.geometry.polygon import orient
 
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.schema import Table
@@ -122,8 +123,8 @@ def place_polygons(polygons: Sequence[Polygon], placement: Placement) -> Surface
         if horizontal:
             (a, b), (d, e) = rotation[0, :2], rotation[1, :2]
             moved = shapely.affinity.affine_transform(polygon, [a, b, d, e, origin[0], origin[1]])
-            facets.append(Facet(moved, np.array([0.0, 0.0, origin[2]]), np.eye(3)))
+            facets.append(Facet(orient(moved), np.array([0.0, 0.0, origin[2]]), np.eye(3)))
         else:
-            facets.append(Facet(polygon, origin.copy(), rotation.T.copy()))
+            facets.append(Facet(orient(polygon), origin.copy(), rotation.T.copy()))
     rims = np.concatenate([boundary_segments(f) for f in facets])
     return Surface(tuple(facets), rims)

@@ -202,7 +202,7 @@ def flat_regions(mesh: SheetMesh) -> list[list[int]]:
         taken[seed] = True
         normal, point = mesh.normals[seed], corners[seed, 0]
         senses, grown = {seed: 1.0}, 0
-        while len(senses) > max(grown, 1) or grown == 0:
+        while len(senses) > grown:
             grown = len(senses)
             queue = deque(senses)
             while queue:
@@ -215,7 +215,8 @@ def flat_regions(mesh: SheetMesh) -> list[list[int]]:
                         taken[other] = True
                         senses[other] = sense
                         queue.append(other)
-            normal, point = _fitted_plane(corners[list(senses)].reshape(-1, 3), normal)
+            if len(senses) > max(grown, 1):
+                normal, point = _fitted_plane(corners[list(senses)].reshape(-1, 3), normal)
         regions.append(list(senses))
     return regions
 
@@ -229,7 +230,9 @@ def _fitted_plane(points: Array, normal: Array) -> tuple[Array, Array]:
 
 def _region_facets(mesh: SheetMesh, region: list[int]) -> list[Facet]:
     corners = mesh.vertices[mesh.faces[region]]
-    normal, center = _fitted_plane(corners.reshape(-1, 3), mesh.normals[region[0]])
+    normal, center = mesh.normals[region[0]], corners[0].mean(axis=0)
+    if len(region) > 1:
+        normal, center = _fitted_plane(corners.reshape(-1, 3), normal)
     if np.ptp(corners[..., 2]) <= mesh.flatness:
         axes, origin = np.eye(3), np.array([0.0, 0.0, float(np.median(corners[..., 2]))])
     else:
