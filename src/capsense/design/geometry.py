@@ -18,7 +18,7 @@ class Facet:
     """A planar polygon, possibly with holes, placed in the sensor frame.
 
     A point (u, v) of the polygon lies at ``origin + u * axes[0] + v * axes[1]``; ``axes[2]`` is
-    the facet's normal. Lengths in metres. Horizontal facets of a loaded design have the sensor
+    the facet's normal. Lengths in metres. Flat horizontal sheets of a loaded design have the sensor
     frame's axes and the origin (0, 0, z), so that (u, v) are sensor coordinates (x, y).
     """
 
