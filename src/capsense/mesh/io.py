@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import importlib
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
+from xml.etree.ElementTree import ParseError
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import MeshError, MissingDependencyError
+from capsense.mesh.msh_reader import parse_msh
 from capsense.mesh.msh_writer import MshVersion, write_msh
 from capsense.mesh.tetmesh import GROUND, IntArray, TetMesh
 
@@ -23,6 +26,8 @@ METRES_PER: dict[str, float] = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 SUFFIXES = (".msh", ".vtu", ".mat")
 """File types that meshes are read from and written to."""
 
+_TETRAHEDRA = ("tetra", "tetra10")
+_OTHER_SOLIDS = ("hexahedron", "wedge", "pyramid", "hexahedron20", "hexahedron27", "polyhedron")
 _NODE_PREFIX, _CELL_PREFIX = "node_group:", "cell_group:"
 
 
@@ -43,10 +48,10 @@ def load_mesh(path: str | Path, unit: Unit | None = None) -> TetMesh:
     Raises
     ------
     MeshError
-        If the suffix is not one of `SUFFIXES`, or the file is missing, unreadable, holds no
-        tetrahedra or is inconsistent.
+        If the suffix is not one of `SUFFIXES`, or the file is missing, unreadable, inconsistent,
+        holds no tetrahedra or holds other solids.
     MissingDependencyError
-        If meshio is needed and not installed.
+        If the file is a `.vtu` and meshio is not installed.
     """
     path = Path(path)
     suffix = _suffix(path)
@@ -55,16 +60,8 @@ def load_mesh(path: str | Path, unit: Unit | None = None) -> TetMesh:
     scale = METRES_PER[unit or ("cm" if suffix == ".mat" else "m")]
     if not path.is_file():
         raise MeshError(f"there is no mesh file {path}")
-    if suffix == ".mat":
-        return _load_mat(path, scale)
-    meshio = _meshio()
-    try:
-        data = meshio.read(path)
-    except (meshio.ReadError, ValueError, KeyError, IndexError, AttributeError, OSError) as error:
-        raise MeshError(f"{path} is not a readable {suffix} file: {error}") from error
-    except SystemExit as error:  # meshio leaves the interpreter on some malformed files
-        raise MeshError(f"{path} is not a readable {suffix} file") from error
-    return _from_msh(data, path, scale) if suffix == ".msh" else _from_vtu(data, path, scale)
+    load = {".msh": _load_msh, ".vtu": _load_vtu, ".mat": _load_mat}[suffix]
+    return load(path, scale)
 
 
 def save_mesh(
@@ -96,7 +93,7 @@ def save_mesh(
         If the suffix is not one of `SUFFIXES`, data does not fit the mesh or the file type, or
         the file cannot be written.
     MissingDependencyError
-        If meshio is needed and not installed.
+        If the file is a `.vtu` and meshio is not installed.
     """
     path = Path(path)
     suffix = _suffix(path)
@@ -128,7 +125,7 @@ def _meshio() -> ModuleType:
         return importlib.import_module("meshio")
     except ImportError as error:
         raise MissingDependencyError(
-            "reading .msh and using .vtu files needs meshio; install it with: "
+            "reading and writing .vtu files needs meshio; install it with: "
             'pip install "capsense[mesh]"'
         ) from error
 
@@ -154,43 +151,36 @@ def _compact(
     )
 
 
+def _load_msh(path: Path, scale: float) -> TetMesh:
+    try:
+        data = parse_msh(path.read_bytes())
+    except (MeshError, ValueError, IndexError, OverflowError, OSError) as error:
+        raise MeshError(f"{path} is not a readable .msh file: {error}") from error
+    if len(data.tets) == 0:
+        raise MeshError(f"{path} holds no tetrahedra")
+    return _compact(data.points * scale, data.tets, data.nodes, data.cells)
+
+
 def _tetrahedra(data: Any, path: Path) -> NDArray[np.integer]:
-    blocks = [b.data[:, :4] for b in data.cells if b.type in ("tetra", "tetra10")]
+    counts = Counter({block.type: len(block.data) for block in data.cells})
+    if others := {kind: n for kind, n in counts.items() if kind in _OTHER_SOLIDS}:
+        raise MeshError(f"{path} holds solids that are not tetrahedra: {others}")
+    blocks = [block.data[:, :4] for block in data.cells if block.type in _TETRAHEDRA]
     if not blocks:
-        kinds = ", ".join(sorted({b.type for b in data.cells})) or "nothing"
-        raise MeshError(f"{path} holds no tetrahedra (it holds: {kinds})")
+        raise MeshError(f"{path} holds no tetrahedra (it holds: {', '.join(counts) or 'nothing'})")
     return np.concatenate(blocks)
 
 
-def _from_msh(data: Any, path: Path, scale: float) -> TetMesh:
+def _load_vtu(path: Path, scale: float) -> TetMesh:
+    meshio = _meshio()
+    try:
+        data = meshio.read(path)
+    except (meshio.ReadError, ParseError, ValueError, KeyError, IndexError, OSError) as error:
+        raise MeshError(f"{path} is not a readable .vtu file: {error}") from error
+    except SystemExit as error:  # meshio leaves the interpreter on some malformed files
+        raise MeshError(f"{path} is not a readable .vtu file") from error
     tets = _tetrahedra(data, path)
-    names = {(int(dim), int(tag)): name for name, (tag, dim) in data.field_data.items()}
-    tags = data.cell_data.get("gmsh:physical", [None] * len(data.cells))
-    nodes: dict[str, list[NDArray[np.integer]]] = {}
-    cells: dict[str, list[NDArray[np.integer]]] = {}
-    first = 0
-    for block, block_tags in zip(data.cells, tags, strict=True):
-        is_tet = block.type in ("tetra", "tetra10")
-        if block_tags is not None and (is_tet or block.dim < 3):
-            for tag in np.unique(block_tags[block_tags > 0]):
-                name = names.get((block.dim, int(tag)), f"physical_{block.dim}_{tag}")
-                members = np.flatnonzero(block_tags == tag)
-                if is_tet:
-                    cells.setdefault(name, []).append(first + members)
-                else:
-                    nodes.setdefault(name, []).append(block.data[members].ravel())
-        first += len(block.data) if is_tet else 0
-    return _compact(
-        np.asarray(data.points, dtype=float)[:, :3] * scale,
-        tets,
-        {name: np.concatenate(parts) for name, parts in nodes.items()},
-        {name: np.concatenate(parts) for name, parts in cells.items()},
-    )
-
-
-def _from_vtu(data: Any, path: Path, scale: float) -> TetMesh:
-    tets = _tetrahedra(data, path)
-    kept = [i for i, block in enumerate(data.cells) if block.type in ("tetra", "tetra10")]
+    kept = [i for i, block in enumerate(data.cells) if block.type in _TETRAHEDRA]
     return _compact(
         np.asarray(data.points, dtype=float) * scale,
         tets,

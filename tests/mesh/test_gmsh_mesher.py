@@ -1,0 +1,223 @@
+"""The Gmsh mesher: conformity, groups, sizes, and manners towards Gmsh's global state."""
+
+from __future__ import annotations
+
+import importlib
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from sensors import rectangle, roof, sheet, two_patches
+
+import capsense.mesh.gmsh_mesher as mesher
+from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
+from capsense.errors import MeshError, MissingDependencyError
+from capsense.mesh import TetMesh, mesh_design
+
+gmsh = pytest.importorskip("gmsh", exc_type=(ImportError, OSError))
+
+
+@pytest.fixture(scope="module")
+def patches() -> TetMesh:
+    return mesh_design(two_patches(), size_at_edges=3e-3, size_far=0.05, growth=0.5)
+
+
+def covered_area(mesh: TetMesh, group: str) -> float:
+    """Area [m²] of the element faces in z = 0 whose corners all belong to a group."""
+    faces = np.concatenate(
+        [mesh.tets[:, list(f)] for f in ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))]
+    )
+    faces = np.unique(np.sort(faces, axis=1), axis=0)
+    faces = faces[np.isin(faces, mesh.node_groups[group]).all(axis=1)]
+    at = mesh.points[faces]
+    flat = (np.abs(at[..., 2]) < 1e-9).all(axis=1)
+    sides = np.cross(at[flat, 1] - at[flat, 0], at[flat, 2] - at[flat, 0])
+    return float(np.linalg.norm(sides, axis=1).sum() / 2)
+
+
+def test_groups_follow_the_design(patches):
+    assert list(patches.node_groups) == ["ground", "E1", "E2", "pour"]
+    assert list(patches.cell_groups) == ["plate"]
+    assert patches.volumes.sum() == pytest.approx(0.2**3, rel=1e-9)
+
+
+def test_sheets_are_unions_of_element_faces(patches):
+    pour = two_patches().conductors[0].surface.area
+    for name, area in (("E1", 4e-4), ("E2", 4e-4), ("pour", pour)):
+        assert covered_area(patches, name) == pytest.approx(area, rel=1e-9)
+    electrode = patches.points[patches.node_groups["E1"]]
+    np.testing.assert_allclose(electrode.min(axis=0), [-0.025, -0.01, 0.0], atol=1e-10)
+    np.testing.assert_allclose(electrode.max(axis=0), [-0.005, 0.01, 0.0], atol=1e-10)
+
+
+def test_every_node_on_a_sheet_is_in_its_group(patches):
+    x, y, z = patches.points.T
+    on = (np.abs(z) < 1e-9) & (np.abs(x - 0.015) < 0.010001) & (np.abs(y) < 0.010001)
+    np.testing.assert_array_equal(np.flatnonzero(on), patches.node_groups["E2"])
+
+
+def test_ground_is_the_whole_box_and_nothing_else(patches):
+    np.testing.assert_array_equal(patches.node_groups["ground"], np.unique(patches.boundary_faces))
+
+
+def test_layers_are_unions_of_elements(patches):
+    plate = patches.cell_groups["plate"]
+    assert patches.volumes[plate].sum() == pytest.approx(0.08 * 0.06 * 0.002, rel=1e-9)
+    corners = patches.points[patches.tets[plate]]
+    assert corners[..., 2].min() == pytest.approx(-0.002, abs=1e-9)
+    assert corners[..., 2].max() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_element_sizes_grow_from_the_rims():
+    design = Design("one", Domain((0.2, 0.2, 0.2), 0.1), (Electrode("E1", rectangle(0, 0.04)),))
+    mesh = mesh_design(design, size_at_edges=2e-3, size_far=0.03, growth=0.4)
+    lengths = np.linalg.norm(np.diff(mesh.points[mesh.edges], axis=1)[:, 0], axis=1)
+    middles = mesh.points[mesh.edges].mean(axis=1)
+    rim = shapely.box(-0.02, -0.02, 0.02, 0.02).exterior
+    in_plane = shapely.distance(shapely.points(middles[:, :2]), rim)
+    away = np.hypot(in_plane, middles[:, 2])
+    wanted = np.minimum(2e-3 + 0.4 * away, 0.03)
+    assert np.median(lengths / wanted) == pytest.approx(1.0, abs=0.15)
+    assert np.median(lengths[away < 1e-9]) == pytest.approx(2e-3, rel=0.15)
+    assert mesh.quality().min_dihedral > 5.0
+    coarse = mesh_design(design, size_at_edges=8e-3, size_far=0.03, growth=0.4)
+    assert coarse.n_tets < mesh.n_tets / 2
+
+
+def test_tilted_facets_and_shared_ridges():
+    design = Design("roof", Domain((0.2, 0.2, 0.2), 0.1), (Electrode("E1", roof()),))
+    mesh = mesh_design(design, size_at_edges=4e-3, growth=0.6)
+    x, y, z = mesh.points[mesh.node_groups["E1"]].T
+    on_flat = (x > -1e-9) & (np.abs(z) < 1e-9)
+    on_tilt = (x < 1e-9) & (np.abs(z - np.tan(np.pi / 6) * x) < 1e-9)
+    assert (on_flat | on_tilt).all()
+    assert (on_flat & on_tilt).sum() >= 6
+    assert x.min() == pytest.approx(-0.02 * np.cos(np.pi / 6), abs=1e-9)
+    assert z.min() == pytest.approx(-0.01, abs=1e-9)
+    assert y.max() == pytest.approx(0.02, abs=1e-9)
+
+
+def test_overlapping_layers_belong_to_the_last():
+    def slab(name: str, low: float, high: float) -> Layer:
+        return Layer(name, name, 2.0, np.array([-0.03, -0.03, low]), np.array([0.03, 0.03, high]))
+
+    design = two_patches(layers=(slab("a", -0.01, -0.002), slab("b", -0.004, -0.001)))
+    mesh = mesh_design(design, size_at_edges=5e-3, growth=0.8)
+    volumes = {name: mesh.volumes[cells].sum() for name, cells in mesh.cell_groups.items()}
+    assert volumes["b"] == pytest.approx(0.06 * 0.06 * 0.003, rel=1e-9)
+    assert volumes["a"] == pytest.approx(0.06 * 0.06 * 0.006, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("design", "message"),
+    [
+        (
+            two_patches(conductors=(Conductor("bar", Role.GROUND, rectangle(0, (0.02, 0.002))),)),
+            "electrode 'E1' touches 'bar'",
+        ),
+        (
+            two_patches(electrodes=(Electrode("E1", rectangle(0.09, 0.02)),)),
+            "electrode 'E1' touches 'ground'",
+        ),
+        (
+            two_patches(electrodes=(Electrode("E1", rectangle(0.2, 0.02)),)),
+            "conductor 'E1' reaches outside the domain",
+        ),
+        (
+            two_patches(electrodes=(Electrode("pour", rectangle(0, 0.02)),)),
+            "name 'pour' is used twice",
+        ),
+        (
+            two_patches(layers=(Layer("far", "x", 2.0, np.full(3, 1.0), np.full(3, 2.0)),)),
+            "layer 'far' lies outside the domain",
+        ),
+    ],
+)
+def test_impossible_designs_are_refused(design, message):
+    with pytest.raises(MeshError, match=message):
+        mesh_design(design, size_at_edges=0.01, growth=1.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"size_at_edges": 0.0}, "size_at_edges must be positive"),
+        ({"growth": -1.0}, "growth must be positive"),
+        ({"size_far": np.inf}, "size_far must be positive"),
+        ({"size_at_edges": 0.1, "size_far": 0.05}, "below size_at_edges"),
+    ],
+)
+def test_wrong_sizes_are_refused(settings, message):
+    with pytest.raises(MeshError, match=message):
+        mesh_design(two_patches(), **settings)
+
+
+def test_too_many_facets_are_refused(monkeypatch):
+    monkeypatch.setattr(mesher, "MAX_FACETS", 2)
+    with pytest.raises(MeshError, match="3 facets; at most 2"):
+        mesh_design(two_patches())
+
+
+def small() -> Design:
+    surface = sheet(shapely.box(-0.02, -0.02, 0.02, 0.02))
+    return Design("small", Domain((0.1, 0.1, 0.1), 0.05), (Electrode("E1", surface),))
+
+
+def test_gmsh_is_left_as_it_was_found():
+    handler = signal.getsignal(signal.SIGINT)
+    first = mesh_design(small(), size_at_edges=0.02)
+    assert not gmsh.isInitialized()
+    assert signal.getsignal(signal.SIGINT) is handler
+    again = mesh_design(small(), size_at_edges=0.02)
+    np.testing.assert_array_equal(first.points, again.points)
+    np.testing.assert_array_equal(first.tets, again.tets)
+
+
+def test_gmsh_is_finalised_after_a_failure(monkeypatch):
+    def fail(*_: Any) -> None:
+        raise Exception("no luck")
+
+    monkeypatch.setattr(gmsh.model.mesh, "generate", fail)
+    with pytest.raises(MeshError, match="could not mesh design 'small': no luck"):
+        mesh_design(small())
+    assert not gmsh.isInitialized()
+
+
+def test_a_session_of_the_caller_survives():
+    gmsh.initialize(interruptible=False, readConfigFiles=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("Mesh.Algorithm3D", 10)
+        gmsh.model.add("mine")
+        gmsh.model.occ.addSphere(0, 0, 0, 1)
+        gmsh.model.occ.synchronize()
+        mesh = mesh_design(small(), size_at_edges=0.02)
+        assert gmsh.isInitialized()
+        assert gmsh.model.getCurrent() == "mine"
+        assert gmsh.model.getEntities(3) == [(3, 1)]
+        assert "capsense design" not in gmsh.model.list()
+        assert gmsh.option.getNumber("Mesh.Algorithm3D") == 10
+    finally:
+        gmsh.finalize()
+    np.testing.assert_array_equal(mesh.tets, mesh_design(small(), size_at_edges=0.02).tets)
+
+
+@pytest.mark.parametrize(
+    ("failure", "mend"),
+    [
+        (ModuleNotFoundError("No module named 'gmsh'"), r'pip install "capsense\[mesh\]"'),
+        (
+            OSError("libGLU.so.1: cannot open shared object file: No such file or directory"),
+            r"shared library libGLU\.so\.1 is missing.*apt-get install -y libglu1-mesa",
+        ),
+    ],
+)
+def test_a_missing_gmsh_names_the_mend(monkeypatch, failure, mend):
+    def missing(name: str) -> None:
+        raise failure
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(MissingDependencyError, match=mend):
+        mesh_design(small())
