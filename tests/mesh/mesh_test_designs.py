@@ -23,8 +23,8 @@ def sheet(polygon: shapely.Polygon, z: float = 0.0) -> Surface:
 
 
 def rectangle(center: ArrayLike, size: ArrayLike, z: float = 0.0) -> Surface:
-    """A rectangle [m] centred at (x, y)."""
-    (x, y), (w, h) = np.asarray(center), np.asarray(size)
+    """A rectangle [m] centred at (x, y); one number stands for both."""
+    (x, y), (w, h) = np.broadcast_to(center, 2), np.broadcast_to(size, 2)
     return sheet(shapely.box(x - w / 2, y - h / 2, x + w / 2, y + h / 2), z)
 
 
