@@ -14,6 +14,7 @@ from mesh_test_designs import rectangle, roof, sheet, two_patches
 import capsense.mesh.gmsh_mesher as mesher
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.errors import MeshError, MissingDependencyError
+from capsense.field.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, mesh_design
 
 gmsh = pytest.importorskip("gmsh", exc_type=(ImportError, OSError))
@@ -85,6 +86,29 @@ def test_element_sizes_grow_from_the_rims():
     assert mesh.quality().min_dihedral > 5.0
     coarse = mesh_design(design, size_at_edges=8e-3, size_far=0.03, growth=0.4)
     assert coarse.n_tets < mesh.n_tets / 2
+
+
+def test_capacitance_on_the_mesh_converges_to_the_reference():
+    """Differential: two coplanar stripes in a grounded cube, by boundary elements [pF].
+
+    The edge singularity makes P1's error first order, so two sizes extrapolate. Measured: +22.4 %
+    and +11.5 %, extrapolated +0.6 % and, for the mutual capacitance, -1.3 %.
+    """
+    reference = np.array([2.40904, -1.2114])
+    stripes = tuple(
+        Electrode(name, rectangle((x, 0.0), (0.01, 0.1)))
+        for name, x in (("E1", 0.0075), ("E2", -0.0075))
+    )
+    design = Design("stripes", Domain((0.5, 0.5, 0.5), 0.25), stripes)
+    coarse, fine = (
+        1e12 * capacitance_p1(mesh_design(design, size_at_edges=h), 1.0, ["E1", "E2"])[0]
+        for h in (2e-3, 1e-3)
+    )
+    errors = np.array([coarse[0], fine[0]]) / reference[0] - 1
+    assert errors == pytest.approx([0.224, 0.115], abs=0.02)
+    extrapolated = 2 * fine - coarse
+    assert extrapolated[0] == pytest.approx(reference[0], rel=0.015)
+    assert extrapolated[1] == pytest.approx(reference[1], rel=0.03)
 
 
 def test_tilted_facets_and_shared_ridges():

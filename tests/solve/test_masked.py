@@ -133,7 +133,7 @@ def test_an_electrode_inside_a_conductor_keeps_its_potential(mesh):
     inside = np.where(box(mesh, (-0.06, -0.045, -0.01), (0.06, -0.015, 0.01)), 0, -1)
     got = MaskedSolver(mesh, STRIPES).step(inside, [GROUNDED])
     assert_physical(got)
-    assert got[0, 0] > 2 * got[2, 2]
+    assert got[0, 0] > 1.2 * got[2, 2]
 
 
 def test_wrong_input_is_refused(mesh, bar):
