@@ -114,6 +114,18 @@ def test_a_plate_thinner_than_a_cell_is_seen():
     np.testing.assert_allclose(found[0, 0], [-0.5005, -0.4995], atol=1e-7)
 
 
+def test_slanted_lines_meet_a_plate_thinner_than_a_step():
+    """Analytic: no line slips through between two samples, wherever the samples fall."""
+    plate = Box((0.15, 0.15, 0.001))
+    shape = tri_mesh(plate.to_trimesh(), cell=0.003)
+    rng = np.random.default_rng(5)
+    o = np.column_stack([rng.uniform(-0.05, 0.05, (1000, 2)), np.zeros(1000)])
+    d = np.column_stack([rng.uniform(-0.6, 0.6, (1000, 2)), np.ones(1000)])
+    found = shape.line_intervals(o, d)
+    np.testing.assert_allclose(found[:, 0], plate.line_intervals(o, d), atol=1e-7)
+    assert np.all(found[:, 1:] == [np.inf, -np.inf])
+
+
 def test_a_grazing_line_does_not_flicker():
     """Analytic: as a line leaves a ball, its chord shrinks steadily down to nothing."""
     shape = tri_mesh(trimesh.creation.icosphere(subdivisions=5, radius=0.05))
@@ -203,6 +215,18 @@ def test_winding_is_mended():
         assert shape.to_trimesh().is_volume
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_winding_is_mended_part_by_part(seed):
+    """Analytic: separate parts of any winding all end with their normals out."""
+    parts = [trimesh.creation.box(extents=(0.01, 0.02, 0.03)) for _ in range(4)]
+    for i, part in enumerate(parts):
+        part.apply_translation((0.1 * i, 0, 0))
+    mesh = trimesh.util.concatenate(parts)
+    turn = np.random.default_rng(seed).random(len(mesh.faces)) < 0.5
+    shape = TriMesh(mesh.vertices, np.where(turn[:, None], mesh.faces[:, ::-1], mesh.faces))
+    assert shape.volume == pytest.approx(4 * 6e-6)
+
+
 def test_pack_uses_the_box_of_the_mesh():
     mesh = torus()
     mesh.apply_translation((0.2, -0.1, 0.3))
@@ -281,3 +305,16 @@ def moebius():
 def test_bad_meshes_are_refused(make, words):
     with pytest.raises(SceneError, match=words):
         make()
+
+
+def test_point_to_triangle_distance():
+    """Differential: against trimesh, and on slivers of no area against their longest side."""
+    rng = np.random.default_rng(4)
+    triangles, points = rng.normal(size=(2000, 3, 3)), 2 * rng.normal(size=(2000, 3))
+    found = [triangle_distance2(t, *p) for t, p in zip(triangles, points, strict=True)]
+    nearest = trimesh.triangles.closest_point(triangles, points)
+    np.testing.assert_allclose(found, ((points - nearest) ** 2).sum(axis=1), atol=1e-12)
+    sliver = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    assert triangle_distance2(sliver, 2.0, 0.0, 4.0) == pytest.approx(16.0)
+    assert triangle_distance2(sliver, 6.0, 0.0, 4.0) == pytest.approx(25.0)
+    assert triangle_distance2(np.zeros((3, 3)), 3.0, 4.0, 0.0) == pytest.approx(25.0)
