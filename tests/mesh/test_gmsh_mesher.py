@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+import trimesh
 from mesh_test_designs import rectangle, roof, sheet, two_patches
 
 import capsense.mesh.gmsh_mesher as mesher
+from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.errors import MeshError, MissingDependencyError
 from capsense.field.stiffness import capacitance_p1
@@ -25,16 +27,17 @@ def patches() -> TetMesh:
     return mesh_design(two_patches(), size_at_edges=3e-3, size_far=0.05, growth=0.5)
 
 
-def covered_area(mesh: TetMesh, group: str) -> float:
-    """Area [m²] of the element faces in z = 0 whose corners all belong to a group."""
+def covered_area(mesh: TetMesh, group: str, outline: shapely.Polygon) -> float:
+    """Area [m²] of the element faces in z = 0, within an outline, with all corners in a group."""
     faces = np.concatenate(
         [mesh.tets[:, list(f)] for f in ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))]
     )
     faces = np.unique(np.sort(faces, axis=1), axis=0)
     faces = faces[np.isin(faces, mesh.node_groups[group]).all(axis=1)]
     at = mesh.points[faces]
-    flat = (np.abs(at[..., 2]) < 1e-9).all(axis=1)
-    sides = np.cross(at[flat, 1] - at[flat, 0], at[flat, 2] - at[flat, 0])
+    kept = (np.abs(at[..., 2]) < 1e-9).all(axis=1)
+    kept &= shapely.contains_xy(outline, *at.mean(axis=1)[:, :2].T)
+    sides = np.cross(at[kept, 1] - at[kept, 0], at[kept, 2] - at[kept, 0])
     return float(np.linalg.norm(sides, axis=1).sum() / 2)
 
 
@@ -45,9 +48,11 @@ def test_groups_follow_the_design(patches):
 
 
 def test_sheets_are_unions_of_element_faces(patches):
-    pour = two_patches().conductors[0].surface.area
-    for name, area in (("E1", 4e-4), ("E2", 4e-4), ("pour", pour)):
-        assert covered_area(patches, name) == pytest.approx(area, rel=1e-9)
+    design = two_patches()
+    for item in (*design.electrodes, *design.conductors):
+        outline = item.surface.facets[0].polygon
+        area = covered_area(patches, item.name, outline)
+        assert area == pytest.approx(outline.area, rel=1e-9)
     electrode = patches.points[patches.node_groups["E1"]]
     np.testing.assert_allclose(electrode.min(axis=0), [-0.025, -0.01, 0.0], atol=1e-10)
     np.testing.assert_allclose(electrode.max(axis=0), [-0.005, 0.01, 0.0], atol=1e-10)
@@ -111,6 +116,18 @@ def test_capacitance_on_the_mesh_converges_to_the_reference():
     assert extrapolated[1] == pytest.approx(reference[1], rel=0.03)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_holes_of_either_direction(sign, flipped):
+    ring = shapely.box(-0.02, -0.02, 0.02, 0.02).difference(shapely.box(-0.01, -0.01, 0.01, 0.01))
+    ring = shapely.geometry.polygon.orient(ring, sign)
+    axes = np.diag([1.0, -1.0, -1.0]) if flipped else np.eye(3)
+    surface = Surface((Facet(ring, np.zeros(3), axes),), sheet(ring).rims)
+    design = Design("ring", Domain((0.1, 0.1, 0.1), 0.05), (Electrode("E1", surface),))
+    mesh = mesh_design(design, size_at_edges=6e-3)
+    assert covered_area(mesh, "E1", ring) == pytest.approx(12e-4, rel=1e-9)
+
+
 def test_tilted_facets_and_shared_ridges():
     design = Design("roof", Domain((0.2, 0.2, 0.2), 0.1), (Electrode("E1", roof()),))
     mesh = mesh_design(design, size_at_edges=4e-3, growth=0.6)
@@ -122,6 +139,31 @@ def test_tilted_facets_and_shared_ridges():
     assert x.min() == pytest.approx(-0.02 * np.cos(np.pi / 6), abs=1e-9)
     assert z.min() == pytest.approx(-0.01, abs=1e-9)
     assert y.max() == pytest.approx(0.02, abs=1e-9)
+
+
+def test_a_curved_closed_conductor_is_meshed_facet_by_facet():
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
+    facets = []
+    for corners in sphere.triangles:
+        u = (corners[1] - corners[0]) / np.linalg.norm(corners[1] - corners[0])
+        n = np.cross(u, corners[2] - corners[0])
+        n /= np.linalg.norm(n)
+        axes = np.array([u, np.cross(n, u), n])
+        polygon = shapely.Polygon((corners - corners[0]) @ axes[:2].T)
+        facets.append(Facet(polygon, corners[0], axes))
+    surface = Surface(tuple(facets), np.empty((0, 2, 3)))
+    design = Design("ball", Domain((0.2, 0.2, 0.2), 0.1), (Electrode("E1", surface),))
+    mesh = mesh_design(design, size_at_edges=0.01)
+    assert mesh.volumes.sum() == pytest.approx(0.2**3, rel=1e-9)
+
+    def height(points: np.ndarray) -> np.ndarray:
+        """Height over the nearest facet plane: zero on this convex surface, negative inside."""
+        offsets = np.einsum("fd,fd->f", sphere.face_normals, sphere.triangles[:, 0])
+        return (points @ sphere.face_normals.T - offsets).max(axis=1)
+
+    assert np.abs(height(mesh.points[mesh.node_groups["E1"]])).max() < 1e-8
+    inner = height(mesh.centroids) < 0
+    assert mesh.volumes[inner].sum() == pytest.approx(sphere.volume, rel=1e-6)
 
 
 def test_overlapping_layers_belong_to_the_last():

@@ -18,13 +18,13 @@ from capsense.errors import MeshError, MissingDependencyError
 from capsense.mesh.tetmesh import GROUND, TetMesh
 
 if TYPE_CHECKING:
-    from shapely.geometry.base import BaseGeometry
-
     from capsense.design.geometry import Surface
     from capsense.design.model import Design, Layer
 
 Array = NDArray[np.float64]
 DimTags = list[tuple[int, int]]
+_Points = dict[tuple[float, ...], int]
+_Lines = dict[tuple[int, int], int]
 
 INSTALL_GMSH = 'pip install "capsense[mesh]"'
 INSTALL_LIBRARIES = (
@@ -228,36 +228,47 @@ def _build_geometry(
 
 
 def _add_surface(occ: Any, surface: Surface) -> list[int]:
-    """Add a sheet's facets as plane faces that share the points and lines they have in common."""
-    points: dict[tuple[float, ...], int] = {}
-    lines: dict[tuple[int, int], int] = {}
+    """Add a sheet's facets as plane faces; those without holes share points and lines.
 
-    def line(a: int, b: int) -> int:
-        if (a, b) in lines:
-            return lines[a, b]
-        if (b, a) in lines:
-            return -lines[b, a]
-        lines[a, b] = occ.addLine(a, b)
-        return lines[a, b]
-
-    def loop(corners: Array) -> int:
-        tags: list[int] = []
-        for corner in corners * _MM:
-            key = tuple(np.round(corner, 6) + 0.0)
-            if key not in points:
-                points[key] = occ.addPoint(*key)
-            if not tags or tags[-1] != points[key]:
-                tags.append(points[key])
-        if tags[0] != tags[-1]:
-            tags.append(tags[0])
-        return occ.addCurveLoop([line(a, b) for a, b in pairwise(tags)])
-
+    Holes are cut out: whether Gmsh subtracts or adds an inner loop depends on its direction.
+    """
+    shared: tuple[_Points, _Lines] = {}, {}
     faces = []
     for facet in surface.facets:
-        rings: Sequence[BaseGeometry] = [facet.polygon.exterior, *facet.polygon.interiors]
-        loops = [loop(facet.to_sensor(np.asarray(ring.coords)[:, :2])) for ring in rings]
-        faces.append(occ.addPlaneSurface(loops))
+        polygon = facet.polygon
+        plates = []
+        for ring in (polygon.exterior, *polygon.interiors):
+            points, lines = ({}, {}) if polygon.interiors else shared
+            corners = facet.to_sensor(np.asarray(ring.coords)[:, :2])
+            plates.append((2, occ.addPlaneSurface([_add_loop(occ, corners, points, lines)])))
+        parts = occ.cut(plates[:1], plates[1:])[0] if polygon.interiors else plates
+        area = sum(occ.getMass(*part) for part in parts)
+        if not math.isclose(area, polygon.area * _MM**2, rel_tol=1e-4):
+            raise MeshError(f"Gmsh cannot make a face of {polygon.wkt[:200]}")
+        faces += [tag for _, tag in parts]
     return faces
+
+
+def _add_loop(occ: Any, corners: Array, points: _Points, lines: _Lines) -> int:
+    """A closed loop of lines through corners [m], shape (c, 3), made or found again."""
+    tags: list[int] = []
+    for corner in corners * _MM:
+        key = tuple(np.round(corner, 6) + 0.0)
+        if key not in points:
+            points[key] = occ.addPoint(*key)
+        if not tags or tags[-1] != points[key]:
+            tags.append(points[key])
+    if tags[0] != tags[-1]:
+        tags.append(tags[0])
+    found = []
+    for a, b in pairwise(tags):
+        if (b, a) in lines:
+            found.append(-lines[b, a])
+            continue
+        if (a, b) not in lines:
+            lines[a, b] = occ.addLine(a, b)
+        found.append(lines[a, b])
+    return occ.addCurveLoop(found)
 
 
 def _set_sizes(

@@ -1,0 +1,22 @@
+"""The example of the reference page runs as printed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+
+def test_the_example_runs(tmp_path, monkeypatch, capsys):
+    page = (Path(__file__).parents[2] / "docs/meshes.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(example, names)
+    assert "negative link weights 0 (0.0%)" in capsys.readouterr().out
+    mesh, solve = names["mesh"], names["capacitance_p1"]
+    capacitance = solve(mesh, 1.0, ["E1"])  # type: ignore[operator]
+    # An 80 mm plate, 20 mm from the floor and 80 mm from the lid: more than two plate capacitors.
+    plates = 8.854e-12 * 0.08**2 * (1 / 0.02 + 1 / 0.08)
+    assert plates < np.squeeze(capacitance) < 2.5 * plates
