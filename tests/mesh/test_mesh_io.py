@@ -114,6 +114,54 @@ def test_msh_of_another_program(tmp_path):
     assert got.cell_groups["wood"].tolist() == [0]
 
 
+@pytest.mark.parametrize("version", ["4.1", "2.2"])
+def test_a_damaged_msh_is_refused_or_read_but_never_crashes(mesh, tmp_path, version):
+    path = tmp_path / "mesh.msh"
+    save_mesh(mesh, path, msh_version=version)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(150):
+        damaged = bytearray(whole[: rng.integers(len(whole))] if rng.random() < 0.5 else whole)
+        for at in rng.integers(len(damaged), size=2) if len(damaged) else ():
+            damaged[at] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            load_mesh(path)
+        except MeshError:
+            refused += 1
+    assert refused > 75
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("$MeshFormat\n4.0 0 8\n$EndMeshFormat\n", "version 4.0 is not supported"),
+        ("$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 1 1 1\n", r"\$Nodes does not end"),
+        ("$MeshFormat\n4.1 0 8\n$EndMeshFormat\n", "holds no nodes"),
+        (
+            "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n1 0 0 0\n$EndNodes\n"
+            "$Elements\n1\n1 4 2 0 1 1 2 3 4\n$EndElements\n",
+            "nodes that it does not hold",
+        ),
+        (
+            "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n1 0 0 0\n$EndNodes\n"
+            "$Elements\n1\n1 5 2 0 1 1 1 1 1 1 1 1 1\n$EndElements\n",
+            "1 solids that are not tetrahedra",
+        ),
+        (
+            "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n1 0 0 0\n$EndNodes\n"
+            "$Elements\n1\n1 15 2 0 1 1\n$EndElements\n",
+            "holds no tetrahedra",
+        ),
+    ],
+)
+def test_msh_files_that_cannot_be_used(tmp_path, content, message):
+    (tmp_path / "a.msh").write_text(content)
+    with pytest.raises(MeshError, match=message):
+        load_mesh(tmp_path / "a.msh")
+
+
 def test_vtu_round_trip_with_data(mesh, tmp_path):
     path = tmp_path / "mesh.vtu"
     potential = np.arange(mesh.n_points) / 7

@@ -230,18 +230,17 @@ def _assemble(
 ) -> MshData:
     if len(tags) == 0:
         raise MeshError("it holds no nodes")
-    row = np.full(int(tags.max()) + 1, -1, dtype=np.int64)
-    row[tags] = np.arange(len(tags))
+    order = np.argsort(tags)
+    known = tags[order]
     tets = [np.empty((0, 4), np.int64)]
     nodes: dict[str, list[IntArray]] = {}
     cells: dict[str, list[IntArray]] = {}
     first = 0
     for block in blocks:
-        if block.corners.min(initial=1) < 1 or block.corners.max(initial=0) >= len(row):
+        found = np.minimum(np.searchsorted(known, block.corners), len(known) - 1)
+        if (known[found] != block.corners).any():
             raise MeshError("elements refer to nodes that it does not hold")
-        corners = row[block.corners]
-        if (corners < 0).any():
-            raise MeshError("elements refer to nodes that it does not hold")
+        corners = order[found]
         dim = _LOW_DIM.get(block.kind, 3)
         if dim == 3 and block.kind not in _TETRAHEDRA:
             raise MeshError(f"it holds {len(corners)} solids that are not tetrahedra")

@@ -61,11 +61,11 @@ class TetMesh:
         tets = _indices(self.tets, len(points), "tets", "points")
         if tets.ndim != 2 or tets.shape[1] != 4 or len(tets) == 0:
             raise MeshError(f"tets must have shape (k, 4) with k > 0, not {tets.shape}")
-        six_volumes = _six_volumes(points, tets)
-        longest = np.linalg.norm(
-            points[tets[:, LOCAL_EDGES[:, 0]]] - points[tets[:, LOCAL_EDGES[:, 1]]], axis=2
-        ).max(axis=1)
-        degenerate = np.abs(six_volumes) <= _FLATTEST * longest**3
+        with np.errstate(over="ignore", invalid="ignore"):
+            six_volumes = _six_volumes(points, tets)
+            sides = points[tets[:, LOCAL_EDGES[:, 0]]] - points[tets[:, LOCAL_EDGES[:, 1]]]
+            longest = np.linalg.norm(sides, axis=2).max(axis=1)
+            degenerate = ~(np.abs(six_volumes) > _FLATTEST * longest**3)
         if degenerate.any():
             raise MeshError(
                 f"{int(degenerate.sum())} of {len(tets)} tetrahedra are degenerate (no volume); "
