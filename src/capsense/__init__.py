@@ -1,1 +1,107 @@
-"""CapSense: real-time simulation of capacitive proximity sensors for robots."""
+"""CapSense: real-time simulation of capacitive proximity sensors for robots.
+
+The public names are listed in ``__all__``. They are imported at first use, so ``import capsense``
+itself is light.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from capsense.design.loader import available_designs, load_design
+    from capsense.design.model import Design
+    from capsense.errors import (
+        CapSenseError,
+        DesignError,
+        FieldError,
+        MeshError,
+        MissingDependencyError,
+        ScenarioError,
+        SceneError,
+        SolveError,
+    )
+    from capsense.scenario import Scenario, load_scenario
+    from capsense.scene.body import Body
+    from capsense.scene.materials import MATERIALS, Material
+    from capsense.scene.mesh_shape import TriMesh
+    from capsense.scene.pose import Pose
+    from capsense.scene.scene import Scene
+    from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
+    from capsense.simulator import Reading, Simulator
+
+    __version__: str
+
+__all__ = [
+    "MATERIALS",
+    "Body",
+    "Box",
+    "CapSenseError",
+    "Capsule",
+    "Cylinder",
+    "Design",
+    "DesignError",
+    "Ellipsoid",
+    "FieldError",
+    "Material",
+    "MeshError",
+    "MissingDependencyError",
+    "Pose",
+    "Reading",
+    "Scenario",
+    "ScenarioError",
+    "Scene",
+    "SceneError",
+    "Simulator",
+    "SolveError",
+    "Sphere",
+    "TriMesh",
+    "__version__",
+    "available_designs",
+    "load_design",
+    "load_scenario",
+]
+
+_HOMES = {
+    "capsense.design.loader": ("available_designs", "load_design"),
+    "capsense.design.model": ("Design",),
+    "capsense.errors": (
+        "CapSenseError",
+        "DesignError",
+        "FieldError",
+        "MeshError",
+        "MissingDependencyError",
+        "ScenarioError",
+        "SceneError",
+        "SolveError",
+    ),
+    "capsense.scenario": ("Scenario", "load_scenario"),
+    "capsense.scene.body": ("Body",),
+    "capsense.scene.materials": ("MATERIALS", "Material"),
+    "capsense.scene.mesh_shape": ("TriMesh",),
+    "capsense.scene.pose": ("Pose",),
+    "capsense.scene.scene": ("Scene",),
+    "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
+    "capsense.simulator": ("Reading", "Simulator"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name, or a submodule, at first use (PEP 562)."""
+    value: Any
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value = version("capsense")
+    elif name in _HOME_OF:
+        value = getattr(import_module(_HOME_OF[name]), name)
+    else:
+        raise AttributeError(f"module 'capsense' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -10,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from capsense._validate import nearest, read_toml, suggest
 from capsense.design.checks import check_design, snap_to_layers
 from capsense.design.clearance import cut_clearance
 from capsense.design.geometry import Surface
 from capsense.design.materials import LAYER_EPS_R
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import Table, nearest, suggest
+from capsense.design.schema import Table
 from capsense.design.shapes import SHAPES, box_surface, planar_surface
 from capsense.errors import DesignError
 
@@ -77,17 +77,8 @@ def load_design(name_or_path: str | Path) -> Design:
 
 
 def _load_file(path: Path) -> Design:
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DesignError(
-            f"there is no design file {path}; check the path, or give one of the packaged names "
-            f"{', '.join(available_designs())}"
-        ) from None
-    except OSError as error:
-        raise DesignError(f"{path} cannot be read: {error.strerror}; give a .toml file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DesignError(f"{path} is not valid TOML: {error}; mend the line it names") from None
+    packaged = f", or give one of the packaged names {', '.join(available_designs())}"
+    data = read_toml(path, "design", DesignError, hint=packaged)
     return parse_design(data, source=path.name, folder=path.parent)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely.affinity import translate
 
+from capsense._validate import UNITS
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Domain, Electrode
 from capsense.design.placement import PLACEMENT_KEYS, read_placement
@@ -17,8 +18,6 @@ from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
 
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
-"""Metres to the unit of an STL file."""
 SIZE_TOLERANCE = 1e-5
 """By how much [m] an imprinted box may differ from the domain."""
 

@@ -1,0 +1,303 @@
+"""Strict reading of TOML files: every key, type, unit and number is checked as it is read."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from capsense.errors import CapSenseError
+
+MAX_LENGTH = 5.0
+"""No length in a file may exceed this [m]."""
+MIN_LENGTH = 1e-6
+"""No size in a file may be smaller than this [m]."""
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+"""Metres to the unit of a geometry file."""
+
+
+def nearest(word: str, options: Iterable[str]) -> str | None:
+    """The option most like ``word``, or None if none is like it."""
+    found = difflib.get_close_matches(word.lower(), list(options), n=1, cutoff=0.5)
+    return found[0] if found else None
+
+
+def suggest(word: str, options: Iterable[str]) -> str:
+    """A sentence part that names the nearest valid option, and all of them."""
+    valid = list(options)
+    close = nearest(word, valid)
+    hint = f"did you mean {close!r}? " if close else ""
+    return f"{hint}valid are {', '.join(valid)}"
+
+
+def read_toml(
+    path: Path, what: str, error: type[CapSenseError], *, hint: str = ""
+) -> dict[str, Any]:
+    """The content of a TOML file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        What it is, for messages, such as ``design``.
+    error
+        The exception to raise.
+    hint
+        A further mend for a file that is not there.
+
+    Raises
+    ------
+    CapSenseError
+        An ``error`` that names the path, if it is missing, unreadable or not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise error(f"there is no {what} file {path}; check the path{hint}") from None
+    except OSError as cause:
+        raise error(f"{path} cannot be read: {cause.strerror}; give a .toml file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
+        raise error(f"{path} is not valid TOML: {cause}; mend the line it names") from None
+
+
+class Table:
+    """One table of a file, with readers that refuse what is not as it should be.
+
+    Subclasses set :attr:`error_type` to the exception of their kind of file.
+
+    Parameters
+    ----------
+    data
+        The raw table.
+    source
+        Name of the file, for messages.
+    item
+        What the table describes, for messages, such as ``electrode "E1"``.
+    limit
+        Largest plausible length [m], such as the domain's longest edge.
+    """
+
+    error_type: ClassVar[type[CapSenseError]] = CapSenseError
+    """What is raised for anything that is wrong."""
+
+    def __init__(self, data: Any, source: str, item: str, limit: float = MAX_LENGTH) -> None:
+        self.source = source
+        self.item = item
+        self.limit = min(limit, MAX_LENGTH)
+        if not isinstance(data, Mapping):
+            raise self.error(f"must be a table of key = value lines, not {data!r}")
+        self.data: Mapping[str, Any] = data
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def error(self, message: str) -> CapSenseError:
+        """An error of :attr:`error_type` that names the file and the item."""
+        return self.error_type(f"{self.source}: {self.item}: {message}")
+
+    def only(self, keys: Iterable[str]) -> None:
+        """Refuse keys that are not in ``keys``, naming the nearest valid one."""
+        valid = list(keys)
+        for key in self.data:
+            if key not in valid:
+                raise self.error(f"unknown key {key!r}; {suggest(key, valid)}")
+
+    def raw(self, key: str, expected: str) -> Any:
+        """The value of a mandatory key."""
+        if key not in self.data:
+            raise self.error(f"missing key {key!r}; add {key} = {expected}")
+        return self.data[key]
+
+    def string(self, key: str, default: str | None = None) -> str:
+        """A non-empty string."""
+        if default is not None and key not in self.data:
+            return default
+        value = self.raw(key, '"…"')
+        if not isinstance(value, str) or not value.strip():
+            raise self.error(f"{key} = {value!r} must be a non-empty string in quotes")
+        return value
+
+    def text(self, key: str) -> str:
+        """An optional string, empty by default."""
+        value = self.data.get(key, "")
+        if not isinstance(value, str):
+            raise self.error(f"{key} = {shorten(value)} must be a string in quotes")
+        return value.strip()
+
+    def choice(self, key: str, options: Sequence[str], default: str | None = None) -> str:
+        """A string that is one of ``options``."""
+        if default is not None and key not in self.data:
+            return default
+        value = self.raw(key, " | ".join(f'"{o}"' for o in options))
+        if not isinstance(value, str) or value not in options:
+            raise self.error(f"{key} = {value!r} is not known; {suggest(str(value), options)}")
+        return value
+
+    def boolean(self, key: str, default: bool) -> bool:
+        """``true`` or ``false``."""
+        value = self.data.get(key, default)
+        if not isinstance(value, bool):
+            raise self.error(f"{key} = {value!r} must be true or false")
+        return value
+
+    def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
+        """An integer from ``low`` to ``high``."""
+        if default is not None and key not in self.data:
+            return default
+        value = self.raw(key, f"an integer from {low} to {high}")
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.error(f"{key} = {value!r} must be an integer from {low} to {high}")
+        return value
+
+    def number(
+        self, key: str, low: float, high: float, default: float | None = None, unit: str = ""
+    ) -> float:
+        """A finite number from ``low`` to ``high``."""
+        if default is not None and key not in self.data:
+            return default
+        span = f"from {low:g} to {high:g}{unit and ' ' + unit}"
+        value = self._finite(key, self.raw(key, f"a number {span}"))
+        if not low <= value <= high:
+            raise self.error(f"{key} = {value:g} must be {span}")
+        return value
+
+    def numbers(self, key: str, count: Sequence[int], what: str) -> tuple[float, ...]:
+        """An array of finite numbers; ``count`` lists the lengths allowed."""
+        return self._array(key, self.raw(key, what), count, what)
+
+    def length(self, key: str, default: float | None = None, *, zero: bool = False) -> float:
+        """A length [m], positive unless ``zero`` also allows 0."""
+        if default is not None and key not in self.data:
+            return default
+        value = self._finite(key, self.raw(key, "a length in metres"))
+        self._size(key, value, zero=zero)
+        return value
+
+    def sizes(self, key: str, count: int, what: str) -> tuple[float, ...]:
+        """``count`` positive lengths [m]."""
+        values = self._array(key, self.raw(key, what), (count,), what)
+        for value in values:
+            self._size(key, value)
+        return values
+
+    def coordinates(
+        self, key: str, count: Sequence[int], default: tuple[float, ...] | None = None
+    ) -> tuple[float, ...]:
+        """Coordinates [m] of either sign; ``count`` lists the numbers of axes allowed."""
+        if default is not None and key not in self.data:
+            return default
+        what = " or ".join("[" + ", ".join("xyz"[:n]) + "]" for n in count) + " in metres"
+        values = self._array(key, self.raw(key, what), count, what)
+        for value in values:
+            self.plausible(key, value)
+        return values
+
+    def coordinate(self, key: str, default: float | None = None) -> float:
+        """One coordinate [m] of either sign."""
+        if default is not None and key not in self.data:
+            return default
+        value = self._finite(key, self.raw(key, "a coordinate in metres"))
+        self.plausible(key, value)
+        return value
+
+    def interval(self, key: str) -> tuple[float, float]:
+        """A rising pair of coordinates [low, high] [m]."""
+        what = "[low, high] in metres"
+        low, high = self._array(key, self.raw(key, what), (2,), what)
+        self.plausible(key, low)
+        self.plausible(key, high)
+        if not high - low >= MIN_LENGTH:
+            raise self.error(f"{key} = [{low:g}, {high:g}] must rise; write [low, high] in metres")
+        return low, high
+
+    def points(self, key: str, least: int) -> list[tuple[float, float]]:
+        """A list of [x, y] points [m], at least ``least`` of them."""
+        value = self.raw(key, f"a list of at least {least} [x, y] points in metres")
+        return self.point_list(key, value, least)
+
+    def point_list(self, key: str, value: Any, least: int) -> list[tuple[float, float]]:
+        """Check one list of [x, y] points [m]."""
+        if not isinstance(value, list) or len(value) < least:
+            raise self.error(
+                f"{key} = {shorten(value)} must be a list of at least {least} [x, y] points in m"
+            )
+        out: list[tuple[float, float]] = []
+        for number, point in enumerate(value):
+            name = f"{key}[{number}]"
+            x, y = self._array(name, point, (2,), "[x, y] in metres")
+            self.plausible(name, x)
+            self.plausible(name, y)
+            out.append((x, y))
+        return out
+
+    def vectors(self, key: str, width: int, what: str) -> list[tuple[float, ...]]:
+        """A list of arrays of ``width`` finite numbers; a single such array counts as one."""
+        value = self.raw(key, f"a list of {what}")
+        if not isinstance(value, list) or not value:
+            raise self.error(f"{key} = {shorten(value)} must be a list of {what}")
+        rows = value if isinstance(value[0], list) else [value]
+        return [self._array(f"{key}[{n}]", row, (width,), what) for n, row in enumerate(rows)]
+
+    def series(self, key: str, low: float, high: float, unit: str) -> list[float] | float:
+        """A number from ``low`` to ``high``, or a list of such numbers."""
+        value = self.raw(key, f"a number from {low:g} to {high:g} {unit}, or a list of them")
+        many = isinstance(value, list)
+        out = []
+        for n, item in enumerate(value if many else [value]):
+            name = f"{key}[{n}]" if many else key
+            number = self._finite(name, item)
+            if not low <= number <= high:
+                raise self.error(f"{name} = {number:g} must be from {low:g} to {high:g} {unit}")
+            out.append(number)
+        return out if many else out[0]
+
+    def tables(self, key: str) -> list[Any]:
+        """An optional array of tables."""
+        value = self.data.get(key, [])
+        if not isinstance(value, list):
+            raise self.error(f"{key!r} must be an array of tables; write [[{key}]]")
+        return value
+
+    def plausible(self, key: str, value: float) -> None:
+        """Refuse a length that only makes sense in millimetres."""
+        if abs(value) > self.limit:
+            raise self.error(
+                f"{key} = {value:g} is larger than {self.limit:g} m, the largest length that can "
+                f"be meant here; lengths are metres; did you mean {value * 1e-3:g}?"
+            )
+
+    def _size(self, key: str, value: float, *, zero: bool = False) -> None:
+        self.plausible(key, value)
+        if zero and value == 0.0:
+            return
+        if value <= 0.0:
+            raise self.error(f"{key} = {value:g} must be positive, in metres")
+        if value < MIN_LENGTH:
+            raise self.error(
+                f"{key} = {value:g} is less than a micrometre; give the length in metres"
+            )
+
+    def _finite(self, key: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.error(
+                f"{key} = {shorten(value)} must be a number without quotes or brackets"
+            )
+        number = float(value)
+        if not math.isfinite(number):
+            raise self.error(f"{key} = {number} must be a finite number")
+        return number
+
+    def _array(self, key: str, value: Any, count: Sequence[int], what: str) -> tuple[float, ...]:
+        if not isinstance(value, list) or len(value) not in count:
+            raise self.error(f"{key} = {shorten(value)} must be {what}")
+        return tuple(self._finite(key, v) for v in value)
+
+
+def shorten(value: Any) -> str:
+    """``repr`` of a value, cut to 60 characters."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "…"

@@ -1,0 +1,158 @@
+"""From a scenario file to a checked :class:`Scenario`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from capsense._validate import read_toml, suggest
+from capsense.design import Design, load_design
+from capsense.errors import DesignError, MeshError, ScenarioError, SceneError
+from capsense.scenario.bodies import read_body
+from capsense.scenario.channels import Excitation
+from capsense.scenario.model import METHODS, MovingBody, Scenario
+from capsense.scenario.schema import Table
+
+TOP_KEYS = (
+    "name",
+    "description",
+    "design",
+    "sample_rate",
+    "duration",
+    "excitation",
+    "pairs",
+    "method",
+    "tolerance",
+    "body",
+)
+
+
+def load_scenario(path: str | Path) -> Scenario:
+    """Load a scenario file.
+
+    Args:
+        path: The ``.toml`` file. Designs and meshes it names are relative to its folder.
+
+    Raises:
+        ScenarioError: There is no such file, or anything in it is wrong; the message names the
+            file, the item, the value and the mend.
+        DesignError: Something is wrong in the design file it names.
+    """
+    file = Path(path)
+    data = read_toml(file, "scenario", ScenarioError)
+    return parse_scenario(data, source=file.name, folder=file.parent)
+
+
+def parse_scenario(
+    data: Mapping[str, Any], *, source: str = "scenario", folder: Path | None = None
+) -> Scenario:
+    """Build a checked scenario from the content of its file, given as nested dicts.
+
+    Args:
+        data: What ``tomllib`` makes of a scenario file.
+        source: Name of the file, for messages.
+        folder: Folder that designs and meshes are relative to; the current one by default.
+
+    Raises:
+        ScenarioError: Anything is wrong; the message names the item, the value and the mend.
+        DesignError: Something is wrong in the design file it names.
+    """
+    where = folder if folder is not None else Path()
+    top = Table(data, source, "scenario")
+    top.only(TOP_KEYS)
+    name = top.string("name")
+    design = _read_design(top, where)
+    sample_rate = top.number("sample_rate", 1e-3, 1e6, unit="Hz")
+    excitation = Excitation(top.choice("excitation", list(Excitation), Excitation.MATRIX.value))
+    pairs = _read_pairs(top, excitation, design)
+    tolerance = top.number("tolerance", 1e-24, 1e-12, unit="F") if "tolerance" in top else None
+    bodies = _read_bodies(top, where)
+    if not bodies and "duration" not in top:
+        raise top.error("has no body and no duration; add a [[body]], or duration = seconds")
+    ends = [b.trajectory.duration for b in bodies if b.trajectory is not None]
+    duration = top.number("duration", 0.0, 1e7, max(ends, default=0.0), unit="s")
+    try:
+        return Scenario(
+            name=name,
+            design=design,
+            bodies=bodies,
+            sample_rate=sample_rate,
+            duration=duration,
+            excitation=excitation,
+            pairs=pairs,
+            method=top.choice("method", METHODS, METHODS[0]),
+            tolerance=tolerance,
+            description=top.text("description"),
+        )
+    except ScenarioError as error:
+        raise top.error(str(error)) from None
+
+
+def _read_design(top: Table, folder: Path) -> Design:
+    value = top.string("design")
+    is_path = value.endswith(".toml") or bool(set("/\\") & set(value))
+    path = folder / value
+    if is_path and not path.is_file():
+        raise top.error(
+            f"design = {value!r}: there is no file {path}; paths are relative to the scenario file"
+        )
+    try:
+        return load_design(path if is_path else value)
+    except DesignError as error:
+        if is_path:
+            raise
+        raise top.error(f"design = {value!r}: {error}") from None
+
+
+def _read_pairs(top: Table, excitation: Excitation, design: Design) -> tuple[tuple[str, str], ...]:
+    if "pairs" not in top:
+        if excitation is Excitation.MUTUAL and len(design.electrodes) < 2:
+            raise top.error(
+                f'excitation = "mutual" needs two electrodes; design {design.name!r} has one; '
+                'use excitation = "self"'
+            )
+        return ()
+    what = 'a list of pairs of electrode names, like [["E1", "E2"]]'
+    value = top.raw("pairs", what)
+    if excitation is not Excitation.MUTUAL:
+        raise top.error(f'pairs is for excitation = "mutual", not "{excitation}"; remove one')
+    if not isinstance(value, list) or not value:
+        raise top.error(f"pairs = {value!r} must be {what}")
+    out: list[tuple[str, str]] = []
+    for number, pair in enumerate(value):
+        if not (
+            isinstance(pair, list) and len(pair) == 2 and all(isinstance(n, str) for n in pair)
+        ):
+            raise top.error(f"pairs[{number}] = {pair!r} must be two electrode names")
+        one, two = pair
+        for electrode in pair:
+            if electrode not in design.electrode_names:
+                raise top.error(
+                    f"pairs[{number}] = {pair!r} names no electrode {electrode!r} of design "
+                    f"{design.name!r}; {suggest(electrode, design.electrode_names)}"
+                )
+        if one == two:
+            raise top.error(f"pairs[{number}] = {pair!r} must name two different electrodes")
+        if (one, two) in out or (two, one) in out:
+            raise top.error(f"pairs[{number}] = {pair!r} is listed twice; remove one")
+        out.append((one, two))
+    return tuple(out)
+
+
+def _read_bodies(top: Table, folder: Path) -> tuple[MovingBody, ...]:
+    out: list[MovingBody] = []
+    names: set[str] = set()
+    for number, raw in enumerate(top.tables("body"), start=1):
+        label = raw.get("name") if isinstance(raw, Mapping) else None
+        tag = f'body "{label}"' if isinstance(label, str) and label else f"body {number}"
+        table = Table(raw, top.source, tag)
+        name = table.string("name")
+        if name in names:
+            raise table.error(f"two bodies are named {name!r}; names must differ")
+        names.add(name)
+        try:
+            out.append(read_body(table, name, folder))
+        except (SceneError, MeshError) as error:
+            raise table.error(str(error)) from None
+    return tuple(out)
