@@ -15,6 +15,7 @@ from capsense.design.model import Design, Role
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.patches import PathPatch
 
 Array = NDArray[np.float64]
 
@@ -55,8 +56,8 @@ def draw_design(design: Design, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _outlines(surface: Surface) -> list[Polygon]:
-    """Shadows [mm] of the facets on the xy plane; facets on edge leave none."""
+def outlines(surface: Surface) -> list[Polygon]:
+    """Shadows [mm] of a surface's facets on the xy plane; facets on edge leave none."""
     out = []
     for facet in surface.facets:
         rings = [r[:, :2] * 1e3 for r in ring_vertices(facet)]
@@ -65,7 +66,8 @@ def _outlines(surface: Surface) -> list[Polygon]:
     return out
 
 
-def _patch(polygon: Polygon, **style: Any) -> Any:
+def outline_patch(polygon: Polygon, **style: Any) -> PathPatch:
+    """A Matplotlib patch of a polygon with its holes; ``style`` as ``PathPatch`` takes it."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -83,7 +85,9 @@ def _top_view(design: Design, ax: Axes) -> None:
         if layer.material == "custom":
             label = f"{layer.name} (εr {layer.eps_r:g})"
         ax.add_patch(
-            _patch(outline, fc=LAYER_COLOUR, ec="#9a9c86", lw=1.0, ls="--", label=label, zorder=0)
+            outline_patch(
+                outline, fc=LAYER_COLOUR, ec="#9a9c86", lw=1.0, ls="--", label=label, zorder=0
+            )
         )
         reach += [low, high]
     conductors = sorted(design.conductors, key=lambda c: float(c.surface.bounds[1, 2]))
@@ -97,19 +101,23 @@ def _top_view(design: Design, ax: Axes) -> None:
             "ls": ":" if buried else "-",
         }
         label = f"{conductor.name} ({conductor.role.value}{', below' if buried else ''})"
-        for number, outline in enumerate(_outlines(conductor.surface)):
+        for number, outline in enumerate(outlines(conductor.surface)):
             ax.add_patch(
-                _patch(outline, label="" if number else label, zorder=order / 100 + 1, **style)
+                outline_patch(
+                    outline, label="" if number else label, zorder=order / 100 + 1, **style
+                )
             )
         reach += list(conductor.surface.bounds[:, :2] * 1e3)
     for number, electrode in enumerate(design.electrodes):
-        outlines = _outlines(electrode.surface)
-        for part, outline in enumerate(outlines):
+        parts = outlines(electrode.surface)
+        for part, outline in enumerate(parts):
             label = "" if number or part else "electrodes"
             fill = ELECTRODES[number % 2]
-            ax.add_patch(_patch(outline, fc=fill, ec="#7d4510", lw=0.8, label=label, zorder=2))
+            ax.add_patch(
+                outline_patch(outline, fc=fill, ec="#7d4510", lw=0.8, label=label, zorder=2)
+            )
         reach += list(electrode.surface.bounds[:, :2] * 1e3)
-        x, y, room = _label_place(electrode.surface, outlines)
+        x, y, room = _label_place(electrode.surface, parts)
         ax.annotate(
             electrode.name,
             (x, y),
@@ -133,12 +141,12 @@ def _top_view(design: Design, ax: Axes) -> None:
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, fontsize=8, frameon=False)
 
 
-def _label_place(surface: Surface, outlines: list[Polygon]) -> tuple[float, float, float]:
+def _label_place(surface: Surface, parts: list[Polygon]) -> tuple[float, float, float]:
     """Where a name goes [mm], and how opaque its background must be."""
-    if not outlines:
+    if not parts:
         x, y = surface.bounds.mean(axis=0)[:2] * 1e3
         return float(x), float(y), 0.8
-    largest = max(outlines, key=lambda p: p.area)
+    largest = max(parts, key=lambda p: p.area)
     spot = largest.centroid if largest.contains(largest.centroid) else None
     if spot is None or len(largest.exterior.coords) > 24:
         spot = shapely.maximum_inscribed_circle(largest).interpolate(0.0)

@@ -1,0 +1,170 @@
+"""``capsense design``: what a design is made of, and what its field came out as."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from capsense.errors import DesignError
+
+if TYPE_CHECKING:
+    from capsense.design import Design, Surface
+    from capsense.simulator import Simulator
+
+NAME = "design"
+HELP = "print a sensor design with its mesh and baseline figures, or draw it"
+DESCRIPTION = """\
+Print what a sensor design is made of, the figures of its mesh, and its baseline: the
+capacitance matrix with nothing in front of it. The field is computed at a design's first
+use and kept in the user's cache; --no-build leaves it alone.
+"""
+EXAMPLES = """\
+  capsense design --list
+  capsense design six_patch
+  capsense design stripe --no-build -o stripe.png     draw it: top view and stack
+  capsense design my/sensor.toml
+"""
+PICTURES = (".png", ".svg", ".pdf")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "design", metavar="NAME|FILE", nargs="?", help="a packaged design, or a design .toml"
+    )
+    parser.add_argument("--list", action="store_true", help="list the packaged designs")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="PICTURE",
+        type=Path,
+        help=f"draw the layout to this file ({', '.join(PICTURES)}); without it nothing is drawn",
+    )
+    parser.add_argument(
+        "--no-build", action="store_true", help="leave out the mesh and baseline figures"
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Print, and draw if asked to, and return the exit code."""
+    from capsense.cli.main import OK
+
+    if args.list:
+        print(_listing())
+        return OK
+    if args.design is None:
+        raise DesignError(
+            "no design given; name a packaged one or a .toml file, or see capsense design --list"
+        )
+    if args.output is not None:
+        _check_picture(args.output)
+
+    from capsense.design import load_design
+
+    design = load_design(args.design)
+    print(describe(design))
+    if args.output is not None:
+        from capsense.design.draw import draw_design
+
+        draw_design(design).get_figure().savefig(args.output, dpi=150)  # type: ignore[union-attr]
+        print(f"\ndrawn to {args.output}")
+    else:
+        print(f"\ndraw it with: capsense design {args.design} --no-build -o {design.name}.png")
+    if not args.no_build:
+        import capsense
+        from capsense.cli.progress import BuildProgress
+
+        with BuildProgress(shown=not args.quiet and sys.stderr.isatty()) as progress:
+            simulator = capsense.Simulator(design, progress=progress)
+        print(f"\n{describe_field(simulator)}")
+    return OK
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse before any computation what Matplotlib would refuse after it."""
+    if path.suffix.lower() not in PICTURES:
+        raise DesignError(
+            f"--output {path} is no picture; give a name that ends in {', '.join(PICTURES)}"
+        )
+    if not path.parent.is_dir():
+        raise DesignError(f"--output {path}: there is no folder {path.parent}; make it first")
+
+
+def _listing() -> str:
+    from capsense.cli.tables import table
+    from capsense.design import available_designs, load_design
+
+    rows = []
+    for name in available_designs():
+        design = load_design(name)
+        rows.append((name, str(len(design.electrodes)), design.description))
+    return table(("name", "electrodes", "description"), rows)
+
+
+def describe(design: Design) -> str:
+    """What a design is made of, as text."""
+    from capsense.cli.tables import facts, table
+
+    x, y, z = (1e3 * s for s in design.domain.size)
+    head = [
+        ("design", design.name),
+        ("", design.description),
+        ("domain", f"{x:g} × {y:g} × {z:g} mm, floor {design.domain.backplane * 1e3:g} mm below"),
+        ("hash", design.content_hash()[:16]),
+    ]
+    blocks = [
+        facts([h for h in head if h[1]]),
+        table(
+            ("electrode", *_SPANS, "area [mm²]"),
+            [(e.name, *_spans(e.surface), _area(e.surface)) for e in design.electrodes],
+        ),
+    ]
+    if design.layers:
+        rows = [
+            (
+                k.name,
+                k.material,
+                f"{k.eps_r:g}",
+                *(_span(low, high) for low, high in zip(k.lower, k.upper, strict=True)),
+            )
+            for k in design.layers
+        ]
+        blocks.append(table(("layer", "material", "eps_r", *_SPANS), rows))
+    if design.conductors:
+        rows = [
+            (c.name, c.role.value, *_spans(c.surface), _area(c.surface)) for c in design.conductors
+        ]
+        blocks.append(table(("conductor", "role", *_SPANS, "area [mm²]"), rows))
+    return "\n\n".join(blocks)
+
+
+_SPANS = ("x [mm]", "y [mm]", "z [mm]")
+
+
+def _span(low: float, high: float) -> str:
+    low, high = round(low * 1e3, 4) + 0.0, round(high * 1e3, 4) + 0.0
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _spans(surface: Surface) -> list[str]:
+    return [_span(low, high) for low, high in zip(*surface.bounds, strict=True)]
+
+
+def _area(surface: Surface) -> str:
+    return f"{surface.area * 1e6:.1f}"
+
+
+def describe_field(simulator: Simulator) -> str:
+    """Mesh figures and baseline matrix, as text."""
+    from capsense.cli.tables import facts, grouped, table
+
+    names = simulator.electrode_names
+    mesh = facts((str(key), grouped(value)) for key, value in simulator.describe().items())
+    rows = [
+        (name, *(f"{c * 1e12:.4f}" for c in row))
+        for name, row in zip(names, simulator.baseline, strict=True)
+    ]
+    return f"{mesh}\n\n{table(('baseline [pF]', *names), rows)}"

@@ -1,0 +1,113 @@
+"""Entry point: parses arguments, runs a subcommand, turns errors into messages and exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+from capsense.cli.registry import load_commands
+from capsense.errors import CapSenseError, FieldError, SolveError
+
+OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+EXIT_CODES = """\
+exit codes:
+  0    done
+  1    failed for a reason that is not your input: a step that was not solved, a full
+       disk, a bug (what was computed until then is kept)
+  2    bad usage or input; the message names what is wrong and how to mend it
+  130  interrupted by Ctrl-C or a request to terminate (what was computed is kept)
+"""
+
+
+class _Version(argparse.Action):
+    """``--version``, looked up only when asked for."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(nargs=0, default=argparse.SUPPRESS, **settings)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        import capsense
+
+        print(f"capsense {capsense.__version__}")
+        parser.exit()
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="capsense",
+        description="Simulate capacitive proximity sensors: from electrodes and bodies in front of "
+        "them to the capacitances that a read-out would see.",
+        epilog=EXIT_CODES + "\n'capsense COMMAND --help' explains a command, with examples.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action=_Version, help="print the version and exit")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in load_commands():
+        sub = commands.add_parser(
+            command.NAME,
+            help=command.HELP,
+            description=command.DESCRIPTION,
+            epilog=f"examples:\n{command.EXAMPLES}\n{EXIT_CODES}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        command.add_arguments(sub)
+        sub.set_defaults(execute=command.execute)
+    return parser
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    say(f"warning: {message}")
+
+
+def say(message: str) -> None:
+    """One line on stderr."""
+    print(f"capsense: {' '.join(message.split())}", file=sys.stderr)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv
+        Arguments after the program's name; those of the process by default.
+
+    Returns
+    -------
+    int
+        The exit code, see :data:`EXIT_CODES`.
+    """
+    args = build_parser().parse_args(argv)
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            return args.execute(args)
+        except (SolveError, FieldError) as error:
+            say(f"error: {error}")
+            return FAILED
+        except CapSenseError as error:
+            say(f"error: {error}")
+            return BAD_INPUT
+        except KeyboardInterrupt:
+            say("interrupted")
+            return INTERRUPTED
+        except BrokenPipeError:  # the reader of our output went away, as in `| head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return OK
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            say(f"error: {where}{error.strerror or error}")
+            return FAILED
+        except Exception as error:
+            traceback.print_exc()
+            say(f"internal error: {error}; this is a bug, please report it with the lines above")
+            return FAILED

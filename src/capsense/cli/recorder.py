@@ -1,0 +1,261 @@
+"""Writes what a run computes: a table as it goes, and everything else at the end."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import ScenarioError
+from capsense.scenario import Channel, Sample, Scenario
+
+Array = NDArray[np.float64]
+
+FILES = ("readings.csv", "readings.npz", "summary.json", "plot.png")
+"""What a run leaves in its output folder."""
+
+
+def prepare_folder(folder: Path, *, force: bool) -> None:
+    """Make the output folder, and see that it can be written to.
+
+    Parameters
+    ----------
+    folder
+        Where results go; made with its parents if it is not there.
+    force
+        Take a folder that holds something, and remove earlier results from it.
+
+    Raises
+    ------
+    ScenarioError
+        If it is a file, holds something and ``force`` is not set, or cannot be written to.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ScenarioError(f"output {folder} is a file; give a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()) and not force:
+            raise ScenarioError(
+                f"output folder {folder} is not empty; give another one, or --force to replace "
+                "the results in it"
+            )
+        probe = folder / f".capsense-{os.getpid()}"
+        probe.write_bytes(b"capsense")
+        probe.unlink()
+        for name in FILES:
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise ScenarioError(
+            f"output folder {folder} cannot be written to: {error.strerror}; give another one"
+        ) from None
+
+
+class Recorder:
+    """Takes samples, writes ``readings.csv`` row by row, and the other files at the end.
+
+    Parameters
+    ----------
+    folder
+        An output folder made by :func:`prepare_folder`.
+    scenario
+        The scenario that is run.
+    baseline
+        Maxwell matrix [F] of the sensor with nothing in front of it, shape (M, M).
+    levels
+        Capacitance [F] of each channel with nothing in front of the sensor.
+    """
+
+    def __init__(
+        self, folder: Path, scenario: Scenario, baseline: Array, levels: tuple[float, ...]
+    ) -> None:
+        self.folder = folder
+        self.scenario = scenario
+        self.baseline = np.asarray(baseline, dtype=float)
+        self.levels = np.array(levels)
+        self.count = 0
+        size, electrodes = scenario.count, len(self.baseline)
+        bodies = len(scenario.bodies)
+        self._capacitance = np.empty((size, electrodes, electrodes))
+        self._delta = np.empty((size, electrodes, electrodes))
+        self._values = np.empty((size, len(scenario.channels)))
+        self._positions = np.empty((size, bodies, 3))
+        self._quaternions = np.empty((size, bodies, 4))
+        self._stats = np.empty((size, 4))
+        self._file = (folder / FILES[0]).open("w", newline="", encoding="utf-8")
+        self._rows = csv.writer(self._file, lineterminator="\n")
+        self._rows.writerow([name for name, _ in column_meanings(scenario.channels)])
+        self._file.flush()
+
+    def add(self, sample: Sample) -> None:
+        """Keep one sample, and write its row."""
+        k, reading = sample.index, sample.reading
+        self._capacitance[k] = reading.capacitance
+        self._delta[k] = reading.delta
+        self._values[k] = sample.values
+        for b, body in enumerate(sample.scene):
+            self._positions[k, b] = body.pose.position
+            self._quaternions[k, b] = body.pose.quaternion
+        stats = reading.stats
+        self._stats[k] = (
+            stats.iterations,
+            stats.error_estimate,
+            stats.wall_time,
+            stats.tolerance,
+        )
+        changes = self._values[k] - self.levels
+        numbers = [*self._values[k], *changes]
+        self._rows.writerow([f"{sample.time:.12g}", *(f"{v:.10g}" for v in numbers)])
+        self._file.flush()
+        self.count = k + 1
+
+    @property
+    def times(self) -> Array:
+        """Times [s] of the samples so far, shape (n,)."""
+        return self.scenario.times[: self.count]
+
+    @property
+    def values(self) -> Array:
+        """Channels [F] of the samples so far, shape (n, K)."""
+        return self._values[: self.count]
+
+    @property
+    def positions(self) -> Array:
+        """Origins of the bodies [m] in the samples so far, shape (n, B, 3)."""
+        return self._positions[: self.count]
+
+    @property
+    def capacitance(self) -> Array:
+        """Maxwell matrices [F] of the samples so far, shape (n, M, M)."""
+        return self._capacitance[: self.count]
+
+    def close(self) -> None:
+        """Close the table."""
+        self._file.close()
+
+    def write_arrays(self) -> None:
+        """Write ``readings.npz``."""
+        n = self.count
+        arrays = {
+            "time": self.times,
+            "capacitance": self._capacitance[:n],
+            "delta": self._delta[:n],
+            "baseline": self.baseline,
+            "electrode_names": np.array(self.scenario.design.electrode_names),
+            "channels": self._values[:n],
+            "channel_baseline": self.levels,
+            "channel_names": np.array([c.column_name for c in self.scenario.channels]),
+            "body_names": np.array([b.body.name for b in self.scenario.bodies], dtype=str),
+            "body_positions": self._positions[:n],
+            "body_quaternions": self._quaternions[:n],
+            "iterations": self._stats[:n, 0].astype(np.int64),
+            "error_estimate": self._stats[:n, 1],
+            "step_time": self._stats[:n, 2],
+        }
+        with _replacing(self.folder / FILES[1]) as path, path.open("wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+    def summary(
+        self, mesh: dict[str, Any], *, interrupted: bool, failure: str | None
+    ) -> dict[str, Any]:
+        """What ``summary.json`` holds."""
+        scenario, n = self.scenario, self.count
+        stats = self._stats[:n]
+        return {
+            "scenario": scenario.name,
+            "design": scenario.design.name,
+            "design_hash": scenario.design.content_hash(),
+            "electrodes": list(scenario.design.electrode_names),
+            "bodies": [b.body.name for b in scenario.bodies],
+            "mesh": mesh,
+            "method": scenario.method,
+            "excitation": scenario.excitation.value,
+            "sample_rate_Hz": scenario.sample_rate,
+            "samples": n,
+            "samples_planned": scenario.count,
+            "interrupted": interrupted,
+            "failure": failure,
+            "step_time_s": _quantiles(stats[:, 2]),
+            "iterations": _quantiles(stats[:, 0]),
+            "largest_error_estimate_F": _largest(stats[:, 1]),
+            "tolerance_F": _largest(stats[:, 3]),
+            "channels": [
+                self._channel_summary(k, channel) for k, channel in enumerate(scenario.channels)
+            ],
+            "columns": dict(column_meanings(scenario.channels)),
+            "versions": versions(),
+        }
+
+    def _channel_summary(self, k: int, channel: Channel) -> dict[str, Any]:
+        values = self.values[:, k]
+        return {
+            "name": channel.column_name,
+            "meaning": channel.meaning,
+            "baseline_F": float(self.levels[k]),
+            "min_F": float(values.min()) if len(values) else None,
+            "max_F": float(values.max()) if len(values) else None,
+        }
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write ``summary.json``."""
+        with _replacing(self.folder / FILES[2]) as path:
+            text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+            path.write_text(text + "\n", encoding="utf-8")
+
+
+class _replacing:
+    """A temporary path that takes the place of a file once its block ends without error."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.part = path.with_name(f".{path.name}.part")
+
+    def __enter__(self) -> Path:
+        return self.part
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            os.replace(self.part, self.path)
+        else:
+            self.part.unlink(missing_ok=True)
+
+
+def column_meanings(channels: tuple[Channel, ...]) -> list[tuple[str, str]]:
+    """Columns of ``readings.csv``, each with what it is."""
+    out = [("time_s", "time since the start, s")]
+    out += [(f"{c.column_name}_F", f"{c.meaning}, F") for c in channels]
+    out += [
+        (f"d{c.column_name}_F", f"{c.meaning}, change from the empty scene, F") for c in channels
+    ]
+    return out
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    out = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in ("capsense", "numpy", "scipy", "numba"):
+        try:
+            out[package] = version(package)
+        except PackageNotFoundError:
+            out[package] = "not installed"
+    return out
+
+
+def _quantiles(values: Array) -> dict[str, float] | None:
+    if not len(values):
+        return None
+    return {
+        "median": float(np.median(values)),
+        "p95": float(np.percentile(values, 95)),
+        "max": float(values.max()),
+    }
+
+
+def _largest(values: Array) -> float | None:
+    return float(values.max()) if len(values) else None

@@ -1,0 +1,227 @@
+"""``capsense run``: a scenario file in, readings out."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from capsense.cli.interrupt import Interrupt
+    from capsense.cli.recorder import Recorder
+    from capsense.scenario import Scenario
+    from capsense.simulator import Simulator
+
+NAME = "run"
+HELP = "simulate a scenario file and write its readings"
+DESCRIPTION = """\
+Simulate a scenario: a sensor, bodies that move in front of it, and how it is sampled.
+
+The output folder receives
+  readings.csv   one row per sample: time and capacitances, written as they are computed
+  readings.npz   the same as arrays, with full matrices and the bodies' poses
+  summary.json   what was computed, how long it took, versions
+  plot.png       the signals, and the bodies' way over the electrodes
+
+Ctrl-C finishes the sample at hand and keeps what was computed.
+The field of a design is computed once, at its first use, and kept in the user's cache.
+"""
+EXAMPLES = """\
+  capsense run examples/hand_approach.toml -o out/
+  capsense run examples/steel_bar_triangle.toml -o out/ --force
+  capsense run my.toml -o quick/ --rate 2        a quick look: two samples a second
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("scenario", metavar="SCENARIO.toml", type=Path, help="the scenario file")
+    parser.add_argument(
+        "-o", "--output", metavar="DIR", type=Path, required=True, help="folder for the results"
+    )
+    parser.add_argument(
+        "--force", action="store_true", help="replace the results in a folder that is not empty"
+    )
+    parser.add_argument(
+        "--rate", metavar="HZ", type=_rate, help="sample rate, instead of the scenario's"
+    )
+    parser.add_argument(
+        "-q", "--quiet", action="store_true", help="no progress bar, no summary; errors only"
+    )
+
+
+def _rate(text: str) -> float:
+    value = float(text)
+    if not 1e-3 <= value <= 1e6:
+        raise argparse.ArgumentTypeError(f"{text} Hz; give a number from 0.001 to 1e6")
+    return value
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the scenario and return the exit code."""
+    from capsense.cli.interrupt import Interrupt
+    from capsense.cli.main import INTERRUPTED, OK, say
+    from capsense.cli.recorder import Recorder, prepare_folder
+    from capsense.scenario import load_scenario
+    from capsense.scenario.play import baseline_of
+
+    scenario = load_scenario(args.scenario)
+    if args.rate is not None:
+        scenario = scenario.resampled(args.rate)
+    for name in _absent(scenario):
+        say(f'warning: body "{name}" never enters the domain; it has no effect')
+    made = not args.output.exists()
+    prepare_folder(args.output, force=args.force)
+    with Interrupt() as interrupt:
+        try:
+            simulator = _build(scenario, quiet=args.quiet)
+            levels = baseline_of(scenario, simulator)
+            recorder = Recorder(args.output, scenario, simulator.baseline, levels)
+        except BaseException:
+            if made:
+                with contextlib.suppress(OSError):
+                    args.output.rmdir()
+            raise
+        interrupt.deferring = True
+        failure: Exception | None = None
+        try:
+            _step(scenario, simulator, recorder, interrupt, quiet=args.quiet)
+        except Exception as error:
+            failure = error
+        recorder.close()
+        summary = recorder.summary(
+            dict(simulator.describe()),
+            interrupted=interrupt.requested,
+            failure=str(failure) if failure is not None else None,
+        )
+        try:
+            _write(recorder, summary)
+        except OSError as error:
+            if failure is None:
+                raise
+            say(f"error: the results could not be written: {error.strerror}")
+    if not args.quiet:
+        print(report(summary, args.output))
+    if failure is not None:
+        time = scenario.times[recorder.count]
+        say(
+            f"stopped at sample {recorder.count} of {scenario.count} (t = {time:g} s); the "
+            f"{recorder.count} before it are in {args.output}"
+        )
+        raise failure
+    if interrupt.requested and recorder.count < scenario.count:
+        say(f"interrupted after {recorder.count} of {scenario.count} samples, which are kept")
+        return INTERRUPTED
+    return OK
+
+
+def _absent(scenario: Scenario) -> list[str]:
+    """Names of the bodies that never enter the domain, looked for at up to 500 samples."""
+    import numpy as np
+
+    domain = scenario.design.domain
+    seen = np.zeros(len(scenario.bodies), dtype=bool)
+    stride = max(1, scenario.count // 500)
+    for time in scenario.times[::stride]:
+        bounds = scenario.scene_at(float(time)).pack().bounds
+        inside = (bounds[:, 0] < domain.upper) & (bounds[:, 1] > domain.lower)
+        seen |= inside.all(axis=1)
+        if seen.all():
+            break
+    return [str(b.body.name) for b, ever in zip(scenario.bodies, seen, strict=True) if not ever]
+
+
+def _progress_shown(quiet: bool) -> bool:
+    return not quiet and sys.stderr.isatty()
+
+
+def _build(scenario: Scenario, *, quiet: bool) -> Simulator:
+    import capsense
+    from capsense.cli.progress import BuildProgress
+
+    settings: dict[str, Any] = {}
+    if scenario.tolerance is not None:
+        settings["tolerance"] = scenario.tolerance
+    with BuildProgress(shown=_progress_shown(quiet)) as progress:
+        return capsense.Simulator(
+            scenario.design, method=scenario.method, progress=progress, **settings
+        )
+
+
+def _step(
+    scenario: Scenario,
+    simulator: Simulator,
+    recorder: Recorder,
+    interrupt: Interrupt,
+    *,
+    quiet: bool,
+) -> None:
+    """Play the scenario into the recorder until its end, or until interrupted."""
+    from tqdm import tqdm
+
+    from capsense.scenario import play
+
+    with tqdm(
+        total=scenario.count, unit=" samples", file=sys.stderr, disable=not _progress_shown(quiet)
+    ) as bar:
+        for sample in play(scenario, simulator):
+            recorder.add(sample)
+            bar.update()
+            if interrupt.requested:
+                break
+
+
+def _write(recorder: Recorder, summary: dict[str, Any]) -> None:
+    from capsense.cli.plot import plot_run
+
+    recorder.write_arrays()
+    recorder.write_summary(summary)
+    if recorder.count:
+        plot_run(recorder).savefig(recorder.folder / "plot.png", dpi=150)
+
+
+def report(summary: dict[str, Any], folder: Path) -> str:
+    """The summary for people."""
+    from capsense.cli.recorder import FILES
+    from capsense.cli.tables import facts, grouped, seconds, table
+
+    mesh = ", ".join(f"{key} {grouped(value)}" for key, value in summary["mesh"].items())
+    samples = f"{summary['samples']} of {summary['samples_planned']}"
+    if summary["interrupted"]:
+        samples += ", interrupted"
+    if summary["failure"]:
+        samples += ", stopped by an error"
+    lines = [
+        ("scenario", summary["scenario"]),
+        ("design", f"{summary['design']}, {len(summary['electrodes'])} electrodes"),
+        ("mesh", mesh),
+        ("samples", f"{samples}, at {summary['sample_rate_Hz']:g} Hz"),
+    ]
+    step = summary["step_time_s"]
+    if step is not None:
+        times = [f"{name} {seconds(step[key])}" for name, key in _STEP_TIMES]
+        error, tolerance = summary["largest_error_estimate_F"], summary["tolerance_F"]
+        lines.append(("step time", ", ".join(times)))
+        lines.append(("error", f"at most {error:.2g} F estimated, tolerance {tolerance:.2g} F"))
+    blocks = [facts(lines)]
+    channels = summary["channels"]
+    if step is not None:
+        header = ("channel", "empty [pF]", "least [pF]", "largest [pF]", "least %", "largest %")
+        blocks.append(table(header, [_channel_row(c) for c in channels[:_MAX_ROWS]]))
+        if len(channels) > _MAX_ROWS:
+            blocks.append(f"and {len(channels) - _MAX_ROWS} more in summary.json")
+    written = [name for name in FILES if (folder / name).exists()]
+    blocks.append(f"wrote {', '.join(written)} to {folder}")
+    return "\n\n".join(blocks)
+
+
+_STEP_TIMES = (("median", "median"), ("95 % below", "p95"), ("longest", "max"))
+_MAX_ROWS = 40
+
+
+def _channel_row(channel: dict[str, Any]) -> list[str]:
+    level, low, high = (channel[key] for key in ("baseline_F", "min_F", "max_F"))
+    share = [f"{100 * v / level:.2f}" if level else "–" for v in (low, high)]
+    return [channel["name"], *(f"{v * 1e12:.5f}" for v in (level, low, high)), *share]
