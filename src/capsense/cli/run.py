@@ -90,13 +90,13 @@ def execute(args: argparse.Namespace) -> int:
             _step(scenario, simulator, recorder, interrupt, quiet=args.quiet)
         except Exception as error:
             failure = error
-        recorder.close()
         summary = recorder.summary(
             dict(simulator.describe()),
             interrupted=interrupt.requested,
             failure=str(failure) if failure is not None else None,
         )
         try:
+            recorder.close()
             _write(recorder, summary)
         except OSError as error:
             if failure is None:

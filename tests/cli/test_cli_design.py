@@ -1,0 +1,153 @@
+"""``capsense design``, the parser, and the helpers for text."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import capsense as cs
+from capsense.cli.main import build_parser, main
+from capsense.cli.registry import COMMANDS, load_commands
+from capsense.cli.tables import facts, grouped, seconds, table
+
+
+def output_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(arguments) == 0
+    text, errors = capsys.readouterr()
+    assert errors == ""
+    return text
+
+
+def test_list(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every packaged design is listed."""
+    text = output_of(["design", "--list"], capsys)
+    for name in cs.available_designs():
+        assert f"\n{name} " in text
+
+
+@pytest.mark.usefixtures("fake")
+def test_figures_and_baseline(capsys: pytest.CaptureFixture[str]) -> None:
+    """Electrodes, layers, conductors, mesh and the matrix in picofarads."""
+    text = output_of(["design", "stripe"], capsys)
+    for part in ("-17.5 to -11.9", "back plane", "ground", "4.5", "11 234", "baseline [pF]"):
+        assert part in text, part
+    matrix = text[text.index("baseline [pF]") :].splitlines()
+    simulator = cs.Simulator("stripe")
+    for line, name, row in zip(
+        matrix[1:], simulator.electrode_names, simulator.baseline, strict=True
+    ):
+        cells = line.split()
+        assert cells[0] == name
+        assert [float(c) for c in cells[1:]] == pytest.approx(row * 1e12, abs=5e-5)
+    assert len({len(line) for line in matrix}) == 1
+
+
+def test_drawing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing is drawn unasked; -o draws, and --no-build needs no simulator."""
+    text = output_of(["design", "patch", "--no-build"], capsys)
+    assert "-o patch.png" in text
+    assert "baseline" not in text
+    for suffix, magic in ((".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")):
+        picture = tmp_path / f"patch{suffix}"
+        assert str(picture) in output_of(
+            ["design", "patch", "--no-build", "-o", str(picture)], capsys
+        )
+        assert picture.read_bytes().startswith(magic)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["design"], "no design given"),
+        (["design", "strip"], "did you mean 'stripe'"),
+        (["design", "no/such.toml"], "no design file no/such.toml"),
+        (["design", "stripe", "-o", "x.docx"], "x.docx is no picture; give .*png"),
+        (["design", "stripe", "-o", "none/x.png"], "no folder none"),
+    ],
+)
+def test_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Wrong input is refused in one line, before anything is printed."""
+    assert main(arguments) == 2
+    text, errors = capsys.readouterr()
+    assert text == ""
+    assert errors.count("\n") == 1
+    assert re.search(message, errors)
+
+
+# ---- the parser ----
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    """--version prints the package's."""
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out == f"capsense {cs.__version__}\n"
+
+
+def test_help_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each help page has examples, which parse, and the exit codes."""
+    for command in load_commands():
+        with pytest.raises(SystemExit) as stopped:
+            main([command.NAME, "--help"])
+        assert stopped.value.code == 0
+        text = capsys.readouterr().out
+        assert "exit codes:" in text
+        examples = [e.split("   ")[0].split() for e in command.EXAMPLES.splitlines()]
+        assert len(examples) >= 2
+        for words in examples:
+            assert words[:2] == ["capsense", command.NAME]
+            build_parser().parse_args(words[1:])
+    assert len(COMMANDS) == len(load_commands())
+
+
+@pytest.mark.parametrize("arguments", [[], ["walk"], ["run"], ["run", "x.toml"]])
+def test_usage_errors(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """What cannot be parsed exits with 2 and shows the usage."""
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert "usage: capsense" in capsys.readouterr().err
+
+
+def test_module_and_script() -> None:
+    """``python -m capsense`` is the command, and returns its exit codes."""
+    command = [sys.executable, "-m", "capsense"]
+    done = subprocess.run([*command, "design", "nosuch"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("capsense: error: no packaged design is named 'nosuch'")
+
+
+@pytest.mark.skipif(not Path("/bin/sh").exists(), reason="needs a shell")
+def test_closed_pipe() -> None:
+    """A reader that goes away early is no error."""
+    line = f"'{sys.executable}' -m capsense design --list | true"
+    done = subprocess.run(["/bin/sh", "-c", line], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
+
+
+# ---- text ----
+
+
+def test_table() -> None:
+    """Numbers to the right, words to the left, no trailing blanks."""
+    text = table(("name", "value"), [("a", "-1.5"), ("long name", "10.25")])
+    assert text == "name       value\na           -1.5\nlong name  10.25"
+    assert table(("a", "b"), []) == "a  b"
+
+
+def test_small_texts() -> None:
+    """Times, counts and facts."""
+    assert [seconds(v) for v in (2e-5, 3.14e-3, 0.5, 2.5)] == [
+        "20 µs",
+        "3.14 ms",
+        "500 ms",
+        "2.5 s",
+    ]
+    assert [grouped(v) for v in (1234567, 12, 0.123456, "x")] == ["1 234 567", "12", "0.1235", "x"]
+    assert facts([("a", "1"), ("bcd", "2")]) == "a    1\nbcd  2"
