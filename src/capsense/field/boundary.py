@@ -1,0 +1,330 @@
+"""Boundary-element solution of a sensor in its grounded box, without any object in it.
+
+Unknowns are the total (free and bound) charge densities on every conducting sheet, dielectric
+interface and box wall; the floor is met by image charges. Potentials can then be evaluated at any
+point, close to the electrodes as well as far away, without a volume mesh.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import shapely
+from numpy.typing import NDArray
+
+from capsense.constants import EPS0
+from capsense.design.geometry import Facet
+from capsense.design.model import Design, Layer, Role
+from capsense.errors import FieldError
+from capsense.field import bem_kernels as kernels
+from capsense.field.panels import Grading, Panels, concatenate, cut_facet, make_panels
+
+Array = NDArray[np.float64]
+
+GROUND, INTERFACE = -1, -2
+"""Owners of panels that belong to no terminal."""
+
+_PLANE_TOL = 1e-6
+_MAX_PANELS = 16_000
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Panel sizes of the boundary-element solution, as multiples of the default."""
+
+    scale: float = 1.0
+    """Larger is coarser and faster."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryModel:
+    """Panels of a design, who owns them, and the permittivity on both sides."""
+
+    panels: Panels
+    owner: NDArray[np.int64]
+    """Terminal index of each panel, or ``GROUND`` or ``INTERFACE``, shape (n,)."""
+    eps_front: Array
+    """Relative permittivity on the side the normal points to, shape (n,)."""
+    eps_back: Array
+    """Relative permittivity on the other side, shape (n,)."""
+    floor: float
+    """Height of the grounded floor [m]."""
+    n_terminals: int
+
+
+def eps_at(design: Design, points: Array) -> Array:
+    """Relative permittivity of a design at points [m], shape (..., 3) -> (...)."""
+    eps = np.ones(points.shape[:-1])
+    for layer in design.layers:
+        inside = ((points > layer.lower) & (points < layer.upper)).all(axis=-1)
+        eps[inside] = layer.eps_r
+    return eps
+
+
+def terminals(design: Design) -> list[str]:
+    """Names of the conductors that can be driven: electrodes, then shields, then floating."""
+    extra = [
+        c for role in (Role.SHIELD, Role.FLOATING) for c in design.conductors if c.role == role
+    ]
+    return [*design.electrode_names, *(c.name for c in extra)]
+
+
+def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryModel:
+    """Cut all conductors, interfaces and walls of a design into panels."""
+    accuracy = accuracy or Accuracy()
+    floor = float(design.domain.lower[2])
+    names = terminals(design)
+    sheets: list[tuple[Facet, int]] = []
+    for body in (*design.electrodes, *design.conductors):
+        owner = names.index(body.name) if body.name in names else GROUND
+        for facet in body.surface.facets:
+            on_floor = (
+                abs(facet.axes[2, 2]) > 1 - 1e-9 and abs(facet.origin[2] - floor) < _PLANE_TOL
+            )
+            if not on_floor:
+                sheets.append((facet, owner))
+    bodies = (*design.electrodes, *design.conductors)
+    rims = np.concatenate([b.surface.rims for b in bodies])
+    gaps = _smallest_gaps(sheets)
+    spacings = _plane_spacings(sheets)
+    thin = min((float((la.upper - la.lower)[2]) for la in design.layers), default=math.inf)
+
+    parts: list[Panels] = []
+    owners: list[NDArray[np.int64]] = []
+    front: list[Array] = []
+    back: list[Array] = []
+
+    def add(facet: Facet, owner: int, grading: Grading, reach: float) -> None:
+        pieces = cut_facet(facet, rims, grading, reach)
+        if not pieces:
+            return
+        panels = make_panels(facet, pieces)
+        parts.append(panels)
+        owners.append(np.full(len(panels), owner, dtype=np.int64))
+        step = 1e-7 * panels.normals
+        front.append(eps_at(design, panels.centers + step))
+        back.append(eps_at(design, panels.centers - step))
+
+    reach = 2.5 * thin if math.isfinite(thin) else 0.0
+    for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
+        width = 2 * facet.polygon.area / facet.polygon.length
+        edge = accuracy.scale * max(min(0.02 * width, 0.15 * gap, 1e-4), 1e-5)
+        largest = accuracy.scale * min(0.005, max(2 * spacing, 0.001))
+        add(facet, owner, _grading(facet, edge, largest, accuracy.scale), 2.5 * spacing)
+    for facet, thickness in _interfaces(design, sheets):
+        edge = accuracy.scale * min(3e-4, 0.3 * thickness)
+        largest = accuracy.scale * min(0.006, max(3 * thickness, 0.002))
+        add(facet, INTERFACE, _grading(facet, edge, largest, accuracy.scale), reach)
+    for facet in _walls(design):
+        add(facet, GROUND, Grading(0.01, largest=accuracy.scale * 0.04), 0.0)
+
+    panels = concatenate(parts)
+    if len(panels) > _MAX_PANELS:
+        raise FieldError(
+            f"design {design.name!r} needs {len(panels)} boundary panels, more than the "
+            f"{_MAX_PANELS} that fit in memory; simplify its outlines or coarsen its STL files"
+        )
+    return BoundaryModel(
+        panels, np.concatenate(owners), np.concatenate(front), np.concatenate(back), floor,
+        len(names),
+    )  # fmt: skip
+
+
+def _grading(facet: Facet, edge: float, largest: float, scale: float) -> Grading:
+    """Long thin panels along straight rims, as fine as the facet's size asks for."""
+    extent = max(np.ptp(np.array(facet.polygon.bounds).reshape(2, 2), axis=0))
+    smallest = scale * min(max(0.08 * extent, 3e-4), 2.5e-3)
+    return Grading(edge, smallest=smallest, largest=max(largest, 1.01 * smallest))
+
+
+def _smallest_gaps(sheets: list[tuple[Facet, int]]) -> list[float]:
+    """Distance of each facet to the nearest other facet [m], from their outlines."""
+    outlines = []
+    for facet, _ in sheets:
+        rings = [facet.polygon.exterior, *facet.polygon.interiors]
+        outlines.append(np.concatenate([facet.to_sensor(np.asarray(r.coords)[:-1]) for r in rings]))
+    gaps = []
+    for k, (facet, owner) in enumerate(sheets):
+        gap = math.inf
+        for other, (mate, mate_owner) in enumerate(sheets):
+            if other == k or (mate_owner == owner and owner >= 0):
+                continue
+            local = (outlines[other] - facet.origin) @ facet.axes.T
+            if np.abs(local[:, 2]).max() < _PLANE_TOL:
+                flat = _to_plane(mate, facet)
+                gap = min(gap, float(facet.polygon.boundary.distance(flat)))
+        gaps.append(max(gap, 1e-5))
+    return gaps
+
+
+def _plane_spacings(sheets: list[tuple[Facet, int]]) -> list[float]:
+    """Distance of each facet to the nearest parallel facet that faces it [m], at most 10 mm."""
+    out = []
+    for k, (facet, _) in enumerate(sheets):
+        spacing = 0.01
+        for other, (mate, _) in enumerate(sheets):
+            height = abs((mate.origin - facet.origin) @ facet.axes[2])
+            parallel = abs(mate.axes[2] @ facet.axes[2]) > 1 - 1e-6
+            if other != k and parallel and _PLANE_TOL < height < spacing:
+                shadow = _to_plane(mate, facet)
+                if facet.polygon.intersects(shadow):
+                    spacing = height
+        out.append(spacing)
+    return out
+
+
+def _to_plane(facet: Facet, target: Facet) -> shapely.Polygon:
+    """Express a coplanar facet's polygon in another facet's plane coordinates."""
+
+    def convert(uv: Array) -> Array:
+        return ((facet.to_sensor(uv) - target.origin) @ target.axes.T)[:, :2]
+
+    return shapely.transform(facet.polygon, convert)
+
+
+def _coplanar(facet: Facet, plane: Facet) -> bool:
+    parallel = abs(facet.axes[2] @ plane.axes[2]) > 1 - 1e-9
+    return bool(parallel and abs((facet.origin - plane.origin) @ plane.axes[2]) < _PLANE_TOL)
+
+
+def _box_faces(layer: Layer) -> list[Facet]:
+    """The six faces of a box, normals outward."""
+    faces = []
+    size, center = layer.upper - layer.lower, (layer.lower + layer.upper) / 2
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            n = np.zeros(3)
+            n[axis] = sign
+            u = np.zeros(3)
+            u[(axis + 1) % 3] = 1.0
+            v = np.cross(n, u)
+            half_u = size[(axis + 1) % 3] / 2
+            half_v = size[(axis + 2) % 3] / 2
+            origin = center + n * size[axis] / 2
+            faces.append(
+                Facet(shapely.box(-half_u, -half_v, half_u, half_v), origin, np.array([u, v, n]))
+            )
+    return faces
+
+
+def _interfaces(design: Design, sheets: list[tuple[Facet, int]]) -> list[tuple[Facet, float]]:
+    """Bare dielectric interfaces (faces not covered by a conductor), with the slab thickness."""
+    out: list[tuple[Facet, float]] = []
+    lower, upper = design.domain.lower, design.domain.upper
+    faces = [_box_faces(layer) for layer in design.layers]
+    for k, layer in enumerate(design.layers):
+        for face in faces[k]:
+            on_wall = np.minimum(
+                np.abs((face.origin - lower) @ face.axes[2]),
+                np.abs((face.origin - upper) @ face.axes[2]),
+            )
+            if on_wall < _PLANE_TOL:
+                continue
+            region = face.polygon
+            for facet, _ in sheets:
+                if _coplanar(facet, face):
+                    region = region.difference(_to_plane(facet, face))
+            for earlier in range(k):
+                for mate in faces[earlier]:
+                    if _coplanar(mate, face):
+                        region = region.difference(_to_plane(mate, face))
+            for piece in shapely.get_parts(region):
+                if piece.area > 1e-12 and piece.geom_type == "Polygon":
+                    thickness = float((layer.upper - layer.lower).min())
+                    out.append((Facet(piece, face.origin, face.axes), thickness))
+    return out
+
+
+def _walls(design: Design) -> list[Facet]:
+    """Ceiling and side walls of the box; the floor is met by images."""
+    box = Layer("box", "", 1.0, design.domain.lower, design.domain.upper)
+    return [f for f in _box_faces(box) if f.axes[2, 2] > -0.5]
+
+
+class BoundarySolution:
+    """A factorised boundary-element system of one design."""
+
+    def __init__(
+        self,
+        design: Design,
+        accuracy: Accuracy | None = None,
+        progress: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.design = design
+        self.model = build_model(design, accuracy)
+        panels, owner = self.model.panels, self.model.owner
+        progress(f"boundary elements: {len(panels)} panels")
+        self._contrast = (self.model.eps_front - self.model.eps_back) / (
+            self.model.eps_front + self.model.eps_back
+        )
+        matrix = kernels.system_matrix(
+            owner == INTERFACE, self._contrast, self.model.floor, *panels.kernel_args
+        )
+        progress("boundary elements: factorising")
+        self._lu = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=True)
+
+    def densities(self, potentials: Array, sources: Array | None = None) -> Array:
+        """Total charge densities [C/m²] on all panels.
+
+        ``potentials``: terminal potentials [V], shape (terminals, k). ``sources``: optional points
+        [m], shape (k, 3), one a column, where a point charge of 4π eps0 · 1 V·m sits.
+        """
+        panels, owner = self.model.panels, self.model.owner
+        rhs = np.zeros((len(panels), potentials.shape[1]))
+        driven = owner >= 0
+        rhs[driven] = potentials[owner[driven]]
+        if sources is not None:
+            conductor = owner != INTERFACE
+            value, grad = _point_fields(self.model, sources)
+            rhs[conductor] -= value[conductor]
+            # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
+            rhs[~conductor] += self._contrast[~conductor, None] * grad[~conductor]
+        return 4 * math.pi * EPS0 * scipy.linalg.lu_solve(self._lu, rhs)
+
+    def terminal_charges(self, densities: Array) -> Array:
+        """Free charge [C] on each terminal, shape (terminals, k)."""
+        model, panels = self.model, self.model.panels
+        mean = 0.5 * (model.eps_front + model.eps_back)
+        jump = model.eps_front - model.eps_back
+        free = mean[:, None] * densities
+        rows = np.flatnonzero((model.owner >= 0) & (np.abs(jump) > 1e-12))
+        if len(rows):
+            grad = kernels.normal_gradient_matrix(rows, model.floor, *panels.kernel_args)
+            # eps0 E_n = -grad . n sigma / (4 pi)
+            free[rows] -= jump[rows, None] * (grad @ densities) / (4 * math.pi)
+        charge = free * panels.areas[:, None]
+        out = np.zeros((model.n_terminals, densities.shape[1]))
+        driven = model.owner >= 0
+        np.add.at(out, model.owner[driven], charge[driven])
+        return out
+
+    def potential(self, points: Array, densities: Array, chunk: int = 2000) -> Array:
+        """Potential [V] of charge densities at points [m], shape (n, 3) -> (n, k)."""
+        out = np.empty((len(points), densities.shape[1]))
+        scaled = densities / (4 * math.pi * EPS0)
+        for start in range(0, len(points), chunk):
+            block = np.ascontiguousarray(points[start : start + chunk])
+            matrix = kernels.potential_matrix(
+                block, self.model.floor, *self.model.panels.kernel_args
+            )
+            out[start : start + chunk] = matrix @ scaled
+        return out
+
+
+def _point_fields(model: BoundaryModel, sources: Array) -> tuple[Array, Array]:
+    """Potential and normal gradient at panel centres of unit 1/r sources and their images."""
+    centers, normals = model.panels.centers, model.panels.normals
+    images = sources.copy()
+    images[:, 2] = 2 * model.floor - images[:, 2]
+    value = np.zeros((len(centers), len(sources)))
+    grad = np.zeros_like(value)
+    for points, sign in ((sources, 1.0), (images, -1.0)):
+        d = centers[:, None] - points[None]
+        r = np.sqrt((d**2).sum(axis=2))
+        value += sign / r
+        grad -= sign * np.einsum("nkd,nd->nk", d, normals) / r**3
+    return value, grad

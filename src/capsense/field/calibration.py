@@ -1,0 +1,112 @@
+"""Adapt link weights so that the online lattice reproduces the accurate empty-domain fields.
+
+Near an electrode's edge the field is singular and the plain weights are too large: the lattice
+sees the electrode half a cell larger than it is. The weights are changed as little as possible
+(relative least squares) such that the accurate fields leave small residuals at free nodes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import lsmr
+
+from capsense.field.lattice import FREE, Lattice
+
+Array = NDArray[np.float64]
+
+_LOWEST, _HIGHEST = -0.8, 4.0
+"""Bounds on the relative change of a weight; weights stay positive."""
+
+
+def calibrate(lattice: Lattice, potentials: Array, strength: float = 0.3) -> tuple[Array, Array]:
+    """Return adapted link weights (3, n) and half-link weights (cuts, 2) [F].
+
+    ``potentials`` are the accurate fields at the nodes [V], shape (n, terminals). Minimises
+    ``|R d + r|² + strength² |d|²`` where d is the relative change of each weight and r the nodal
+    residuals relative to the flux that passes the node. Half-links of crossed links come in the
+    order of ``lattice.cuts``: lower node to sheet, upper node to sheet.
+    """
+    links = _Links(lattice, potentials)
+    rows, rhs = [], []
+    free = lattice.owner == FREE
+    for k in range(potentials.shape[1]):
+        flux = links.weight * links.drop[:, k]
+        through = links.sum_abs(flux)
+        scale = np.where(free & (through > 0), 1.0 / np.maximum(through, 1e-300), 0.0)
+        rows.append(sp.diags(scale) @ links.incidence @ sp.diags(flux))
+        rhs.append(-scale * (links.incidence @ flux))
+    matrix, target = sp.vstack(rows).tocsr(), np.concatenate(rhs)
+    change = np.zeros(len(links.weight))
+    fixed = np.zeros(len(change), dtype=bool)
+    for _ in range(4):
+        open_ = sp.diags((~fixed).astype(float))
+        part = lsmr(matrix @ open_, target - matrix @ (change * fixed), damp=strength, maxiter=60)[
+            0
+        ]
+        change = np.where(fixed, change, part)
+        outside = (change < _LOWEST) | (change > _HIGHEST)
+        if not (outside & ~fixed).any():
+            break
+        change = np.clip(change, _LOWEST, _HIGHEST)
+        fixed |= outside
+    change = np.clip(change, _LOWEST, _HIGHEST)
+    return links.scatter(links.weight * (1.0 + change))
+
+
+class _Links:
+    """All links and half-links with at least one free end, as flat arrays."""
+
+    def __init__(self, lattice: Lattice, potentials: Array) -> None:
+        self._lattice = lattice
+        n, cuts = lattice.n_nodes, lattice.cuts
+        whole = lattice.weights > 0
+        for axis in range(3):
+            whole[axis, cuts.node[cuts.axis == axis]] = False
+        self._axis, self._node = np.nonzero(whole)
+        strides = np.array(lattice.strides)
+        a, b = self._node, self._node + strides[self._axis]
+        w = lattice.weights[self._axis, self._node]
+        drop = potentials[a] - potentials[b]
+        rows, cols, values = [a, b], [np.arange(len(a))] * 2, [np.ones(len(a)), -np.ones(len(a))]
+        weights, drops = [w], [drop]
+        half = half_link_weights(lattice)
+        first = len(a)
+        for side, who in enumerate((cuts.lower_owner, cuts.upper_owner)):
+            end = cuts.node + (strides[cuts.axis] if side else 0)
+            held = np.zeros((len(end), potentials.shape[1]))
+            driven = np.flatnonzero(who >= 0)
+            held[driven, who[driven]] = 1.0
+            rows.append(end)
+            cols.append(first + np.arange(len(end)))
+            values.append(np.ones(len(end)))
+            weights.append(half[:, side])
+            drops.append(potentials[end] - held)
+            first += len(end)
+        self.weight, self.drop = np.concatenate(weights), np.concatenate(drops)
+        self.incidence = sp.csr_matrix(
+            (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))),
+            shape=(n, len(self.weight)),
+        )
+        self._n_whole = len(a)
+
+    def sum_abs(self, flux: Array) -> Array:
+        """Sum of |flux| over the links at each node, shape (n,)."""
+        return abs(self.incidence) @ np.abs(flux)
+
+    def scatter(self, weight: Array) -> tuple[Array, Array]:
+        """Return lattice arrays from the flat list."""
+        out = np.zeros_like(self._lattice.weights)
+        out[self._axis, self._node] = weight[: self._n_whole]
+        n_cuts = len(self._lattice.cuts)
+        half = weight[self._n_whole :].reshape(2, n_cuts).T
+        return out, np.ascontiguousarray(half)
+
+
+def half_link_weights(lattice: Lattice) -> Array:
+    """Geometric weights [F] of the half-links of crossed links, shape (cuts, 2)."""
+    cuts = lattice.cuts
+    w = lattice.weights[cuts.axis, cuts.node]
+    least = 1e-3
+    return np.stack([w / np.maximum(cuts.lower, least), w / np.maximum(cuts.upper, least)], axis=1)

@@ -1,0 +1,379 @@
+"""The online solver: what a scene changes in the capacitances of a design, step after step.
+
+Unknown is u = φ − φ⁰, the change of each terminal's potential. See ``docs/theory.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.constants import EPS0
+from capsense.errors import SceneError, SolveError
+from capsense.field.background import BackgroundField
+from capsense.field.lattice import FREE
+from capsense.scene import Scene, TriMesh
+from capsense.scene.shape import ShapeKind
+
+from capsense.solve import pcg_kernels as pcg
+from capsense.solve import trace_kernels as tracing
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+LANES = pcg.LANES
+_UNIT = EPS0 * 1e-3
+"""Operator entries are stored in this unit [F], which makes them of order one."""
+CONTACT = 1e-4
+"""Thickness [m] of the insulating film that keeps a conductor off an electrode it touches."""
+
+
+@dataclass(frozen=True, eq=False)
+class Perturbation:
+    """What a scene does to a design."""
+
+    delta: Array
+    """Change of the Maxwell matrix of all terminals [F], shape (terminals, terminals)."""
+    iterations: int
+    """Conjugate-gradient iterations."""
+    error_estimate: float
+    """Estimated error of any entry of ``delta`` that iterating on would remove [F]."""
+    tolerance: float
+    """What ``error_estimate`` was iterated down to [F]."""
+
+
+class PerturbationSolver:
+    """Solves scene after scene, each started from the last one's solution.
+
+    Args:
+        background: Field of the design.
+        tolerance: Iterate until the error of a capacitance is below this [F] …
+        relative_tolerance: … or below this fraction of the largest change.
+        frequency: Excitation frequency [Hz]; decides which materials conduct.
+        max_iterations: Give up after so many iterations.
+    """
+
+    def __init__(
+        self,
+        background: BackgroundField,
+        *,
+        tolerance: float = 1e-18,
+        relative_tolerance: float = 1e-5,
+        frequency: float = 250e3,
+        max_iterations: int = 500,
+    ) -> None:
+        self.background = background
+        self.tolerance = tolerance
+        self.relative_tolerance = relative_tolerance
+        self.frequency = frequency
+        self.max_iterations = max_iterations
+        la = background.lattice
+        n = la.n_nodes
+        self._n_terminals = len(background.terminals)
+        self._strides = np.array(la.strides, dtype=np.int64)
+        # nodes below lo and from hi on lie on a wall; the passes over neighbours may skip them
+        self._lo, self._hi = la.strides[0], n - la.strides[0]
+        self._base_weight, self._base_extra = self._base_operator()
+        self._cut_index = np.full((3, n), -1, dtype=np.int64)
+        self._cut_index[la.cuts.axis, la.cuts.node] = np.arange(len(la.cuts))
+        self._weight = np.empty((3, n), np.float32)
+        self._extra = np.empty(n, np.float32)
+        self._diagonal, self._active = np.empty(n, np.float32), np.zeros(n, np.float32)
+        self._inverse = np.zeros(n, np.float32)
+        self._stamp, self._mark = np.zeros(n, np.int64), 0
+        self._links = _Buffers(max(4096, n // 4))
+        self._blocks: list[_Block] = []
+        self._lanes: tuple[object, ...] = ()
+
+    def reset(self) -> None:
+        """Forget the last solution."""
+        self._blocks = []
+        self._lanes = ()
+
+    def step(self, scene: Scene) -> Perturbation:
+        """Solve a scene.
+
+        Raises:
+            SceneError: More bodies meet on one line than the scan can hold.
+            SolveError: The iteration did not converge.
+        """
+        n_terminals = self._n_terminals
+        if len(scene) == 0:
+            self.reset()
+            return Perturbation(np.zeros((n_terminals, n_terminals)), 0, 0.0, self.tolerance)
+        conductors = _Conductors(scene, self.frequency)
+        n_tie, n_energy, n_couple = self._trace(scene, conductors)
+        lanes, grounds = conductors.lanes(n_terminals)
+        self._prepare(scene, conductors, lanes, n_terminals + len(grounds))
+        energy, iterations, left, goal = self._solve_blocks(n_tie, n_energy, lanes)
+        energy = energy[: n_terminals + len(grounds), : n_terminals + len(grounds)]
+        conductors.add_couplings(energy, self._links, n_couple, lanes)
+        delta = _reduce(energy, n_terminals, grounds)
+        if not np.isfinite(delta).all():
+            raise SolveError("a step gave a capacitance that is not finite")
+        if iterations >= self.max_iterations and left > goal:
+            raise SolveError(
+                f"no convergence in {iterations} iterations: estimated error {left:.2e} F, "
+                f"asked for {goal:.2e} F"
+            )
+        return Perturbation(delta, iterations, left, goal)
+
+    def potentials(self) -> Array:
+        """Change of the potentials at the nodes in the last step [V], shape (n, terminals)."""
+        if not self._blocks:
+            return np.zeros((self.background.lattice.n_nodes, self._n_terminals))
+        stacked = np.concatenate([b.u for b in self._blocks], axis=1)
+        out = stacked[:, : self._n_terminals].astype(float)
+        inside = (self._active == 0) & (self.background.lattice.owner == FREE)
+        out[inside] = -self.background.potentials[inside]
+        return out
+
+    # -- the stages ---------------------------------------------------------------------------
+
+    def _base_operator(self) -> tuple[Array32, Array32]:
+        la = self.background.lattice
+        weight = la.weights / _UNIT
+        extra = np.zeros(la.n_nodes)
+        cuts, half = la.cuts, self.background.half_weights / _UNIT
+        if len(cuts):
+            weight[cuts.axis, cuts.node] = 0.0
+            np.add.at(extra, cuts.node, half[:, 0])
+            np.add.at(extra, cuts.node + self._strides[cuts.axis], half[:, 1])
+        return weight.astype(np.float32), extra.astype(np.float32)
+
+    def _trace(self, scene: Scene, conductors: _Conductors) -> tuple[int, int, int]:
+        la = self.background.lattice
+        packed = scene.pack()
+        grids, shapes, firsts, origins, inverses = _mesh_grids(packed.shapes, packed.kinds)
+        while True:
+            self._weight[:] = self._base_weight
+            self._extra[:] = self._base_extra
+            conductors.parent[:] = np.arange(len(conductors.parent))
+            b = self._links
+            status = tracing.trace(
+                *la.axes, self._strides, self._base_weight, self._base_extra, la.eps_r, la.owner,
+                la.kink, self._cut_index, la.cuts.lower, la.cuts.lower_owner, la.cuts.upper,
+                la.cuts.upper_owner, self.background.half_weights / _UNIT,
+                packed.kinds, packed.params, packed.rotation, packed.position, packed.bounds,
+                conductors.index, conductors.eps_r, len(packed), grids, shapes, firsts, origins,
+                inverses, CONTACT, self._weight, self._extra, b.tie_node, b.tie_weight,
+                b.tie_conductor, b.tie_point, b.tie_coef, b.tie_end, b.tie_end_coef,
+                b.energy_link, b.energy_weight, b.energy_kind, b.energy_end, b.couple,
+                b.couple_weight, conductors.parent, b.counts,
+            )  # fmt: skip
+            if status == 0:
+                return tuple(int(c) for c in b.counts)  # type: ignore[return-value]
+            if status == 1:
+                raise SceneError(
+                    f"more than {tracing.MAX_STRETCHES} stretches of bodies lie on one line "
+                    "through the domain; join small bodies into one mesh"
+                )
+            self._links = _Buffers(2 * len(b.tie_node))
+
+    def _prepare(
+        self, scene: Scene, conductors: _Conductors, lanes: NDArray[np.int64], n_lanes: int
+    ) -> None:
+        """Build diagonal and preconditioner; carry the last solution over."""
+        la = self.background.lattice
+        before = self._active.copy()
+        pcg.operator_diagonal(
+            self._weight, self._extra, la.owner, self._strides, self._diagonal, self._active
+        )
+        pcg.factorise(self._weight, self._diagonal, self._active, self._strides, self._inverse)
+        signature = (len(scene), *lanes.tolist())
+        if signature != self._lanes or not self._blocks:
+            old = self._blocks
+            self._blocks = self._make_blocks(n_lanes)
+            for block, last in zip(self._blocks, old, strict=False):
+                keep = min(LANES, self._n_terminals - block.first)
+                if keep > 0:
+                    block.u[:, :keep] = last.u[:, :keep]
+            self._lanes = signature
+        woken = np.flatnonzero((before == 0) & (self._active != 0) & (la.owner == FREE))
+        for block in self._blocks:
+            if woken.size < la.n_nodes // 2:
+                block.u[woken] = -block.phi[woken]
+
+    def _make_blocks(self, n_lanes: int) -> list[_Block]:
+        phi = self.background.potentials
+        n = len(phi)
+        blocks = []
+        for first in range(0, n_lanes, LANES):
+            block = np.zeros((n, LANES), np.float32)
+            part = phi[:, first : first + LANES]
+            block[:, : part.shape[1]] = part
+            held = np.arange(first, first + LANES)
+            held[held >= self._n_terminals] = -1
+            blocks.append(_Block(first, block, held))
+        return blocks
+
+    def _solve_blocks(
+        self, n_tie: int, n_energy: int, lanes: NDArray[np.int64]
+    ) -> tuple[Array, int, float, float]:
+        b, count = self._links, len(self._blocks)
+        energy = np.zeros((count * LANES, count * LANES))
+        iterations, left, goal = 0, 0.0, self.tolerance
+        for block in self._blocks:
+            block.rhs[:] = 0.0
+            block.value = np.empty((max(1, n_tie), LANES))
+            block.drop = np.empty((max(1, n_energy), LANES))
+            local = np.where((lanes >= block.first) & (lanes < block.first + LANES), lanes, -1)
+            pcg.load(
+                block.phi, block.first, np.where(local >= 0, local - block.first, -1), block.held,
+                n_tie, b.tie_node, b.tie_weight, b.tie_conductor, b.tie_point, b.tie_coef,
+                b.tie_end, b.tie_end_coef, n_energy, b.energy_link, b.energy_weight,
+                b.energy_kind, b.energy_end, 1.0, block.rhs, block.value, block.drop,
+            )  # fmt: skip
+        for i, first in enumerate(self._blocks):
+            for j, second in enumerate(self._blocks[i:], start=i):
+                part = np.zeros((LANES, LANES))
+                pcg.gram(n_tie, b.tie_weight, first.value, second.value, part)
+                pcg.gram(n_energy, b.energy_weight, first.drop, second.drop, part)
+                _place(energy, i, j, part)
+        for i, block in enumerate(self._blocks):
+            start = np.abs(np.diag(energy))[i * LANES : (i + 1) * LANES]
+            wanted = np.maximum(
+                self.tolerance / _UNIT, self.relative_tolerance * np.maximum(0.2 * start, 1e-9)
+            )
+            rest = np.zeros(LANES)
+            done = pcg.solve(
+                self._weight, self._diagonal, self._active, self._inverse, self._strides,
+                self._lo, self._hi, block.rhs, block.u, block.r, block.z, block.p, block.ap,
+                wanted, self.max_iterations, rest,
+            )  # fmt: skip
+            iterations = max(iterations, done)
+            left, goal = max(left, rest.max() * _UNIT), max(goal, wanted.max() * _UNIT)
+        for i, first in enumerate(self._blocks):
+            for j, second in enumerate(self._blocks[i:], start=i):
+                part = np.zeros((LANES, LANES))
+                self._mark += 1
+                pcg.sparse_inner(
+                    n_tie, b.tie_node, n_energy, b.energy_link, b.energy_kind, self._stamp,
+                    self._mark, self._active, first.rhs, second.u, part,
+                )  # fmt: skip
+                pcg.inner(self._lo, self._hi, self._active, first.u, second.r, part)
+                if i == j:
+                    part = 0.5 * (part + part.T)
+                _place(energy, i, j, -part)
+        return energy * _UNIT, iterations, left, goal
+
+
+def _place(energy: Array, i: int, j: int, part: Array) -> None:
+    rows, cols = slice(i * LANES, (i + 1) * LANES), slice(j * LANES, (j + 1) * LANES)
+    energy[rows, cols] += part
+    if i != j:
+        energy[cols, rows] += part.T
+
+
+def _reduce(energy: Array, n: int, grounds: Array) -> Array:
+    """Eliminate floating conductors, each tied to ground through ``grounds`` [F]."""
+    if not len(grounds):
+        return energy
+    inner = energy[n:, n:] + np.diag(grounds)
+    outer = energy[:n, n:]
+    return energy[:n, :n] - outer @ np.linalg.solve(inner, outer.T)
+
+
+class _Conductors:
+    """Which bodies conduct, and what ties them to ground."""
+
+    def __init__(self, scene: Scene, frequency: float) -> None:
+        self.index = np.full(len(scene), -1, dtype=np.int64)
+        self.eps_r = np.ones(len(scene))
+        ties: list[float] = []
+        for i, body in enumerate(scene):
+            if body.material.is_conductor(frequency):
+                self.index[i] = len(ties)
+                known = {"grounded": np.inf, "floating": 0.0}
+                ties.append(known[body.grounding] if isinstance(body.grounding, str)
+                            else float(body.grounding))  # fmt: skip
+            else:
+                self.eps_r[i] = body.material.eps_r
+        self._ties = np.array(ties)
+        self.parent = np.arange(max(1, len(ties)))
+
+    def _root(self, c: int) -> int:
+        while self.parent[c] != c:
+            c = int(self.parent[c])
+        return c
+
+    def lanes(self, n_terminals: int) -> tuple[NDArray[np.int64], Array]:
+        """Lane of each conductor (−1: at ground) and capacitance to ground of each lane [F]."""
+        roots = [self._root(c) for c in range(len(self._ties))]
+        total = np.zeros(len(self._ties))
+        for c, root in enumerate(roots):
+            total[root] += self._ties[c]
+        floating = sorted({r for r in roots if np.isfinite(total[r])})
+        lanes = np.full(max(1, len(roots)), -1, dtype=np.int64)
+        for c, root in enumerate(roots):
+            if root in floating:
+                lanes[c] = n_terminals + floating.index(root)
+        return lanes, total[floating] if floating else np.zeros(0)
+
+    def add_couplings(
+        self, energy: Array, buffers: _Buffers, count: int, lanes: NDArray[np.int64]
+    ) -> None:
+        """Add links that run from one conductor straight to another."""
+        for i in range(count):
+            a, b = lanes[buffers.couple[i, 0]], lanes[buffers.couple[i, 1]]
+            if a == b:
+                continue
+            w = buffers.couple_weight[i] * _UNIT
+            for lane in (a, b):
+                if lane >= 0:
+                    energy[lane, lane] += w
+            if a >= 0 and b >= 0:
+                energy[a, b] -= w
+                energy[b, a] -= w
+
+
+class _Block:
+    """Eight right-hand sides."""
+
+    def __init__(self, first: int, phi: Array32, held: NDArray[np.int64]) -> None:
+        self.first, self.phi, self.held = first, phi, held
+        self.rhs, self.u, self.r, self.z, self.p, self.ap = (np.zeros_like(phi) for _ in range(6))
+        self.value = np.empty((0, LANES))
+        self.drop = np.empty((0, LANES))
+
+
+class _Buffers:
+    """Room for what the scan of a scene finds."""
+
+    def __init__(self, size: int) -> None:
+        self.tie_node = np.empty(size, np.int64)
+        self.tie_weight = np.empty(size)
+        self.tie_conductor = np.empty(size, np.int64)
+        self.tie_point = np.zeros((size, 4), np.int64)
+        self.tie_coef = np.zeros((size, 4))
+        self.tie_end = np.empty(size, np.int64)
+        self.tie_end_coef = np.empty(size)
+        self.energy_link = np.empty((size, 2), np.int64)
+        self.energy_weight = np.empty(size)
+        self.energy_kind = np.empty(size, np.int64)
+        self.energy_end = np.empty(size, np.int64)
+        self.couple = np.empty((size, 2), np.int64)
+        self.couple_weight = np.empty(size)
+        self.counts = np.zeros(3, np.int64)
+
+
+def _mesh_grids(
+    shapes: tuple[object, ...], kinds: NDArray[np.int64]
+) -> tuple[Array32, NDArray[np.int64], NDArray[np.int64], Array, Array]:
+    """Concatenate the distance grids of mesh bodies."""
+    n = len(shapes)
+    sizes = np.zeros((n, 3), np.int64)
+    first, origin, inverse = np.zeros(n, np.int64), np.zeros((n, 3)), np.ones(n)
+    parts: list[Array32] = []
+    offset = 0
+    for i, shape in enumerate(shapes):
+        if kinds[i] == ShapeKind.MESH and isinstance(shape, TriMesh):
+            grid = shape.grid
+            sizes[i], first[i] = grid.values.shape, offset
+            origin[i], inverse[i] = grid.origin, 1.0 / grid.cell
+            parts.append(grid.values.ravel())
+            offset += parts[-1].size
+    flat = np.concatenate(parts) if parts else np.zeros(1, np.float32)
+    return flat, sizes, first, origin, inverse
