@@ -120,6 +120,11 @@ class PerturbationSolver:
             )
         return Perturbation(delta, iterations, left, goal)
 
+    def solve(self, scene: Scene) -> tuple[Array, int, float, float]:
+        """Return :meth:`step`'s change, iterations, error estimate [F] and tolerance [F]."""
+        result = self.step(scene)
+        return result.delta, result.iterations, result.error_estimate, result.tolerance
+
     def potentials(self) -> Array:
         """Change of the potentials at the nodes in the last step [V], shape (n, terminals)."""
         if not self._blocks:

@@ -1,0 +1,200 @@
+"""A sensor in a changing world: :class:`Simulator` turns scenes into readings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.design import load_design
+from capsense.design.model import Design, Role
+from capsense.errors import SceneError
+from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.cache import load_or_build
+from capsense.scene import Scene
+
+Array = NDArray[np.float64]
+Method = Literal["perturbation", "masked"]
+
+
+@dataclass(frozen=True)
+class StepStats:
+    """How a step was solved."""
+
+    iterations: int
+    """Iterations of the linear solver."""
+    error_estimate: float
+    """Estimated error of a capacitance that iterating on would remove [F]."""
+    tolerance: float
+    """What the error estimate was brought below [F]."""
+    wall_time: float
+    """Time the step took [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """The capacitances of one instant."""
+
+    capacitance: Array
+    """Maxwell capacitance matrix of the electrodes, shields at ground [F], shape (M, M)."""
+    delta: Array
+    """Change against the empty domain, ``capacitance - baseline`` [F], shape (M, M)."""
+    stats: StepStats
+    electrode_names: tuple[str, ...]
+    _shield_coupling: Array = field(repr=False)
+
+    @property
+    def self_capacitance(self) -> Array:
+        """What a self-mode channel measures [F], shape (M,).
+
+        Electrode i is driven, shields are driven with it, all other electrodes are grounded:
+        the diagonal of the Maxwell matrix plus the (negative) coupling to the shields.
+        """
+        return np.diag(self.capacitance) + self._shield_coupling
+
+    @property
+    def mutual_capacitance(self) -> Array:
+        """Mutual capacitances ``-C_ij`` [F] off the diagonal, zero on it, shape (M, M)."""
+        out = -self.capacitance
+        np.fill_diagonal(out, 0.0)
+        return out
+
+
+class _Method(Protocol):
+    """What a solver offers: the change of the matrix of all terminals."""
+
+    def solve(self, scene: Scene) -> tuple[Array, int, float, float]: ...
+
+    def reset(self) -> None: ...
+
+
+class Simulator:
+    """Reads the capacitances of a sensor, scene after scene.
+
+    Args:
+        design: A design, a packaged name, or the path of a design file.
+        method: ``"perturbation"`` (accurate, default) or ``"masked"``, the scheme of
+            Schöffmann et al. 2022: objects are staircases of tetrahedra, solved in full.
+        tolerance: Iterate until a capacitance is known to this [F] …
+        relative_tolerance: … or to this fraction of the largest change, whichever is larger.
+        frequency: Excitation frequency [Hz]; decides which materials conduct.
+        settings: Numerical settings of the background field; default from ``design.build``.
+        cache_dir: Where built fields are kept; default the user's cache directory.
+        progress: Called with a stage's name and the fraction done while a field is built.
+
+    Raises:
+        DesignError: The design is wrong.
+        FieldError: The background field could not be built.
+    """
+
+    def __init__(
+        self,
+        design: Design | str | Path,
+        *,
+        method: Method = "perturbation",
+        tolerance: float = 1e-18,
+        relative_tolerance: float = 1e-5,
+        frequency: float = 250e3,
+        settings: BuildSettings | None = None,
+        cache_dir: Path | None = None,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> None:
+        if method not in ("perturbation", "masked"):
+            raise ValueError(f'method is {method!r}; choose "perturbation" or "masked"')
+        for name, value in (
+            ("tolerance", tolerance), ("relative_tolerance", relative_tolerance),
+            ("frequency", frequency),
+        ):  # fmt: skip
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value!r}; give a positive number")
+        self.design = design if isinstance(design, Design) else load_design(design)
+        self.method: Method = method
+        self.background: BackgroundField = load_or_build(
+            self.design, settings, cache_dir=cache_dir, progress=progress
+        )
+        if method == "masked":
+            from capsense.solve.scene_masks import MaskedScenes
+
+            self._solver: _Method = MaskedScenes(self.design, self.background, frequency)
+        else:
+            from capsense.solve.perturbation import PerturbationSolver
+
+            self._solver = PerturbationSolver(
+                self.background, tolerance=tolerance, relative_tolerance=relative_tolerance,
+                frequency=frequency,
+            )  # fmt: skip
+        n = len(self.design.electrodes)
+        floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
+        names = self.background.terminals
+        self._electrodes = np.arange(n)
+        self._floating = np.array([names.index(f) for f in floating], dtype=np.int64)
+        self._shields = np.array(
+            [k for k in range(n, len(names)) if names[k] not in floating], dtype=np.int64
+        )
+        self._empty = self._without_floating(self.background.capacitance)
+        self.baseline: Array = self._empty[:n, :n].copy()
+        """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
+        self.baseline.setflags(write=False)
+
+    @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Electrode names in matrix order."""
+        return self.design.electrode_names
+
+    def step(self, scene: Scene) -> Reading:
+        """Return the reading of a scene, given in the sensor frame.
+
+        The solution of the previous step is the starting point.
+
+        Raises:
+            SceneError: ``scene`` is not a scene.
+            SolveError: The solver did not reach its tolerance.
+        """
+        if not isinstance(scene, Scene):
+            raise SceneError(f"step takes a Scene, not {type(scene).__name__}; write Scene([...])")
+        start = time.perf_counter()
+        change, iterations, error, goal = self._solver.solve(scene)
+        if len(self._floating):
+            change = self._without_floating(self.background.capacitance + change) - self._empty
+        n = len(self._electrodes)
+        total = self._empty + change
+        delta = change[:n, :n]
+        stats = StepStats(iterations, error, goal, time.perf_counter() - start)
+        return Reading(
+            self.baseline + delta, delta.copy(), stats, self.electrode_names,
+            total[:n, n:].sum(axis=1),
+        )  # fmt: skip
+
+    def reset(self) -> None:
+        """Forget the previous step."""
+        self._solver.reset()
+
+    def describe(self) -> dict[str, float | int | str]:
+        """Return the figures of the design's mesh and field."""
+        la = self.background.lattice
+        return {
+            "design": self.design.name,
+            "electrodes": len(self.design.electrodes),
+            "method": self.method,
+            "boundary panels": self.background.n_panels,
+            "lattice": " x ".join(str(n) for n in la.shape),
+            "nodes": la.n_nodes,
+            "links": int((la.weights > 0).sum()),
+            "tetrahedra": la.n_tets,
+            "cut links": len(la.cuts),
+        }
+
+    def _without_floating(self, matrix: Array) -> Array:
+        """Eliminate the design's floating conductors; electrodes and shields remain."""
+        keep = np.concatenate([self._electrodes, self._shields])
+        inner = matrix[np.ix_(keep, keep)]
+        if not len(self._floating):
+            return inner
+        cross = matrix[np.ix_(keep, self._floating)]
+        own = matrix[np.ix_(self._floating, self._floating)]
+        return inner - cross @ np.linalg.solve(own, cross.T)

@@ -1,0 +1,83 @@
+"""The paper's scheme on scenes: tetrahedra whose centroid lies in a body take its material."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.design.model import Design, Role
+from capsense.errors import SceneError
+from capsense.field.background import BackgroundField
+from capsense.field.lattice import WALL
+from capsense.mesh import TetMesh, kuhn_tets
+from capsense.scene import Scene
+from capsense.solve.masked import GROUNDED, MaskedSolver
+
+Array = NDArray[np.float64]
+
+
+class MaskedScenes:
+    """Masks the Kuhn tetrahedra of the online lattice with a scene's bodies and solves in full.
+
+    Floating conductors are met by a large permittivity, as a scheme that knows only permittivity
+    must; impedances to ground cannot be represented and are refused.
+    """
+
+    FLOATING_EPS_R = 1e4
+
+    def __init__(self, design: Design, background: BackgroundField, frequency: float) -> None:
+        self._frequency = frequency
+        la = background.lattice
+        mesh = kuhn_tets(*la.axes)
+        owner = la.owner
+        groups = {
+            name: np.flatnonzero(owner == k) for k, name in enumerate(background.terminals)
+        }
+        missing = [name for name, nodes in groups.items() if not len(nodes)]
+        if missing:
+            raise SceneError(
+                f"method 'masked' needs mesh nodes on every electrode; {missing[0]!r} has none: "
+                "raise [build] resolution, or use method 'perturbation'"
+            )
+        groups["ground"] = np.flatnonzero(owner == WALL)
+        self._mesh = TetMesh(mesh.points, mesh.tets, node_groups=groups)
+        self._centroids = self._mesh.centroids
+        eps = np.ones(self._mesh.n_tets)
+        for layer in design.layers:
+            inside = (self._centroids > layer.lower) & (self._centroids < layer.upper)
+            eps[inside.all(axis=1)] = layer.eps_r
+        self._solver = MaskedSolver(
+            self._mesh, list(background.terminals), ("ground",), eps_background=eps
+        )
+        empty = np.full(self._mesh.n_tets, -1, dtype=np.int64)
+        self._empty = self._solver.step(empty, np.zeros(0))
+
+    def reset(self) -> None:
+        """Forget the last solution."""
+        self._solver.reset()
+
+    def solve(self, scene: Scene) -> tuple[Array, int, float, float]:
+        """Return the change of the terminals' matrix [F], iterations, and the tolerance twice."""
+        inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)
+        eps = np.ones(len(scene))
+        for i, body in enumerate(scene):
+            if not isinstance(body.grounding, str):
+                raise SceneError(
+                    f"body {body.name or i} is tied to ground through {body.grounding} F; method "
+                    "'masked' knows only grounded and floating bodies"
+                )
+            local = body.pose.inverse().apply(self._centroids)
+            within = body.shape.signed_distance(local) < 0
+            conducts = body.material.is_conductor(self._frequency)
+            if conducts:
+                eps[i] = GROUNDED if body.grounding == "grounded" else self.FLOATING_EPS_R
+                inside[within] = i
+            else:
+                eps[i] = body.material.eps_r
+                taken = inside >= 0
+                conductor = np.array([b.material.is_conductor(self._frequency) for b in scene])
+                inside[within & ~(taken & conductor[inside])] = i
+        matrix = self._solver.step(inside, eps)
+        stats = self._solver.stats
+        goal = self._solver.tolerance * float(np.abs(matrix).max())
+        return matrix - self._empty, int(stats.iterations), goal, goal
