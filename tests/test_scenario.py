@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import math
 import re
 import tomllib
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from changed_data import DROP, changed_copy
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,25 +48,12 @@ BASE = tomllib.loads(
     pose = { position = [0.0, 0.05, 0.1] }
     """
 )
-DROP = object()
 INF, NAN = math.inf, math.nan
 
 
 def changed(*changes: tuple[str, Any]) -> dict[str, Any]:
     """The base scenario with values replaced, or dropped, at dotted paths."""
-    data = copy.deepcopy(BASE)
-    for path, value in changes:
-        *parents, last = path.split(".")
-        node: Any = data
-        for key in parents:
-            node = node[int(key)] if key.isdigit() else node.setdefault(key, {})
-        if value is DROP:
-            del node[last]
-        elif last == "+":
-            node.append(value)
-        else:
-            node[int(last) if last.isdigit() else last] = value
-    return data
+    return changed_copy(BASE, *changes)
 
 
 # ---- what a scenario means ----

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from changed_data import DROP, changed_copy
 
 from capsense.design import load_design, parse_design
 from capsense.errors import CapSenseError, DesignError
@@ -41,7 +41,6 @@ BASE = tomllib.loads(
     z = -0.001
     """
 )
-DROP = object()
 INF, NAN = float("inf"), float("nan")
 NEXT_LAYER = {"name": "film", "eps_r": 3.0, "size": [0.1, 0.08]}
 POUR = {"name": "pour", "role": "ground", "shape": "rectangle", "size": [0.11, 0.08]}
@@ -49,19 +48,7 @@ POUR = {"name": "pour", "role": "ground", "shape": "rectangle", "size": [0.11, 0
 
 def changed(*changes: tuple[str, Any]) -> dict[str, Any]:
     """The base design with values replaced, or dropped, at dotted paths."""
-    data = copy.deepcopy(BASE)
-    for path, value in changes:
-        *parents, last = path.split(".")
-        node: Any = data
-        for key in parents:
-            node = node[int(key)] if key.isdigit() else node.setdefault(key, {})
-        if value is DROP:
-            del node[last]
-        elif last == "+":
-            node.append(value)
-        else:
-            node[last] = value
-    return data
+    return changed_copy(BASE, *changes)
 
 
 A, B, PLATE, BACK = "electrode.0.", "electrode.1.", "layer.0.", "conductor.0."
