@@ -30,6 +30,10 @@ GROUND, INTERFACE = -1, -2
 
 _PLANE_TOL = 1e-6
 _MAX_PANELS = 16_000
+_FEW_FACETS = 64
+"""Sheets of more facets than this are curved; their facets are not searched for narrow gaps."""
+_FAR_PLANE = 0.01
+"""Parallel sheets farther apart than this [m] need no panels of their distance."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
     floor = float(design.domain.lower[2])
     names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
+    flat: list[bool] = []
     for body in (*design.electrodes, *design.conductors):
         owner = names.index(body.name) if body.name in names else GROUND
         for facet in body.surface.facets:
@@ -87,10 +92,14 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
             )
             if not on_floor:
                 sheets.append((facet, owner))
+                flat.append(len(body.surface.facets) <= _FEW_FACETS)
     bodies = (*design.electrodes, *design.conductors)
     rims = np.concatenate([b.surface.rims for b in bodies])
-    gaps = _smallest_gaps(sheets)
-    spacings = _plane_spacings(sheets)
+    gaps, spacings = np.full(len(sheets), np.inf), np.full(len(sheets), _FAR_PLANE)
+    few = np.flatnonzero(flat)
+    if len(few):
+        gaps[few] = _smallest_gaps([sheets[k] for k in few])
+        spacings[few] = _plane_spacings([sheets[k] for k in few])
     thin = min((float((la.upper - la.lower)[2]) for la in design.layers), default=math.inf)
 
     parts: list[Panels] = []
@@ -165,7 +174,7 @@ def _plane_spacings(sheets: list[tuple[Facet, int]]) -> list[float]:
     """Distance of each facet to the nearest parallel facet that faces it [m], at most 10 mm."""
     out = []
     for k, (facet, _) in enumerate(sheets):
-        spacing = 0.01
+        spacing = _FAR_PLANE
         for other, (mate, _) in enumerate(sheets):
             height = abs((mate.origin - facet.origin) @ facet.axes[2])
             parallel = abs(mate.axes[2] @ facet.axes[2]) > 1 - 1e-6
