@@ -159,10 +159,10 @@ def _area(surface: Surface) -> str:
 
 def describe_field(simulator: Simulator) -> str:
     """Mesh figures and baseline matrix, as text."""
-    from capsense.cli.tables import facts, grouped, table
+    from capsense.cli.tables import facts, field_figures, grouped, table
 
     names = simulator.electrode_names
-    mesh = facts((str(key), grouped(value)) for key, value in simulator.describe().items())
+    mesh = facts((str(key), grouped(value)) for key, value in field_figures(simulator).items())
     rows = [
         (name, *(f"{c * 1e12:.4f}" for c in row))
         for name, row in zip(names, simulator.baseline, strict=True)

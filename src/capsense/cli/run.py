@@ -64,6 +64,7 @@ def execute(args: argparse.Namespace) -> int:
     from capsense.cli.interrupt import Interrupt
     from capsense.cli.main import INTERRUPTED, OK, say
     from capsense.cli.recorder import Recorder, prepare_folder
+    from capsense.cli.tables import field_figures
     from capsense.scenario import load_scenario
     from capsense.scenario.play import baseline_of
 
@@ -91,7 +92,7 @@ def execute(args: argparse.Namespace) -> int:
         except Exception as error:
             failure = error
         summary = recorder.summary(
-            dict(simulator.describe()),
+            field_figures(simulator),
             interrupted=interrupt.requested,
             failure=str(failure) if failure is not None else None,
         )
@@ -187,7 +188,7 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     from capsense.cli.recorder import FILES
     from capsense.cli.tables import facts, grouped, seconds, table
 
-    mesh = ", ".join(f"{key} {grouped(value)}" for key, value in summary["mesh"].items())
+    mesh = ", ".join(f"{grouped(value)} {key}" for key, value in summary["mesh"].items())
     samples = f"{summary['samples']} of {summary['samples_planned']}"
     if summary["interrupted"]:
         samples += ", interrupted"

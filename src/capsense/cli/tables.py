@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from capsense.simulator import Simulator
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -45,3 +49,9 @@ def grouped(value: object) -> str:
     if isinstance(value, bool) or not isinstance(value, int):
         return f"{value:.4g}" if isinstance(value, float) else str(value)
     return f"{value:,}".replace(",", " ")
+
+
+def field_figures(simulator: Simulator) -> dict[str, float | int | str]:
+    """The figures of a design's mesh and field, without what is printed elsewhere."""
+    told = ("design", "electrodes", "method")
+    return {key: value for key, value in simulator.describe().items() if key not in told}

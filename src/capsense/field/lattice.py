@@ -30,17 +30,17 @@ _ON_PLANE = 1e-7
 class LatticeSettings:
     """Spacings of the online lattice; all lengths in metres."""
 
-    edge: float = 0.004
+    edge: float = 0.006
     """Largest spacing beside an electrode's edge, in the plane."""
-    growth: float = 0.45
+    growth: float = 0.5
     """Growth of the in-plane spacing per unit distance from the nearest edge."""
-    far: float = 0.022
+    far: float = 0.035
     """Largest in-plane spacing."""
-    face: float = 0.001
+    face: float = 0.0015
     """Spacing beside an electrode's face, across the plane."""
-    growth_z: float = 0.4
+    growth_z: float = 0.3
     """Growth of the spacing across the plane per unit distance from the nearest face."""
-    far_z: float = 0.018
+    far_z: float = 0.014
     """Largest spacing across the plane."""
     merge: float = 0.0008
     """Edges closer to each other than this share one lattice plane."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from capsense._validate import read_toml, suggest
 from capsense.design import Design, load_design
@@ -13,6 +13,9 @@ from capsense.scenario.bodies import read_body
 from capsense.scenario.channels import Excitation
 from capsense.scenario.model import METHODS, MovingBody, Scenario
 from capsense.scenario.schema import Table
+
+if TYPE_CHECKING:
+    from capsense.simulator import Method
 
 TOP_KEYS = (
     "name",
@@ -81,7 +84,7 @@ def parse_scenario(
             duration=duration,
             excitation=excitation,
             pairs=pairs,
-            method=top.choice("method", METHODS, METHODS[0]),
+            method=cast("Method", top.choice("method", METHODS, METHODS[0])),
             tolerance=tolerance,
             description=top.text("description"),
         )

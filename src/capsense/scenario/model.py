@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,14 @@ from capsense.scenario.channels import Channel, Excitation, channels_of
 from capsense.scenario.trajectory import Trajectory
 from capsense.scene import Body, Pose, Scene
 
+if TYPE_CHECKING:
+    from capsense.simulator import Method
+
 Array = NDArray[np.float64]
 
 MAX_SAMPLES = 1_000_000
 """A scenario of more samples is refused."""
-METHODS = ("perturbation", "masked")
+METHODS: tuple[Method, ...] = ("perturbation", "masked")
 """The simulator's methods, the default first."""
 
 
@@ -58,10 +62,10 @@ class Scenario:
     excitation: Excitation = Excitation.MATRIX
     pairs: tuple[tuple[str, str], ...] = ()
     """For mutual excitation: the pairs read, by electrode name; all of them if empty."""
-    method: str = METHODS[0]
+    method: Method = METHODS[0]
     """The simulator's method."""
     tolerance: float | None = None
-    """Largest error of a capacitance the solver may leave [F]; None for its own default."""
+    """Error of a capacitance that the solver may leave [F]; None for its own default."""
     description: str = ""
 
     def __post_init__(self) -> None:
