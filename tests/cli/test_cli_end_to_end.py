@@ -1,0 +1,73 @@
+"""The command itself, in processes of their own, with the real simulator."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+COMMAND = [sys.executable, "-m", "capsense"]
+
+
+def test_run(tmp_path: Path) -> None:
+    """A whole run: physical matrices, and a solver that kept its promise."""
+    scenario = ROOT / "examples" / "hand_approach.toml"
+    out = tmp_path / "out"
+    done = subprocess.run(
+        [*COMMAND, "run", str(scenario), "-o", str(out), "--rate", "2"],
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "a forearm over six electrodes" in done.stdout
+    arrays = np.load(out / "readings.npz")
+    capacitance = arrays["capacitance"]
+    assert capacitance.shape == (12, 6, 6)
+    scale = np.abs(capacitance).max()
+    assert capacitance == pytest.approx(capacitance.transpose(0, 2, 1), abs=1e-6 * scale)
+    off = capacitance[:, ~np.eye(6, dtype=bool)]
+    assert off.max() <= 1e-3 * scale
+    assert capacitance.sum(axis=2).min() >= -1e-3 * scale
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["largest_error_estimate_F"] <= summary["tolerance_F"]
+    assert summary["mesh"]["nodes"] > 1000
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is not a signal there")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt(tmp_path: Path, number: signal.Signals) -> None:
+    """A signal in the middle: exit code 130, and every file holds the same samples."""
+    out = tmp_path / "out"
+    scenario = ROOT / "examples" / "hand_approach.toml"
+    process = subprocess.Popen(
+        [*COMMAND, "run", str(scenario), "-o", str(out), "--rate", "5000"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    table = out / "readings.csv"
+    deadline = time.monotonic() + 300
+    while not (table.exists() and len(table.read_bytes().splitlines()) > 5):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "no samples within five minutes"
+        time.sleep(0.05)
+    process.send_signal(number)
+    text, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    assert "interrupted after" in errors
+    assert "Traceback" not in errors
+    rows = len(table.read_text(encoding="utf-8").splitlines()) - 1
+    assert 5 <= rows < 28000
+    assert len(np.load(out / "readings.npz")["time"]) == rows
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["samples"] == rows
+    assert summary["interrupted"] is True
+    assert f"{rows} of {summary['samples_planned']}, interrupted" in text
+    assert (out / "plot.png").read_bytes().startswith(b"\x89PNG")
