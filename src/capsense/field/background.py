@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
+import math
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
 from capsense.errors import FieldError
-from capsense.field.boundary import Accuracy, BoundarySolution, terminals
+from capsense.field.boundary import (
+    Accuracy,
+    BoundaryModel,
+    BoundarySolution,
+    build_model,
+    terminals,
+)
 from capsense.field.calibration import calibrate, half_link_weights
-from capsense.field.lattice import FREE, Cuts, Lattice, LatticeSettings, build_lattice
+from capsense.field.lattice import FREE, Lattice, LatticeSettings, build_lattice
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-FORMAT = 1
-"""Version of the stored form; part of the cache key."""
+NUMERICS = 1
+"""Raise it when the same design and settings give other fields than before: it is part of the cache
+key, and fields of the old numerics are then no longer used."""
+
+_PART = 256
+"""Nodes evaluated at a time, between two chances to stop."""
+_SAVE_EVERY = 2.0
+"""Work that an interruption may cost [s]."""
 
 
 @dataclass(frozen=True)
 class BuildSettings:
     """Everything numerical that a background field depends on."""
 
-    lattice: LatticeSettings = LatticeSettings()
+    lattice: LatticeSettings = field(default_factory=LatticeSettings)
     panel_scale: float = 1.0
     """Panel sizes of the boundary elements, as multiples of the default."""
     calibration: float = 0.3
@@ -53,100 +65,150 @@ class BackgroundField:
     """Size of the boundary-element system."""
 
 
+class Checkpoint(Protocol):
+    """Where a build leaves the results of finished stages, and finds those of an earlier one."""
+
+    def load(self, stage: str) -> dict[str, NDArray[Any]] | None:
+        """Return the arrays of a finished stage, or None."""
+
+    def save(self, stage: str, **arrays: NDArray[Any]) -> None:
+        """Keep the arrays of a finished stage."""
+
+
+class NoCheckpoint:
+    """Keeps nothing."""
+
+    def load(self, stage: str) -> dict[str, NDArray[Any]] | None:
+        """Return None."""
+        return None
+
+    def save(self, stage: str, **arrays: NDArray[Any]) -> None:
+        """Do nothing."""
+
+
 def build_background(
-    design: Design, settings: BuildSettings | None = None, progress: Progress | None = None
+    design: Design,
+    settings: BuildSettings | None = None,
+    progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> BackgroundField:
     """Solve the empty domain of a design and carry the fields to the online lattice.
 
-    ``progress`` is called with a stage's name and the fraction done.
+    ``progress`` is called with a stage's name and the fraction done, which never falls. Stages
+    found in ``checkpoint`` are not computed again; the result is the same to the last bit.
 
     Raises:
         FieldError: The geometry needs more panels than fit, or a result is not finite.
     """
     settings = settings or BuildSettings()
-    tell = progress or (lambda stage, fraction: None)
-    names = tuple(terminals(design))
+    kept = checkpoint or NoCheckpoint()
+    tell = _rising(progress or (lambda stage, fraction: None))
     tell("lattice", 0.0)
     lattice = build_lattice(design, settings.lattice)
-    solution = BoundarySolution(
-        design, Accuracy(settings.panel_scale), lambda text: tell(text, 0.05)
-    )
-    densities = solution.densities(np.eye(len(names)))
-    capacitance = solution.terminal_charges(densities)
-    capacitance = 0.5 * (capacitance + capacitance.T)
-    potentials = node_potentials(lattice, solution, densities, tell)
-    if not (np.isfinite(potentials).all() and np.isfinite(capacitance).all()):
-        raise FieldError(f"the background field of design {design.name!r} is not finite")
-    tell("calibration", 0.9)
+    charges = _solve_charges(design, settings, kept, tell)
+    potentials = _node_potentials(lattice, charges, kept, tell)
+    tell("calibration", 0.92)
     weights, half = lattice.weights, half_link_weights(lattice)
-    if np.isfinite(settings.calibration):
+    if math.isfinite(settings.calibration):
         weights, half = calibrate(lattice, potentials, settings.calibration)
-    lattice = Lattice(
-        lattice.axes, weights, lattice.eps_r, lattice.owner, lattice.kink, lattice.cuts
-    )
+    _require_finite(design, potentials, charges.capacitance, weights, half)
     tell("done", 1.0)
     return BackgroundField(
-        lattice, half, potentials, capacitance, names, len(solution.model.panels)
-    )
+        replace(lattice, weights=weights), half, potentials, charges.capacitance,
+        tuple(terminals(design)), len(charges.densities),
+    )  # fmt: skip
 
 
-def node_potentials(
-    lattice: Lattice, solution: BoundarySolution, densities: Array, tell: Progress
+# -- stages -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Charges:
+    """The solved boundary elements: all that the field at any point follows from."""
+
+    evaluator: _Evaluator
+    densities: Array
+    """Charge densities [C/m²] on the panels, a column for each terminal, (panels, terminals)."""
+    capacitance: Array
+    """Maxwell matrix [F] of the terminals."""
+
+
+class _Evaluator(BoundarySolution):
+    """Evaluates the potential of known densities; its system of equations is never set up."""
+
+    def __init__(self, design: Design, model: BoundaryModel) -> None:
+        self.design = design
+        self.model = model
+
+
+def _solve_charges(
+    design: Design, settings: BuildSettings, kept: Checkpoint, tell: Progress
+) -> _Charges:
+    """Solve the boundary elements with each terminal at 1 V in turn."""
+    accuracy = Accuracy(settings.panel_scale)
+    n = len(terminals(design))
+    found = kept.load("charges")
+    if found is not None:
+        model = build_model(design, accuracy)
+        densities, capacitance = found["densities"], found["capacitance"]
+        if densities.shape == (len(model.panels), n) and capacitance.shape == (n, n):
+            return _Charges(_Evaluator(design, model), densities, capacitance)
+    fractions = iter((0.02, 0.10))  # at the start of the matrix and of its factorisation
+    solution = BoundarySolution(design, accuracy, lambda text: tell(text, next(fractions, 0.10)))
+    densities = solution.densities(np.eye(n))
+    capacitance = solution.terminal_charges(densities)
+    capacitance = 0.5 * (capacitance + capacitance.T)
+    _require_finite(design, densities, capacitance)
+    kept.save("charges", densities=densities, capacitance=capacitance)
+    # the factorised matrix is large, and no longer needed
+    return _Charges(_Evaluator(design, solution.model), densities, capacitance)
+
+
+def _node_potentials(
+    lattice: Lattice, charges: _Charges, kept: Checkpoint, tell: Progress
 ) -> Array:
     """Evaluate the terminals' fields at all nodes; held nodes get their exact potential."""
-    potentials = np.zeros((lattice.n_nodes, densities.shape[1]))
-    points = lattice.points
+    n_terminals = charges.densities.shape[1]
     free = np.flatnonzero(lattice.owner == FREE)
-    for part in np.array_split(free, max(1, len(free) // 4000)):
-        potentials[part] = solution.potential(points[part], densities)
-        tell("field at the nodes", 0.1 + 0.8 * (part[-1] + 1) / lattice.n_nodes)
+    points = lattice.points[free]
+    values = np.empty((len(free), n_terminals))
+    done = 0
+    while done < len(free) and (found := kept.load(f"potentials-{done}")) is not None:
+        rows = found["values"]
+        whole = len(rows) % _PART == 0 or done + len(rows) == len(free)
+        if not len(rows) or not whole or rows.shape != values[done : done + len(rows)].shape:
+            break
+        values[done : done + len(rows)] = rows
+        done += len(rows)
+    saved, since = done, time.monotonic()
+    for start in range(done, len(free), _PART):
+        tell("field at the nodes", 0.2 + 0.72 * start / len(free))
+        done = min(start + _PART, len(free))
+        values[start:done] = charges.evaluator.potential(points[start:done], charges.densities)
+        if time.monotonic() - since > _SAVE_EVERY:
+            kept.save(f"potentials-{saved}", values=values[saved:done])
+            saved, since = done, time.monotonic()
+    if saved < done:
+        kept.save(f"potentials-{saved}", values=values[saved:done])
+    potentials = np.zeros((lattice.n_nodes, n_terminals))
+    potentials[free] = values
     driven = np.flatnonzero(lattice.owner >= 0)
     potentials[driven, lattice.owner[driven]] = 1.0
     return np.clip(potentials, 0.0, 1.0)
 
 
-def save_background(field: BackgroundField, path: Path) -> None:
-    """Write a field to an .npz file (single precision, compressed)."""
-    la = field.lattice
-    meta = {"format": FORMAT, "terminals": field.terminals, "n_panels": field.n_panels}
-    arrays = {
-        "meta": np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8),
-        "x": la.axes[0], "y": la.axes[1], "z": la.axes[2],
-        "weights": la.weights.astype(np.float32), "eps_r": la.eps_r.astype(np.float32),
-        "owner": la.owner.astype(np.int16), "kink": la.kink,
-        "half_weights": field.half_weights, "capacitance": field.capacitance,
-        "potentials": field.potentials.astype(np.float32),
-        "cut_axis": la.cuts.axis, "cut_node": la.cuts.node,
-        "cut_lower": la.cuts.lower, "cut_lower_owner": la.cuts.lower_owner,
-        "cut_upper": la.cuts.upper, "cut_upper_owner": la.cuts.upper_owner,
-    }  # fmt: skip
-    with open(path, "wb") as stream:
-        np.savez_compressed(stream, **arrays)
+def _require_finite(design: Design, *arrays: Array) -> None:
+    if not all(np.isfinite(a).all() for a in arrays):
+        raise FieldError(f"the background field of design {design.name!r} is not finite")
 
 
-def load_background(path: Path) -> BackgroundField:
-    """Read a field written by :func:`save_background`.
+def _rising(progress: Progress) -> Progress:
+    """Pass progress on with fractions from 0 to 1 that never fall."""
+    highest = 0.0
 
-    Raises:
-        FieldError: The file is damaged or of another format version.
-    """
-    try:
-        with np.load(path) as data:
-            meta = json.loads(data["meta"].tobytes())
-            if meta["format"] != FORMAT:
-                raise FieldError(f"{path} has format {meta['format']}, this version reads {FORMAT}")
-            cuts = Cuts(
-                data["cut_axis"], data["cut_node"], data["cut_lower"], data["cut_lower_owner"],
-                data["cut_upper"], data["cut_upper_owner"],
-            )  # fmt: skip
-            lattice = Lattice(
-                (data["x"], data["y"], data["z"]),
-                data["weights"].astype(float), data["eps_r"].astype(float),
-                data["owner"].astype(np.int64), data["kink"], cuts,
-            )  # fmt: skip
-            return BackgroundField(
-                lattice, data["half_weights"], data["potentials"].astype(float),
-                data["capacitance"], tuple(meta["terminals"]), int(meta["n_panels"]),
-            )  # fmt: skip
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
-        raise FieldError(f"{path} is not a readable background field: {error}") from error
+    def tell(stage: str, fraction: float) -> None:
+        nonlocal highest
+        highest = max(highest, min(fraction, 1.0))
+        progress(stage, highest)
+
+    return tell

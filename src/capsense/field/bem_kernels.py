@@ -14,6 +14,8 @@ import numpy as np
 from numba import njit, prange
 
 _TINY = 1e-30
+_OUTER = 1.6
+"""Pairs nearer than this many sums of their diameters average the outer integral too."""
 _NEAR = 2.0
 """Panels nearer than this many of their own diameters are integrated in closed form."""
 
@@ -148,7 +150,7 @@ def _mean_normal_gradient(  # type: ignore[no-untyped-def]
             centers[i, 1] - centers[j, 1],
             zc - centers[j, 2],
         )
-        reach = diameters[j] + diameters[i]
+        reach = _OUTER * (diameters[j] + diameters[i])
         if dx * dx + dy * dy + dz * dz < reach * reach:
             if (
                 image == 0
@@ -246,7 +248,7 @@ def system_matrix(  # type: ignore[no-untyped-def]
                 dx = centers[i, 0] - centers[j, 0]
                 dy = centers[i, 1] - centers[j, 1]
                 dz = centers[i, 2] - centers[j, 2]
-                reach = diameters[j] + diameters[i]
+                reach = _OUTER * (diameters[j] + diameters[i])
                 near = dx * dx + dy * dy + dz * dz < reach * reach
                 value = 0.0
                 if near or (diameters[i] > centers[i, 2] - floor and dx * dx + dy * dy < reach * reach):

@@ -159,18 +159,17 @@ def _plan_axes(design: Design, s: LatticeSettings) -> tuple[Array, Array, Array]
     sheets = [b.surface for b in (*design.electrodes, *design.conductors)]
     out = []
     for axis in range(3):
-        planes = [_sheet_planes(sheet, axis) for sheet in sheets]
-        planes += [np.array([la.lower[axis], la.upper[axis]]) for la in design.layers]
-        critical = _merge(np.concatenate(planes), s.merge, lower[axis], upper[axis])
-        gaps = np.diff(np.concatenate([[lower[axis]], critical, [upper[axis]]]))
-        nearest = np.minimum(gaps[1:], gaps[:-1])
+        edges = np.concatenate([_sheet_planes(sheet, axis) for sheet in sheets])
+        edges = _merge(edges, s.merge, lower[axis], upper[axis])
+        faces = np.array([[la.lower[axis], la.upper[axis]] for la in design.layers]).ravel()
+        planes = _merge(np.concatenate([edges, faces]), s.merge, lower[axis], upper[axis])
         if axis < 2:
-            size = np.clip(0.5 * nearest, 1.2 * s.merge, s.edge)
+            gaps = np.diff(np.concatenate([[lower[axis]], edges, [upper[axis]]]))
+            size = np.clip(0.5 * np.minimum(gaps[1:], gaps[:-1]), 1.2 * s.merge, s.edge)
             growth, far = s.growth, s.far
         else:
-            size = np.clip(0.6 * nearest, 0.5 * s.merge, s.face)
-            growth, far = s.growth_z, s.far_z
-        out.append(_graded(lower[axis], upper[axis], critical, size, growth, far))
+            size, growth, far = np.full(len(edges), s.face), s.growth_z, s.far_z
+        out.append(_graded(lower[axis], upper[axis], planes, edges, size, growth, far))
     return out[0], out[1], out[2]
 
 
@@ -201,16 +200,16 @@ def _merge(values: Array, distance: float, lower: float, upper: float) -> Array:
 
 
 def _graded(
-    lower: float, upper: float, critical: Array, size: Array, growth: float, far: float
+    lower: float, upper: float, planes: Array, edges: Array, size: Array, growth: float, far: float
 ) -> Array:
-    """Place planes at all critical coordinates and grade the spacing between them."""
-    stops = np.concatenate([[lower], critical, [upper]])
+    """Lay planes through ``planes``, spaced by ``size`` at ``edges`` and growing from there."""
+    stops = np.concatenate([[lower], planes, [upper]])
     out = [lower]
     for a, b in zip(stops[:-1], stops[1:], strict=True):
         t = np.linspace(a, b, 801)
         mid = 0.5 * (t[1:] + t[:-1])
         h = np.minimum(
-            (size[None] + growth * np.abs(mid[:, None] - critical[None])).min(axis=1), far
+            (size[None] + growth * np.abs(mid[:, None] - edges[None])).min(axis=1), far
         )
         count = np.concatenate([[0.0], np.cumsum(np.diff(t) / h)])
         n = max(1, int(np.ceil(count[-1] - 0.1)))

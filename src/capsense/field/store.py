@@ -1,0 +1,189 @@
+"""Fields and intermediate results as files: written whole or not at all, damage is detected.
+
+A file is an ``.npz`` archive followed by the SHA-256 of its bytes, so that whatever is read was
+written by this module and is complete. ``meta`` inside it says what the file is and for which key.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import uuid
+import zipfile
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import FieldError
+from capsense.field.background import BackgroundField
+from capsense.field.lattice import Cuts, Lattice
+
+FORMAT = 2
+"""Version of the stored form; part of the cache key."""
+
+_DIGEST = hashlib.sha256().digest_size
+_CUTS = ("axis", "node", "lower", "lower_owner", "upper", "upper_owner")
+
+Arrays = dict[str, NDArray[Any]]
+
+
+# -- files ----------------------------------------------------------------------------------
+
+
+def write_arrays(
+    path: Path,
+    arrays: Mapping[str, NDArray[Any]],
+    meta: Mapping[str, Any],
+    compression: int = zipfile.ZIP_STORED,
+) -> None:
+    """Write arrays and ``meta`` to a file that appears only when it is complete.
+
+    Raises:
+        OSError: The file could not be written; nothing is left behind.
+        FieldError: An array holds a number that is not finite.
+    """
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise FieldError(f"{name} is not finite; it is not stored in {path}")
+    text = json.dumps({"format": FORMAT, **meta}).encode()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression) as archive:
+        for name, array in {"meta": np.frombuffer(text, dtype=np.uint8), **arrays}.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+    content = buffer.getvalue()
+    write_whole(path, content + hashlib.sha256(content).digest())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Put ``content`` at ``path`` in one step; no other process sees part of it."""
+    part = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.part")
+    try:
+        part.write_bytes(content)
+        os.replace(part, path)
+    except BaseException:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+
+
+def parse_arrays(content: bytes, source: str, **expected: str) -> tuple[Arrays, dict[str, Any]]:
+    """Return the arrays and the meta of what :func:`write_arrays` wrote.
+
+    ``expected`` are entries of the meta, such as the key, that must have these values.
+
+    Raises:
+        FieldError: The content is damaged, of another format, or not what was expected.
+    """
+    body, digest = content[:-_DIGEST], content[-_DIGEST:]
+    if hashlib.sha256(body).digest() != digest:
+        raise FieldError(f"{source} is damaged, or not a file of this version")
+    try:
+        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        meta = json.loads(arrays.pop("meta").tobytes())
+    except (ValueError, KeyError, zipfile.BadZipFile, RuntimeError) as error:
+        raise FieldError(f"{source} cannot be read: {error}") from error
+    for name, value in {"format": FORMAT, **expected}.items():
+        if meta.get(name) != value:
+            raise FieldError(f"{source} has {name} {meta.get(name)!r}, expected {value!r}")
+    return arrays, meta
+
+
+def read_arrays(path: Path, **expected: str) -> tuple[Arrays, dict[str, Any]]:
+    """Read a file of :func:`write_arrays`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        FieldError: The file is unreadable, damaged or not what was expected.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise FieldError(f"{path} cannot be read: {error}") from error
+    return parse_arrays(content, str(path), **expected)
+
+
+# -- background fields ----------------------------------------------------------------------
+
+
+def save_background(
+    field: BackgroundField,
+    path: Path,
+    key: str = "",
+    *,
+    compact: bool = False,
+    note: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a field.
+
+    By default exactly. ``compact`` stores potentials and link weights in single precision, with a
+    relative error of 6e-8 everywhere, also far away where potentials are small, and packs harder.
+    ``note`` is kept in the file's meta.
+
+    Raises:
+        OSError: The file could not be written; nothing is left behind.
+        FieldError: The field is not finite.
+    """
+    la = field.lattice
+    real = np.dtype("<f4" if compact else "<f8")
+    arrays = {
+        "x": la.axes[0], "y": la.axes[1], "z": la.axes[2],
+        "eps_r": la.eps_r, "owner": la.owner.astype(np.int16), "kink": la.kink,
+        **{f"cut_{name}": getattr(la.cuts, name) for name in _CUTS},
+        "half_weights": field.half_weights, "capacitance": field.capacitance,
+        "weights": _byte_planes(la.weights.astype(real)),
+        "potentials": _byte_planes(field.potentials.T.astype(real)),
+    }  # fmt: skip
+    if not (np.isfinite(la.weights).all() and np.isfinite(field.potentials).all()):
+        raise FieldError(f"the field is not finite; it is not stored in {path}")
+    meta = {
+        **(note or {}),
+        "kind": "field", "key": key, "terminals": field.terminals, "n_panels": field.n_panels,
+    }  # fmt: skip
+    write_arrays(path, arrays, meta, zipfile.ZIP_LZMA if compact else zipfile.ZIP_DEFLATED)
+
+
+def load_background(path: Path, key: str = "") -> BackgroundField:
+    """Read a field written by :func:`save_background` with the same key.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        FieldError: The file is damaged, of another format version or for another key.
+    """
+    return to_background(*read_arrays(path, kind="field", key=key))
+
+
+def to_background(arrays: Arrays, meta: Mapping[str, Any]) -> BackgroundField:
+    """Put a field together from the content of its file."""
+    lattice = Lattice(
+        (arrays["x"], arrays["y"], arrays["z"]),
+        _from_byte_planes(arrays["weights"]), arrays["eps_r"],
+        arrays["owner"].astype(np.int64), arrays["kink"],
+        Cuts(*(arrays[f"cut_{name}"] for name in _CUTS)),
+    )  # fmt: skip
+    return BackgroundField(
+        lattice, arrays["half_weights"],
+        np.ascontiguousarray(_from_byte_planes(arrays["potentials"]).T),
+        arrays["capacitance"], tuple(meta["terminals"]), int(meta["n_panels"]),
+    )  # fmt: skip
+
+
+def _byte_planes(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """All first bytes, then all second bytes, and so on: exponents pack well, digits do not."""
+    split = np.ascontiguousarray(values)[..., None].view(np.uint8)
+    return np.ascontiguousarray(np.moveaxis(split, -1, 0))
+
+
+def _from_byte_planes(planes: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Undo :func:`_byte_planes`; the number of planes is the size of a number."""
+    split = np.ascontiguousarray(np.moveaxis(planes, 0, -1))
+    return split.view(f"<f{len(planes)}")[..., 0].astype(np.float64)
