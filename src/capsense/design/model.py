@@ -95,6 +95,11 @@ class Design:
         return design_hash(self)
 
     @property
+    def sheets(self) -> tuple[Electrode | Conductor, ...]:
+        """Everything that conducts: the electrodes, then the other conductors."""
+        return (*self.electrodes, *self.conductors)
+
+    @property
     def electrode_names(self) -> tuple[str, ...]:
         """Electrode names in matrix order."""
         return tuple(e.name for e in self.electrodes)

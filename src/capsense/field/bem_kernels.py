@@ -21,7 +21,7 @@ _NEAR = 2.0
 
 
 @njit(cache=True)
-def polygon_potential(edges, normal, x, y, z):  # type: ignore[no-untyped-def]
+def polygon_potential(edges, normal, x, y, z):
     """Return ∫ dS' / |r − r'| [m] over a polygon given by its edges (k, 2, 3)."""
     nx, ny, nz = normal[0], normal[1], normal[2]
     d = nx * (x - edges[0, 0, 0]) + ny * (y - edges[0, 0, 1]) + nz * (z - edges[0, 0, 2])
@@ -45,10 +45,8 @@ def polygon_potential(edges, normal, x, y, z):  # type: ignore[no-untyped-def]
             continue
         rp = math.sqrt(r0 + lp * lp)
         rm = math.sqrt(r0 + lm * lm)
-        if lm + lp > 0.0:
-            log = math.log((rp + lp) / (rm + lm))
-        else:
-            log = math.log((rm - lm) / (rp - lp))
+        far = lm + lp > 0.0
+        log = math.log((rp + lp) / (rm + lm) if far else (rm - lm) / (rp - lp))
         total += t * log
         if h > 1e-12:
             total -= h * (math.atan(t * lp / (r0 + h * rp)) - math.atan(t * lm / (r0 + h * rm)))
@@ -56,7 +54,7 @@ def polygon_potential(edges, normal, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def polygon_gradient(edges, normal, x, y, z, out):  # type: ignore[no-untyped-def]
+def polygon_gradient(edges, normal, x, y, z, out):
     """Write ∇ ∫ dS' / |r − r'| (dimensionless) into ``out`` (3,).
 
     On the polygon itself the normal part is the principal value, zero.
@@ -98,7 +96,7 @@ def polygon_gradient(edges, normal, x, y, z, out):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _panel_potential(j, edges, first, normals, centers, diameters, quad, weights, x, y, z):  # type: ignore[no-untyped-def]
+def _panel_potential(j, edges, first, normals, centers, diameters, quad, weights, x, y, z):
     dx, dy, dz = x - centers[j, 0], y - centers[j, 1], z - centers[j, 2]
     if dx * dx + dy * dy + dz * dz < (_NEAR * diameters[j]) ** 2:
         return polygon_potential(edges[first[j] : first[j + 1]], normals[j], x, y, z)
@@ -112,7 +110,7 @@ def _panel_potential(j, edges, first, normals, centers, diameters, quad, weights
 
 
 @njit(cache=True)
-def _panel_gradient(j, edges, first, normals, centers, diameters, quad, weights, x, y, z, out):  # type: ignore[no-untyped-def]
+def _panel_gradient(j, edges, first, normals, centers, diameters, quad, weights, x, y, z, out):
     dx, dy, dz = x - centers[j, 0], y - centers[j, 1], z - centers[j, 2]
     if dx * dx + dy * dy + dz * dz < (_NEAR * diameters[j]) ** 2:
         polygon_gradient(edges[first[j] : first[j + 1]], normals[j], x, y, z, out)
@@ -130,7 +128,7 @@ def _panel_gradient(j, edges, first, normals, centers, diameters, quad, weights,
 
 
 @njit(cache=True)
-def _mean_normal_gradient(  # type: ignore[no-untyped-def]
+def _mean_normal_gradient(
     i, j, floor, edges, first, normals, centers, diameters, quad, weights, grad
 ):
     """Mean over panel i of n_i · ∇ of panel j's unit potential and its image's.
@@ -202,7 +200,7 @@ def _mean_normal_gradient(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def potential_matrix(points, floor, edges, first, normals, centers, diameters, quad, weights):  # type: ignore[no-untyped-def]
+def potential_matrix(points, floor, edges, first, normals, centers, diameters, quad, weights):
     """Return G [m], shape (points, panels): potential times 4π eps0 of unit charge densities.
 
     The grounded plane z = ``floor`` is met by image charges.
@@ -222,7 +220,7 @@ def potential_matrix(points, floor, edges, first, normals, centers, diameters, q
 
 
 @njit(cache=True, parallel=True)
-def system_matrix(  # type: ignore[no-untyped-def]
+def system_matrix(
     is_interface, contrast, floor, edges, first, normals, centers, diameters, quad, weights
 ):
     """Return the boundary-element matrix, shape (n, n), rows scaled by 4π eps0.
@@ -251,7 +249,9 @@ def system_matrix(  # type: ignore[no-untyped-def]
                 reach = _OUTER * (diameters[j] + diameters[i])
                 near = dx * dx + dy * dy + dz * dz < reach * reach
                 value = 0.0
-                if near or (diameters[i] > centers[i, 2] - floor and dx * dx + dy * dy < reach * reach):
+                if near or (
+                    diameters[i] > centers[i, 2] - floor and dx * dx + dy * dy < reach * reach
+                ):
                     for q in range(quad.shape[1]):
                         w = weights[i, q]
                         if w != 0.0:
@@ -306,9 +306,7 @@ def system_matrix(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def normal_gradient_matrix(  # type: ignore[no-untyped-def]
-    rows, floor, edges, first, normals, centers, diameters, quad, weights
-):
+def normal_gradient_matrix(rows, floor, edges, first, normals, centers, diameters, quad, weights):
     """Return n · ∇ of each panel's unit potential, averaged over the panels ``rows``."""
     n, m = rows.shape[0], centers.shape[0]
     out = np.empty((n, m))

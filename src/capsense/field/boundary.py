@@ -84,7 +84,7 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
     names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
     flat: list[bool] = []
-    for body in (*design.electrodes, *design.conductors):
+    for body in design.sheets:
         owner = names.index(body.name) if body.name in names else GROUND
         for facet in body.surface.facets:
             on_floor = (
@@ -93,8 +93,7 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
             if not on_floor:
                 sheets.append((facet, owner))
                 flat.append(len(body.surface.facets) <= _FEW_FACETS)
-    bodies = (*design.electrodes, *design.conductors)
-    rims = np.concatenate([b.surface.rims for b in bodies])
+    rims = np.concatenate([b.surface.rims for b in design.sheets])
     gaps, spacings = np.full(len(sheets), np.inf), np.full(len(sheets), _FAR_PLANE)
     few = np.flatnonzero(flat)
     if len(few):

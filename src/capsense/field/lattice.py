@@ -8,6 +8,7 @@ not lie on lattice planes cut the links they cross.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -128,7 +129,7 @@ def build_lattice(design: Design, settings: LatticeSettings | None = None) -> La
     names = terminals(design)
     owner = np.full(shape, FREE, dtype=np.int64)
     crossings: list[tuple[int, NDArray[np.int64], Array, int]] = []
-    for body in (*design.electrodes, *design.conductors):
+    for body in design.sheets:
         who = names.index(body.name) if body.name in names else WALL
         _claim_nodes(axes, owner, crossings, body.surface, who)
     for axis in range(3):
@@ -156,7 +157,7 @@ def build_lattice(design: Design, settings: LatticeSettings | None = None) -> La
 
 def _plan_axes(design: Design, s: LatticeSettings) -> tuple[Array, Array, Array]:
     lower, upper = design.domain.lower, design.domain.upper
-    sheets = [b.surface for b in (*design.electrodes, *design.conductors)]
+    sheets = [b.surface for b in design.sheets]
     out = []
     for axis in range(3):
         edges = np.concatenate([_sheet_planes(sheet, axis) for sheet in sheets])
@@ -205,12 +206,10 @@ def _graded(
     """Lay planes through ``planes``, spaced by ``size`` at ``edges`` and growing from there."""
     stops = np.concatenate([[lower], planes, [upper]])
     out = [lower]
-    for a, b in zip(stops[:-1], stops[1:], strict=True):
+    for a, b in pairwise(stops):
         t = np.linspace(a, b, 801)
         mid = 0.5 * (t[1:] + t[:-1])
-        h = np.minimum(
-            (size[None] + growth * np.abs(mid[:, None] - edges[None])).min(axis=1), far
-        )
+        h = np.minimum((size[None] + growth * np.abs(mid[:, None] - edges[None])).min(axis=1), far)
         count = np.concatenate([[0.0], np.cumsum(np.diff(t) / h)])
         n = max(1, int(np.ceil(count[-1] - 0.1)))
         out.extend(np.interp(np.arange(1, n) * count[-1] / n, count, t))
@@ -286,8 +285,7 @@ def _cross_triangles(
         iq = np.flatnonzero((axes[q] >= y0) & (axes[q] <= y1))
         if not len(ip) or not len(iq):
             continue
-        gp, gq = np.meshgrid(ip, iq, indexing="ij")
-        gp, gq = gp.ravel(), gq.ravel()
+        gp, gq = np.repeat(ip, len(iq)), np.tile(iq, len(ip))
         inside = shapely.contains_xy(shadow, axes[p][gp], axes[q][gq])
         gp, gq = gp[inside], gq[inside]
         n = facet.axes[2]
@@ -330,11 +328,9 @@ def _collect_cuts(
     for (axis, node), hits in sorted(found.items()):
         first, last = min(hits), max(hits)
         rows.append((axis, node, first[0], first[1], 1.0 - last[0], last[1]))
-    cols = list(zip(*rows, strict=True)) if rows else [()] * 6
-    whole, real = np.int64, np.float64
-    kinds = (whole, whole, real, whole, real, whole)
-    arrays = [np.array(c, dtype=k) for c, k in zip(cols, kinds, strict=True)]
-    return Cuts(*arrays)
+    table = np.array(rows, dtype=float).reshape(-1, 6)
+    whole = table.astype(np.int64)
+    return Cuts(whole[:, 0], whole[:, 1], table[:, 2], whole[:, 3], table[:, 4], whole[:, 5])
 
 
 # -- materials --------------------------------------------------------------------------------

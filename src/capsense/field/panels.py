@@ -118,9 +118,7 @@ def cut_facet(facet: Facet, rims: Array, grading: Grading, reach: float = 0.0) -
     return pieces
 
 
-def _project_rims(
-    facet: Facet, rims: Array, reach: float
-) -> tuple[NDArray[np.object_], Array]:
+def _project_rims(facet: Facet, rims: Array, reach: float) -> tuple[NDArray[np.object_], Array]:
     """Rims near a facet's plane as lines in it, with their heights above it [m]."""
     local = (rims.reshape(-1, 2, 3) - facet.origin) @ facet.axes.T
     height = np.abs(local[..., 2]).max(axis=1)
@@ -137,8 +135,7 @@ def _cells(region: shapely.Geometry, size: float) -> list[Polygon]:
     x0, y0, x1, y1 = region.bounds
     nx, ny = max(1, round((x1 - x0) / size)), max(1, round((y1 - y0) / size))
     xs, ys = np.linspace(x0, x1, nx + 1), np.linspace(y0, y1, ny + 1)
-    gx, gy = np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij")
-    gx, gy = gx.ravel(), gy.ravel()
+    gx, gy = np.repeat(np.arange(nx), ny), np.tile(np.arange(ny), nx)
     boxes = shapely.box(xs[gx], ys[gy], xs[gx + 1], ys[gy + 1])
     shapely.prepare(region)
     boxes = boxes[shapely.intersects(region, boxes)]

@@ -16,7 +16,7 @@ _RELAX = np.float32(0.97)
 
 
 @njit(cache=True)
-def operator_diagonal(weight, extra, owner, strides, diagonal, active):  # type: ignore[no-untyped-def]
+def operator_diagonal(weight, extra, owner, strides, diagonal, active):
     """Sum the links and ties at each node; nodes that are held or inside a conductor are off."""
     sx, sy = strides[0], strides[1]
     n = owner.shape[0]
@@ -26,8 +26,13 @@ def operator_diagonal(weight, extra, owner, strides, diagonal, active):  # type:
             diagonal[a] = 1.0
             continue
         d = (
-            weight[0, a] + weight[0, a - sx] + weight[1, a] + weight[1, a - sy]
-            + weight[2, a] + weight[2, a - 1] + extra[a]
+            weight[0, a]
+            + weight[0, a - sx]
+            + weight[1, a]
+            + weight[1, a - sy]
+            + weight[2, a]
+            + weight[2, a - 1]
+            + extra[a]
         )
         if d > 0.0:
             active[a] = 1.0
@@ -38,7 +43,7 @@ def operator_diagonal(weight, extra, owner, strides, diagonal, active):  # type:
 
 
 @njit(cache=True, fastmath=True)
-def factorise(weight, diagonal, active, strides, inverse):  # type: ignore[no-untyped-def]
+def factorise(weight, diagonal, active, strides, inverse):
     """Write the inverse pivots of the incomplete factorisation; zero at nodes that are off."""
     sx, sy = strides[0], strides[1]
     n = diagonal.shape[0]
@@ -61,7 +66,7 @@ def factorise(weight, diagonal, active, strides, inverse):  # type: ignore[no-un
 
 
 @njit(cache=True, fastmath=True)
-def precondition(weight, inverse, strides, lo, hi, r, z, rz):  # type: ignore[no-untyped-def]
+def precondition(weight, inverse, strides, lo, hi, r, z, rz):
     """Solve the incomplete factors for z and accumulate r · z per lane."""
     sx, sy = strides[0], strides[1]
     wx, wy, wz = weight[0], weight[1], weight[2]
@@ -73,9 +78,7 @@ def precondition(weight, inverse, strides, lo, hi, r, z, rz):  # type: ignore[no
             continue
         ux, uy, uz = wx[a - sx], wy[a - sy], wz[a - 1]
         for k in range(LANES):
-            z[a, k] = g * (
-                r[a, k] + ux * z[a - sx, k] + uy * z[a - sy, k] + uz * z[a - 1, k]
-            )
+            z[a, k] = g * (r[a, k] + ux * z[a - sx, k] + uy * z[a - sy, k] + uz * z[a - 1, k])
     total = np.zeros(LANES, np.float64)
     part = np.zeros(LANES, np.float32)
     count = 0
@@ -98,7 +101,7 @@ def precondition(weight, inverse, strides, lo, hi, r, z, rz):  # type: ignore[no
 
 
 @njit(cache=True, fastmath=True)
-def apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap):  # type: ignore[no-untyped-def]
+def apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap):
     """Write the operator times p and accumulate p · A p per lane."""
     sx, sy = strides[0], strides[1]
     wx, wy, wz = weight[0], weight[1], weight[2]
@@ -117,9 +120,12 @@ def apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap):  # ty
         for k in range(LANES):
             v = (
                 d * p[a, k]
-                - x0 * p[a - sx, k] - x1 * p[a + sx, k]
-                - y0 * p[a - sy, k] - y1 * p[a + sy, k]
-                - z0 * p[a - 1, k] - z1 * p[a + 1, k]
+                - x0 * p[a - sx, k]
+                - x1 * p[a + sx, k]
+                - y0 * p[a - sy, k]
+                - y1 * p[a + sy, k]
+                - z0 * p[a - 1, k]
+                - z1 * p[a + 1, k]
             )
             ap[a, k] = v
             part[k] += p[a, k] * v
@@ -134,14 +140,14 @@ def apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap):  # ty
 
 
 @njit(cache=True, fastmath=True)
-def _direction(lo, hi, p, z, beta):  # type: ignore[no-untyped-def]
+def _direction(lo, hi, p, z, beta):
     for a in range(lo, hi):
         for k in range(LANES):
             p[a, k] = z[a, k] + beta[k] * p[a, k]
 
 
 @njit(cache=True, fastmath=True)
-def _advance(lo, hi, u, r, p, ap, alpha):  # type: ignore[no-untyped-def]
+def _advance(lo, hi, u, r, p, ap, alpha):
     for a in range(lo, hi):
         for k in range(LANES):
             u[a, k] += alpha[k] * p[a, k]
@@ -149,9 +155,23 @@ def _advance(lo, hi, u, r, p, ap, alpha):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def solve(  # type: ignore[no-untyped-def]
-    weight, diagonal, active, inverse, strides, lo, hi, rhs, u, r, z, p, ap,
-    tolerance, max_iterations, left,
+def solve(
+    weight,
+    diagonal,
+    active,
+    inverse,
+    strides,
+    lo,
+    hi,
+    rhs,
+    u,
+    r,
+    z,
+    p,
+    ap,
+    tolerance,
+    max_iterations,
+    left,
 ):
     """Iterate until the energy still missing is below ``tolerance`` in every lane.
 
@@ -191,7 +211,7 @@ def solve(  # type: ignore[no-untyped-def]
                 left[k] = decrement * ratio / (1.0 - ratio)
             previous[k] = decrement
             old[k] = rz[k]
-            if left[k] > tolerance[k] or iteration == 0 and decrement > tolerance[k]:
+            if left[k] > tolerance[k] or (iteration == 0 and decrement > tolerance[k]):
                 done = False
         _advance(lo, hi, u, r, p, ap, alpha)
         iteration += 1
@@ -201,10 +221,28 @@ def solve(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def load(  # type: ignore[no-untyped-def]
-    phi, first_lane, floating_lane, held, n_tie, tie_node, tie_weight, tie_conductor, tie_point,
-    tie_coef, tie_end, tie_end_coef, n_energy, energy_link, energy_weight, energy_kind, energy_end,
-    scale, rhs, value, drop,
+def load(
+    phi,
+    first_lane,
+    floating_lane,
+    held,
+    n_tie,
+    tie_node,
+    tie_weight,
+    tie_conductor,
+    tie_point,
+    tie_coef,
+    tie_end,
+    tie_end_coef,
+    n_energy,
+    energy_link,
+    energy_weight,
+    energy_kind,
+    energy_end,
+    scale,
+    rhs,
+    value,
+    drop,
 ):
     """Fill one block's right-hand sides, and each tie's and energy term's value per lane.
 
@@ -242,7 +280,7 @@ def load(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def gram(n, weight, left, right, out):  # type: ignore[no-untyped-def]
+def gram(n, weight, left, right, out):
     """Add Σ_i weight_i left_i right_iᵀ to ``out`` (8, 8)."""
     for i in range(n):
         w = weight[i]
@@ -253,7 +291,7 @@ def gram(n, weight, left, right, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True)
-def inner(lo, hi, active, left, right, out):  # type: ignore[no-untyped-def]
+def inner(lo, hi, active, left, right, out):
     """Add leftᵀ right over the active nodes to ``out`` (8, 8)."""
     part = np.zeros((LANES, LANES), np.float32)
     count = 0
@@ -277,7 +315,9 @@ def inner(lo, hi, active, left, right, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def sparse_inner(n_tie, tie_node, n_energy, energy_link, energy_kind, stamp, mark, active, left, right, out):  # type: ignore[no-untyped-def]
+def sparse_inner(
+    n_tie, tie_node, n_energy, energy_link, energy_kind, stamp, mark, active, left, right, out
+):
     """Add leftᵀ right over the nodes that carry a load, each once, to ``out`` (8, 8)."""
     for i in range(n_tie + 2 * n_energy):
         if i < n_tie:

@@ -16,7 +16,6 @@ from capsense.field.background import BackgroundField
 from capsense.field.lattice import FREE
 from capsense.scene import Scene, TriMesh
 from capsense.scene.shape import ShapeKind
-
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.model import Design, Role
+from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.field.background import BackgroundField
 from capsense.field.lattice import WALL
@@ -31,7 +31,8 @@ class MaskedScenes:
         mesh = kuhn_tets(*la.axes)
         owner = la.owner
         groups = {
-            name: np.flatnonzero(owner == k) for k, name in enumerate(background.terminals)
+            name: np.flatnonzero(owner == k).astype(np.int32)
+            for k, name in enumerate(background.terminals)
         }
         missing = [name for name, nodes in groups.items() if not len(nodes)]
         if missing:
@@ -39,7 +40,7 @@ class MaskedScenes:
                 f"method 'masked' needs mesh nodes on every electrode; {missing[0]!r} has none: "
                 "raise [build] resolution, or use method 'perturbation'"
             )
-        groups["ground"] = np.flatnonzero(owner == WALL)
+        groups["ground"] = np.flatnonzero(owner == WALL).astype(np.int32)
         self._mesh = TetMesh(mesh.points, mesh.tets, node_groups=groups)
         self._centroids = self._mesh.centroids
         eps = np.ones(self._mesh.n_tets)
@@ -50,7 +51,7 @@ class MaskedScenes:
             self._mesh, list(background.terminals), ("ground",), eps_background=eps
         )
         empty = np.full(self._mesh.n_tets, -1, dtype=np.int64)
-        self._empty = self._solver.step(empty, np.zeros(0))
+        self._empty = self._solver.step(empty, [])
 
     def reset(self) -> None:
         """Forget the last solution."""
@@ -77,7 +78,7 @@ class MaskedScenes:
                 taken = inside >= 0
                 conductor = np.array([b.material.is_conductor(self._frequency) for b in scene])
                 inside[within & ~(taken & conductor[inside])] = i
-        matrix = self._solver.step(inside, eps)
+        matrix = self._solver.step(inside, eps.tolist())
         stats = self._solver.stats
         goal = self._solver.tolerance * float(np.abs(matrix).max())
         return matrix - self._empty, int(stats.iterations), goal, goal

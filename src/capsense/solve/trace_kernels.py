@@ -28,15 +28,38 @@ _LEAST = 1e-3
 
 
 @njit(cache=True)
-def _body_stretches(axis, p, q, op, oq, kinds, params, rotation, position, bounds, bodies, n_bodies,  # type: ignore[no-untyped-def]
-                    grids, grid_shape, grid_first, grid_origin, grid_inv, t0, t1, who, scratch):
+def _body_stretches(
+    axis,
+    p,
+    q,
+    op,
+    oq,
+    kinds,
+    params,
+    rotation,
+    position,
+    bounds,
+    bodies,
+    n_bodies,
+    grids,
+    grid_shape,
+    grid_first,
+    grid_origin,
+    grid_inv,
+    t0,
+    t1,
+    who,
+    scratch,
+):
     """Collect the stretches of one lattice line inside bodies; return their number or −1."""
     n = 0
     for m in range(n_bodies):
         body = bodies[m]
         if (
-            op < bounds[body, 0, p] or op > bounds[body, 1, p]
-            or oq < bounds[body, 0, q] or oq > bounds[body, 1, q]
+            op < bounds[body, 0, p]
+            or op > bounds[body, 1, p]
+            or oq < bounds[body, 0, q]
+            or oq > bounds[body, 1, q]
         ):
             continue
         ox, oy, oz, dx, dy, dz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -53,11 +76,16 @@ def _body_stretches(axis, p, q, op, oq, kinds, params, rotation, position, bound
             first = grid_first[body]
             values = grids[first : first + s[0] * s[1] * s[2]].reshape((s[0], s[1], s[2]))
             count = mesh_line_intervals(
-                values, grid_origin[body], grid_inv[body],
+                values,
+                grid_origin[body],
+                grid_inv[body],
                 r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az,
                 r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az,
                 r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az,
-                r[axis, 0], r[axis, 1], r[axis, 2], scratch,
+                r[axis, 0],
+                r[axis, 1],
+                r[axis, 2],
+                scratch,
             )
         else:
             scratch[0, 0], scratch[0, 1] = body_line_interval(
@@ -74,7 +102,7 @@ def _body_stretches(axis, p, q, op, oq, kinds, params, rotation, position, bound
 
 
 @njit(cache=True)
-def _resolve(n, t0, t1, who, conductor, r0, r1, rwho, cuts, parent):  # type: ignore[no-untyped-def]
+def _resolve(n, t0, t1, who, conductor, r0, r1, rwho, cuts, parent):
     """Turn overlapping stretches into disjoint ones, in order; join conductors that touch."""
     if n == 1:
         r0[0], r1[0], rwho[0] = t0[0], t1[0], who[0]
@@ -115,7 +143,7 @@ def _resolve(n, t0, t1, who, conductor, r0, r1, rwho, cuts, parent):  # type: ig
 
 
 @njit(cache=True)
-def _join(parent, a, b):  # type: ignore[no-untyped-def]
+def _join(parent, a, b):
     while parent[a] != a:
         a = parent[a]
     while parent[b] != b:
@@ -127,13 +155,53 @@ def _join(parent, a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def trace(  # type: ignore[no-untyped-def]
-    x, y, z, strides, base_weight, base_extra, eps_r, owner, kink,
-    cut_index, cut_lower, cut_lower_owner, cut_upper, cut_upper_owner, half_weight,
-    kinds, params, rotation, position, bounds, conductor, body_eps, n_bodies,
-    grids, grid_shape, grid_first, grid_origin, grid_inv, contact,
-    weight, extra, tie_node, tie_weight, tie_conductor, tie_point, tie_coef, tie_end, tie_end_coef,
-    energy_link, energy_weight, energy_kind, energy_end, couple, couple_weight, parent, counts,
+def trace(
+    x,
+    y,
+    z,
+    strides,
+    base_weight,
+    base_extra,
+    eps_r,
+    owner,
+    kink,
+    cut_index,
+    cut_lower,
+    cut_lower_owner,
+    cut_upper,
+    cut_upper_owner,
+    half_weight,
+    kinds,
+    params,
+    rotation,
+    position,
+    bounds,
+    conductor,
+    body_eps,
+    n_bodies,
+    grids,
+    grid_shape,
+    grid_first,
+    grid_origin,
+    grid_inv,
+    contact,
+    weight,
+    extra,
+    tie_node,
+    tie_weight,
+    tie_conductor,
+    tie_point,
+    tie_coef,
+    tie_end,
+    tie_end_coef,
+    energy_link,
+    energy_weight,
+    energy_kind,
+    energy_end,
+    couple,
+    couple_weight,
+    parent,
+    counts,
 ):
     """Scan a scene; fill link weights, ties, energy terms and couplings. Return 0, or an error.
 
@@ -178,8 +246,27 @@ def trace(  # type: ignore[no-untyped-def]
                 continue
             for iq in range(1, cq.shape[0] - 1):
                 n = _body_stretches(
-                    axis, p, q, op, cq[iq], kinds, params, rotation, position, bounds, near, n_near,
-                    grids, grid_shape, grid_first, grid_origin, grid_inv, t0, t1, who, scratch,
+                    axis,
+                    p,
+                    q,
+                    op,
+                    cq[iq],
+                    kinds,
+                    params,
+                    rotation,
+                    position,
+                    bounds,
+                    near,
+                    n_near,
+                    grids,
+                    grid_shape,
+                    grid_first,
+                    grid_origin,
+                    grid_inv,
+                    t0,
+                    t1,
+                    who,
+                    scratch,
                 )
                 if n == 0:
                     continue
@@ -228,7 +315,7 @@ def trace(  # type: ignore[no-untyped-def]
                         # series resistance up to the first conductor, and back from the last
                         resist, pos, k = 0.0, pa, seg
                         first_r, first_s, first_k, first_deep = -1.0, 0.0, -1, False
-                        gap, last_t, last_k, last_deep = 0.0, pa, -1, False
+                        last_t, last_k, last_deep = pa, -1, False
                         touched = False
                         while k < n and r0[k] < pb:
                             s0, s1 = max(r0[k], pa), min(r1[k], pb)
@@ -279,7 +366,11 @@ def trace(  # type: ignore[no-untyped-def]
                             extra[na if na >= 0 else nb] -= w
                         inner = w
                         for side in range(2):
-                            r, s = (first_r, first_s) if side == 0 else (resist, (pb - last_t) / length)
+                            r, s = (
+                                (first_r, first_s)
+                                if side == 0
+                                else (resist, (pb - last_t) / length)
+                            )
                             tied = na if side == 0 else nb
                             deep = first_deep if side == 0 else last_deep
                             free = tied >= 0 and owner[tied] == -1
@@ -294,8 +385,27 @@ def trace(  # type: ignore[no-untyped-def]
                             if free:
                                 extra[tied] += w / r
                             _tie_value(
-                                n_tie, side, s, r, na, nb, ea, eb, stride, m, last, part, cut,
-                                pa, pb, c, kink, tie_point, tie_coef, tie_end, tie_end_coef,
+                                n_tie,
+                                side,
+                                s,
+                                r,
+                                na,
+                                nb,
+                                ea,
+                                eb,
+                                stride,
+                                m,
+                                last,
+                                part,
+                                cut,
+                                pa,
+                                pb,
+                                c,
+                                kink,
+                                tie_point,
+                                tie_coef,
+                                tie_end,
+                                tie_end_coef,
                             )
                             n_tie += 1
                         energy_link[n_energy, 0], energy_link[n_energy, 1] = na, nb
@@ -308,9 +418,28 @@ def trace(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _tie_value(  # type: ignore[no-untyped-def]
-    i, side, s, r, na, nb, ea, eb, stride, m, last, part, cut, pa, pb, c, kink,
-    tie_point, tie_coef, tie_end, tie_end_coef,
+def _tie_value(
+    i,
+    side,
+    s,
+    r,
+    na,
+    nb,
+    ea,
+    eb,
+    stride,
+    m,
+    last,
+    part,
+    cut,
+    pa,
+    pb,
+    c,
+    kink,
+    tie_point,
+    tie_coef,
+    tie_end,
+    tie_end_coef,
 ):
     """Coefficients of the background potential at a crossing, from nodes along the line.
 
