@@ -101,8 +101,8 @@ def build_background(
         FieldError: The geometry needs more panels than fit, or a result is not finite.
     """
     settings = settings or BuildSettings()
-    kept = checkpoint or NoCheckpoint()
-    tell = _rising(progress or (lambda stage, fraction: None))
+    kept = NoCheckpoint() if checkpoint is None else checkpoint
+    tell = _rising(progress)
     tell("lattice", 0.0)
     lattice = build_lattice(design, settings.lattice)
     charges = _solve_charges(design, settings, kept, tell)
@@ -202,13 +202,14 @@ def _require_finite(design: Design, *arrays: Array) -> None:
         raise FieldError(f"the background field of design {design.name!r} is not finite")
 
 
-def _rising(progress: Progress) -> Progress:
-    """Pass progress on with fractions from 0 to 1 that never fall."""
+def _rising(progress: Progress | None) -> Progress:
+    """Pass progress on, if anybody wants it, with fractions from 0 to 1 that never fall."""
     highest = 0.0
 
     def tell(stage: str, fraction: float) -> None:
         nonlocal highest
         highest = max(highest, min(fraction, 1.0))
-        progress(stage, highest)
+        if progress is not None:
+            progress(stage, highest)
 
     return tell

@@ -107,6 +107,8 @@ def read_arrays(path: Path, **expected: str) -> tuple[Arrays, dict[str, Any]]:
         content = path.read_bytes()
     except FileNotFoundError:
         raise
+    except NotADirectoryError as error:
+        raise FileNotFoundError(*error.args) from error
     except OSError as error:
         raise FieldError(f"{path} cannot be read: {error}") from error
     return parse_arrays(content, str(path), **expected)

@@ -1,0 +1,132 @@
+"""Fields as files: exact, whole, and never silently wrong."""
+
+from __future__ import annotations
+
+import errno
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_field import SETTINGS, arrays, digest, tiny_design
+
+from capsense.errors import FieldError
+from capsense.field import store
+from capsense.field.background import BackgroundField, build_background
+from capsense.field.store import load_background, read_arrays, save_background, write_arrays
+
+
+@pytest.fixture(scope="module")
+def field() -> BackgroundField:
+    return build_background(tiny_design(), SETTINGS)
+
+
+def test_a_field_comes_back_to_the_last_bit(field: BackgroundField, tmp_path: Path) -> None:
+    assert len(field.lattice.cuts) > 0
+    save_background(field, tmp_path / "a.npz", "key")
+    back = load_background(tmp_path / "a.npz", "key")
+    assert digest(back) == digest(field)
+    assert (back.terminals, back.n_panels) == (field.terminals, field.n_panels)
+    for name, array in arrays(back).items():
+        assert array.flags.c_contiguous, name
+    assert os.listdir(tmp_path) == ["a.npz"]
+
+
+def test_a_compact_field_is_close_everywhere(field: BackgroundField, tmp_path: Path) -> None:
+    save_background(field, tmp_path / "exact.npz", "key")
+    save_background(field, tmp_path / "compact.npz", "key", compact=True)
+    back = load_background(tmp_path / "compact.npz", "key")
+    for name in ("weights", "potentials"):
+        np.testing.assert_allclose(arrays(back)[name], arrays(field)[name], rtol=6e-8, atol=0.0)
+    assert np.abs(back.potentials - field.potentials).max() < 1e-6
+    for name in set(arrays(field)) - {"weights", "potentials"}:
+        assert np.array_equal(arrays(back)[name], arrays(field)[name]), name
+    sizes = [(tmp_path / f"{name}.npz").stat().st_size for name in ("compact", "exact")]
+    assert sizes[0] < 0.6 * sizes[1]
+
+
+def test_numpy_reads_the_file(field: BackgroundField, tmp_path: Path) -> None:
+    save_background(field, tmp_path / "a.npz", "key")
+    with np.load(tmp_path / "a.npz") as archive:
+        assert np.array_equal(archive["capacitance"], field.capacitance)
+
+
+def test_every_damaged_byte_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    write_arrays(path, {"values": np.arange(5.0)}, {"kind": "test", "key": "k"})
+    good = path.read_bytes()
+    assert np.array_equal(read_arrays(path, kind="test", key="k")[0]["values"], np.arange(5.0))
+    for position in range(len(good)):
+        path.write_bytes(good[:position] + bytes([good[position] ^ 4]) + good[position + 1 :])
+        with pytest.raises(FieldError, match="damaged"):
+            read_arrays(path, kind="test", key="k")
+    for length in (0, 1, 31, 32, 33, len(good) // 2, len(good) - 1):
+        path.write_bytes(good[:length])
+        with pytest.raises(FieldError, match="damaged"):
+            read_arrays(path, kind="test", key="k")
+
+
+def test_files_of_others_are_refused(
+    field: BackgroundField, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.npz"
+    save_background(field, path, "one key")
+    with pytest.raises(FieldError, match="has key 'one key', expected 'another'"):
+        load_background(path, "another")
+    with pytest.raises(FieldError, match="has kind 'field', expected 'charges'"):
+        read_arrays(path, kind="charges", key="one key")
+    monkeypatch.setattr(store, "FORMAT", store.FORMAT + 1)
+    with pytest.raises(FieldError, match="has format"):
+        load_background(path, "one key")
+    np.savez(path, x=np.zeros(3))
+    with pytest.raises(FieldError, match="not a file of this version"):
+        load_background(path, "one key")
+    with pytest.raises(FileNotFoundError):
+        load_background(tmp_path / "none.npz", "one key")
+    with pytest.raises(FieldError, match="cannot be read"):
+        load_background(tmp_path, "one key")
+
+
+@pytest.mark.parametrize("name", ["potentials", "capacitance", "half_weights", "weights"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_is_never_stored(
+    field: BackgroundField, tmp_path: Path, name: str, value: float
+) -> None:
+    bad = arrays(field)[name].copy()
+    bad.flat[1] = value
+    if name == "weights":
+        wrong = replace(field, lattice=replace(field.lattice, weights=bad))
+    else:
+        wrong = replace(field, **{name: bad})
+    for compact in (False, True):
+        with pytest.raises(FieldError, match="not finite"):
+            save_background(wrong, tmp_path / "a.npz", compact=compact)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("stage", ["write", "rename"])
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "full"), KeyboardInterrupt()])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, error: BaseException
+) -> None:
+    path = tmp_path / "a.npz"
+    write_arrays(path, {"values": np.zeros(3)}, {"kind": "old"})
+
+    def half(self: Path, content: bytes) -> int:
+        with open(self, "wb") as stream:
+            stream.write(content[: len(content) // 2])
+        raise error
+
+    def refuse(*_: object) -> None:
+        raise error
+
+    if stage == "write":
+        monkeypatch.setattr(Path, "write_bytes", half)
+    else:
+        monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(type(error)):
+        write_arrays(path, {"values": np.ones(3)}, {"kind": "new"})
+    monkeypatch.undo()
+    assert os.listdir(tmp_path) == ["a.npz"]
+    assert not read_arrays(path, kind="old")[0]["values"].any()

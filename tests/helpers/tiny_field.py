@@ -1,0 +1,84 @@
+"""A design whose field is built in a fraction of a second, and a process that builds it.
+
+``python tiny_field.py CACHE LOG DELAY`` writes each stage to LOG as ``PID STAGE``, pausing DELAY
+seconds at every part of the field, and prints a digest of the field.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capsense.design import Design
+from capsense.design.loader import parse_design
+from capsense.field import background
+from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.cache import load_or_build
+from capsense.field.lattice import LatticeSettings
+
+SETTINGS = BuildSettings(LatticeSettings().refined(0.5), panel_scale=8.0)
+PART = 32
+"""Nodes of a part; so few that the tiny field has many parts."""
+
+
+def tiny_data(**changes: Any) -> dict[str, Any]:
+    """A square and a disc in a small box, as a design file holds them."""
+    return {
+        "name": "tiny",
+        "domain": {"size": [0.1, 0.1, 0.1], "backplane": 0.01},
+        "electrode": [
+            {"name": "A", "shape": "rectangle", "size": [0.02, 0.02], "center": [-0.015, 0.0]},
+            {"name": "B", "shape": "disc", "radius": 0.01, "center": [0.015, 0.0]},
+        ],
+        **changes,
+    }
+
+
+def tiny_design(**changes: Any) -> Design:
+    """The design of :func:`tiny_data`."""
+    return parse_design(tiny_data(**changes))
+
+
+def arrays(field: BackgroundField) -> dict[str, np.ndarray]:
+    """All arrays of a field."""
+    la = field.lattice
+    out = {
+        "x": la.axes[0], "y": la.axes[1], "z": la.axes[2],
+        "weights": la.weights, "eps_r": la.eps_r, "owner": la.owner, "kink": la.kink,
+        "half_weights": field.half_weights, "potentials": field.potentials,
+        "capacitance": field.capacitance,
+    }  # fmt: skip
+    return {**out, **{f"cut {k}": v for k, v in vars(la.cuts).items()}}
+
+
+def digest(field: BackgroundField) -> str:
+    """SHA-256 of all arrays, with their types and shapes."""
+    total = hashlib.sha256()
+    for name, array in arrays(field).items():
+        total.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
+    return total.hexdigest()
+
+
+def main() -> None:
+    """Build, and report."""
+    cache, log, delay = Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3])
+    background._PART, background._SAVE_EVERY = PART, 0.0
+
+    def progress(stage: str, fraction: float) -> None:
+        with log.open("a") as stream:
+            stream.write(f"{os.getpid()} {stage}\n")
+        if stage == "field at the nodes":
+            time.sleep(delay)
+
+    field = load_or_build(tiny_design(), SETTINGS, cache_dir=cache, progress=progress)
+    sys.stdout.write(f"{digest(field)}\n")
+
+
+if __name__ == "__main__":
+    main()
