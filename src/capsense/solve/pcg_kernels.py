@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-LANES = 8
+from capsense.solve.simd import LANES, load, madd, splat, store, vmadd
+
 _RELAX = np.float32(0.97)
 """Share of the dropped fill-in that is moved to the diagonal."""
 
@@ -65,93 +66,101 @@ def factorise(weight, diagonal, active, strides, inverse):
         inverse[a] = np.float32(1.0) / max(d, np.float32(0.02) * diagonal[a])
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
+def _flush(part, row, total):
+    """Add a row of single-precision partial sums to double-precision totals, and clear it."""
+    for k in range(LANES):
+        total[k] += part[row, k]
+        part[row, k] = 0.0
+
+
+@njit(cache=True)
 def precondition(weight, inverse, strides, lo, hi, r, z, rz):
-    """Solve the incomplete factors for z and accumulate r · z per lane."""
+    """Solve the incomplete factors for z and write r · z per lane. ``z`` off [lo, hi) is zero."""
     sx, sy = strides[0], strides[1]
     wx, wy, wz = weight[0], weight[1], weight[2]
+    zero = splat(np.float32(0.0))
+    last = zero
     for a in range(lo, hi):
-        g = inverse[a]
-        if g == 0.0:
-            for k in range(LANES):
-                z[a, k] = 0.0
-            continue
-        ux, uy, uz = wx[a - sx], wy[a - sy], wz[a - 1]
-        for k in range(LANES):
-            z[a, k] = g * (r[a, k] + ux * z[a - sx, k] + uy * z[a - sy, k] + uz * z[a - 1, k])
-    total = np.zeros(LANES, np.float64)
-    part = np.zeros(LANES, np.float32)
-    count = 0
-    for a in range(hi - 1, lo - 1, -1):
-        g = inverse[a]
-        if g == 0.0:
-            continue
-        ux, uy, uz = g * wx[a], g * wy[a], g * wz[a]
-        for k in range(LANES):
-            z[a, k] += ux * z[a + sx, k] + uy * z[a + sy, k] + uz * z[a + 1, k]
-            part[k] += r[a, k] * z[a, k]
-        count += 1
-        if count == 256:
-            count = 0
-            for k in range(LANES):
-                total[k] += part[k]
-                part[k] = 0.0
-    for k in range(LANES):
-        rz[k] = total[k] + part[k]
+        v = madd(wz[a - 1], last, load(r, a))
+        v = madd(wy[a - sy], load(z, a - sy), v)
+        v = madd(wx[a - sx], load(z, a - sx), v)
+        last = madd(inverse[a], v, zero)
+        store(z, a, last)
+    part = np.zeros((1, LANES), np.float32)
+    rz[:] = 0.0
+    last = zero
+    for start in range(hi, lo, -sy):
+        total = zero
+        for a in range(start - 1, start - sy - 1, -1):
+            v = madd(wz[a], last, zero)
+            v = madd(wy[a], load(z, a + sy), v)
+            v = madd(wx[a], load(z, a + sx), v)
+            last = madd(inverse[a], v, load(z, a))
+            store(z, a, last)
+            total = vmadd(last, load(r, a), total)
+        store(part, 0, total)
+        _flush(part, 0, rz)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap):
-    """Write the operator times p and accumulate p · A p per lane."""
+    """Write the operator times p, zero at nodes that are off, and p · A p per lane."""
     sx, sy = strides[0], strides[1]
     wx, wy, wz = weight[0], weight[1], weight[2]
-    total = np.zeros(LANES, np.float64)
-    part = np.zeros(LANES, np.float32)
-    count = 0
-    for a in range(lo, hi):
-        if active[a] == 0.0:
-            for k in range(LANES):
-                ap[a, k] = 0.0
-            continue
-        d = diagonal[a]
-        x0, x1 = wx[a - sx], wx[a]
-        y0, y1 = wy[a - sy], wy[a]
-        z0, z1 = wz[a - 1], wz[a]
-        for k in range(LANES):
-            v = (
-                d * p[a, k]
-                - x0 * p[a - sx, k]
-                - x1 * p[a + sx, k]
-                - y0 * p[a - sy, k]
-                - y1 * p[a + sy, k]
-                - z0 * p[a - 1, k]
-                - z1 * p[a + 1, k]
-            )
-            ap[a, k] = v
-            part[k] += p[a, k] * v
-        count += 1
-        if count == 256:
-            count = 0
-            for k in range(LANES):
-                total[k] += part[k]
-                part[k] = 0.0
-    for k in range(LANES):
-        pap[k] = total[k] + part[k]
+    zero = splat(np.float32(0.0))
+    part = np.zeros((1, LANES), np.float32)
+    pap[:] = 0.0
+    for start in range(lo, hi, sy):
+        total = zero
+        for a in range(start, start + sy):
+            on = active[a]
+            here = load(p, a)
+            v = madd(diagonal[a] * on, here, zero)
+            v = madd(-wx[a - sx] * on, load(p, a - sx), v)
+            v = madd(-wx[a] * on, load(p, a + sx), v)
+            v = madd(-wy[a - sy] * on, load(p, a - sy), v)
+            v = madd(-wy[a] * on, load(p, a + sy), v)
+            v = madd(-wz[a - 1] * on, load(p, a - 1), v)
+            v = madd(-wz[a] * on, load(p, a + 1), v)
+            store(ap, a, v)
+            total = vmadd(here, v, total)
+        store(part, 0, total)
+        _flush(part, 0, pap)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _direction(lo, hi, p, z, beta):
+    """p ← z + beta p, with beta of shape (1, 8)."""
+    b = load(beta, 0)
     for a in range(lo, hi):
-        for k in range(LANES):
-            p[a, k] = z[a, k] + beta[k] * p[a, k]
+        store(p, a, vmadd(b, load(p, a), load(z, a)))
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _advance(lo, hi, u, r, p, ap, alpha):
+    """u ← u + alpha p and r ← r − alpha A p, with alpha of shape (2, 8): alpha and −alpha."""
+    forward, back = load(alpha, 0), load(alpha, 1)
     for a in range(lo, hi):
-        for k in range(LANES):
-            u[a, k] += alpha[k] * p[a, k]
-            r[a, k] -= alpha[k] * ap[a, k]
+        store(u, a, vmadd(forward, load(p, a), load(u, a)))
+        store(r, a, vmadd(back, load(ap, a), load(r, a)))
+
+
+@njit(cache=True)
+def _residual(lo, hi, active, rhs, ap, r):
+    """r ← rhs − A u where nodes are on."""
+    for a in range(lo, hi):
+        on = active[a]
+        zero = splat(np.float32(0.0))
+        store(r, a, madd(-on, load(ap, a), madd(on, load(rhs, a), zero)))
+
+
+@njit(cache=True)
+def clear_held(active, u):
+    """Set the solution to zero at nodes that are off."""
+    for a in range(u.shape[0]):
+        if active[a] == 0.0:
+            store(u, a, splat(np.float32(0.0)))
 
 
 @njit(cache=True)
@@ -179,29 +188,23 @@ def solve(
     What is still missing is estimated from the last decrements and their ratio. ``tolerance`` and
     ``left`` (output) are per lane, in the units of the energy. Returns the iterations done.
     """
-    beta, alpha = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
+    beta, alpha = np.zeros((1, LANES), np.float32), np.zeros((2, LANES), np.float32)
     rz, pap, old = np.empty(LANES), np.empty(LANES), np.ones(LANES)
     previous = np.full(LANES, np.inf)
-    n = u.shape[0]
-    for a in range(n):
-        if active[a] == 0.0:
-            for k in range(LANES):
-                u[a, k] = 0.0
+    clear_held(active, u)
     apply_operator(weight, diagonal, active, strides, lo, hi, u, ap, pap)
-    for a in range(lo, hi):
-        for k in range(LANES):
-            r[a, k] = (rhs[a, k] - ap[a, k]) * active[a]
+    _residual(lo, hi, active, rhs, ap, r)
     iteration = 0
     while iteration < max_iterations:
         precondition(weight, inverse, strides, lo, hi, r, z, rz)
         for k in range(LANES):
-            beta[k] = 0.0 if iteration == 0 or old[k] <= 0.0 else rz[k] / old[k]
+            beta[0, k] = 0.0 if iteration == 0 or old[k] <= 0.0 else rz[k] / old[k]
         _direction(lo, hi, p, z, beta)
         apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap)
         done = True
         for k in range(LANES):
             step = rz[k] / pap[k] if pap[k] > 0.0 else 0.0
-            alpha[k] = step
+            alpha[0, k], alpha[1, k] = step, -step
             decrement = step * rz[k]
             if decrement <= 0.0:
                 left[k] = 0.0
@@ -221,7 +224,7 @@ def solve(
 
 
 @njit(cache=True)
-def load(
+def load_scene(
     phi,
     first_lane,
     floating_lane,
@@ -290,28 +293,33 @@ def gram(n, weight, left, right, out):
                 out[k, m] += v * right[i, m]
 
 
-@njit(cache=True, fastmath=True)
-def inner(lo, hi, active, left, right, out):
-    """Add leftᵀ right over the active nodes to ``out`` (8, 8)."""
+@njit(cache=True)
+def inner(lo, hi, strides, left, right, out):
+    """Add leftᵀ right over the nodes to ``out`` (8, 8)."""
+    zero = splat(np.float32(0.0))
     part = np.zeros((LANES, LANES), np.float32)
-    count = 0
-    for a in range(lo, hi):
-        if active[a] == 0.0:
-            continue
+    for start in range(lo, hi, strides[1]):
+        s0, s1, s2, s3, s4, s5, s6, s7 = zero, zero, zero, zero, zero, zero, zero, zero
+        for a in range(start, start + strides[1]):
+            v = load(right, a)
+            s0 = madd(left[a, 0], v, s0)
+            s1 = madd(left[a, 1], v, s1)
+            s2 = madd(left[a, 2], v, s2)
+            s3 = madd(left[a, 3], v, s3)
+            s4 = madd(left[a, 4], v, s4)
+            s5 = madd(left[a, 5], v, s5)
+            s6 = madd(left[a, 6], v, s6)
+            s7 = madd(left[a, 7], v, s7)
+        store(part, 0, s0)
+        store(part, 1, s1)
+        store(part, 2, s2)
+        store(part, 3, s3)
+        store(part, 4, s4)
+        store(part, 5, s5)
+        store(part, 6, s6)
+        store(part, 7, s7)
         for k in range(LANES):
-            v = left[a, k]
-            for m in range(LANES):
-                part[k, m] += v * right[a, m]
-        count += 1
-        if count == 256:
-            count = 0
-            for k in range(LANES):
-                for m in range(LANES):
-                    out[k, m] += part[k, m]
-                    part[k, m] = 0.0
-    for k in range(LANES):
-        for m in range(LANES):
-            out[k, m] += part[k, m]
+            _flush(part, k, out[k])
 
 
 @njit(cache=True)

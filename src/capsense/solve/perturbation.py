@@ -224,7 +224,7 @@ class PerturbationSolver:
             block.value = np.empty((max(1, n_tie), LANES))
             block.drop = np.empty((max(1, n_energy), LANES))
             local = np.where((lanes >= block.first) & (lanes < block.first + LANES), lanes, -1)
-            pcg.load(
+            pcg.load_scene(
                 block.phi, block.first, np.where(local >= 0, local - block.first, -1), block.held,
                 n_tie, b.tie_node, b.tie_weight, b.tie_conductor, b.tie_point, b.tie_coef,
                 b.tie_end, b.tie_end_coef, n_energy, b.energy_link, b.energy_weight,
@@ -257,7 +257,7 @@ class PerturbationSolver:
                     n_tie, b.tie_node, n_energy, b.energy_link, b.energy_kind, self._stamp,
                     self._mark, self._active, first.rhs, second.u, part,
                 )  # fmt: skip
-                pcg.inner(self._lo, self._hi, self._active, first.u, second.r, part)
+                pcg.inner(self._lo, self._hi, self._strides, first.u, second.r, part)
                 if i == j:
                     part = 0.5 * (part + part.T)
                 _place(energy, i, j, -part)
