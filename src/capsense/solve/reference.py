@@ -1,0 +1,362 @@
+"""The slow, readable twin of the online solver: the same discrete problem, solved directly.
+
+Nothing here is compiled and nothing is carried from one scene to the next. Bodies are met through
+their shapes' ``line_intervals``, the matrix is factorised, and everything is in double precision.
+The kernels are tested against it.
+
+**Links.** A lattice link of weight w runs from a node to the next along an axis; where a sheet of
+the design cuts it, two half-links run from the nodes to the sheet. Between its ends a scene lays
+stretches of dielectric and of conductor. A stretch of length ℓ of the link's total L adds the
+resistance ℓ / (L κ), κ being its permittivity over that of the empty domain; so the empty link has
+resistance 1.
+
+- No conductor: the link's weight becomes w / Σ resistance. The change δ = w′ − w drives both ends,
+  ``−δ (φ⁰_a − φ⁰_b)`` at a, and adds ``δ Δφ⁰_i Δφ⁰_j`` to the energy.
+- A conductor: the link is taken away. From each end a *tie* of weight w / r leads to the first
+  conductor met, r being the resistance up to it. A node inside the conductor has none. The tie's
+  far end is at −φ⁰ of that point (u = φ − φ⁰ and φ = 0 there). The rest of the link's empty-domain
+  energy, weight w (1 − r_a − r_b), is added. Conductors that face each other on one link are joined
+  by a coupling.
+
+**Energy.** With K the matrix of links and ties, f_i the loads and v the ties' values,
+
+    ΔC_ij = Σ_ties (w/r) v_i v_j + Σ_links δ Δφ⁰_i Δφ⁰_j − f_i · K⁻¹ f_j
+
+over electrodes and floating conductors alike; a floating conductor is one more right-hand side, of
+tie value −1. Floating conductors are then eliminated with what ties them to ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from capsense.field.background import BackgroundField
+from capsense.field.lattice import FREE
+from capsense.scene import Body, Scene
+from capsense.solve.perturbation import CONTACT
+from capsense.solve.trace_kernels import _LEAST, _SNAP
+
+Array = NDArray[np.float64]
+
+
+def reference_delta(background: BackgroundField, scene: Scene, frequency: float = 250e3) -> Array:
+    """Change of the Maxwell matrix of all terminals by a scene [F], shape (terminals, terminals).
+
+    Takes seconds at the default resolution; meant for coarse lattices and single scenes.
+    """
+    problem = _Problem(background, scene, frequency)
+    for axis in range(3):
+        for nodes, stretches in problem.lines(axis):
+            problem.lay(axis, nodes, stretches)
+    return problem.solve()
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """Where a lattice line runs inside a body: coordinates [m] along the line."""
+
+    start: float
+    end: float
+    body: int
+
+
+@dataclass(frozen=True)
+class _Link:
+    """A link or half-link; an end is a node, or at a terminal's sheet (or a grounded one)."""
+
+    weight: float
+    starts: float
+    """Coordinate [m] of end a."""
+    ends: float
+    """Coordinate [m] of end b."""
+    nodes: tuple[int, int]
+    """Flat indices of ends a and b; −1 on a sheet that cuts the link."""
+    held: tuple[int, int]
+    """Terminals of the ends on a sheet; negative otherwise."""
+
+
+@dataclass
+class _Problem:
+    background: BackgroundField
+    scene: Scene
+    frequency: float
+    rows: list[int] = field(default_factory=list)
+    cols: list[int] = field(default_factory=list)
+    entries: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        bg, la = self.background, self.background.lattice
+        self.conductors = [
+            b for b, body in enumerate(self.scene) if body.material.is_conductor(self.frequency)
+        ]
+        self.n_terminals = len(bg.terminals)
+        self.n_lanes = self.n_terminals + len(self.conductors)
+        self.load = np.zeros((la.n_nodes, self.n_lanes))
+        self.energy = np.zeros((self.n_lanes, self.n_lanes))
+        self.same = {b: b for b in self.conductors}
+        self.cut_of = {
+            (int(a), int(n)): k
+            for k, (a, n) in enumerate(zip(la.cuts.axis, la.cuts.node, strict=True))
+        }
+
+    # -- geometry ---------------------------------------------------------------------------
+
+    def lines(self, axis: int) -> Iterator[tuple[NDArray[np.int64], list[_Stretch]]]:
+        """All lattice lines along an axis off the walls: their nodes, and bodies on them."""
+        la = self.background.lattice
+        p, q = [a for a in range(3) if a != axis]
+        grid = np.arange(la.n_nodes).reshape(la.shape)
+        inner = [slice(1, -1)] * 3
+        inner[axis] = slice(None)
+        nodes = np.moveaxis(grid[tuple(inner)], axis, -1).reshape(-1, la.shape[axis])
+        origins = la.points[nodes[:, 0]]
+        origins[:, axis] = 0.0
+        direction = np.eye(3)[axis]
+        found = [_intervals(body, origins, direction) for body in self.scene]
+        for i in range(len(nodes)):
+            raw = [
+                _Stretch(a, b, body)
+                for body, intervals in enumerate(found)
+                for a, b in intervals[i]
+                if b > a
+            ]
+            yield nodes[i], self._disjoint(raw)
+
+    def _disjoint(self, raw: list[_Stretch]) -> list[_Stretch]:
+        """Conductors win over dielectrics, later dielectrics over earlier ones."""
+        stops = sorted({x for s in raw for x in (s.start, s.end)})
+        out: list[_Stretch] = []
+        for a, b in zip(stops[:-1], stops[1:], strict=True):
+            here = [s.body for s in raw if s.start <= (a + b) / 2 <= s.end]
+            metal = [body for body in here if body in self.same]
+            if b - a <= 1e-12 or not here:
+                continue
+            for other in metal[1:]:
+                self._join(metal[0], other)
+            best = metal[0] if metal else max(here)
+            touching = bool(out) and a - out[-1].end <= 1e-12
+            if touching and out[-1].body == best:
+                out[-1] = _Stretch(out[-1].start, b, best)
+                continue
+            if touching and out[-1].body in self.same and best in self.same:
+                self._join(out[-1].body, best)
+            out.append(_Stretch(a, b, best))
+        return out
+
+    def _join(self, a: int, b: int) -> None:
+        """Bodies that touch are one conductor."""
+        old, new = self.same[b], self.same[a]
+        self.same = {k: new if v == old else v for k, v in self.same.items()}
+
+    def links(self, axis: int, nodes: NDArray[np.int64]) -> Iterator[_Link]:
+        """The links and half-links of a line."""
+        bg, la = self.background, self.background.lattice
+        c = la.axes[axis]
+        for m in range(len(c) - 1):
+            a, b = int(nodes[m]), int(nodes[m + 1])
+            if la.owner[a] != FREE and la.owner[a] == la.owner[b]:
+                continue  # both ends on one sheet: no field between them
+            k = self.cut_of.get((axis, a))
+            if k is None:
+                yield _Link(float(la.weights[axis, a]), c[m], c[m + 1], (a, b), (-3, -3))
+                continue
+            low = c[m] + la.cuts.lower[k] * (c[m + 1] - c[m])
+            high = c[m + 1] - la.cuts.upper[k] * (c[m + 1] - c[m])
+            half = bg.half_weights[k]
+            yield _Link(half[0], c[m], low, (a, -1), (-3, int(la.cuts.lower_owner[k])))
+            yield _Link(half[1], high, c[m + 1], (-1, b), (int(la.cuts.upper_owner[k]), -3))
+
+    # -- assembly ---------------------------------------------------------------------------
+
+    def lay(self, axis: int, nodes: NDArray[np.int64], stretches: list[_Stretch]) -> None:
+        """Add a line's links, changed by what lies on it."""
+        for link in self.links(axis, nodes):
+            on = [s for s in stretches if s.end > link.starts and s.start < link.ends]
+            on = [s for s in on if min(s.end, link.ends) > max(s.start, link.starts)]
+            if any(s.body in self.same for s in on):
+                self._lay_conductor(axis, nodes, link, on)
+                continue
+            resistance = self._resistance(axis, nodes, link, on, link.starts, link.ends)
+            weight = link.weight
+            if abs(resistance - 1.0) > 1e-9:
+                weight = link.weight / resistance
+                drop = self._end_value(link, 0) - self._end_value(link, 1)
+                change = weight - link.weight
+                self.energy += change * np.outer(drop, drop)
+                for node, sign in zip(link.nodes, (-1.0, 1.0), strict=True):
+                    if node >= 0:
+                        self.load[node] += sign * change * drop
+            self._add(link.nodes, weight)
+
+    def _lay_conductor(
+        self, axis: int, nodes: NDArray[np.int64], link: _Link, on: list[_Stretch]
+    ) -> None:
+        la, length = self.background.lattice, link.ends - link.starts
+        metal = [s for s in on if s.body in self.same]
+        rest = link.weight
+        near = metal[0].start, metal[-1].end
+        for side, (stretch, surface) in enumerate(zip((metal[0], metal[-1]), near, strict=True)):
+            node = link.nodes[side]
+            free = node >= 0 and la.owner[node] == FREE
+            if side == 0:
+                surface = max(surface, link.starts)
+                r = self._resistance(axis, nodes, link, on, link.starts, surface)
+                deep = stretch.start < link.starts - _SNAP * length
+            else:
+                surface = min(surface, link.ends)
+                r = self._resistance(axis, nodes, link, on, surface, link.ends)
+                deep = stretch.end > link.ends + _SNAP * length
+            if r <= 0.0 and deep and free:
+                continue  # the node lies inside the conductor
+            r = max(r, _LEAST if free else min(CONTACT / length, 1.0))
+            value = self._background_at(axis, nodes, link, side, surface, r)
+            value[self.n_terminals + self.conductors.index(stretch.body)] = -1.0
+            weight = link.weight / r
+            rest -= link.weight * r
+            self.energy += weight * np.outer(value, value)
+            if free:
+                self.load[node] -= weight * value
+                self._add((node, -1), weight)
+        drop = self._end_value(link, 0) - self._end_value(link, 1)
+        self.energy += rest * np.outer(drop, drop)
+        for a, b in zip(metal[:-1], metal[1:], strict=True):
+            gap = self._resistance(axis, nodes, link, on, a.end, b.start)
+            if a.body != b.body and gap > 0.0:
+                pair = np.zeros(self.n_lanes)
+                pair[self.n_terminals + self.conductors.index(a.body)] = 1.0
+                pair[self.n_terminals + self.conductors.index(b.body)] = -1.0
+                self.energy += link.weight / max(gap, _LEAST) * np.outer(pair, pair)
+
+    def _resistance(
+        self,
+        axis: int,
+        nodes: NDArray[np.int64],
+        link: _Link,
+        on: list[_Stretch],
+        a: float,
+        b: float,
+    ) -> float:
+        """Resistance of a link between two of its points, with no conductor in between."""
+        la = self.background.lattice
+        first = link.nodes[0] if link.nodes[0] >= 0 else link.nodes[1] - la.strides[axis]
+        empty = la.eps_r[axis, first]
+        total = max(0.0, b - a)
+        for s in on:
+            part = min(s.end, b) - max(s.start, a)
+            if part > 0.0 and s.body not in self.same:
+                total += part * (empty / self.scene[s.body].material.eps_r - 1.0)
+        return total / (link.ends - link.starts)
+
+    def _end_value(self, link: _Link, side: int) -> Array:
+        """Background potential of a link's end, per lane."""
+        out = np.zeros(self.n_lanes)
+        if link.nodes[side] >= 0:
+            out[: self.n_terminals] = self.background.potentials[link.nodes[side]]
+        elif link.held[side] >= 0:
+            out[link.held[side]] = 1.0
+        return out
+
+    def _background_at(
+        self,
+        axis: int,
+        nodes: NDArray[np.int64],
+        link: _Link,
+        side: int,
+        surface: float,
+        resistance: float,
+    ) -> Array:
+        """Background potential at a conductor's surface, per lane.
+
+        Lagrange's polynomial through the link's ends and, where the potential is smooth across an
+        end, the node beyond it. Where the resistance is not the plain distance (a dielectric in
+        front, or a film), the point is moved along the link by the difference.
+        """
+        la = self.background.lattice
+        value_a, value_b = self._end_value(link, 0), self._end_value(link, 1)
+        length = link.ends - link.starts
+        distance = (surface - link.starts if side == 0 else link.ends - surface) / length
+        shift = (distance - resistance) * (value_a - value_b) * (1.0 if side == 0 else -1.0)
+        if min(link.nodes) < 0:
+            t = (surface - link.starts) / length
+            return (1.0 - t) * value_a + t * value_b + shift
+        c = la.axes[axis]
+        m = int(np.flatnonzero(nodes == link.nodes[0])[0])
+        points = {m: value_a, m + 1: value_b}
+        for end, beyond in ((m, m - 1), (m + 1, m + 2)):
+            if 0 <= beyond < len(c) and not la.kink[nodes[end]]:
+                points[beyond] = np.zeros(self.n_lanes)
+                points[beyond][: self.n_terminals] = self.background.potentials[nodes[beyond]]
+        out = shift
+        for i, value in points.items():
+            out = out + value * np.prod(
+                [(surface - c[j]) / (c[i] - c[j]) for j in points if j != i]
+            )
+        return out
+
+    def _add(self, ends: tuple[int, int], weight: float) -> None:
+        for a, b in (ends, ends[::-1]):
+            if a >= 0:
+                self.rows.append(a)
+                self.cols.append(a)
+                self.entries.append(weight)
+                if b >= 0:
+                    self.rows.append(a)
+                    self.cols.append(b)
+                    self.entries.append(-weight)
+
+    # -- solution ---------------------------------------------------------------------------
+
+    def solve(self) -> Array:
+        """Solve, merge the lanes of joined conductors, eliminate the floating ones."""
+        la = self.background.lattice
+        shape = (la.n_nodes, la.n_nodes)
+        matrix = sp.coo_matrix((self.entries, (self.rows, self.cols)), shape=shape).tocsr()
+        free = np.flatnonzero((la.owner == FREE) & (matrix.diagonal() > 0.0))
+        merge = self._merged_lanes()
+        load, energy = self.load[free] @ merge, merge.T @ self.energy @ merge
+        u = spla.spsolve(matrix[free][:, free].tocsc(), load)
+        energy = energy - load.T @ u.reshape(load.shape)
+        n = self.n_terminals
+        grounds = np.diag(self._grounds())
+        inner, outer = energy[n:, n:] + grounds, energy[:n, n:]
+        delta = energy[:n, :n]
+        if len(grounds):
+            delta = delta - outer @ np.linalg.solve(inner, outer.T)
+        return 0.5 * (delta + delta.T)
+
+    def _groups(self) -> list[list[int]]:
+        """Joined conductors with no member at ground."""
+        roots = sorted(set(self.same.values()))
+        groups = [[b for b, root in self.same.items() if root == r] for r in roots]
+        return [g for g in groups if all(self.scene[b].grounding != "grounded" for b in g)]
+
+    def _merged_lanes(self) -> Array:
+        """Terminals unchanged, one lane a group of floating conductors, shape (lanes, new)."""
+        groups, n = self._groups(), self.n_terminals
+        out = np.zeros((self.n_lanes, n + len(groups)))
+        out[:n, :n] = np.eye(n)
+        for k, group in enumerate(groups):
+            out[[n + self.conductors.index(b) for b in group], n + k] = 1.0
+        return out
+
+    def _grounds(self) -> list[float]:
+        """What ties each group to ground [F]."""
+        return [sum(_farads(self.scene[b]) for b in group) for group in self._groups()]
+
+
+def _farads(body: Body) -> float:
+    return 0.0 if isinstance(body.grounding, str) else float(body.grounding)
+
+
+def _intervals(body: Body, origins: Array, direction: Array) -> list[list[tuple[float, float]]]:
+    """Stretches of lines inside a body, coordinates [m] along the lines."""
+    back = body.pose.rotation.T
+    local = (origins - np.asarray(body.pose.position)) @ back.T
+    found = body.shape.line_intervals(local, back @ direction).reshape(len(origins), -1, 2)
+    return [[(a, b) for a, b in rows if b > a] for rows in found]
