@@ -20,6 +20,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -135,12 +136,12 @@ def _graded(t: Array, size: Array, stops: tuple[float, ...]) -> Array:
     rate = 1.0 / size
     count = np.concatenate([[0.0], np.cumsum(np.diff(t) * (rate[1:] + rate[:-1]) / 2)])
     out = [t[0]]
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         if b - a < 1e-12:
             continue
         ca, cb = np.interp([a, b], t, count)
         n = max(2, math.ceil(cb - ca))
-        out += list(np.interp(ca + (cb - ca) * np.arange(1, n) / n, count, t)) + [b]
+        out += [*np.interp(ca + (cb - ca) * np.arange(1, n) / n, count, t), b]
     return np.array(out)
 
 
@@ -262,8 +263,8 @@ def write(design: Design) -> None:
             "error": np.round(error * 1e12, 8).tolist(),
         }
     text = {
-        "about": "Change of the Maxwell matrix by a grounded limb-like capsule over six_patch_bare; "
-        "written by benchmarks/references.py",
+        "about": "Change of the Maxwell matrix by a grounded limb-like capsule over "
+        "six_patch_bare; written by benchmarks/references.py",
         "method": __doc__.split("\n\n", 2)[2].strip(),
         "units": "delta and error (estimated) in pF, lengths in m; cases by gap in mm",
         "radius": RADIUS,

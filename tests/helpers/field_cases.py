@@ -74,7 +74,7 @@ def capsule(gap: float, **options: Any) -> cs.Body:
     """The limb-like capsule with its lowest point ``gap`` [m] above the electrode plane."""
     data = capsule_figures()
     axis = np.array(data["axis"])
-    center = np.array(data["center_at_gap_zero"]) + (0.0, 0.0, gap)
+    center = np.array(data["center_at_gap_zero"]) + np.array([0.0, 0.0, gap])
     side = np.cross((0.0, 0.0, 1.0), axis)
     side /= np.linalg.norm(side)
     rotation = np.stack([side, np.cross(axis, side), axis], axis=1)

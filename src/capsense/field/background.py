@@ -102,7 +102,7 @@ def build_background(
     """
     settings = settings or BuildSettings()
     kept = NoCheckpoint() if checkpoint is None else checkpoint
-    tell = _rising(progress)
+    tell = (lambda stage, fraction: None) if progress is None else progress
     tell("lattice", 0.0)
     lattice = build_lattice(design, settings.lattice)
     charges = _solve_charges(design, settings, kept, tell)
@@ -200,16 +200,3 @@ def _node_potentials(
 def _require_finite(design: Design, *arrays: Array) -> None:
     if not all(np.isfinite(a).all() for a in arrays):
         raise FieldError(f"the background field of design {design.name!r} is not finite")
-
-
-def _rising(progress: Progress | None) -> Progress:
-    """Pass progress on, if anybody wants it, with fractions from 0 to 1 that never fall."""
-    highest = 0.0
-
-    def tell(stage: str, fraction: float) -> None:
-        nonlocal highest
-        highest = max(highest, min(fraction, 1.0))
-        if progress is not None:
-            progress(stage, highest)
-
-    return tell

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -110,7 +111,6 @@ class _Problem:
     def lines(self, axis: int) -> Iterator[tuple[NDArray[np.int64], list[_Stretch]]]:
         """All lattice lines along an axis off the walls: their nodes, and bodies on them."""
         la = self.background.lattice
-        p, q = [a for a in range(3) if a != axis]
         grid = np.arange(la.n_nodes).reshape(la.shape)
         inner = [slice(1, -1)] * 3
         inner[axis] = slice(None)
@@ -132,7 +132,7 @@ class _Problem:
         """Conductors win over dielectrics, later dielectrics over earlier ones."""
         stops = sorted({x for s in raw for x in (s.start, s.end)})
         out: list[_Stretch] = []
-        for a, b in zip(stops[:-1], stops[1:], strict=True):
+        for a, b in pairwise(stops):
             here = [s.body for s in raw if s.start <= (a + b) / 2 <= s.end]
             metal = [body for body in here if body in self.same]
             if b - a <= 1e-12 or not here:
@@ -225,7 +225,7 @@ class _Problem:
                 self._add((node, -1), weight)
         drop = self._end_value(link, 0) - self._end_value(link, 1)
         self.energy += rest * np.outer(drop, drop)
-        for a, b in zip(metal[:-1], metal[1:], strict=True):
+        for a, b in pairwise(metal):
             gap = self._resistance(axis, nodes, link, on, a.end, b.start)
             if a.body != b.body and gap > 0.0:
                 pair = np.zeros(self.n_lanes)
