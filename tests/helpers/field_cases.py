@@ -95,6 +95,12 @@ def body_of(case: str) -> cs.Body:
     return ball(grounding=rest[0])
 
 
+def rectangle(center: ArrayLike, size: ArrayLike) -> shapely.Polygon:
+    """A rectangle [m] centred at (x, y)."""
+    (x, y), (w, h) = np.asarray(center), np.asarray(size)
+    return shapely.box(x - w / 2, y - h / 2, x + w / 2, y + h / 2)
+
+
 def sheet(polygon: shapely.Polygon, z: float = 0.0) -> Surface:
     """A flat sheet at height z [m] whose outlines are its rims."""
     polygon = shapely.geometry.polygon.orient(polygon)

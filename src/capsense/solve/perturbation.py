@@ -275,8 +275,9 @@ def _reduce(energy: Array, n: int, grounds: Array) -> Array:
     """Eliminate floating conductors, each tied to ground through ``grounds`` [F]."""
     if not len(grounds):
         return energy
-    inner = energy[n:, n:] + np.diag(grounds)
-    outer = energy[:n, n:]
+    seen = n + np.flatnonzero(np.diag(energy)[n:] > 0)  # the others meet no lattice line
+    inner = energy[np.ix_(seen, seen)] + np.diag(grounds[seen - n])
+    outer = energy[:n, seen]
     return energy[:n, :n] - outer @ np.linalg.solve(inner, outer.T)
 
 
