@@ -81,6 +81,8 @@ class PerturbationSolver:
         self._extra = np.empty(n, np.float32)
         self._diagonal, self._active = np.empty(n, np.float32), np.zeros(n, np.float32)
         self._inverse = np.zeros(n, np.float32)
+        self._inside, self._n_inside = np.full(n, -1, np.int64), 0
+        self._inside_nodes = np.empty(n, np.int64)
         self._stamp, self._mark = np.zeros(n, np.int64), 0
         self._links = _Buffers(max(4096, n // 4))
         self._blocks: list[_Block] = []
@@ -156,13 +158,20 @@ class PerturbationSolver:
             self._extra[:] = self._base_extra
             conductors.parent[:] = np.arange(len(conductors.parent))
             b = self._links
+            self._inside[self._inside_nodes[: self._n_inside]] = -1
+            self._n_inside = tracing.mark_inside(
+                *la.axes, la.owner, packed.kinds, packed.params, packed.rotation,
+                packed.position, packed.bounds, conductors.index, len(packed), grids, shapes,
+                firsts, origins, inverses, self._inside, self._inside_nodes,
+            )  # fmt: skip
             status = tracing.trace(
                 *la.axes, self._strides, self._base_weight, self._base_extra, la.eps_r, la.owner,
                 la.kink, self._cut_index, la.cuts.lower, la.cuts.lower_owner, la.cuts.upper,
                 la.cuts.upper_owner, self.background.half_weights / _UNIT,
                 packed.kinds, packed.params, packed.rotation, packed.position, packed.bounds,
                 conductors.index, conductors.eps_r, len(packed), grids, shapes, firsts, origins,
-                inverses, CONTACT, self._weight, self._extra, b.tie_node, b.tie_weight,
+                inverses, CONTACT, self._inside, self._inside_nodes, self._n_inside,
+                self._weight, self._extra, b.tie_node, b.tie_weight,
                 b.tie_conductor, b.tie_point, b.tie_coef, b.tie_end, b.tie_end_coef,
                 b.energy_link, b.energy_weight, b.energy_kind, b.energy_end, b.couple,
                 b.couple_weight, conductors.parent, b.counts,

@@ -23,82 +23,184 @@ MAX_STRETCHES = 64
 _MESH_STRETCHES = 4
 _SNAP = 1e-6
 """Fraction of a link within which a surface counts as lying on a node."""
+_RAMP = 4.0
+"""Steepness with which a body's share of a line's column turns into its weight.
+
+At 1 the weight is the covered share itself, at infinity a line is met all or nothing. Smooth
+motion asks for a small value; measured errors are smallest from 4 on (see docs/theory.md).
+"""
+_WHOLE = 0.999
+"""Weight above which a body is taken to fill the column."""
 _LEAST = 1e-3
 """Smallest fraction of a link between a free node and a conductor."""
 
 
 @njit(cache=True)
-def _body_stretches(
-    axis,
-    p,
-    q,
-    op,
-    oq,
-    kinds,
-    params,
-    rotation,
-    position,
-    bounds,
-    bodies,
-    n_bodies,
-    grids,
-    grid_shape,
-    grid_first,
-    grid_origin,
-    grid_inv,
-    t0,
-    t1,
-    who,
-    scratch,
-):
-    """Collect the stretches of one lattice line inside bodies; return their number or −1."""
+def _pierce(axis, p, q, op, oq, body, kinds, params, rotation, position, grids, grid_shape,
+            grid_first, grid_origin, grid_inv, out):  # fmt: skip
+    """Stretches of a line along ``axis`` inside one body, at (op, oq) across; return how many."""
+    ox, oy, oz, dx, dy, dz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if axis == 0:
+        oy, oz, dx = op, oq, 1.0
+    elif axis == 1:
+        ox, oz, dy = op, oq, 1.0
+    else:
+        ox, oy, dz = op, oq, 1.0
+    if kinds[body] == _MESH:
+        r, c = rotation[body], position[body]
+        ax, ay, az = ox - c[0], oy - c[1], oz - c[2]
+        s = grid_shape[body]
+        first = grid_first[body]
+        values = grids[first : first + s[0] * s[1] * s[2]].reshape((s[0], s[1], s[2]))
+        return mesh_line_intervals(
+            values, grid_origin[body], grid_inv[body],
+            r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az,
+            r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az,
+            r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az,
+            r[axis, 0], r[axis, 1], r[axis, 2], out,
+        )  # fmt: skip
+    out[0, 0], out[0, 1] = body_line_interval(
+        kinds[body], params[body], rotation[body], position[body], ox, oy, oz, dx, dy, dz
+    )
+    return 1 if out[0, 1] > out[0, 0] else 0
+
+
+@njit(cache=True)
+def _chord(axis, at_p, at_q, through, low, high, body, kinds, params, rotation, position, grids,
+           grid_shape, grid_first, grid_origin, grid_inv, out):  # fmt: skip
+    """Part of [low, high] that a body covers around ``through`` on a line along ``axis``."""
+    p = 1 if axis == 0 else 0
+    q = 1 if axis == 2 else 2
+    n = _pierce(axis, p, q, at_p, at_q, body, kinds, params, rotation, position, grids,
+                grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+    for k in range(n):
+        if out[k, 0] - 1e-12 <= through and through <= out[k, 1] + 1e-12:
+            return max(low, out[k, 0]), min(high, out[k, 1])
+    return through, through
+
+
+@njit(cache=True)
+def _across(axis, along, t, u, v, low, high, body, kinds, params, rotation, position, grids,
+            grid_shape, grid_first, grid_origin, grid_inv, out):  # fmt: skip
+    """Chord along ``along`` through the point (t on ``axis``, u on ``along``, v on the third)."""
+    third = 3 - axis - along
+    if axis < third:
+        return _chord(along, t, v, u, low, high, body, kinds, params, rotation, position, grids,
+                      grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+    return _chord(along, v, t, u, low, high, body, kinds, params, rotation, position, grids,
+                  grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+
+
+@njit(cache=True)
+def _covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, kinds, params, rotation, position,
+                       bounds, conductor, bodies, n_bodies, grids, grid_shape, grid_first,
+                       grid_origin, grid_inv, t0, t1, who, cover, out):  # fmt: skip
+    """Stretches of a lattice line's column inside bodies, and the weight of each.
+
+    The column of a line reaches half-way to its neighbours, [pl, ph] x [ql, qh]. A conductor's
+    stretch is taken at the middle of what it covers of the column, and weighted by the share it
+    covers, so that an edge that moves across a line makes it enter gradually. Dielectrics are met
+    on the line itself. Returns the number of stretches, or −1 if they do not fit.
+    """
     n = 0
     for m in range(n_bodies):
         body = bodies[m]
         if (
-            op < bounds[body, 0, p]
-            or op > bounds[body, 1, p]
-            or oq < bounds[body, 0, q]
-            or oq > bounds[body, 1, q]
-        ):
+            ph < bounds[body, 0, p] or pl > bounds[body, 1, p]
+            or qh < bounds[body, 0, q] or ql > bounds[body, 1, q]
+        ):  # fmt: skip
             continue
-        ox, oy, oz, dx, dy, dz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        if axis == 0:
-            oy, oz, dx = op, oq, 1.0
-        elif axis == 1:
-            ox, oz, dy = op, oq, 1.0
-        else:
-            ox, oy, dz = op, oq, 1.0
-        if kinds[body] == _MESH:
-            r, c = rotation[body], position[body]
-            ax, ay, az = ox - c[0], oy - c[1], oz - c[2]
-            s = grid_shape[body]
-            first = grid_first[body]
-            values = grids[first : first + s[0] * s[1] * s[2]].reshape((s[0], s[1], s[2]))
-            count = mesh_line_intervals(
-                values,
-                grid_origin[body],
-                grid_inv[body],
-                r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az,
-                r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az,
-                r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az,
-                r[axis, 0],
-                r[axis, 1],
-                r[axis, 2],
-                scratch,
-            )
-        else:
-            scratch[0, 0], scratch[0, 1] = body_line_interval(
-                kinds[body], params[body], rotation[body], position[body], ox, oy, oz, dx, dy, dz
-            )
-            count = 1
-        for k in range(count):
-            if scratch[k, 1] > scratch[k, 0]:
+        sp, sq = op, oq
+        count = _pierce(axis, p, q, sp, sq, body, kinds, params, rotation, position, grids,
+                        grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+        if conductor[body] < 0:
+            for k in range(count):
                 if n == MAX_STRETCHES:
                     return -1
-                t0[n], t1[n], who[n] = scratch[k, 0], scratch[k, 1], body
+                t0[n], t1[n], who[n], cover[n] = out[k, 0], out[k, 1], body, 1.0
+                n += 1
+            continue
+        trial = 0
+        while count == 0 and trial < 8:
+            # no hit in the middle: look at the column's edges and corners
+            sp = pl if trial in (0, 4, 5) else (ph if trial in (1, 6, 7) else op)
+            sq = ql if trial in (2, 4, 6) else (qh if trial in (3, 5, 7) else oq)
+            trial += 1
+            count = _pierce(axis, p, q, sp, sq, body, kinds, params, rotation, position, grids,
+                            grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+        if count == 0:
+            continue
+        middle = 0.5 * (out[0, 0] + out[0, 1])
+        for k in range(1, count):
+            if out[k, 1] - out[k, 0] > 2.0 * abs(out[0, 1] - middle):
+                middle = 0.5 * (out[k, 0] + out[k, 1])
+        if trial in (3, 4):
+            ca, cb = _across(axis, q, middle, sq, sp, ql, qh, body, kinds, params, rotation,
+                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
+                             out)  # fmt: skip
+            sq = 0.5 * (ca + cb)
+            share = (cb - ca) / (qh - ql)
+            ca, cb = _across(axis, p, middle, sp, sq, pl, ph, body, kinds, params, rotation,
+                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
+                             out)  # fmt: skip
+            sp = 0.5 * (ca + cb)
+            share *= (cb - ca) / (ph - pl)
+        else:
+            ca, cb = _across(axis, p, middle, sp, sq, pl, ph, body, kinds, params, rotation,
+                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
+                             out)  # fmt: skip
+            sp = 0.5 * (ca + cb)
+            share = (cb - ca) / (ph - pl)
+            ca, cb = _across(axis, q, middle, sq, sp, ql, qh, body, kinds, params, rotation,
+                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
+                             out)  # fmt: skip
+            sq = 0.5 * (ca + cb)
+            share *= (cb - ca) / (qh - ql)
+        share = 0.5 + _RAMP * (share - 0.5)
+        if share > _WHOLE:
+            share, sp, sq = 1.0, op, oq
+        elif share <= 0.0:
+            continue
+        count = _pierce(axis, p, q, sp, sq, body, kinds, params, rotation, position, grids,
+                        grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+        for k in range(count):
+            if out[k, 1] > out[k, 0]:
+                if n == MAX_STRETCHES:
+                    return -1
+                t0[n], t1[n], who[n], cover[n] = out[k, 0], out[k, 1], body, share
                 n += 1
     return n
+
+
+@njit(cache=True)
+def mark_inside(x, y, z, owner, kinds, params, rotation, position, bounds, conductor, n_bodies,
+                grids, grid_shape, grid_first, grid_origin, grid_inv, inside, nodes):  # fmt: skip
+    """Mark free nodes inside conductors with the conductor's index; return how many there are."""
+    ny, nz = y.shape[0], z.shape[0]
+    out = np.empty((_MESH_STRETCHES, 2))
+    found = 0
+    for body in range(n_bodies):
+        if conductor[body] < 0:
+            continue
+        for i in range(1, x.shape[0] - 1):
+            if x[i] < bounds[body, 0, 0] or x[i] > bounds[body, 1, 0]:
+                continue
+            for j in range(1, ny - 1):
+                if y[j] < bounds[body, 0, 1] or y[j] > bounds[body, 1, 1]:
+                    continue
+                count = _pierce(2, 0, 1, x[i], y[j], body, kinds, params, rotation, position,
+                                grids, grid_shape, grid_first, grid_origin, grid_inv,
+                                out)  # fmt: skip
+                for k in range(count):
+                    m = max(1, np.searchsorted(z, out[k, 0]))
+                    while m < nz - 1 and z[m] <= out[k, 1]:
+                        a = (i * ny + j) * nz + m
+                        if owner[a] == -1 and inside[a] < 0:
+                            inside[a] = conductor[body]
+                            nodes[found] = a
+                            found += 1
+                        m += 1
+    return found
 
 
 @njit(cache=True)
@@ -185,6 +287,9 @@ def trace(
     grid_origin,
     grid_inv,
     contact,
+    inside,
+    inside_nodes,
+    n_inside,
     weight,
     extra,
     tie_node,
@@ -214,6 +319,9 @@ def trace(
     n_tie, n_energy, n_couple = 0, 0, 0
     t0, t1 = np.empty(MAX_STRETCHES), np.empty(MAX_STRETCHES)
     who = np.empty(MAX_STRETCHES, np.int64)
+    cover = np.empty(MAX_STRETCHES)
+    u0, u1 = np.empty(MAX_STRETCHES), np.empty(MAX_STRETCHES)
+    uwho = np.empty(MAX_STRETCHES, np.int64)
     r0, r1 = np.empty(2 * MAX_STRETCHES), np.empty(2 * MAX_STRETCHES)
     rwho = np.empty(2 * MAX_STRETCHES, np.int64)
     sorted_cuts = np.empty(2 * MAX_STRETCHES)
@@ -235,184 +343,235 @@ def trace(
         # lines on the walls carry no unknowns
         for ip in range(1, cp.shape[0] - 1):
             op = cp[ip]
-            if op < low or op > high:
+            pl, ph = 0.5 * (cp[ip - 1] + op), 0.5 * (op + cp[ip + 1])
+            if ph < low or pl > high:
                 continue
             n_near = 0
             for body in range(n_bodies):
-                if bounds[body, 0, p] <= op and op <= bounds[body, 1, p]:
+                if bounds[body, 0, p] <= ph and pl <= bounds[body, 1, p]:
                     near[n_near] = body
                     n_near += 1
             if n_near == 0:
                 continue
             for iq in range(1, cq.shape[0] - 1):
-                n = _body_stretches(
-                    axis,
-                    p,
-                    q,
-                    op,
-                    cq[iq],
-                    kinds,
-                    params,
-                    rotation,
-                    position,
-                    bounds,
-                    near,
-                    n_near,
-                    grids,
-                    grid_shape,
-                    grid_first,
-                    grid_origin,
-                    grid_inv,
-                    t0,
-                    t1,
-                    who,
-                    scratch,
-                )
-                if n == 0:
+                oq = cq[iq]
+                ql, qh = 0.5 * (cq[iq - 1] + oq), 0.5 * (oq + cq[iq + 1])
+                total = _covered_stretches(
+                    axis, p, q, op, oq, pl, ph, ql, qh, kinds, params, rotation, position, bounds,
+                    conductor, near, n_near, grids, grid_shape, grid_first, grid_origin, grid_inv,
+                    t0, t1, who, cover, scratch,
+                )  # fmt: skip
+                if total == 0:
                     continue
-                if n < 0:
+                if total < 0:
                     return 1
-                n = _resolve(n, t0, t1, who, conductor, r0, r1, rwho, sorted_cuts, parent)
-                line = ip * sp + iq * sq
-                m = max(0, np.searchsorted(c, r0[0]) - 1)
-                seg = 0
-                while m < last:
-                    ta, tb = c[m], c[m + 1]
-                    while seg < n and r1[seg] <= ta:
-                        seg += 1
-                    if seg == n:
-                        break
-                    if r0[seg] >= tb:
-                        m = max(m + 1, np.searchsorted(c, r0[seg]) - 1)
-                        continue
-                    node = line + m * stride
-                    if owner[node] != -1 and owner[node] == owner[node + stride]:
-                        m += 1
-                        continue  # both ends on one held sheet: no field between them
-                    # a held sheet between the nodes splits the link in two
-                    cut = cut_index[axis, node]
-                    parts = 1 if cut < 0 else 2
-                    for part in range(parts):
-                        if (
-                            n_tie + 8 > tie_node.shape[0]
-                            or n_energy + 4 > energy_weight.shape[0]
-                            or n_couple + 8 > couple_weight.shape[0]
-                        ):
-                            return 2
-                        pa, pb = ta, tb
-                        na, nb = node, node + stride
-                        ea, eb = -3, -3
-                        w = base_weight[axis, node]
-                        if cut >= 0:
-                            w = half_weight[cut, part]
-                            if part == 0:
-                                pb = ta + cut_lower[cut] * (tb - ta)
-                                nb, eb = -1, cut_lower_owner[cut]
-                            else:
-                                pa = tb - cut_upper[cut] * (tb - ta)
-                                na, ea = -1, cut_upper_owner[cut]
-                        length = pb - pa
-                        # series resistance up to the first conductor, and back from the last
-                        resist, pos, k = 0.0, pa, seg
-                        first_r, first_s, first_k, first_deep = -1.0, 0.0, -1, False
-                        last_t, last_k, last_deep = pa, -1, False
-                        touched = False
-                        while k < n and r0[k] < pb:
-                            s0, s1 = max(r0[k], pa), min(r1[k], pb)
-                            body = rwho[k]
-                            kappa = 1.0
-                            if s1 > s0:
-                                touched = True
-                                if s0 > pos:
-                                    resist += (s0 - pos) / length
-                                if conductor[body] >= 0:
-                                    if first_k < 0:
-                                        first_r, first_k = resist, conductor[body]
-                                        first_s = (s0 - pa) / length
-                                        first_deep = r0[k] < pa - _SNAP * length
-                                    elif last_k != conductor[body] and resist > 0.0:
-                                        couple[n_couple, 0] = last_k
-                                        couple[n_couple, 1] = conductor[body]
-                                        couple_weight[n_couple] = w / max(resist, _LEAST)
-                                        n_couple += 1
-                                    last_k, last_t = conductor[body], s1
-                                    last_deep = r1[k] > pb + _SNAP * length
-                                    resist = 0.0
-                                else:
-                                    kappa = body_eps[body] / eps_r[axis, node]
-                                    resist += (s1 - s0) / length / kappa
-                                pos = s1
-                            k += 1
-                        if not touched:
-                            continue
-                        if pos < pb:
-                            resist += (pb - pos) / length
-                        if first_k < 0:
-                            # dielectric only
-                            if abs(resist - 1.0) > 1e-9:
-                                change = w / resist - w
-                                if cut < 0:
-                                    weight[axis, node] = w + change
-                                else:
-                                    extra[na if na >= 0 else nb] += change
-                                energy_link[n_energy, 0], energy_link[n_energy, 1] = na, nb
-                                energy_end[n_energy] = ea if na < 0 else eb
-                                energy_weight[n_energy], energy_kind[n_energy] = change, 1
-                                n_energy += 1
-                            continue
-                        if cut < 0:
-                            weight[axis, node] = 0.0
+                # bodies that fill different shares of the column are met layer by layer
+                level = 1.0
+                upper = 0.0
+                for k in range(total):
+                    upper = max(upper, cover[k])
+                level = upper
+                while level > 0.0:
+                    below = 0.0
+                    n = 0
+                    for k in range(total):
+                        if cover[k] >= level:
+                            u0[n], u1[n], uwho[n] = t0[k], t1[k], who[k]
+                            n += 1
                         else:
-                            extra[na if na >= 0 else nb] -= w
-                        inner = w
-                        for side in range(2):
-                            r, s = (
-                                (first_r, first_s)
-                                if side == 0
-                                else (resist, (pb - last_t) / length)
-                            )
-                            tied = na if side == 0 else nb
-                            deep = first_deep if side == 0 else last_deep
-                            free = tied >= 0 and owner[tied] == -1
-                            if r <= 0.0 and deep and free:
-                                continue  # the node lies inside the conductor
-                            least = _LEAST if free else min(contact / length, 1.0)
-                            r = max(r, least)
-                            inner -= w * r
-                            tie_node[n_tie] = tied if free else -1
-                            tie_weight[n_tie] = w / r
-                            tie_conductor[n_tie] = first_k if side == 0 else last_k
-                            if free:
-                                extra[tied] += w / r
-                            _tie_value(
-                                n_tie,
-                                side,
-                                s,
-                                r,
-                                na,
-                                nb,
-                                ea,
-                                eb,
-                                stride,
-                                m,
-                                last,
-                                part,
-                                cut,
-                                pa,
-                                pb,
-                                c,
-                                kink,
-                                tie_point,
-                                tie_coef,
-                                tie_end,
-                                tie_end_coef,
-                            )
-                            n_tie += 1
-                        energy_link[n_energy, 0], energy_link[n_energy, 1] = na, nb
-                        energy_end[n_energy] = ea if na < 0 else eb
-                        energy_weight[n_energy], energy_kind[n_energy] = inner, 0
+                            below = max(below, cover[k])
+                    share = level - below
+                    level = below
+                    n = _resolve(n, u0, u1, uwho, conductor, r0, r1, rwho, sorted_cuts, parent)
+                    line = ip * sp + iq * sq
+                    m = max(0, np.searchsorted(c, r0[0]) - 1)
+                    seg = 0
+                    while m < last:
+                        ta, tb = c[m], c[m + 1]
+                        while seg < n and r1[seg] <= ta:
+                            seg += 1
+                        if seg == n:
+                            break
+                        if r0[seg] >= tb:
+                            m = max(m + 1, np.searchsorted(c, r0[seg]) - 1)
+                            continue
+                        node = line + m * stride
+                        if inside[node] >= 0 and inside[node + stride] >= 0:
+                            m += 1
+                            continue  # the whole link lies inside
+                        if owner[node] != -1 and owner[node] == owner[node + stride]:
+                            m += 1
+                            continue  # both ends on one held sheet: no field between them
+                        # a held sheet between the nodes splits the link in two
+                        cut = cut_index[axis, node]
+                        parts = 1 if cut < 0 else 2
+                        for part in range(parts):
+                            if (
+                                n_tie + 8 > tie_node.shape[0]
+                                or n_energy + 4 > energy_weight.shape[0]
+                                or n_couple + 8 > couple_weight.shape[0]
+                            ):
+                                return 2
+                            pa, pb = ta, tb
+                            na, nb = node, node + stride
+                            ea, eb = -3, -3
+                            w = share * base_weight[axis, node]
+                            if cut >= 0:
+                                w = share * half_weight[cut, part]
+                                if part == 0:
+                                    pb = ta + cut_lower[cut] * (tb - ta)
+                                    nb, eb = -1, cut_lower_owner[cut]
+                                else:
+                                    pa = tb - cut_upper[cut] * (tb - ta)
+                                    na, ea = -1, cut_upper_owner[cut]
+                            length = pb - pa
+                            # series resistance up to the first conductor, and back from the last
+                            resist, pos, k = 0.0, pa, seg
+                            first_r, first_s, first_k, first_deep = -1.0, 0.0, -1, False
+                            last_t, last_k, last_deep = pa, -1, False
+                            touched = False
+                            while k < n and r0[k] < pb:
+                                s0, s1 = max(r0[k], pa), min(r1[k], pb)
+                                body = rwho[k]
+                                kappa = 1.0
+                                if s1 > s0:
+                                    touched = True
+                                    if s0 > pos:
+                                        resist += (s0 - pos) / length
+                                    if conductor[body] >= 0:
+                                        if first_k < 0:
+                                            first_r, first_k = resist, conductor[body]
+                                            first_s = (s0 - pa) / length
+                                            first_deep = r0[k] < pa - _SNAP * length
+                                        elif last_k != conductor[body] and resist > 0.0:
+                                            couple[n_couple, 0] = last_k
+                                            couple[n_couple, 1] = conductor[body]
+                                            couple_weight[n_couple] = w / max(resist, _LEAST)
+                                            n_couple += 1
+                                        last_k, last_t = conductor[body], s1
+                                        last_deep = r1[k] > pb + _SNAP * length
+                                        resist = 0.0
+                                    else:
+                                        kappa = body_eps[body] / eps_r[axis, node]
+                                        resist += (s1 - s0) / length / kappa
+                                    pos = s1
+                                k += 1
+                            if not touched:
+                                continue
+                            if pos < pb:
+                                resist += (pb - pos) / length
+                            if first_k < 0:
+                                # dielectric only
+                                if abs(resist - 1.0) > 1e-9:
+                                    change = w / resist - w
+                                    if cut < 0:
+                                        weight[axis, node] += change
+                                    else:
+                                        extra[na if na >= 0 else nb] += change
+                                    energy_link[n_energy, 0], energy_link[n_energy, 1] = na, nb
+                                    energy_end[n_energy] = ea if na < 0 else eb
+                                    energy_weight[n_energy], energy_kind[n_energy] = change, 1
+                                    n_energy += 1
+                                continue
+                            if (
+                                first_deep
+                                and last_deep
+                                and first_r <= 0.0
+                                and resist <= 0.0
+                                and (na < 0 or (owner[na] == -1 and inside[na] < 0))
+                                and (nb < 0 or (owner[nb] == -1 and inside[nb] < 0))
+                                and cut < 0
+                            ):
+                                continue  # the body runs beside the link, not across it
+                            if cut < 0:
+                                weight[axis, node] -= w
+                            else:
+                                extra[na if na >= 0 else nb] -= w
+                            inner = w
+                            for side in range(2):
+                                r, s = (
+                                    (first_r, first_s)
+                                    if side == 0
+                                    else (resist, (pb - last_t) / length)
+                                )
+                                tied = na if side == 0 else nb
+                                deep = first_deep if side == 0 else last_deep
+                                free = tied >= 0 and owner[tied] == -1
+                                if free and (inside[tied] >= 0 or (r <= 0.0 and deep)):
+                                    continue  # no field on this side
+                                least = _LEAST if free else min(contact / length, 1.0)
+                                r = max(r, least)
+                                inner -= w * r
+                                tie_node[n_tie] = tied if free else -1
+                                tie_weight[n_tie] = w / r
+                                tie_conductor[n_tie] = first_k if side == 0 else last_k
+                                if free:
+                                    extra[tied] += w / r
+                                _tie_value(
+                                    n_tie,
+                                    side,
+                                    s,
+                                    r,
+                                    na,
+                                    nb,
+                                    ea,
+                                    eb,
+                                    stride,
+                                    m,
+                                    last,
+                                    part,
+                                    cut,
+                                    pa,
+                                    pb,
+                                    c,
+                                    kink,
+                                    tie_point,
+                                    tie_coef,
+                                    tie_end,
+                                    tie_end_coef,
+                                )
+                                n_tie += 1
+                            energy_link[n_energy, 0], energy_link[n_energy, 1] = na, nb
+                            energy_end[n_energy] = ea if na < 0 else eb
+                            energy_weight[n_energy], energy_kind[n_energy] = inner, 0
+                            n_energy += 1
+                        m += 1
+    # links that are left between a node inside a conductor and one outside
+    for i in range(n_inside):
+        a = inside_nodes[i]
+        for axis in range(3):
+            stride = strides[axis]
+            for way in range(2):
+                lower = a if way == 0 else a - stride
+                b = a + stride if way == 0 else a - stride
+                if cut_index[axis, lower] >= 0:
+                    continue
+                if n_tie + 8 > tie_node.shape[0] or n_energy + 4 > energy_weight.shape[0]:
+                    return 2
+                if inside[b] >= 0:
+                    if way == 0:
+                        weight[axis, lower] = 0.0
+                        energy_link[n_energy, 0], energy_link[n_energy, 1] = a, b
+                        energy_end[n_energy] = -3
+                        energy_weight[n_energy] = base_weight[axis, lower]
+                        energy_kind[n_energy] = 0
                         n_energy += 1
-                    m += 1
+                    continue
+                w = weight[axis, lower]
+                weight[axis, lower] = 0.0
+                if w <= 1e-5 * base_weight[axis, lower]:
+                    continue
+                free = owner[b] == -1
+                tie_node[n_tie] = b if free else -1
+                tie_weight[n_tie] = w
+                tie_conductor[n_tie] = inside[a]
+                for k in range(4):
+                    tie_point[n_tie, k], tie_coef[n_tie, k] = a, 0.0
+                tie_coef[n_tie, 0] = 1.0
+                tie_end[n_tie], tie_end_coef[n_tie] = -3, 0.0
+                if free:
+                    extra[b] += w
+                n_tie += 1
     counts[0], counts[1], counts[2] = n_tie, n_energy, n_couple
     return 0
 
