@@ -55,3 +55,12 @@ def simulators(field_cache: Path) -> Simulators:
         return made[key]
 
     return get
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave slow tests out unless a marker expression or a single test asks for them."""
+    if config.option.markexpr or any("::" in a for a in config.args):
+        return
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.skip(reason="slow; run with -m slow"))

@@ -323,10 +323,11 @@ class _Problem:
         u = spla.spsolve(matrix[free][:, free].tocsc(), load)
         energy = energy - load.T @ u.reshape(load.shape)
         n = self.n_terminals
-        grounds = np.diag(self._grounds())
-        inner, outer = energy[n:, n:] + grounds, energy[:n, n:]
+        inner, outer = energy[n:, n:] + np.diag(self._grounds()), energy[:n, n:]
+        met = np.flatnonzero(np.diag(inner) > 0.0)  # the others lie between the lattice lines
+        inner, outer = inner[np.ix_(met, met)], outer[:, met]
         delta = energy[:n, :n]
-        if len(grounds):
+        if len(met):
             delta = delta - outer @ np.linalg.solve(inner, outer.T)
         return 0.5 * (delta + delta.T)
 
