@@ -1,0 +1,108 @@
+"""Panels: pieces that fill a sheet exactly, finer towards its rims."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from field_cases import sheet
+
+from capsense.design.geometry import Facet
+from capsense.field.panels import Grading, Panels, concatenate, cut_facet, make_panels
+
+SHAPES = {
+    "square": shapely.box(0.0, 0.0, 0.03, 0.03),
+    "sliver": shapely.box(0.0, 0.0, 0.1, 0.0004),
+    "triangle": shapely.Polygon([(0.0, 0.0), (0.03, 0.002), (0.01, 0.02)]),
+    "L": shapely.Polygon(
+        [(0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.01, 0.01), (0.01, 0.02), (0.0, 0.02)]
+    ),
+    "holes": shapely.box(0.0, 0.0, 0.04, 0.03)
+    .difference(shapely.box(0.005, 0.005, 0.015, 0.02))
+    .difference(shapely.Point(0.03, 0.015).buffer(0.006)),
+    "disc": shapely.Point(0.0, 0.0).buffer(0.02, quad_segs=16),
+}
+TILTED = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+
+
+def cut(polygon: shapely.Polygon, grading: Grading) -> tuple[list[shapely.Polygon], Panels]:
+    """Cut a tilted facet of this outline, graded to all its rims."""
+    facet = Facet(polygon, np.array([0.1, -0.2, 0.05]), TILTED)
+    rims = facet.to_sensor(sheet(polygon).rims[..., :2])
+    pieces = cut_facet(facet, rims, grading)
+    return pieces, make_panels(facet, pieces)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_pieces_tile_the_facet(name):
+    """Invariant: no gap, no overlap, every panel in the facet's plane."""
+    polygon = shapely.geometry.polygon.orient(SHAPES[name])
+    pieces, panels = cut(polygon, Grading(1e-4, largest=0.004))
+    assert len(pieces) == len(panels)
+    assert sum(p.area for p in pieces) == pytest.approx(polygon.area, rel=1e-6)
+    assert shapely.union_all(pieces).symmetric_difference(polygon).area < 1e-6 * polygon.area
+    np.testing.assert_allclose(panels.areas, [p.area for p in pieces], rtol=1e-9)
+    assert (panels.areas > 0).all()
+    np.testing.assert_allclose(panels.normals, np.tile(TILTED[2], (len(panels), 1)))
+    for points in (panels.centers, panels.edges.reshape(-1, 3), panels.quad[panels.weights > 0]):
+        np.testing.assert_allclose((points - [0.1, -0.2, 0.05]) @ TILTED[2], 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_quadrature_is_exact_for_quadratics(name):
+    """Analytic: ∫ (c + b·x + x·A x) dS by the mid-edge rule on another triangulation."""
+    polygon = SHAPES[name]
+    _, panels = cut(polygon, Grading(2e-4, largest=0.006))
+    local = (panels.quad - [0.1, -0.2, 0.05]) @ TILTED.T
+
+    def f(u, v):
+        return 1.0 + 30.0 * u - 20.0 * v + 1e3 * u * u - 700.0 * u * v + 300.0 * v * v
+
+    got = float((panels.weights * f(local[..., 0], local[..., 1])).sum())
+    expected = 0.0
+    for triangle in shapely.constrained_delaunay_triangles(polygon).geoms:
+        corners = np.asarray(triangle.exterior.coords)[:3]
+        middles = (corners + np.roll(corners, 1, axis=0)) / 2
+        expected += triangle.area * f(*middles.T).mean()
+    assert got == pytest.approx(expected, rel=1e-6)
+
+
+def test_panels_are_finer_towards_rims():
+    """Invariant: width grows no faster than the distance to the rims, from ``edge`` on."""
+    grading = Grading(1e-4, largest=0.004)
+    pieces, _ = cut(SHAPES["square"], grading)
+    boundary = SHAPES["square"].exterior
+    for piece in pieces:
+        thickness = 2 * shapely.maximum_inscribed_circle(piece).length
+        distance = boundary.distance(piece)
+        assert thickness <= max(1.2 * grading.edge, grading.aspect * distance)
+        assert max(np.ptp(np.array(piece.bounds).reshape(2, 2), axis=0)) <= 1.5 * grading.largest
+    assert min(p.area for p in pieces) < 1e-7
+
+
+def test_rims_of_another_sheet_refine_from_half_their_height_on():
+    """Invariant: a rim 1 mm above the facet makes panels finer below it, but none of edge size."""
+    polygon = SHAPES["square"]
+    facet = Facet(polygon, np.zeros(3), np.eye(3))
+    rim = np.array([[[0.01, -0.1, 0.001], [0.01, 0.1, 0.001]]])
+    plain = cut_facet(facet, rim, Grading(1e-4, largest=0.004), reach=0.0)
+    near = cut_facet(facet, rim, Grading(1e-4, largest=0.004), reach=0.003)
+    assert len(near) > len(plain)
+    widths = [np.ptp(np.array(p.bounds).reshape(2, 2), axis=0).min() for p in near]
+    assert min(widths) > 3e-4
+    assert sum(p.area for p in near) == pytest.approx(polygon.area, rel=1e-6)
+
+
+def test_concatenation_keeps_panels_apart():
+    """Invariant: edges, quadrature and areas stay with their panel."""
+    parts = [cut(SHAPES[n], Grading(5e-4, largest=0.01))[1] for n in ("holes", "square", "L")]
+    joined = concatenate(parts)
+    assert len(joined) == sum(len(p) for p in parts)
+    np.testing.assert_allclose(joined.areas, np.concatenate([p.areas for p in parts]))
+    offset = 0
+    for part in parts:
+        for k in range(len(part)):
+            mine = part.edges[part.first[k] : part.first[k + 1]]
+            j = offset + k
+            np.testing.assert_array_equal(joined.edges[joined.first[j] : joined.first[j + 1]], mine)
+        offset += len(part)

@@ -1,0 +1,126 @@
+"""Floating bodies, and bodies tied to ground through a capacitance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from field_cases import ball
+
+import capsense as cs
+from capsense.constants import EPS0
+
+Array = np.ndarray
+
+
+def delta(sim: cs.Simulator, *bodies: cs.Body) -> Array:
+    sim.reset()
+    return sim.step(cs.Scene(bodies)).delta
+
+
+def assert_same(got: Array, expected: Array, part: float) -> None:
+    np.testing.assert_allclose(got, expected, rtol=0, atol=part * np.abs(expected).max())
+
+
+def test_a_large_capacitance_to_ground_grounds(simulators):
+    """Analytic: 1 F is a short circuit."""
+    sim = simulators("six_patch_bare")
+    assert_same(delta(sim, ball(grounding=1.0)), delta(sim, ball()), 2e-4)
+
+
+def test_a_tiny_capacitance_to_ground_floats(simulators):
+    """Analytic: 1e-20 F is an open circuit."""
+    sim = simulators("six_patch_bare")
+    floating = delta(sim, ball(grounding="floating"))
+    assert_same(delta(sim, ball(grounding=1e-20)), floating, 2e-4)
+
+
+def test_impedance_lies_in_between_as_a_divider(simulators):
+    """Analytic: ΔC(C_g) = ΔC_float + (ΔC_ground − ΔC_float) C_g / (C_g + C_self)."""
+    sim = simulators("six_patch_bare")
+    grounded, floating = delta(sim, ball()), delta(sim, ball(grounding="floating"))
+    step = grounded - floating
+    assert np.linalg.matrix_rank(step, tol=1e-3 * np.abs(step).max()) == 1
+    ties = np.array([1e-12, 3e-12, 10e-12])
+    share = np.array([(delta(sim, ball(grounding=c)) - floating)[0, 0] / step[0, 0] for c in ties])
+    own = ties * (1 / share - 1)
+    np.testing.assert_allclose(own, own.mean(), rtol=2e-3)
+    # a free sphere has 4π eps0 R; floor and electrodes nearby add to it
+    free = 4 * math.pi * EPS0 * 0.04
+    assert 1.1 * free < own.mean() < 2.0 * free
+
+
+def test_the_order_of_readings_does_not_matter(simulators):
+    """Invariant: floating → grounded → floating returns to the same reading."""
+    sim = simulators("six_patch_bare")
+    sim.reset()
+    first, _, third = (
+        sim.step(cs.Scene([ball(grounding=g)])).delta for g in ("floating", "grounded", "floating")
+    )
+    assert_same(third, first, 1e-4)
+
+
+HALF = (0.03, 0.06, 0.06)
+
+
+@pytest.mark.parametrize("overlap", [0.0, 0.005])
+@pytest.mark.parametrize("grounding", ["floating", 1e-12])
+def test_touching_bodies_are_one(simulators, overlap, grounding):
+    """Invariant: two halves that touch or overlap equal their union, ties to ground in parallel."""
+    sim = simulators("six_patch_bare")
+    rotation = (0.0, 0.0, 0.1, 1.0)
+    pose = cs.Pose((0.0, 0.0, 0.06), rotation)
+    along = pose.rotation[:, 0]
+    halves = [
+        cs.Body(
+            cs.Box((HALF[0] + overlap, *HALF[1:])),
+            cs.Pose(np.array(pose.position) + side * (HALF[0] - overlap) / 2 * along, rotation),
+            grounding=grounding,
+        )
+        for side in (-1.0, 1.0)
+    ]
+    total = grounding if isinstance(grounding, str) else 2 * grounding
+    union = cs.Body(cs.Box((2 * HALF[0], *HALF[1:])), pose, grounding=total)
+    assert_same(delta(sim, *halves), delta(sim, union), 2e-3)
+
+
+def test_a_grounded_body_grounds_what_it_touches(simulators):
+    """Invariant: a floating body in contact with a grounded one is grounded."""
+    sim = simulators("six_patch_bare")
+    arm = cs.Body(cs.Box((0.02, 0.02, 0.2)), cs.Pose((0.03, 0.0, 0.2)))
+    both = delta(sim, ball(grounding="floating"), arm)
+    assert_same(both, delta(sim, ball(), arm), 1e-4)
+    apart = cs.Body(cs.Box((0.02, 0.02, 0.2)), cs.Pose((0.1, 0.0, 0.2)))
+    assert np.abs(
+        delta(sim, ball(grounding="floating"), apart) - delta(sim, ball(), apart)
+    ).max() > (0.1 * np.abs(both).max())
+
+
+def test_a_floating_plate_couples_electrodes(simulators):
+    """Measured: floating metal over two electrodes raises the mutual capacitance between them."""
+    sim = simulators("six_patch_bare")
+    plate = cs.Box((0.1, 0.03, 0.005))
+    pose = cs.Pose((0.0, 0.025, 0.008))
+    floating = delta(sim, cs.Body(plate, pose, grounding="floating"))
+    grounded = delta(sim, cs.Body(plate, pose))
+    assert floating[3, 4] < 0 < grounded[3, 4]
+    assert floating[3, 5] < 0
+
+
+def test_grounding_of_a_dielectric_is_ignored(simulators):
+    """Invariant: what does not conduct cannot be grounded."""
+    sim = simulators("six_patch_bare")
+    one, two = (delta(sim, ball(material="glass", grounding=g)) for g in ("grounded", "floating"))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_two_floating_bodies_far_apart_add_up(simulators):
+    """Measured: bodies over opposite ends of the sensor change their own ends alone."""
+    sim = simulators("six_patch_bare")
+    left, right = (
+        cs.Body(cs.Sphere(0.01), cs.Pose((x, 0.0, 0.02)), grounding="floating")
+        for x in (-0.05, 0.05)
+    )
+    both = delta(sim, left, right)
+    assert_same(both, delta(sim, left) + delta(sim, right), 0.03)
