@@ -92,6 +92,7 @@ class PerturbationSolver:
         """Forget the last solution."""
         self._blocks = []
         self._lanes = ()
+        self._active[:] = 0.0
 
     def step(self, scene: Scene) -> Perturbation:
         """Solve a scene.
