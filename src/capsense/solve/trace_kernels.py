@@ -23,7 +23,7 @@ MAX_STRETCHES = 64
 _MESH_STRETCHES = 4
 _SNAP = 1e-6
 """Fraction of a link within which a surface counts as lying on a node."""
-_RAMP = 4.0
+_RAMP = 2.0
 """Steepness with which a body's share of a line's column turns into its weight.
 
 At 1 the weight is the covered share itself, at infinity a line is met all or nothing. Smooth
@@ -396,14 +396,14 @@ def trace(
                             m = max(m + 1, np.searchsorted(c, r0[seg]) - 1)
                             continue
                         node = line + m * stride
-                        if inside[node] >= 0 and inside[node + stride] >= 0:
+                        # a held sheet between the nodes splits the link in two
+                        cut = cut_index[axis, node]
+                        if cut < 0 and inside[node] >= 0 and inside[node + stride] >= 0:
                             m += 1
                             continue  # the whole link lies inside
                         if owner[node] != -1 and owner[node] == owner[node + stride]:
                             m += 1
                             continue  # both ends on one held sheet: no field between them
-                        # a held sheet between the nodes splits the link in two
-                        cut = cut_index[axis, node]
                         parts = 1 if cut < 0 else 2
                         for part in range(parts):
                             if (
