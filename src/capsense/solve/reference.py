@@ -4,8 +4,13 @@ Nothing here is compiled and nothing is carried from one scene to the next. Bodi
 their shapes' ``line_intervals``, the matrix is factorised, and everything is in double precision.
 The kernels are tested against it.
 
-**Links.** A lattice link of weight w runs from a node to the next along an axis; where a sheet of
-the design cuts it, two half-links run from the nodes to the sheet. Between its ends a scene lays
+**Columns.** A lattice line stands for the column half-way to its neighbours. A conductor weighs in
+with the share of the column that it covers, steepened by ``_RAMP``, and is met at the middle of the
+part that it covers; dielectrics are met on the line itself. A line that several bodies cover to
+different shares is a bundle of lines, each with its part of every link's weight.
+
+**Links.** A link of weight w runs from a node to the next along an axis; where a sheet of the
+design cuts it, two half-links run from the nodes to the sheet. Between its ends a scene lays
 stretches of dielectric and of conductor. A stretch of length ℓ of the link's total L adds the
 resistance ℓ / (L κ), κ being its permittivity over that of the empty domain; so the empty link has
 resistance 1.
@@ -16,7 +21,9 @@ resistance 1.
   conductor met, r being the resistance up to it. A node inside the conductor has none. The tie's
   far end is at −φ⁰ of that point (u = φ − φ⁰ and φ = 0 there). The rest of the link's empty-domain
   energy, weight w (1 − r_a − r_b), is added. Conductors that face each other on one link are joined
-  by a coupling.
+  by a coupling. A conductor that covers all of a link, but neither of its nodes, runs beside it and
+  leaves it as it is.
+- What is left of a link from a node inside a conductor to one outside is a tie too, to the node.
 
 **Energy.** With K the matrix of links and ties, f_i the loads and v the ties' values,
 
@@ -41,7 +48,7 @@ from capsense.field.background import BackgroundField
 from capsense.field.lattice import FREE
 from capsense.scene import Body, Scene
 from capsense.solve.perturbation import CONTACT
-from capsense.solve.trace_kernels import _LEAST, _SNAP
+from capsense.solve.trace_kernels import _LEAST, _RAMP, _SNAP, _WHOLE
 
 Array = NDArray[np.float64]
 
@@ -53,8 +60,10 @@ def reference_delta(background: BackgroundField, scene: Scene, frequency: float 
     """
     problem = _Problem(background, scene, frequency)
     for axis in range(3):
-        for nodes, stretches in problem.lines(axis):
-            problem.lay(axis, nodes, stretches)
+        for nodes, bundle in problem.lines(axis):
+            for share, stretches in bundle:
+                problem.lay(axis, nodes, stretches, share)
+    problem.close_nodes_inside()
     return problem.solve()
 
 
@@ -87,9 +96,10 @@ class _Problem:
     background: BackgroundField
     scene: Scene
     frequency: float
-    rows: list[int] = field(default_factory=list)
-    cols: list[int] = field(default_factory=list)
-    entries: list[float] = field(default_factory=list)
+    links_left: dict[tuple[int, int], float] = field(default_factory=dict)
+    """Weights [F] of whole links by axis and lower node."""
+    diagonal: dict[int, float] = field(default_factory=dict)
+    """Weights [F] of ties and half-links by node."""
 
     def __post_init__(self) -> None:
         bg, la = self.background, self.background.lattice
@@ -105,28 +115,93 @@ class _Problem:
             (int(a), int(n)): k
             for k, (a, n) in enumerate(zip(la.cuts.axis, la.cuts.node, strict=True))
         }
+        for axis, node in np.argwhere(la.weights > 0).tolist():
+            if (axis, node) not in self.cut_of:
+                self.links_left[axis, node] = float(la.weights[axis, node])
+        for k, node in enumerate(la.cuts.node.tolist()):
+            beyond = node + la.strides[la.cuts.axis[k]]
+            self._tie(node, float(bg.half_weights[k, 0]))
+            self._tie(beyond, float(bg.half_weights[k, 1]))
+        self.bounds = self.scene.pack().bounds
+        self.inside = self._nodes_inside()
+
+    def _nodes_inside(self) -> dict[int, int]:
+        """Free nodes inside conductors, with the first such body; seen along z."""
+        la = self.background.lattice
+        free = np.flatnonzero(la.owner == FREE)
+        points = la.points[free]
+        out: dict[int, int] = {}
+        for body in self.conductors:
+            for node, z, stretches in zip(
+                free.tolist(), points[:, 2], _pierce(self.scene[body], points, 2), strict=True
+            ):
+                if any(a <= z <= b for a, b in stretches):
+                    out.setdefault(node, body)
+        return out
 
     # -- geometry ---------------------------------------------------------------------------
 
-    def lines(self, axis: int) -> Iterator[tuple[NDArray[np.int64], list[_Stretch]]]:
-        """All lattice lines along an axis off the walls: their nodes, and bodies on them."""
+    def lines(
+        self, axis: int
+    ) -> Iterator[tuple[NDArray[np.int64], list[tuple[float, list[_Stretch]]]]]:
+        """All lattice lines off the walls that meet a body: their nodes, and a bundle.
+
+        A bundle is a list of shares and of the stretches met with this share.
+        """
         la = self.background.lattice
-        grid = np.arange(la.n_nodes).reshape(la.shape)
-        inner = [slice(1, -1)] * 3
-        inner[axis] = slice(None)
-        nodes = np.moveaxis(grid[tuple(inner)], axis, -1).reshape(-1, la.shape[axis])
-        origins = la.points[nodes[:, 0]]
-        origins[:, axis] = 0.0
-        direction = np.eye(3)[axis]
-        found = [_intervals(body, origins, direction) for body in self.scene]
-        for i in range(len(nodes)):
-            raw = [
-                _Stretch(a, b, body)
-                for body, intervals in enumerate(found)
-                for a, b in intervals[i]
-                if b > a
+        p, q = [a for a in range(3) if a != axis]
+        grid = np.moveaxis(np.arange(la.n_nodes).reshape(la.shape), axis, -1)
+        for i in range(1, len(la.axes[p]) - 1):
+            for j in range(1, len(la.axes[q]) - 1):
+                column = _Column.around(la.axes, axis, i, j)
+                found = [
+                    (cover, _Stretch(a, b, body))
+                    for body in range(len(self.scene))
+                    for cover, a, b in self._met(column, body)
+                ]
+                levels = sorted({cover for cover, _ in found})
+                steps = np.diff([0.0, *levels])
+                bundle = [
+                    (share, self._disjoint([s for cover, s in found if cover >= level]))
+                    for share, level in zip(steps, levels, strict=True)
+                ]
+                if bundle:
+                    yield grid[i, j], bundle
+
+    def _met(self, column: _Column, number: int) -> list[tuple[float, float, float]]:
+        """How much a body weighs in a column, and its stretches there: (weight, start, end)."""
+        body, axis = self.scene[number], column.axis
+        low, high = self.bounds[number]
+        if any(end < low[a] or start > high[a] for a, (start, end) in column.bounds.items()):
+            return []
+        middle = column.at(*column.middle)
+        if number not in self.same:
+            return [(1.0, a, b) for a, b in _pierce(body, middle[None], axis)[0]]
+        trials = [middle, *(column.at(*uv) for uv in column.rim)]
+        hits = _pierce(body, np.array(trials), axis)
+        first = next((k for k, hit in enumerate(hits) if hit), None)
+        if first is None:
+            return []
+        a, b = max(hits[first], key=lambda ab: ab[1] - ab[0])
+        point, share = trials[first].copy(), 1.0
+        point[axis] = 0.5 * (a + b)
+        p, q = column.across
+        for along in (q, p) if first in (3, 4) else (p, q):
+            low, high = column.bounds[along]
+            chord = [
+                (max(low, a), min(high, b))
+                for a, b in _pierce(body, point[None], along)[0]
+                if a - 1e-12 <= point[along] <= b + 1e-12
             ]
-            yield nodes[i], self._disjoint(raw)
+            a, b = chord[0] if chord else (point[along], point[along])
+            share *= (b - a) / (high - low)
+            point[along] = 0.5 * (a + b)
+        weight = 0.5 + _RAMP * (share - 0.5)
+        if weight > _WHOLE:
+            weight, point = 1.0, middle
+        if weight <= 0.0:
+            return []
+        return [(weight, a, b) for a, b in _pierce(body, point[None], axis)[0]]
 
     def _disjoint(self, raw: list[_Stretch]) -> list[_Stretch]:
         """Conductors win over dielectrics, later dielectrics over earlier ones."""
@@ -154,8 +229,8 @@ class _Problem:
         old, new = self.same[b], self.same[a]
         self.same = {k: new if v == old else v for k, v in self.same.items()}
 
-    def links(self, axis: int, nodes: NDArray[np.int64]) -> Iterator[_Link]:
-        """The links and half-links of a line."""
+    def links(self, axis: int, nodes: NDArray[np.int64], share: float) -> Iterator[_Link]:
+        """The links and half-links of a line, with this share of their weights."""
         bg, la = self.background, self.background.lattice
         c = la.axes[axis]
         for m in range(len(c) - 1):
@@ -164,65 +239,80 @@ class _Problem:
                 continue  # both ends on one sheet: no field between them
             k = self.cut_of.get((axis, a))
             if k is None:
-                yield _Link(float(la.weights[axis, a]), c[m], c[m + 1], (a, b), (-3, -3))
+                yield _Link(share * float(la.weights[axis, a]), c[m], c[m + 1], (a, b), (-3, -3))
                 continue
             low = c[m] + la.cuts.lower[k] * (c[m + 1] - c[m])
             high = c[m + 1] - la.cuts.upper[k] * (c[m + 1] - c[m])
-            half = bg.half_weights[k]
+            half = share * bg.half_weights[k]
             yield _Link(half[0], c[m], low, (a, -1), (-3, int(la.cuts.lower_owner[k])))
             yield _Link(half[1], high, c[m + 1], (-1, b), (int(la.cuts.upper_owner[k]), -3))
 
     # -- assembly ---------------------------------------------------------------------------
 
-    def lay(self, axis: int, nodes: NDArray[np.int64], stretches: list[_Stretch]) -> None:
-        """Add a line's links, changed by what lies on it."""
-        for link in self.links(axis, nodes):
-            on = [s for s in stretches if s.end > link.starts and s.start < link.ends]
-            on = [s for s in on if min(s.end, link.ends) > max(s.start, link.starts)]
+    def lay(
+        self, axis: int, nodes: NDArray[np.int64], stretches: list[_Stretch], share: float
+    ) -> None:
+        """Change a line's links, to this share, by what lies on it."""
+        for link in self.links(axis, nodes, share):
+            on = [s for s in stretches if min(s.end, link.ends) > max(s.start, link.starts)]
+            if not on or (min(link.nodes) >= 0 and all(n in self.inside for n in link.nodes)):
+                continue
             if any(s.body in self.same for s in on):
                 self._lay_conductor(axis, nodes, link, on)
                 continue
             resistance = self._resistance(axis, nodes, link, on, link.starts, link.ends)
-            weight = link.weight
             if abs(resistance - 1.0) > 1e-9:
-                weight = link.weight / resistance
                 drop = self._end_value(link, 0) - self._end_value(link, 1)
-                change = weight - link.weight
+                change = link.weight / resistance - link.weight
                 self.energy += change * np.outer(drop, drop)
                 for node, sign in zip(link.nodes, (-1.0, 1.0), strict=True):
                     if node >= 0:
                         self.load[node] += sign * change * drop
-            self._add(link.nodes, weight)
+                self._change(axis, link, change)
+
+    def _change(self, axis: int, link: _Link, change: float) -> None:
+        """Add to the weight of a link or half-link."""
+        if min(link.nodes) < 0:
+            self._tie(max(link.nodes), change)
+        else:
+            self.links_left[axis, link.nodes[0]] += change
+
+    def _tie(self, node: int, weight: float) -> None:
+        self.diagonal[node] = self.diagonal.get(node, 0.0) + weight
 
     def _lay_conductor(
         self, axis: int, nodes: NDArray[np.int64], link: _Link, on: list[_Stretch]
     ) -> None:
         la, length = self.background.lattice, link.ends - link.starts
         metal = [s for s in on if s.body in self.same]
+        surfaces = max(metal[0].start, link.starts), min(metal[-1].end, link.ends)
+        resistances = (
+            self._resistance(axis, nodes, link, on, link.starts, surfaces[0]),
+            self._resistance(axis, nodes, link, on, surfaces[1], link.ends),
+        )
+        deep = (
+            metal[0].start < link.starts - _SNAP * length,
+            metal[-1].end > link.ends + _SNAP * length,
+        )
+        free = [n >= 0 and la.owner[n] == FREE for n in link.nodes]
+        inside = [n in self.inside for n in link.nodes]
+        if max(resistances) <= 0.0 and all(deep) and all(free) and not any(inside):
+            return  # the body runs beside the link, not across it
+        self._change(axis, link, -link.weight)
         rest = link.weight
-        near = metal[0].start, metal[-1].end
-        for side, (stretch, surface) in enumerate(zip((metal[0], metal[-1]), near, strict=True)):
-            node = link.nodes[side]
-            free = node >= 0 and la.owner[node] == FREE
-            if side == 0:
-                surface = max(surface, link.starts)
-                r = self._resistance(axis, nodes, link, on, link.starts, surface)
-                deep = stretch.start < link.starts - _SNAP * length
-            else:
-                surface = min(surface, link.ends)
-                r = self._resistance(axis, nodes, link, on, surface, link.ends)
-                deep = stretch.end > link.ends + _SNAP * length
-            if r <= 0.0 and deep and free:
-                continue  # the node lies inside the conductor
-            r = max(r, _LEAST if free else min(CONTACT / length, 1.0))
+        for side, stretch in enumerate((metal[0], metal[-1])):
+            node, surface, r = link.nodes[side], surfaces[side], resistances[side]
+            if free[side] and (inside[side] or (r <= 0.0 and deep[side])):
+                continue  # no field on this side
+            r = max(r, _LEAST if free[side] else min(CONTACT / length, 1.0))
             value = self._background_at(axis, nodes, link, side, surface, r)
             value[self.n_terminals + self.conductors.index(stretch.body)] = -1.0
             weight = link.weight / r
             rest -= link.weight * r
             self.energy += weight * np.outer(value, value)
-            if free:
+            if free[side]:
                 self.load[node] -= weight * value
-                self._add((node, -1), weight)
+                self._tie(node, weight)
         drop = self._end_value(link, 0) - self._end_value(link, 1)
         self.energy += rest * np.outer(drop, drop)
         for a, b in pairwise(metal):
@@ -299,25 +389,46 @@ class _Problem:
             )
         return out
 
-    def _add(self, ends: tuple[int, int], weight: float) -> None:
-        for a, b in (ends, ends[::-1]):
-            if a >= 0:
-                self.rows.append(a)
-                self.cols.append(a)
-                self.entries.append(weight)
-                if b >= 0:
-                    self.rows.append(a)
-                    self.cols.append(b)
-                    self.entries.append(-weight)
+    def close_nodes_inside(self) -> None:
+        """Turn what is left of links at nodes inside conductors into ties."""
+        la = self.background.lattice
+        for node, body in self.inside.items():
+            value = np.zeros(self.n_lanes)
+            value[: self.n_terminals] = self.background.potentials[node]
+            value[self.n_terminals + self.conductors.index(body)] = -1.0
+            for axis in range(3):
+                for lower, other in (
+                    (node, node + la.strides[axis]), (node - la.strides[axis],) * 2,
+                ):  # fmt: skip
+                    weight = self.links_left.pop((axis, lower), 0.0)
+                    whole = float(la.weights[axis, lower])
+                    if other in self.inside:
+                        drop = np.zeros(self.n_lanes)
+                        phi = self.background.potentials
+                        drop[: self.n_terminals] = phi[node] - phi[other]
+                        self.energy += weight * np.outer(drop, drop)
+                    elif weight > 1e-5 * whole:
+                        self.energy += weight * np.outer(value, value)
+                        if la.owner[other] == FREE:
+                            self.load[other] -= weight * value
+                            self._tie(other, weight)
 
     # -- solution ---------------------------------------------------------------------------
 
     def solve(self) -> Array:
         """Solve, merge the lanes of joined conductors, eliminate the floating ones."""
         la = self.background.lattice
+        keys = np.array(list(self.links_left), dtype=np.int64).reshape(-1, 2)
+        weight = np.array(list(self.links_left.values()))
+        a = keys[:, 1]
+        b = a + np.array(la.strides)[keys[:, 0]]
         shape = (la.n_nodes, la.n_nodes)
-        matrix = sp.coo_matrix((self.entries, (self.rows, self.cols)), shape=shape).tocsr()
-        free = np.flatnonzero((la.owner == FREE) & (matrix.diagonal() > 0.0))
+        links = sp.coo_matrix((weight, (a, b)), shape=shape).tocsr()
+        total = np.asarray(links.sum(axis=0)).ravel() + np.asarray(links.sum(axis=1)).ravel()
+        for node, extra in self.diagonal.items():
+            total[node] += extra
+        matrix = (sp.diags(total) - links - links.T).tocsr()
+        free = np.flatnonzero((la.owner == FREE) & (total > 1e-9 * la.weights.max()))
         merge = self._merged_lanes()
         load, energy = self.load[free] @ merge, merge.T @ self.energy @ merge
         u = spla.spsolve(matrix[free][:, free].tocsc(), load)
@@ -355,9 +466,45 @@ def _farads(body: Body) -> float:
     return 0.0 if isinstance(body.grounding, str) else float(body.grounding)
 
 
-def _intervals(body: Body, origins: Array, direction: Array) -> list[list[tuple[float, float]]]:
-    """Stretches of lines inside a body, coordinates [m] along the lines."""
+@dataclass(frozen=True)
+class _Column:
+    """What a lattice line stands for: half-way to its neighbours."""
+
+    axis: int
+    across: tuple[int, int]
+    middle: tuple[float, float]
+    bounds: dict[int, tuple[float, float]]
+
+    @classmethod
+    def around(cls, axes: tuple[Array, ...], axis: int, i: int, j: int) -> _Column:
+        p, q = [a for a in range(3) if a != axis]
+        bounds = {
+            a: ((c[k - 1] + c[k]) / 2, (c[k] + c[k + 1]) / 2)
+            for a, c, k in ((p, axes[p], i), (q, axes[q], j))
+        }
+        return cls(axis, (p, q), (float(axes[p][i]), float(axes[q][j])), bounds)
+
+    @property
+    def rim(self) -> list[tuple[float, float]]:
+        """Middles of the column's sides, then its corners."""
+        (u, v), (p, q) = self.middle, self.across
+        (pl, ph), (ql, qh) = self.bounds[p], self.bounds[q]
+        return [
+            (pl, v), (ph, v), (u, ql), (u, qh), (pl, ql), (pl, qh), (ph, ql), (ph, qh)
+        ]  # fmt: skip
+
+    def at(self, u: float, v: float) -> Array:
+        """A point of the line at (u, v) across."""
+        out = np.zeros(3)
+        out[list(self.across)] = u, v
+        return out
+
+
+def _pierce(body: Body, points: Array, axis: int) -> list[list[tuple[float, float]]]:
+    """Stretches inside a body of lines along an axis: coordinates [m] of their ends."""
+    origins = points.copy()
+    origins[:, axis] = 0.0
     back = body.pose.rotation.T
     local = (origins - np.asarray(body.pose.position)) @ back.T
-    found = body.shape.line_intervals(local, back @ direction).reshape(len(origins), -1, 2)
-    return [[(a, b) for a, b in rows if b > a] for rows in found]
+    found = body.shape.line_intervals(local, back[:, axis]).reshape(len(origins), -1, 2)
+    return [[(float(a), float(b)) for a, b in rows if b > a] for rows in found]
