@@ -33,7 +33,7 @@ class LatticeSettings:
 
     edge: float = 0.006
     """Largest spacing beside an electrode's edge, in the plane."""
-    growth: float = 0.5
+    growth: float = 0.45
     """Growth of the in-plane spacing per unit distance from the nearest edge."""
     far: float = 0.035
     """Largest in-plane spacing."""

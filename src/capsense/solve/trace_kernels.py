@@ -23,7 +23,7 @@ MAX_STRETCHES = 64
 _MESH_STRETCHES = 4
 _SNAP = 1e-6
 """Fraction of a link within which a surface counts as lying on a node."""
-_RAMP = 2.0
+_RAMP = 4.0
 """Steepness with which a body's share of a line's column turns into its weight.
 
 At 1 the weight is the covered share itself, at infinity a line is met all or nothing. Smooth
