@@ -18,6 +18,7 @@ from capsense.scene import Scene, TriMesh
 from capsense.scene.shape import ShapeKind
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
+from capsense.solve.column_kernels import MAX_STRETCHES, mark_inside
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -160,7 +161,7 @@ class PerturbationSolver:
             conductors.parent[:] = np.arange(len(conductors.parent))
             b = self._links
             self._inside[self._inside_nodes[: self._n_inside]] = -1
-            self._n_inside = tracing.mark_inside(
+            self._n_inside = mark_inside(
                 *la.axes, la.owner, packed.kinds, packed.params, packed.rotation,
                 packed.position, packed.bounds, conductors.index, len(packed), grids, shapes,
                 firsts, origins, inverses, self._inside, self._inside_nodes,
@@ -181,7 +182,7 @@ class PerturbationSolver:
                 return tuple(int(c) for c in b.counts)  # type: ignore[return-value]
             if status == 1:
                 raise SceneError(
-                    f"more than {tracing.MAX_STRETCHES} stretches of bodies lie on one line "
+                    f"more than {MAX_STRETCHES} stretches of bodies lie on one line "
                     "through the domain; join small bodies into one mesh"
                 )
             self._links = _Buffers(2 * len(b.tie_node))

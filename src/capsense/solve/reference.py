@@ -5,7 +5,7 @@ their shapes' ``line_intervals``, the matrix is factorised, and everything is in
 The kernels are tested against it.
 
 **Columns.** A lattice line stands for the column half-way to its neighbours. A conductor weighs in
-with the share of the column that it covers, steepened by ``_RAMP``, and is met at the middle of the
+with the share of the column that it covers, steepened by ``RAMP``, and is met at the middle of the
 part that it covers; dielectrics are met on the line itself. A line that several bodies cover to
 different shares is a bundle of lines, each with its part of every link's weight.
 
@@ -47,8 +47,9 @@ from numpy.typing import NDArray
 from capsense.field.background import BackgroundField
 from capsense.field.lattice import FREE
 from capsense.scene import Body, Scene
+from capsense.solve.column_kernels import RAMP, WHOLE
 from capsense.solve.perturbation import CONTACT
-from capsense.solve.trace_kernels import _LEAST, _RAMP, _SNAP, _WHOLE
+from capsense.solve.trace_kernels import _LEAST, _SNAP
 
 Array = NDArray[np.float64]
 
@@ -196,8 +197,8 @@ class _Problem:
             a, b = chord[0] if chord else (point[along], point[along])
             share *= (b - a) / (high - low)
             point[along] = 0.5 * (a + b)
-        weight = 0.5 + _RAMP * (share - 0.5)
-        if weight > _WHOLE:
+        weight = 0.5 + RAMP * (share - 0.5)
+        if weight > WHOLE:
             weight, point = 1.0, middle
         if weight <= 0.0:
             return []
