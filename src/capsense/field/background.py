@@ -43,7 +43,7 @@ class BuildSettings:
     lattice: LatticeSettings = field(default_factory=LatticeSettings)
     panel_scale: float = 1.0
     """Panel sizes of the boundary elements, as multiples of the default."""
-    calibration: float = 0.5
+    calibration: float = 0.36
     """Strength of the pull towards geometric weights; infinity switches calibration off."""
 
 
