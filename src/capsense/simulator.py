@@ -15,7 +15,7 @@ from capsense.design import load_design
 from capsense.design.model import Design, Role
 from capsense.errors import SceneError
 from capsense.field.background import BackgroundField, BuildSettings
-from capsense.field.cache import load_or_build
+from capsense.field.cache import default_settings, load_or_build
 from capsense.scene import Scene
 
 Array = NDArray[np.float64]
@@ -120,7 +120,9 @@ class Simulator:
         if method == "masked":
             from capsense.solve.scene_masks import MaskedScenes
 
-            self._solver: _Method = MaskedScenes(self.design, self.background, frequency)
+            self._solver: _Method = MaskedScenes(
+                self.design, self.background, settings or default_settings(self.design), frequency
+            )
         else:
             from capsense.solve.perturbation import PerturbationSolver
 
@@ -182,7 +184,7 @@ class Simulator:
             "electrodes": len(self.design.electrodes),
             "method": self.method,
             "boundary panels": self.background.n_panels,
-            "lattice": " x ".join(str(n) for n in la.shape),
+            "lattice": " + ".join("x".join(str(n) for n in s.shape) for s in la.storeys),
             "nodes": la.n_nodes,
             "links": int((la.weights > 0).sum()),
             "tetrahedra": la.n_tets,

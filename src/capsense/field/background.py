@@ -21,7 +21,7 @@ from capsense.field.boundary import (
     terminals,
 )
 from capsense.field.calibration import calibrate, half_link_weights
-from capsense.field.lattice import FREE, Lattice, LatticeSettings, build_lattice
+from capsense.field.lattice import Lattice, LatticeSettings, build_lattice
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -169,7 +169,7 @@ def _node_potentials(
 ) -> Array:
     """Evaluate the terminals' fields at all nodes; held nodes get their exact potential."""
     n_terminals = charges.densities.shape[1]
-    free = np.flatnonzero(lattice.owner == FREE)
+    free = np.flatnonzero(lattice.unknown)
     points = lattice.points[free]
     values = np.empty((len(free), n_terminals))
     done = 0
@@ -194,6 +194,7 @@ def _node_potentials(
     potentials[free] = values
     driven = np.flatnonzero(lattice.owner >= 0)
     potentials[driven, lattice.owner[driven]] = 1.0
+    potentials = potentials[lattice.home]
     return np.clip(potentials, 0.0, 1.0)
 
 

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import lsmr
 
-from capsense.field.lattice import FREE, Lattice
+from capsense.field.lattice import Lattice
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def calibrate(lattice: Lattice, potentials: Array, strength: float = 0.36) -> tu
     """
     links = _Links(lattice, potentials)
     rows, rhs = [], []
-    free = lattice.owner == FREE
+    free = lattice.unknown
     for k in range(potentials.shape[1]):
         flux = links.weight * links.drop[:, k]
         through = links.sum_abs(flux)
@@ -65,8 +65,7 @@ class _Links:
         for axis in range(3):
             whole[axis, cuts.node[cuts.axis == axis]] = False
         self._axis, self._node = np.nonzero(whole)
-        strides = np.array(lattice.strides)
-        a, b = self._node, self._node + strides[self._axis]
+        a, b = self._node, lattice.home[lattice.beyond(self._axis, self._node)]
         w = lattice.weights[self._axis, self._node]
         drop = potentials[a] - potentials[b]
         rows, cols, values = [a, b], [np.arange(len(a))] * 2, [np.ones(len(a)), -np.ones(len(a))]
@@ -74,7 +73,7 @@ class _Links:
         half = half_link_weights(lattice)
         first = len(a)
         for side, who in enumerate((cuts.lower_owner, cuts.upper_owner)):
-            end = cuts.node + (strides[cuts.axis] if side else 0)
+            end = lattice.beyond(cuts.axis, cuts.node) if side else cuts.node
             held = np.zeros((len(end), potentials.shape[1]))
             driven = np.flatnonzero(who >= 0)
             held[driven, who[driven]] = 1.0

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from capsense.errors import FieldError
 from capsense.field.background import BackgroundField
-from capsense.field.lattice import Cuts, Lattice
+from capsense.field.lattice import Cuts, Joints, Lattice, Storey
 
-FORMAT = 2
+FORMAT = 3
 """Version of the stored form; part of the cache key."""
 
 _DIGEST = hashlib.sha256().digest_size
@@ -138,7 +138,13 @@ def save_background(
     la = field.lattice
     real = np.dtype("<f4" if compact else "<f8")
     arrays = {
-        "x": la.axes[0], "y": la.axes[1], "z": la.axes[2],
+        **{
+            f"{what}_{name}{k}": values
+            for k, storey in enumerate(la.storeys)
+            for what, three in (("node", storey.axes), ("face", storey.faces))
+            for name, values in zip("xyz", three, strict=True)
+        },
+        "ceiling": la.joints.ceiling, "parent": la.joints.parent,
         "eps_r": la.eps_r, "owner": la.owner.astype(np.int16), "kink": la.kink,
         **{f"cut_{name}": getattr(la.cuts, name) for name in _CUTS},
         "half_weights": field.half_weights, "capacitance": field.capacitance,
@@ -166,8 +172,16 @@ def load_background(path: Path, key: str = "") -> BackgroundField:
 
 def to_background(arrays: Arrays, meta: Mapping[str, Any]) -> BackgroundField:
     """Put a field together from the content of its file."""
+    storeys: list[Storey] = []
+    while f"node_x{len(storeys)}" in arrays:
+        k = len(storeys)
+        nodes, faces = (
+            (arrays[f"{what}_x{k}"], arrays[f"{what}_y{k}"], arrays[f"{what}_z{k}"])
+            for what in ("node", "face")
+        )
+        storeys.append(Storey(nodes, faces, storeys[-1].stop if k else 0))
     lattice = Lattice(
-        (arrays["x"], arrays["y"], arrays["z"]),
+        tuple(storeys), Joints(arrays["ceiling"], arrays["parent"]),
         _from_byte_planes(arrays["weights"]), arrays["eps_r"],
         arrays["owner"].astype(np.int64), arrays["kink"],
         Cuts(*(arrays[f"cut_{name}"] for name in _CUTS)),

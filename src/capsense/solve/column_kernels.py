@@ -27,9 +27,27 @@ WHOLE = 0.999
 """Weight above which a body is taken to fill the column."""
 
 
+BODY = np.dtype(
+    [
+        ("kind", np.int64),
+        ("params", np.float64, (3,)),
+        ("rotation", np.float64, (3, 3)),
+        ("position", np.float64, (3,)),
+        ("bounds", np.float64, (2, 3)),
+        ("conductor", np.int64),
+        ("eps_r", np.float64),
+        ("grid_first", np.int64),
+        ("grid_shape", np.int64, (3,)),
+        ("grid_origin", np.float64, (3,)),
+        ("grid_inv", np.float64),
+    ]
+)
+"""A body of a scene as the scan sees it: shape and pose, the index of a conductor (−1: dielectric),
+and where a mesh's distances begin among those of all meshes."""
+
+
 @njit(cache=True)
-def _pierce(axis, p, q, op, oq, body, kinds, params, rotation, position, grids, grid_shape,
-            grid_first, grid_origin, grid_inv, out):  # fmt: skip
+def pierce(axis, op, oq, body, grids, out):
     """Stretches of a line along ``axis`` inside one body, at (op, oq) across; return how many."""
     ox, oy, oz, dx, dy, dz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if axis == 0:
@@ -38,158 +56,104 @@ def _pierce(axis, p, q, op, oq, body, kinds, params, rotation, position, grids, 
         ox, oz, dy = op, oq, 1.0
     else:
         ox, oy, dz = op, oq, 1.0
-    if kinds[body] == _MESH:
-        r, c = rotation[body], position[body]
+    r, c = body.rotation, body.position
+    if body.kind == _MESH:
         ax, ay, az = ox - c[0], oy - c[1], oz - c[2]
-        s = grid_shape[body]
-        first = grid_first[body]
+        s = body.grid_shape
+        first = body.grid_first
         values = grids[first : first + s[0] * s[1] * s[2]].reshape((s[0], s[1], s[2]))
         return mesh_line_intervals(
-            values, grid_origin[body], grid_inv[body],
+            values, body.grid_origin, body.grid_inv,
             r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az,
             r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az,
             r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az,
             r[axis, 0], r[axis, 1], r[axis, 2], out,
         )  # fmt: skip
-    out[0, 0], out[0, 1] = body_line_interval(
-        kinds[body], params[body], rotation[body], position[body], ox, oy, oz, dx, dy, dz
-    )
+    out[0, 0], out[0, 1] = body_line_interval(body.kind, body.params, r, c, ox, oy, oz, dx, dy, dz)
     return 1 if out[0, 1] > out[0, 0] else 0
 
 
 @njit(cache=True)
-def _chord(axis, at_p, at_q, through, low, high, body, kinds, params, rotation, position, grids,
-           grid_shape, grid_first, grid_origin, grid_inv, out):  # fmt: skip
-    """Part of [low, high] that a body covers around ``through`` on a line along ``axis``."""
-    p = 1 if axis == 0 else 0
-    q = 1 if axis == 2 else 2
-    n = _pierce(axis, p, q, at_p, at_q, body, kinds, params, rotation, position, grids,
-                grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+def _chord(axis, along, t, u, v, low, high, body, grids, out):
+    """Part of [low, high] that a body covers around a point on a line along ``along``.
+
+    The point lies at t on ``axis``, u on ``along`` and v on the third axis.
+    """
+    if axis < 3 - axis - along:
+        n = pierce(along, t, v, body, grids, out)
+    else:
+        n = pierce(along, v, t, body, grids, out)
     for k in range(n):
-        if out[k, 0] - 1e-12 <= through and through <= out[k, 1] + 1e-12:
+        if out[k, 0] - 1e-12 <= u and u <= out[k, 1] + 1e-12:
             return max(low, out[k, 0]), min(high, out[k, 1])
-    return through, through
+    return u, u
 
 
 @njit(cache=True)
-def _across(axis, along, t, u, v, low, high, body, kinds, params, rotation, position, grids,
-            grid_shape, grid_first, grid_origin, grid_inv, out):  # fmt: skip
-    """Chord along ``along`` through the point (t on ``axis``, u on ``along``, v on the third)."""
-    third = 3 - axis - along
-    if axis < third:
-        return _chord(along, t, v, u, low, high, body, kinds, params, rotation, position, grids,
-                      grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
-    return _chord(along, v, t, u, low, high, body, kinds, params, rotation, position, grids,
-                  grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+def _covered_share(axis, p, q, t, sp, sq, q_first, pl, ph, ql, qh, body, grids, out):
+    """Share of a column's cross-section at t that a body covers around (sp, sq), and its middle."""
+    share = 1.0
+    for turn in range(2):
+        if (turn == 0) == q_first:
+            a, b = _chord(axis, q, t, sq, sp, ql, qh, body, grids, out)
+            sq = 0.5 * (a + b)
+            share *= (b - a) / (qh - ql)
+        else:
+            a, b = _chord(axis, p, t, sp, sq, pl, ph, body, grids, out)
+            sp = 0.5 * (a + b)
+            share *= (b - a) / (ph - pl)
+    return share, sp, sq
 
 
 @njit(cache=True)
-def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, kinds, params, rotation, position,
-                       bounds, conductor, bodies, n_bodies, grids, grid_shape, grid_first,
-                       grid_origin, grid_inv, t0, t1, who, cover, out):  # fmt: skip
+def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, grids, t0, t1,
+                      who, cover, out):  # fmt: skip
     """Stretches of a lattice line's column inside bodies, and the weight of each.
 
-    The column of a line reaches half-way to its neighbours, [pl, ph] x [ql, qh]. A conductor's
-    stretch is taken at the middle of what it covers of the column, and weighted by the share it
-    covers, so that an edge that moves across a line makes it enter gradually. Dielectrics are met
-    on the line itself. Returns the number of stretches, or −1 if they do not fit.
+    The column of a line reaches about half-way to its neighbours, [pl, ph] x [ql, qh]. A
+    conductor's stretch is taken at the middle of what it covers of the column, and weighted by the
+    share it covers, so that an edge that moves across a line makes it enter gradually. Dielectrics
+    are met on the line itself. Returns the number of stretches, or −1 if they do not fit.
     """
     n = 0
-    for m in range(n_bodies):
-        body = bodies[m]
-        if (
-            ph < bounds[body, 0, p] or pl > bounds[body, 1, p]
-            or qh < bounds[body, 0, q] or ql > bounds[body, 1, q]
-        ):  # fmt: skip
+    for m in range(n_near):
+        body = bodies[near[m]]
+        bounds = body.bounds
+        if ph < bounds[0, p] or pl > bounds[1, p] or qh < bounds[0, q] or ql > bounds[1, q]:
             continue
         sp, sq = op, oq
-        count = _pierce(axis, p, q, sp, sq, body, kinds, params, rotation, position, grids,
-                        grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
-        if conductor[body] < 0:
-            for k in range(count):
-                if n == MAX_STRETCHES:
-                    return -1
-                t0[n], t1[n], who[n], cover[n] = out[k, 0], out[k, 1], body, 1.0
-                n += 1
-            continue
-        trial = 0
-        while count == 0 and trial < 8:
-            # no hit in the middle: look at the column's edges and corners
-            sp = pl if trial in (0, 4, 5) else (ph if trial in (1, 6, 7) else op)
-            sq = ql if trial in (2, 4, 6) else (qh if trial in (3, 5, 7) else oq)
-            trial += 1
-            count = _pierce(axis, p, q, sp, sq, body, kinds, params, rotation, position, grids,
-                            grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
-        if count == 0:
-            continue
-        middle = 0.5 * (out[0, 0] + out[0, 1])
-        for k in range(1, count):
-            if out[k, 1] - out[k, 0] > 2.0 * abs(out[0, 1] - middle):
-                middle = 0.5 * (out[k, 0] + out[k, 1])
-        if trial in (3, 4):
-            ca, cb = _across(axis, q, middle, sq, sp, ql, qh, body, kinds, params, rotation,
-                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
-                             out)  # fmt: skip
-            sq = 0.5 * (ca + cb)
-            share = (cb - ca) / (qh - ql)
-            ca, cb = _across(axis, p, middle, sp, sq, pl, ph, body, kinds, params, rotation,
-                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
-                             out)  # fmt: skip
-            sp = 0.5 * (ca + cb)
-            share *= (cb - ca) / (ph - pl)
-        else:
-            ca, cb = _across(axis, p, middle, sp, sq, pl, ph, body, kinds, params, rotation,
-                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
-                             out)  # fmt: skip
-            sp = 0.5 * (ca + cb)
-            share = (cb - ca) / (ph - pl)
-            ca, cb = _across(axis, q, middle, sq, sp, ql, qh, body, kinds, params, rotation,
-                             position, grids, grid_shape, grid_first, grid_origin, grid_inv,
-                             out)  # fmt: skip
-            sq = 0.5 * (ca + cb)
-            share *= (cb - ca) / (qh - ql)
-        share = 0.5 + RAMP * (share - 0.5)
-        if share > WHOLE:
-            share, sp, sq = 1.0, op, oq
-        elif share <= 0.0:
-            continue
-        count = _pierce(axis, p, q, sp, sq, body, kinds, params, rotation, position, grids,
-                        grid_shape, grid_first, grid_origin, grid_inv, out)  # fmt: skip
+        count = pierce(axis, sp, sq, body, grids, out)
+        share = 1.0
+        if body.conductor >= 0:
+            trial = 0
+            while count == 0 and trial < 8:
+                # no hit in the middle: look at the column's edges and corners
+                sp = pl if trial in (0, 4, 5) else (ph if trial in (1, 6, 7) else op)
+                sq = ql if trial in (2, 4, 6) else (qh if trial in (3, 5, 7) else oq)
+                trial += 1
+                count = pierce(axis, sp, sq, body, grids, out)
+            if count == 0:
+                continue
+            a, b = out[0, 0], out[0, 1]
+            for k in range(1, count):
+                if out[k, 1] - out[k, 0] > b - a:
+                    a, b = out[k, 0], out[k, 1]
+            share, sp, sq = _covered_share(
+                axis, p, q, 0.5 * (a + b), sp, sq, trial in (3, 4), pl, ph, ql, qh, body, grids, out
+            )
+            share = 0.5 + RAMP * (share - 0.5)
+            if share <= 0.0:
+                continue
+            if share > WHOLE:
+                share, sp, sq = 1.0, op, oq
+            if share == 1.0 and trial == 0 and count == 1:
+                out[0, 0], out[0, 1] = a, b
+            else:
+                count = pierce(axis, sp, sq, body, grids, out)
         for k in range(count):
             if out[k, 1] > out[k, 0]:
                 if n == MAX_STRETCHES:
                     return -1
-                t0[n], t1[n], who[n], cover[n] = out[k, 0], out[k, 1], body, share
+                t0[n], t1[n], who[n], cover[n] = out[k, 0], out[k, 1], near[m], share
                 n += 1
     return n
-
-
-@njit(cache=True)
-def mark_inside(x, y, z, owner, kinds, params, rotation, position, bounds, conductor, n_bodies,
-                grids, grid_shape, grid_first, grid_origin, grid_inv, inside, nodes):  # fmt: skip
-    """Mark free nodes inside conductors with the conductor's index; return how many there are."""
-    ny, nz = y.shape[0], z.shape[0]
-    out = np.empty((MESH_STRETCHES, 2))
-    found = 0
-    for body in range(n_bodies):
-        if conductor[body] < 0:
-            continue
-        for i in range(1, x.shape[0] - 1):
-            if x[i] < bounds[body, 0, 0] or x[i] > bounds[body, 1, 0]:
-                continue
-            for j in range(1, ny - 1):
-                if y[j] < bounds[body, 0, 1] or y[j] > bounds[body, 1, 1]:
-                    continue
-                count = _pierce(2, 0, 1, x[i], y[j], body, kinds, params, rotation, position,
-                                grids, grid_shape, grid_first, grid_origin, grid_inv,
-                                out)  # fmt: skip
-                for k in range(count):
-                    m = max(1, np.searchsorted(z, out[k, 0]))
-                    while m < nz - 1 and z[m] <= out[k, 1]:
-                        a = (i * ny + j) * nz + m
-                        if owner[a] == -1 and inside[a] < 0:
-                            inside[a] = conductor[body]
-                            nodes[found] = a
-                            found += 1
-                        m += 1
-    return found

@@ -3,6 +3,12 @@
 Vectors have shape (n, 8): the lanes of one node lie together, so that a pass over the links
 serves all right-hand sides. The preconditioner is a modified incomplete Cholesky factorisation
 without fill-in (Gustafsson 1978).
+
+Every pass goes storey by storey, column by column; ``storeys`` holds a row (first node, nx, ny, nz)
+for each. The floor node of a column stands for the columns that it goes on from, as their mean
+weighted by the links that lead to it; a ceiling node for the one above that its column leads into.
+With these two kept up to date, by :func:`lift` and :func:`lower`, a pass needs to know nothing of
+storeys.
 """
 
 from __future__ import annotations
@@ -17,53 +23,113 @@ _RELAX = np.float32(0.97)
 
 
 @njit(cache=True)
-def operator_diagonal(weight, extra, owner, strides, diagonal, active):
-    """Sum the links and ties at each node; nodes that are held or inside a conductor are off."""
-    sx, sy = strides[0], strides[1]
-    n = owner.shape[0]
-    for a in range(n):
-        if owner[a] != -1:
-            active[a] = 0.0
-            diagonal[a] = 1.0
-            continue
-        d = (
-            weight[0, a]
-            + weight[0, a - sx]
-            + weight[1, a]
-            + weight[1, a - sy]
-            + weight[2, a]
-            + weight[2, a - 1]
-            + extra[a]
-        )
-        if d > 0.0:
-            active[a] = 1.0
-            diagonal[a] = d
-        else:
-            active[a] = 0.0
-            diagonal[a] = 1.0
+def operator_diagonal(weight, extra, owner, storeys, ceiling, parent, share, diagonal, active):
+    """Sum the links and ties at each unknown; nodes inside a conductor are off.
+
+    Adds ties of ceiling nodes to the nodes they stand for, and sets up the floor nodes: their links
+    upward, and in ``share`` the part that each column below has in one.
+    """
+    for j in range(ceiling.shape[0]):
+        c, b = ceiling[j], parent[j]
+        extra[b] += extra[c]
+        extra[c] = 0.0
+        weight[2, b - 1] = 0.0
+    for j in range(ceiling.shape[0]):
+        weight[2, parent[j] - 1] += weight[2, ceiling[j] - 1]
+    for j in range(ceiling.shape[0]):
+        total = weight[2, parent[j] - 1]
+        share[j] = weight[2, ceiling[j] - 1] / total if total > 0.0 else 0.0
+    wx, wy, wz = weight[0], weight[1], weight[2]
+    for s in range(storeys.shape[0]):
+        first, nx, ny, nz = storeys[s]
+        sx, sy = ny * nz, nz
+        for i in range(1, nx - 1):
+            for j in range(1, ny - 1):
+                start = first + i * sx + j * sy
+                for a in range(start + 1, start + nz - 1):
+                    active[a] = 0.0
+                    diagonal[a] = 1.0
+                    if owner[a] == -1:
+                        d = wx[a] + wx[a - sx] + wy[a] + wy[a - sy] + wz[a] + wz[a - 1] + extra[a]
+                        if d > 0.0:
+                            active[a] = 1.0
+                            diagonal[a] = d
+    for j in range(ceiling.shape[0]):
+        active[ceiling[j]] = active[parent[j]]
 
 
 @njit(cache=True, fastmath=True)
-def factorise(weight, diagonal, active, strides, inverse):
-    """Write the inverse pivots of the incomplete factorisation; zero at nodes that are off."""
-    sx, sy = strides[0], strides[1]
-    n = diagonal.shape[0]
+def factorise(weight, diagonal, active, storeys, ceiling, parent, inverse):
+    """Write the inverse pivots of the incomplete factorisation; zero at nodes that are off.
+
+    A floor node's "pivot" is what the elimination of the columns below takes from the node above.
+    """
     wx, wy, wz = weight[0], weight[1], weight[2]
-    for a in range(n):
-        if active[a] == 0.0:
-            inverse[a] = 0.0
-            continue
-        d = diagonal[a]
-        b = a - sx
-        g = wx[b] * inverse[b]
-        d -= g * (wx[b] + _RELAX * (wy[b] * active[b + sy] + wz[b] * active[b + 1]))
-        b = a - sy
-        g = wy[b] * inverse[b]
-        d -= g * (wy[b] + _RELAX * (wx[b] * active[b + sx] + wz[b] * active[b + 1]))
-        b = a - 1
-        g = wz[b] * inverse[b]
-        d -= g * (wz[b] + _RELAX * (wx[b] * active[b + sx] + wy[b] * active[b + sy]))
-        inverse[a] = np.float32(1.0) / max(d, np.float32(0.02) * diagonal[a])
+    done = 0
+    for s in range(storeys.shape[0]):
+        first, nx, ny, nz = storeys[s]
+        sx, sy = ny * nz, nz
+        for i in range(1, nx - 1):
+            for j in range(1, ny - 1):
+                start = first + i * sx + j * sy
+                for a in range(start + 1, start + nz - 1):
+                    if active[a] == 0.0:
+                        inverse[a] = 0.0
+                        continue
+                    d = diagonal[a]
+                    b = a - sx
+                    g = wx[b] * inverse[b]
+                    d -= g * (wx[b] + _RELAX * (wy[b] * active[b + sy] + wz[b] * active[b + 1]))
+                    b = a - sy
+                    g = wy[b] * inverse[b]
+                    d -= g * (wy[b] + _RELAX * (wx[b] * active[b + sx] + wz[b] * active[b + 1]))
+                    b = a - 1
+                    g = wz[b] * inverse[b]
+                    d -= g * (wz[b] + _RELAX * (wx[b] * active[b + sx] + wy[b] * active[b + sy]))
+                    inverse[a] = np.float32(1.0) / max(d, np.float32(0.02) * diagonal[a])
+        stop = first + nx * sx
+        begin = done
+        while done < ceiling.shape[0] and ceiling[done] < stop:
+            inverse[parent[done] - 1] = 0.0
+            done += 1
+        for j in range(begin, done):
+            b, floor = ceiling[j] - 1, parent[j] - 1
+            total = wz[floor]
+            if total > 0.0:
+                g = wz[b] * inverse[b]
+                lost = g * (wz[b] + _RELAX * (wx[b] * active[b + sx] + wy[b] * active[b + sy]))
+                inverse[floor] += lost / (total * total)
+
+
+@njit(cache=True)
+def lift(ceiling, parent, share, begin, end, v):
+    """Set floor nodes to the weighted mean of the columns below, for joints [begin, end)."""
+    zero = splat(np.float32(0.0))
+    for j in range(begin, end):
+        store(v, parent[j] - 1, zero)
+    for j in range(begin, end):
+        floor = parent[j] - 1
+        store(v, floor, madd(share[j], load(v, ceiling[j] - 1), load(v, floor)))
+
+
+@njit(cache=True)
+def lower(ceiling, parent, begin, end, v):
+    """Set ceiling nodes to the nodes they stand for, for joints [begin, end)."""
+    for j in range(begin, end):
+        store(v, ceiling[j], load(v, parent[j]))
+
+
+@njit(cache=True)
+def joints_of(storeys, ceiling):
+    """First joint of each storey, and the number of joints behind; shape (storeys + 1,)."""
+    out = np.zeros(storeys.shape[0] + 1, np.int64)
+    done = 0
+    for s in range(storeys.shape[0]):
+        stop = storeys[s, 0] + storeys[s, 1] * storeys[s, 2] * storeys[s, 3]
+        while done < ceiling.shape[0] and ceiling[done] < stop:
+            done += 1
+        out[s + 1] = done
+    return out
 
 
 @njit(cache=True)
@@ -75,92 +141,127 @@ def _flush(part, row, total):
 
 
 @njit(cache=True)
-def precondition(weight, inverse, strides, lo, hi, r, z, rz):
-    """Solve the incomplete factors for z and write r · z per lane. ``z`` off [lo, hi) is zero."""
-    sx, sy = strides[0], strides[1]
-    wx, wy, wz = weight[0], weight[1], weight[2]
-    zero = splat(np.float32(0.0))
-    last = zero
-    for a in range(lo, hi):
-        v = madd(wz[a - 1], last, load(r, a))
-        v = madd(wy[a - sy], load(z, a - sy), v)
-        v = madd(wx[a - sx], load(z, a - sx), v)
-        last = madd(inverse[a], v, zero)
-        store(z, a, last)
-    part = np.zeros((1, LANES), np.float32)
-    rz[:] = 0.0
-    last = zero
-    for start in range(hi, lo, -sy):
-        total = zero
-        for a in range(start - 1, start - sy - 1, -1):
-            v = madd(wz[a], last, zero)
-            v = madd(wy[a], load(z, a + sy), v)
-            v = madd(wx[a], load(z, a + sx), v)
-            last = madd(inverse[a], v, load(z, a))
-            store(z, a, last)
-            total = vmadd(last, load(r, a), total)
-        store(part, 0, total)
-        _flush(part, 0, rz)
-
-
-@njit(cache=True)
-def apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap):
-    """Write the operator times p, zero at nodes that are off, and p · A p per lane."""
-    sx, sy = strides[0], strides[1]
-    wx, wy, wz = weight[0], weight[1], weight[2]
-    zero = splat(np.float32(0.0))
-    part = np.zeros((1, LANES), np.float32)
-    pap[:] = 0.0
-    for start in range(lo, hi, sy):
-        total = zero
-        for a in range(start, start + sy):
-            on = active[a]
-            here = load(p, a)
-            v = madd(diagonal[a] * on, here, zero)
-            v = madd(-wx[a - sx] * on, load(p, a - sx), v)
-            v = madd(-wx[a] * on, load(p, a + sx), v)
-            v = madd(-wy[a - sy] * on, load(p, a - sy), v)
-            v = madd(-wy[a] * on, load(p, a + sy), v)
-            v = madd(-wz[a - 1] * on, load(p, a - 1), v)
-            v = madd(-wz[a] * on, load(p, a + 1), v)
-            store(ap, a, v)
-            total = vmadd(here, v, total)
-        store(part, 0, total)
-        _flush(part, 0, pap)
-
-
-@njit(cache=True)
-def _direction(lo, hi, p, z, beta):
-    """p ← z + beta p, with beta of shape (1, 8)."""
-    b = load(beta, 0)
-    for a in range(lo, hi):
-        store(p, a, vmadd(b, load(p, a), load(z, a)))
-
-
-@njit(cache=True)
-def _advance(lo, hi, u, r, p, ap, alpha):
-    """u ← u + alpha p and r ← r − alpha A p, with alpha of shape (2, 8): alpha and −alpha."""
-    forward, back = load(alpha, 0), load(alpha, 1)
-    for a in range(lo, hi):
-        store(u, a, vmadd(forward, load(p, a), load(u, a)))
+def _advance(u, r, p, ap, alpha):
+    """u ← u + alpha p and r ← r − alpha A p, with ``alpha`` of shape (2, 8): alpha and −alpha."""
+    on, back = load(alpha, 0), load(alpha, 1)
+    for a in range(u.shape[0]):
+        store(u, a, vmadd(on, load(p, a), load(u, a)))
         store(r, a, vmadd(back, load(ap, a), load(r, a)))
 
 
 @njit(cache=True)
-def _residual(lo, hi, active, rhs, ap, r):
-    """r ← rhs − A u where nodes are on."""
-    for a in range(lo, hi):
-        on = active[a]
-        zero = splat(np.float32(0.0))
-        store(r, a, madd(-on, load(ap, a), madd(on, load(rhs, a), zero)))
+def forward(weight, inverse, storeys, ceiling, parent, share, u, r, p, ap, alpha, y, rz):
+    """Advance as :func:`_advance` does, then solve the lower incomplete factor for y.
+
+    Writes r · M⁻¹ r per lane to ``rz``, M being the product of the incomplete factors.
+    """
+    wx, wy, wz = weight[0], weight[1], weight[2]
+    zero = splat(np.float32(0.0))
+    part = np.zeros((1, LANES), np.float32)
+    rz[:] = 0.0
+    on, back = load(alpha, 0), load(alpha, 1)
+    joints = joints_of(storeys, ceiling)
+    for s in range(storeys.shape[0]):
+        first, nx, ny, nz = storeys[s]
+        sx, sy = ny * nz, nz
+        if s > 0:
+            lift(ceiling, parent, share, joints[s - 1], joints[s], y)
+        for i in range(1, nx - 1):
+            total = zero
+            for j in range(1, ny - 1):
+                start = first + i * sx + j * sy
+                last = load(y, start)
+                for a in range(start + 1, start + nz - 1):
+                    store(u, a, vmadd(on, load(p, a), load(u, a)))
+                    v = vmadd(back, load(ap, a), load(r, a))
+                    store(r, a, v)
+                    v = madd(wz[a - 1], last, v)
+                    v = madd(wy[a - sy], load(y, a - sy), v)
+                    v = madd(wx[a - sx], load(y, a - sx), v)
+                    last = madd(inverse[a], v, zero)
+                    store(y, a, last)
+                    total = vmadd(last, v, total)
+            store(part, 0, total)
+            _flush(part, 0, rz)
 
 
 @njit(cache=True)
-def clear_held(active, u):
-    """Set the solution to zero at nodes that are off."""
+def backward(weight, inverse, storeys, ceiling, parent, share, y, p, beta):
+    """Solve the upper factor in place, y → z, and set p ← z + beta p, with beta of shape (1, 8)."""
+    wx, wy, wz = weight[0], weight[1], weight[2]
+    zero = splat(np.float32(0.0))
+    b = load(beta, 0)
+    joints = joints_of(storeys, ceiling)
+    for s in range(storeys.shape[0] - 1, -1, -1):
+        first, nx, ny, nz = storeys[s]
+        sx, sy = ny * nz, nz
+        lower(ceiling, parent, joints[s], joints[s + 1], y)
+        for i in range(nx - 2, 0, -1):
+            for j in range(ny - 2, 0, -1):
+                start = first + i * sx + j * sy
+                last = load(y, start + nz - 1)
+                for a in range(start + nz - 2, start, -1):
+                    v = madd(wz[a], last, zero)
+                    v = madd(wy[a], load(y, a + sy), v)
+                    v = madd(wx[a], load(y, a + sx), v)
+                    last = madd(inverse[a], v, load(y, a))
+                    store(y, a, last)
+                    store(p, a, vmadd(b, load(p, a), last))
+    lift(ceiling, parent, share, 0, ceiling.shape[0], p)
+    lower(ceiling, parent, 0, ceiling.shape[0], p)
+
+
+@njit(cache=True)
+def apply_operator(weight, diagonal, active, storeys, p, ap, pap):
+    """Write the operator times p, zero at nodes that are off, and p · A p per lane.
+
+    Floor and ceiling nodes of p must be up to date.
+    """
+    wx, wy, wz = weight[0], weight[1], weight[2]
+    zero = splat(np.float32(0.0))
+    part = np.zeros((1, LANES), np.float32)
+    pap[:] = 0.0
+    for s in range(storeys.shape[0]):
+        first, nx, ny, nz = storeys[s]
+        sx, sy = ny * nz, nz
+        for i in range(1, nx - 1):
+            total = zero
+            for j in range(1, ny - 1):
+                start = first + i * sx + j * sy
+                below, here = load(p, start), load(p, start + 1)
+                for a in range(start + 1, start + nz - 1):
+                    above = load(p, a + 1)
+                    v = madd(wx[a - sx], load(p, a - sx), zero)
+                    v = madd(wx[a], load(p, a + sx), v)
+                    v = madd(wy[a - sy], load(p, a - sy), v)
+                    v = madd(wy[a], load(p, a + sy), v)
+                    v = madd(wz[a - 1], below, v)
+                    v = madd(wz[a], above, v)
+                    v = madd(-diagonal[a], here, v)
+                    v = madd(-active[a], v, zero)
+                    store(ap, a, v)
+                    total = vmadd(here, v, total)
+                    below, here = here, above
+            store(part, 0, total)
+            _flush(part, 0, pap)
+
+
+@njit(cache=True)
+def start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r, p, ap, pap):
+    """Clear the solution where nodes are off, and set r ← rhs − A u and p ← 0."""
+    zero = splat(np.float32(0.0))
     for a in range(u.shape[0]):
         if active[a] == 0.0:
-            store(u, a, splat(np.float32(0.0)))
+            store(u, a, zero)
+    lift(ceiling, parent, share, 0, ceiling.shape[0], u)
+    lower(ceiling, parent, 0, ceiling.shape[0], u)
+    apply_operator(weight, diagonal, active, storeys, u, ap, pap)
+    for a in range(u.shape[0]):
+        on = active[a]
+        store(r, a, madd(on, load(rhs, a), madd(-on, load(ap, a), zero)))
+        store(p, a, zero)
+    for j in range(ceiling.shape[0]):
+        store(r, ceiling[j], zero)
 
 
 @njit(cache=True)
@@ -169,9 +270,10 @@ def solve(
     diagonal,
     active,
     inverse,
-    strides,
-    lo,
-    hi,
+    storeys,
+    ceiling,
+    parent,
+    share,
     rhs,
     u,
     r,
@@ -191,16 +293,14 @@ def solve(
     beta, alpha = np.zeros((1, LANES), np.float32), np.zeros((2, LANES), np.float32)
     rz, pap, old = np.empty(LANES), np.empty(LANES), np.ones(LANES)
     previous = np.full(LANES, np.inf)
-    clear_held(active, u)
-    apply_operator(weight, diagonal, active, strides, lo, hi, u, ap, pap)
-    _residual(lo, hi, active, rhs, ap, r)
+    start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r, p, ap, pap)
     iteration = 0
     while iteration < max_iterations:
-        precondition(weight, inverse, strides, lo, hi, r, z, rz)
+        forward(weight, inverse, storeys, ceiling, parent, share, u, r, p, ap, alpha, z, rz)
         for k in range(LANES):
             beta[0, k] = 0.0 if iteration == 0 or old[k] <= 0.0 else rz[k] / old[k]
-        _direction(lo, hi, p, z, beta)
-        apply_operator(weight, diagonal, active, strides, lo, hi, p, ap, pap)
+        backward(weight, inverse, storeys, ceiling, parent, share, z, p, beta)
+        apply_operator(weight, diagonal, active, storeys, p, ap, pap)
         done = True
         for k in range(LANES):
             step = rz[k] / pap[k] if pap[k] > 0.0 else 0.0
@@ -216,77 +316,55 @@ def solve(
             old[k] = rz[k]
             if left[k] > tolerance[k] or (iteration == 0 and decrement > tolerance[k]):
                 done = False
-        _advance(lo, hi, u, r, p, ap, alpha)
         iteration += 1
         if done:
             break
+    _advance(u, r, p, ap, alpha)
     return iteration
 
 
 @njit(cache=True)
-def load_scene(
-    phi,
-    first_lane,
-    floating_lane,
-    held,
-    n_tie,
-    tie_node,
-    tie_weight,
-    tie_conductor,
-    tie_point,
-    tie_coef,
-    tie_end,
-    tie_end_coef,
-    n_energy,
-    energy_link,
-    energy_weight,
-    energy_kind,
-    energy_end,
-    scale,
-    rhs,
-    value,
-    drop,
-):
+def load_scene(phi, floating_lane, held, ties, energies, rhs, value, drop):
     """Fill one block's right-hand sides, and each tie's and energy term's value per lane.
 
     ``floating_lane[c]`` is the lane of conductor c in this block, or −1. ``held[l]`` is the
-    terminal of lane l or −1. ``scale`` turns farads into the units of the operator.
+    terminal of lane l or −1.
     """
-    for i in range(n_tie):
-        node = tie_node[i]
+    for i in range(ties.shape[0]):
+        tie = ties[i]
+        point, coef = tie.point, tie.coef
         for k in range(LANES):
             v = 0.0
             for t in range(4):
-                v += tie_coef[i, t] * phi[tie_point[i, t], k]
-            if tie_end[i] >= 0 and held[k] == tie_end[i]:
-                v += tie_end_coef[i]
+                v += coef[t] * phi[point[t], k]
+            if tie.end >= 0 and held[k] == tie.end:
+                v += tie.end_coef
             value[i, k] = v
-        lane = floating_lane[tie_conductor[i]]
+        lane = floating_lane[tie.conductor]
         if lane >= 0:
             value[i, lane] = -1.0
-        if node >= 0:
-            w = tie_weight[i] * scale
+        if tie.node >= 0:
             for k in range(LANES):
-                rhs[node, k] -= w * value[i, k]
-    for i in range(n_energy):
-        a, b = energy_link[i, 0], energy_link[i, 1]
+                rhs[tie.node, k] -= tie.weight * value[i, k]
+    for i in range(energies.shape[0]):
+        term = energies[i]
         for k in range(LANES):
-            end = 1.0 if energy_end[i] >= 0 and held[k] == energy_end[i] else 0.0
-            drop[i, k] = (phi[a, k] if a >= 0 else end) - (phi[b, k] if b >= 0 else end)
-        if energy_kind[i] == 1:
-            w = energy_weight[i] * scale
+            end = 1.0 if term.end >= 0 and held[k] == term.end else 0.0
+            at_a = phi[term.a, k] if term.a >= 0 else end
+            drop[i, k] = at_a - (phi[term.b, k] if term.b >= 0 else end)
+        if term.drives:
             for k in range(LANES):
-                if a >= 0:
-                    rhs[a, k] -= w * drop[i, k]
-                if b >= 0:
-                    rhs[b, k] += w * drop[i, k]
+                if term.a >= 0:
+                    rhs[term.a, k] -= term.weight * drop[i, k]
+                if term.b >= 0:
+                    rhs[term.b, k] += term.weight * drop[i, k]
 
 
 @njit(cache=True)
-def gram(n, weight, left, right, out):
-    """Add Σ_i weight_i left_i right_iᵀ to ``out`` (8, 8)."""
-    for i in range(n):
-        w = weight[i]
+def gram(terms, left, right, out):
+    """Add Σ_i weight_i left_i right_iᵀ over ties or energy terms to ``out`` (8, 8)."""
+    for i in range(terms.shape[0]):
+        w = terms[i].weight
         for k in range(LANES):
             v = w * left[i, k]
             for m in range(LANES):
@@ -294,13 +372,13 @@ def gram(n, weight, left, right, out):
 
 
 @njit(cache=True)
-def inner(lo, hi, strides, left, right, out):
+def inner(left, right, out):
     """Add leftᵀ right over the nodes to ``out`` (8, 8)."""
     zero = splat(np.float32(0.0))
     part = np.zeros((LANES, LANES), np.float32)
-    for start in range(lo, hi, strides[1]):
+    for start in range(0, left.shape[0], 64):
         s0, s1, s2, s3, s4, s5, s6, s7 = zero, zero, zero, zero, zero, zero, zero, zero
-        for a in range(start, start + strides[1]):
+        for a in range(start, min(start + 64, left.shape[0])):
             v = load(right, a)
             s0 = madd(left[a, 0], v, s0)
             s1 = madd(left[a, 1], v, s1)
@@ -323,20 +401,25 @@ def inner(lo, hi, strides, left, right, out):
 
 
 @njit(cache=True)
-def sparse_inner(
-    n_tie, tie_node, n_energy, energy_link, energy_kind, stamp, mark, active, left, right, out
-):
+def _add_outer(a, left, right, out):
+    for k in range(LANES):
+        v = np.float64(left[a, k])
+        for m in range(LANES):
+            out[k, m] += v * right[a, m]
+
+
+@njit(cache=True)
+def sparse_inner(ties, energies, stamp, mark, active, left, right, out):
     """Add leftᵀ right over the nodes that carry a load, each once, to ``out`` (8, 8)."""
-    for i in range(n_tie + 2 * n_energy):
-        if i < n_tie:
-            a = tie_node[i]
-        else:
-            e = (i - n_tie) // 2
-            a = energy_link[e, (i - n_tie) % 2] if energy_kind[e] == 1 else -1
-        if a < 0 or active[a] == 0.0 or stamp[a] == mark:
-            continue
-        stamp[a] = mark
-        for k in range(LANES):
-            v = np.float64(left[a, k])
-            for m in range(LANES):
-                out[k, m] += v * right[a, m]
+    for i in range(ties.shape[0]):
+        a = ties[i].node
+        if a >= 0 and active[a] != 0.0 and stamp[a] != mark:
+            stamp[a] = mark
+            _add_outer(a, left, right, out)
+    for i in range(energies.shape[0]):
+        if energies[i].drives:
+            for k in range(2):
+                a = energies[i].a if k == 0 else energies[i].b
+                if a >= 0 and active[a] != 0.0 and stamp[a] != mark:
+                    stamp[a] = mark
+                    _add_outer(a, left, right, out)

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from capsense.constants import EPS0
 from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
-from capsense.field.lattice import FREE
 from capsense.scene import Scene, TriMesh
 from capsense.scene.shape import ShapeKind
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
-from capsense.solve.column_kernels import MAX_STRETCHES, mark_inside
+from capsense.solve.column_kernels import BODY, MAX_STRETCHES
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 LANES = pcg.LANES
+_NO_GRIDS = np.zeros(1, np.float32)
 _UNIT = EPS0 * 1e-3
 """Operator entries are stored in this unit [F], which makes them of order one."""
 CONTACT = 1e-4
@@ -72,20 +72,15 @@ class PerturbationSolver:
         la = background.lattice
         n = la.n_nodes
         self._n_terminals = len(background.terminals)
-        self._strides = np.array(la.strides, dtype=np.int64)
-        # nodes below lo and from hi on lie on a wall; the passes over neighbours may skip them
-        self._lo, self._hi = la.strides[0], n - la.strides[0]
         self._base_weight, self._base_extra = self._base_operator()
-        self._cut_index = np.full((3, n), -1, dtype=np.int64)
-        self._cut_index[la.cuts.axis, la.cuts.node] = np.arange(len(la.cuts))
-        self._weight = np.empty((3, n), np.float32)
-        self._extra = np.empty(n, np.float32)
-        self._diagonal, self._active = np.empty(n, np.float32), np.zeros(n, np.float32)
+        self._mesh = _Mesh(background, self._base_weight)
+        self._diagonal, self._active = np.ones(n, np.float32), np.zeros(n, np.float32)
         self._inverse = np.zeros(n, np.float32)
-        self._inside, self._n_inside = np.full(n, -1, np.int64), 0
-        self._inside_nodes = np.empty(n, np.int64)
+        self._share = np.zeros(len(la.joints), np.float32)
         self._stamp, self._mark = np.zeros(n, np.int64), 0
-        self._links = _Buffers(max(4096, n // 4))
+        self._inside, self._inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
+        self._counts = np.zeros(4, np.int64)
+        self._found = _Found(n, max(4096, n // 4))
         self._blocks: list[_Block] = []
         self._lanes: tuple[object, ...] = ()
 
@@ -112,7 +107,7 @@ class PerturbationSolver:
         self._prepare(scene, conductors, lanes, n_terminals + len(grounds))
         energy, iterations, left, goal = self._solve_blocks(n_tie, n_energy, lanes)
         energy = energy[: n_terminals + len(grounds), : n_terminals + len(grounds)]
-        conductors.add_couplings(energy, self._links, n_couple, lanes)
+        conductors.add_couplings(energy, self._found.couples[:n_couple], lanes)
         delta = _reduce(energy, n_terminals, grounds)
         if not np.isfinite(delta).all():
             raise SolveError("a step gave a capacitance that is not finite")
@@ -134,8 +129,10 @@ class PerturbationSolver:
             return np.zeros((self.background.lattice.n_nodes, self._n_terminals))
         stacked = np.concatenate([b.u for b in self._blocks], axis=1)
         out = stacked[:, : self._n_terminals].astype(float)
-        inside = (self._active == 0) & (self.background.lattice.owner == FREE)
+        la = self.background.lattice
+        inside = (self._active == 0) & la.unknown
         out[inside] = -self.background.potentials[inside]
+        out = out[la.home]
         return out
 
     # -- the stages ---------------------------------------------------------------------------
@@ -148,44 +145,32 @@ class PerturbationSolver:
         if len(cuts):
             weight[cuts.axis, cuts.node] = 0.0
             np.add.at(extra, cuts.node, half[:, 0])
-            np.add.at(extra, cuts.node + self._strides[cuts.axis], half[:, 1])
+            np.add.at(extra, la.beyond(cuts.axis, cuts.node), half[:, 1])
         return weight.astype(np.float32), extra.astype(np.float32)
 
     def _trace(self, scene: Scene, conductors: _Conductors) -> tuple[int, int, int]:
-        la = self.background.lattice
-        packed = scene.pack()
-        grids, shapes, firsts, origins, inverses = _mesh_grids(packed.shapes, packed.kinds)
+        bodies, grids = _pack_bodies(scene, conductors)
+        mesh = self._mesh
         while True:
-            self._weight[:] = self._base_weight
-            self._extra[:] = self._base_extra
+            found = self._found
+            found.weight[:] = self._base_weight
+            found.extra[:] = self._base_extra
             conductors.parent[:] = np.arange(len(conductors.parent))
-            b = self._links
-            self._inside[self._inside_nodes[: self._n_inside]] = -1
-            self._n_inside = mark_inside(
-                *la.axes, la.owner, packed.kinds, packed.params, packed.rotation,
-                packed.position, packed.bounds, conductors.index, len(packed), grids, shapes,
-                firsts, origins, inverses, self._inside, self._inside_nodes,
-            )  # fmt: skip
             status = tracing.trace(
-                *la.axes, self._strides, self._base_weight, self._base_extra, la.eps_r, la.owner,
-                la.kink, self._cut_index, la.cuts.lower, la.cuts.lower_owner, la.cuts.upper,
-                la.cuts.upper_owner, self.background.half_weights / _UNIT,
-                packed.kinds, packed.params, packed.rotation, packed.position, packed.bounds,
-                conductors.index, conductors.eps_r, len(packed), grids, shapes, firsts, origins,
-                inverses, CONTACT, self._inside, self._inside_nodes, self._n_inside,
-                self._weight, self._extra, b.tie_node, b.tie_weight,
-                b.tie_conductor, b.tie_point, b.tie_coef, b.tie_end, b.tie_end_coef,
-                b.energy_link, b.energy_weight, b.energy_kind, b.energy_end, b.couple,
-                b.couple_weight, conductors.parent, b.counts,
+                mesh.scan_storeys, mesh.axes, mesh.faces, mesh.nodes, mesh.links, mesh.cuts,
+                mesh.ceiling, mesh.parent, mesh.home, bodies, grids, CONTACT, conductors.parent,
+                found.weight, found.extra, self._inside, self._inside_nodes, found.ties,
+                found.energies, found.couples, self._counts,
             )  # fmt: skip
-            if status == 0:
-                return tuple(int(c) for c in b.counts)  # type: ignore[return-value]
-            if status == 1:
+            if status == tracing.FULL:
+                ties, energies, couples, _ = self._counts.tolist()
+                return ties, energies, couples
+            if status == tracing.CROWDED:
                 raise SceneError(
                     f"more than {MAX_STRETCHES} stretches of bodies lie on one line "
                     "through the domain; join small bodies into one mesh"
                 )
-            self._links = _Buffers(2 * len(b.tie_node))
+            self._found = _Found(len(found.extra), 2 * len(found.ties))
 
     def _prepare(
         self, scene: Scene, conductors: _Conductors, lanes: NDArray[np.int64], n_lanes: int
@@ -193,10 +178,15 @@ class PerturbationSolver:
         """Build diagonal and preconditioner; carry the last solution over."""
         la = self.background.lattice
         before = self._active.copy()
+        found, mesh = self._found, self._mesh
         pcg.operator_diagonal(
-            self._weight, self._extra, la.owner, self._strides, self._diagonal, self._active
-        )
-        pcg.factorise(self._weight, self._diagonal, self._active, self._strides, self._inverse)
+            found.weight, found.extra, la.owner, mesh.storeys, mesh.ceiling, mesh.parent,
+            self._share, self._diagonal, self._active,
+        )  # fmt: skip
+        pcg.factorise(
+            found.weight, self._diagonal, self._active, mesh.storeys, mesh.ceiling, mesh.parent,
+            self._inverse,
+        )  # fmt: skip
         signature = (len(scene), *lanes.tolist())
         if signature != self._lanes or not self._blocks:
             old = self._blocks
@@ -206,7 +196,7 @@ class PerturbationSolver:
                 if keep > 0:
                     block.u[:, :keep] = last.u[:, :keep]
             self._lanes = signature
-        woken = np.flatnonzero((before == 0) & (self._active != 0) & (la.owner == FREE))
+        woken = np.flatnonzero((before == 0) & (self._active != 0) & la.unknown)
         for block in self._blocks:
             if woken.size < la.n_nodes // 2:
                 block.u[woken] = -block.phi[woken]
@@ -227,25 +217,24 @@ class PerturbationSolver:
     def _solve_blocks(
         self, n_tie: int, n_energy: int, lanes: NDArray[np.int64]
     ) -> tuple[Array, int, float, float]:
-        b, count = self._links, len(self._blocks)
+        mesh, count = self._mesh, len(self._blocks)
+        ties, energies = self._found.ties[:n_tie], self._found.energies[:n_energy]
         energy = np.zeros((count * LANES, count * LANES))
         iterations, left, goal = 0, 0.0, self.tolerance
         for block in self._blocks:
             block.rhs[:] = 0.0
-            block.value = np.empty((max(1, n_tie), LANES))
-            block.drop = np.empty((max(1, n_energy), LANES))
+            block.value = np.empty((n_tie, LANES))
+            block.drop = np.empty((n_energy, LANES))
             local = np.where((lanes >= block.first) & (lanes < block.first + LANES), lanes, -1)
             pcg.load_scene(
-                block.phi, block.first, np.where(local >= 0, local - block.first, -1), block.held,
-                n_tie, b.tie_node, b.tie_weight, b.tie_conductor, b.tie_point, b.tie_coef,
-                b.tie_end, b.tie_end_coef, n_energy, b.energy_link, b.energy_weight,
-                b.energy_kind, b.energy_end, 1.0, block.rhs, block.value, block.drop,
+                block.phi, np.where(local >= 0, local - block.first, -1), block.held, ties,
+                energies, block.rhs, block.value, block.drop,
             )  # fmt: skip
         for i, first in enumerate(self._blocks):
             for j, second in enumerate(self._blocks[i:], start=i):
                 part = np.zeros((LANES, LANES))
-                pcg.gram(n_tie, b.tie_weight, first.value, second.value, part)
-                pcg.gram(n_energy, b.energy_weight, first.drop, second.drop, part)
+                pcg.gram(ties, first.value, second.value, part)
+                pcg.gram(energies, first.drop, second.drop, part)
                 _place(energy, i, j, part)
         for i, block in enumerate(self._blocks):
             start = np.abs(np.diag(energy))[i * LANES : (i + 1) * LANES]
@@ -254,8 +243,8 @@ class PerturbationSolver:
             )
             rest = np.zeros(LANES)
             done = pcg.solve(
-                self._weight, self._diagonal, self._active, self._inverse, self._strides,
-                self._lo, self._hi, block.rhs, block.u, block.r, block.z, block.p, block.ap,
+                self._found.weight, self._diagonal, self._active, self._inverse, mesh.storeys, mesh.ceiling,
+                mesh.parent, self._share, block.rhs, block.u, block.r, block.z, block.p, block.ap,
                 wanted, self.max_iterations, rest,
             )  # fmt: skip
             iterations = max(iterations, done)
@@ -265,10 +254,10 @@ class PerturbationSolver:
                 part = np.zeros((LANES, LANES))
                 self._mark += 1
                 pcg.sparse_inner(
-                    n_tie, b.tie_node, n_energy, b.energy_link, b.energy_kind, self._stamp,
-                    self._mark, self._active, first.rhs, second.u, part,
+                    ties, energies, self._stamp, self._mark, self._active, first.rhs, second.u,
+                    part,
                 )  # fmt: skip
-                pcg.inner(self._lo, self._hi, self._strides, first.u, second.r, part)
+                pcg.inner(first.u, second.r, part)
                 if i == j:
                     part = 0.5 * (part + part.T)
                 _place(energy, i, j, -part)
@@ -329,14 +318,14 @@ class _Conductors:
         return lanes, total[floating] if floating else np.zeros(0)
 
     def add_couplings(
-        self, energy: Array, buffers: _Buffers, count: int, lanes: NDArray[np.int64]
+        self, energy: Array, couples: NDArray[np.void], lanes: NDArray[np.int64]
     ) -> None:
         """Add links that run from one conductor straight to another."""
-        for i in range(count):
-            a, b = lanes[buffers.couple[i, 0]], lanes[buffers.couple[i, 1]]
+        for first, second, weight in couples.tolist():
+            a, b = lanes[first], lanes[second]
             if a == b:
                 continue
-            w = buffers.couple_weight[i] * _UNIT
+            w = weight * _UNIT
             for lane in (a, b):
                 if lane >= 0:
                     energy[lane, lane] += w
@@ -355,41 +344,66 @@ class _Block:
         self.drop = np.empty((0, LANES))
 
 
-class _Buffers:
-    """Room for what the scan of a scene finds."""
+class _Found:
+    """Room for what the scan of a scene finds on n nodes."""
 
-    def __init__(self, size: int) -> None:
-        self.tie_node = np.empty(size, np.int64)
-        self.tie_weight = np.empty(size)
-        self.tie_conductor = np.empty(size, np.int64)
-        self.tie_point = np.zeros((size, 4), np.int64)
-        self.tie_coef = np.zeros((size, 4))
-        self.tie_end = np.empty(size, np.int64)
-        self.tie_end_coef = np.empty(size)
-        self.energy_link = np.empty((size, 2), np.int64)
-        self.energy_weight = np.empty(size)
-        self.energy_kind = np.empty(size, np.int64)
-        self.energy_end = np.empty(size, np.int64)
-        self.couple = np.empty((size, 2), np.int64)
-        self.couple_weight = np.empty(size)
-        self.counts = np.zeros(3, np.int64)
+    def __init__(self, n: int, size: int) -> None:
+        self.weight, self.extra = np.empty((3, n), np.float32), np.empty(n, np.float32)
+        self.ties = np.zeros(size, tracing.TIE)
+        self.energies = np.zeros(size, tracing.ENERGY)
+        self.couples = np.zeros(size, tracing.COUPLE)
 
 
-def _mesh_grids(
-    shapes: tuple[object, ...], kinds: NDArray[np.int64]
-) -> tuple[Array32, NDArray[np.int64], NDArray[np.int64], Array, Array]:
-    """Concatenate the distance grids of mesh bodies."""
-    n = len(shapes)
-    sizes = np.zeros((n, 3), np.int64)
-    first, origin, inverse = np.zeros(n, np.int64), np.zeros((n, 3)), np.ones(n)
+class _Mesh:
+    """The lattice and its empty-domain operator, packed for the kernels."""
+
+    def __init__(self, background: BackgroundField, weight: Array32) -> None:
+        la = background.lattice
+        sizes = [(s.first, *s.shape) for s in la.storeys]
+        highest = np.array([s.shape for s in la.storeys]) - 1
+        highest[:-1, 2] -= 1
+        self.scan_storeys = np.zeros(len(sizes), tracing.STOREY)
+        self.storeys = np.array(sizes, dtype=np.int64)
+        self.scan_storeys["first"], self.scan_storeys["shape"] = (
+            self.storeys[:, 0], self.storeys[:, 1:]
+        )  # fmt: skip
+        self.scan_storeys["begin"] = (
+            np.cumsum([0, *self.storeys[:, 1:].ravel()])[:-1].reshape(-1, 3)
+        )  # fmt: skip
+        self.scan_storeys["lowest"][1:, 2] = 1
+        self.scan_storeys["highest"] = highest
+        self.axes = np.concatenate([c for s in la.storeys for c in s.axes])
+        self.faces = np.concatenate([[*f, np.inf] for s in la.storeys for f in s.faces])
+        self.nodes = np.zeros(la.n_nodes, tracing.NODE)
+        self.nodes["owner"], self.nodes["kink"] = la.owner, la.kink
+        self.links = np.zeros((3, la.n_nodes), tracing.LINK)
+        self.links["weight"], self.links["eps_r"], self.links["cut"] = weight, la.eps_r, -1
+        self.links["cut"][la.cuts.axis, la.cuts.node] = np.arange(len(la.cuts))
+        self.cuts = np.zeros(len(la.cuts), tracing.CUT)
+        self.cuts["half"] = background.half_weights / _UNIT
+        self.cuts["length"] = np.stack([la.cuts.lower, la.cuts.upper], axis=1)
+        self.cuts["owner"] = np.stack([la.cuts.lower_owner, la.cuts.upper_owner], axis=1)
+        self.ceiling, self.parent, self.home = la.joints.ceiling, la.joints.parent, la.home
+
+
+def _pack_bodies(scene: Scene, conductors: _Conductors) -> tuple[NDArray[np.void], Array32]:
+    """Bodies as the scan takes them, and the distance grids of meshes, one after the other."""
+    packed = scene.pack()
+    bodies = np.zeros(len(packed), BODY)
+    for name, values in (
+        ("kind", packed.kinds), ("params", packed.params), ("rotation", packed.rotation),
+        ("position", packed.position), ("bounds", packed.bounds),
+        ("conductor", conductors.index), ("eps_r", conductors.eps_r),
+    ):  # fmt: skip
+        bodies[name] = values
     parts: list[Array32] = []
     offset = 0
-    for i, shape in enumerate(shapes):
-        if kinds[i] == ShapeKind.MESH and isinstance(shape, TriMesh):
-            grid = shape.grid
-            sizes[i], first[i] = grid.values.shape, offset
-            origin[i], inverse[i] = grid.origin, 1.0 / grid.cell
-            parts.append(grid.values.ravel())
-            offset += parts[-1].size
-    flat = np.concatenate(parts) if parts else np.zeros(1, np.float32)
-    return flat, sizes, first, origin, inverse
+    for i in np.flatnonzero(packed.kinds == ShapeKind.MESH):
+        shape = packed.shapes[i]
+        assert isinstance(shape, TriMesh)
+        grid = shape.grid
+        bodies["grid_shape"][i], bodies["grid_first"][i] = grid.values.shape, offset
+        bodies["grid_origin"][i], bodies["grid_inv"][i] = grid.origin, 1.0 / grid.cell
+        parts.append(grid.values.ravel())
+        offset += parts[-1].size
+    return bodies, np.concatenate(parts) if parts else _NO_GRIDS

@@ -45,7 +45,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from capsense.field.background import BackgroundField
-from capsense.field.lattice import FREE
+from capsense.field.lattice import FREE, Storey
 from capsense.scene import Body, Scene
 from capsense.solve.column_kernels import RAMP, WHOLE
 from capsense.solve.perturbation import CONTACT
@@ -61,11 +61,23 @@ def reference_delta(background: BackgroundField, scene: Scene, frequency: float 
     """
     problem = _Problem(background, scene, frequency)
     for axis in range(3):
-        for nodes, bundle in problem.lines(axis):
+        for line, bundle in problem.lines(axis):
             for share, stretches in bundle:
-                problem.lay(axis, nodes, stretches, share)
+                problem.lay(line, stretches, share)
     problem.close_nodes_inside()
     return problem.solve()
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A lattice line of one storey."""
+
+    axis: int
+    nodes: NDArray[np.int64]
+    c: Array
+    """Coordinates [m] of the nodes."""
+    smooth: tuple[int, int]
+    """First and last node between which values may be interpolated by cubics."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +132,7 @@ class _Problem:
             if (axis, node) not in self.cut_of:
                 self.links_left[axis, node] = float(la.weights[axis, node])
         for k, node in enumerate(la.cuts.node.tolist()):
-            beyond = node + la.strides[la.cuts.axis[k]]
+            beyond = int(la.beyond(la.cuts.axis[k], node))
             self._tie(node, float(bg.half_weights[k, 0]))
             self._tie(beyond, float(bg.half_weights[k, 1]))
         self.bounds = self.scene.pack().bounds
@@ -129,7 +141,7 @@ class _Problem:
     def _nodes_inside(self) -> dict[int, int]:
         """Free nodes inside conductors, with the first such body; seen along z."""
         la = self.background.lattice
-        free = np.flatnonzero(la.owner == FREE)
+        free = np.flatnonzero(la.unknown)
         points = la.points[free]
         out: dict[int, int] = {}
         for body in self.conductors:
@@ -138,23 +150,33 @@ class _Problem:
             ):
                 if any(a <= z <= b for a, b in stretches):
                     out.setdefault(node, body)
+        for node, parent in zip(la.joints.ceiling.tolist(), la.joints.parent.tolist(), strict=True):
+            if parent in out:
+                out[node] = out[parent]
         return out
 
     # -- geometry ---------------------------------------------------------------------------
 
-    def lines(
-        self, axis: int
-    ) -> Iterator[tuple[NDArray[np.int64], list[tuple[float, list[_Stretch]]]]]:
-        """All lattice lines off the walls that meet a body: their nodes, and a bundle.
+    def lines(self, axis: int) -> Iterator[tuple[_Line, list[tuple[float, list[_Stretch]]]]]:
+        """All lattice lines off the walls that meet a body, each with a bundle.
 
         A bundle is a list of shares and of the stretches met with this share.
         """
-        la = self.background.lattice
+        for storey in self.background.lattice.storeys:
+            yield from self._lines_of(storey, axis)
+
+    def _lines_of(
+        self, storey: Storey, axis: int
+    ) -> Iterator[tuple[_Line, list[tuple[float, list[_Stretch]]]]]:
         p, q = [a for a in range(3) if a != axis]
-        grid = np.moveaxis(np.arange(la.n_nodes).reshape(la.shape), axis, -1)
-        for i in range(1, len(la.axes[p]) - 1):
-            for j in range(1, len(la.axes[q]) - 1):
-                column = _Column.around(la.axes, axis, i, j)
+        grid, c = np.moveaxis(storey.nodes, axis, -1), storey.axes[axis]
+        smooth = (0, len(c) - 1)
+        if axis == 2:
+            highest = storey.stop == self.background.lattice.n_nodes
+            smooth = (1 if storey.first else 0, len(c) - (1 if highest else 2))
+        for i in range(1, len(storey.axes[p]) - 1):
+            for j in range(1, len(storey.axes[q]) - 1):
+                column = _Column.around(storey, axis, i, j)
                 found = [
                     (cover, _Stretch(a, b, body))
                     for body in range(len(self.scene))
@@ -167,7 +189,7 @@ class _Problem:
                     for share, level in zip(steps, levels, strict=True)
                 ]
                 if bundle:
-                    yield grid[i, j], bundle
+                    yield _Line(axis, grid[i, j], c, smooth), bundle
 
     def _met(self, column: _Column, number: int) -> list[tuple[float, float, float]]:
         """How much a body weighs in a column, and its stretches there: (weight, start, end)."""
@@ -230,15 +252,17 @@ class _Problem:
         old, new = self.same[b], self.same[a]
         self.same = {k: new if v == old else v for k, v in self.same.items()}
 
-    def links(self, axis: int, nodes: NDArray[np.int64], share: float) -> Iterator[_Link]:
+    def links(self, line: _Line, share: float) -> Iterator[_Link]:
         """The links and half-links of a line, with this share of their weights."""
         bg, la = self.background, self.background.lattice
-        c = la.axes[axis]
+        axis, c = line.axis, line.c
         for m in range(len(c) - 1):
-            a, b = int(nodes[m]), int(nodes[m + 1])
+            a, b = int(line.nodes[m]), int(line.nodes[m + 1])
             if la.owner[a] != FREE and la.owner[a] == la.owner[b]:
                 continue  # both ends on one sheet: no field between them
             k = self.cut_of.get((axis, a))
+            if k is None and la.weights[axis, a] == 0.0:
+                continue  # the storey below has this link
             if k is None:
                 yield _Link(share * float(la.weights[axis, a]), c[m], c[m + 1], (a, b), (-3, -3))
                 continue
@@ -250,18 +274,17 @@ class _Problem:
 
     # -- assembly ---------------------------------------------------------------------------
 
-    def lay(
-        self, axis: int, nodes: NDArray[np.int64], stretches: list[_Stretch], share: float
-    ) -> None:
+    def lay(self, line: _Line, stretches: list[_Stretch], share: float) -> None:
         """Change a line's links, to this share, by what lies on it."""
-        for link in self.links(axis, nodes, share):
+        axis = line.axis
+        for link in self.links(line, share):
             on = [s for s in stretches if min(s.end, link.ends) > max(s.start, link.starts)]
             if not on or (min(link.nodes) >= 0 and all(n in self.inside for n in link.nodes)):
                 continue
             if any(s.body in self.same for s in on):
-                self._lay_conductor(axis, nodes, link, on)
+                self._lay_conductor(line, link, on)
                 continue
-            resistance = self._resistance(axis, nodes, link, on, link.starts, link.ends)
+            resistance = self._resistance(axis, link, on, link.starts, link.ends)
             if abs(resistance - 1.0) > 1e-9:
                 drop = self._end_value(link, 0) - self._end_value(link, 1)
                 change = link.weight / resistance - link.weight
@@ -281,15 +304,14 @@ class _Problem:
     def _tie(self, node: int, weight: float) -> None:
         self.diagonal[node] = self.diagonal.get(node, 0.0) + weight
 
-    def _lay_conductor(
-        self, axis: int, nodes: NDArray[np.int64], link: _Link, on: list[_Stretch]
-    ) -> None:
+    def _lay_conductor(self, line: _Line, link: _Link, on: list[_Stretch]) -> None:
+        axis = line.axis
         la, length = self.background.lattice, link.ends - link.starts
         metal = [s for s in on if s.body in self.same]
         surfaces = max(metal[0].start, link.starts), min(metal[-1].end, link.ends)
         resistances = (
-            self._resistance(axis, nodes, link, on, link.starts, surfaces[0]),
-            self._resistance(axis, nodes, link, on, surfaces[1], link.ends),
+            self._resistance(axis, link, on, link.starts, surfaces[0]),
+            self._resistance(axis, link, on, surfaces[1], link.ends),
         )
         deep = (
             metal[0].start < link.starts - _SNAP * length,
@@ -306,7 +328,7 @@ class _Problem:
             if free[side] and (inside[side] or (r <= 0.0 and deep[side])):
                 continue  # no field on this side
             r = max(r, _LEAST if free[side] else min(CONTACT / length, 1.0))
-            value = self._background_at(axis, nodes, link, side, surface, r)
+            value = self._background_at(line, link, side, surface, r)
             value[self.n_terminals + self.conductors.index(stretch.body)] = -1.0
             weight = link.weight / r
             rest -= link.weight * r
@@ -317,25 +339,17 @@ class _Problem:
         drop = self._end_value(link, 0) - self._end_value(link, 1)
         self.energy += rest * np.outer(drop, drop)
         for a, b in pairwise(metal):
-            gap = self._resistance(axis, nodes, link, on, a.end, b.start)
+            gap = self._resistance(axis, link, on, a.end, b.start)
             if a.body != b.body and gap > 0.0:
                 pair = np.zeros(self.n_lanes)
                 pair[self.n_terminals + self.conductors.index(a.body)] = 1.0
                 pair[self.n_terminals + self.conductors.index(b.body)] = -1.0
                 self.energy += link.weight / max(gap, _LEAST) * np.outer(pair, pair)
 
-    def _resistance(
-        self,
-        axis: int,
-        nodes: NDArray[np.int64],
-        link: _Link,
-        on: list[_Stretch],
-        a: float,
-        b: float,
-    ) -> float:
+    def _resistance(self, axis: int, link: _Link, on: list[_Stretch], a: float, b: float) -> float:
         """Resistance of a link between two of its points, with no conductor in between."""
         la = self.background.lattice
-        first = link.nodes[0] if link.nodes[0] >= 0 else link.nodes[1] - la.strides[axis]
+        first = link.nodes[0] if link.nodes[0] >= 0 else link.nodes[1] - la.storeys[0].strides[axis]
         empty = la.eps_r[axis, first]
         total = max(0.0, b - a)
         for s in on:
@@ -354,13 +368,7 @@ class _Problem:
         return out
 
     def _background_at(
-        self,
-        axis: int,
-        nodes: NDArray[np.int64],
-        link: _Link,
-        side: int,
-        surface: float,
-        resistance: float,
+        self, line: _Line, link: _Link, side: int, surface: float, resistance: float
     ) -> Array:
         """Background potential at a conductor's surface, per lane.
 
@@ -376,11 +384,12 @@ class _Problem:
         if min(link.nodes) < 0:
             t = (surface - link.starts) / length
             return (1.0 - t) * value_a + t * value_b + shift
-        c = la.axes[axis]
+        c, nodes = line.c, line.nodes
         m = int(np.flatnonzero(nodes == link.nodes[0])[0])
         points = {m: value_a, m + 1: value_b}
+        low, high = line.smooth
         for end, beyond in ((m, m - 1), (m + 1, m + 2)):
-            if 0 <= beyond < len(c) and not la.kink[nodes[end]]:
+            if m < high and low <= beyond <= high and not la.kink[nodes[end]]:
                 points[beyond] = np.zeros(self.n_lanes)
                 points[beyond][: self.n_terminals] = self.background.potentials[nodes[beyond]]
         out = shift
@@ -398,9 +407,8 @@ class _Problem:
             value[: self.n_terminals] = self.background.potentials[node]
             value[self.n_terminals + self.conductors.index(body)] = -1.0
             for axis in range(3):
-                for lower, other in (
-                    (node, node + la.strides[axis]), (node - la.strides[axis],) * 2,
-                ):  # fmt: skip
+                stride = int(la.beyond(axis, np.array(node))) - node
+                for lower, other in ((node, node + stride), (node - stride,) * 2):
                     weight = self.links_left.pop((axis, lower), 0.0)
                     whole = float(la.weights[axis, lower])
                     if other in self.inside:
@@ -421,17 +429,18 @@ class _Problem:
         la = self.background.lattice
         keys = np.array(list(self.links_left), dtype=np.int64).reshape(-1, 2)
         weight = np.array(list(self.links_left.values()))
-        a = keys[:, 1]
-        b = a + np.array(la.strides)[keys[:, 0]]
+        a, b = keys[:, 1], la.home[la.beyond(keys[:, 0], keys[:, 1])]
         shape = (la.n_nodes, la.n_nodes)
         links = sp.coo_matrix((weight, (a, b)), shape=shape).tocsr()
         total = np.asarray(links.sum(axis=0)).ravel() + np.asarray(links.sum(axis=1)).ravel()
         for node, extra in self.diagonal.items():
-            total[node] += extra
+            total[la.home[node]] += extra
+        load = np.zeros_like(self.load)
+        np.add.at(load, la.home, self.load)
         matrix = (sp.diags(total) - links - links.T).tocsr()
-        free = np.flatnonzero((la.owner == FREE) & (total > 1e-9 * la.weights.max()))
+        free = np.flatnonzero(la.unknown & (total > 1e-9 * la.weights.max()))
         merge = self._merged_lanes()
-        load, energy = self.load[free] @ merge, merge.T @ self.energy @ merge
+        load, energy = load[free] @ merge, merge.T @ self.energy @ merge
         u = spla.spsolve(matrix[free][:, free].tocsc(), load)
         energy = energy - load.T @ u.reshape(load.shape)
         n = self.n_terminals
@@ -469,7 +478,7 @@ def _farads(body: Body) -> float:
 
 @dataclass(frozen=True)
 class _Column:
-    """What a lattice line stands for: half-way to its neighbours."""
+    """What a lattice line stands for: about half-way to its neighbours."""
 
     axis: int
     across: tuple[int, int]
@@ -477,13 +486,13 @@ class _Column:
     bounds: dict[int, tuple[float, float]]
 
     @classmethod
-    def around(cls, axes: tuple[Array, ...], axis: int, i: int, j: int) -> _Column:
+    def around(cls, storey: Storey, axis: int, i: int, j: int) -> _Column:
         p, q = [a for a in range(3) if a != axis]
         bounds = {
-            a: ((c[k - 1] + c[k]) / 2, (c[k] + c[k + 1]) / 2)
-            for a, c, k in ((p, axes[p], i), (q, axes[q], j))
+            a: (float(storey.faces[a][k - 1]), float(storey.faces[a][k]))
+            for a, k in ((p, i), (q, j))
         }
-        return cls(axis, (p, q), (float(axes[p][i]), float(axes[q][j])), bounds)
+        return cls(axis, (p, q), (float(storey.axes[p][i]), float(storey.axes[q][j])), bounds)
 
     @property
     def rim(self) -> list[tuple[float, float]]:

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.field.background import BackgroundField
-from capsense.field.lattice import WALL
+from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.held_nodes import WALL, hold_nodes
+from capsense.field.planes import plan_axes
 from capsense.mesh import TetMesh, kuhn_tets
 from capsense.scene import Scene
 from capsense.solve.masked import GROUNDED, MaskedSolver
@@ -25,11 +26,13 @@ class MaskedScenes:
 
     FLOATING_EPS_R = 1e4
 
-    def __init__(self, design: Design, background: BackgroundField, frequency: float) -> None:
+    def __init__(
+        self, design: Design, background: BackgroundField, settings: BuildSettings, frequency: float
+    ) -> None:
         self._frequency = frequency
-        la = background.lattice
-        mesh = kuhn_tets(*la.axes)
-        owner = la.owner
+        axes = plan_axes(design, settings.lattice)
+        mesh = kuhn_tets(*axes)
+        owner = hold_nodes(design, axes)[0].ravel()
         groups = {
             name: np.flatnonzero(owner == k).astype(np.int32)
             for k, name in enumerate(background.terminals)

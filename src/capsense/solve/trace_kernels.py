@@ -9,21 +9,71 @@ slow, readable twin.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
-from capsense.solve.column_kernels import MAX_STRETCHES, MESH_STRETCHES, covered_stretches
+from capsense.solve.column_kernels import MAX_STRETCHES, MESH_STRETCHES, covered_stretches, pierce
 
 _SNAP = 1e-6
 """Fraction of a link within which a surface counts as lying on a node."""
 _LEAST = 1e-3
 """Smallest fraction of a link between a free node and a conductor."""
+FULL, CROWDED, SHORT = 0, 1, 2
+"""Outcomes of a scan: whole; more stretches on a line than fit; more findings than fit."""
+
+
+STOREY = np.dtype(
+    [
+        ("first", np.int64),
+        ("shape", np.int64, (3,)),
+        ("begin", np.int64, (3,)),
+        ("lowest", np.int64, (3,)),
+        ("highest", np.int64, (3,)),
+    ]
+)
+"""First node and shape of a storey, where its coordinates begin along each axis, and the first and
+last node on a line whose values may be used together (the floor's and ceiling's may not)."""
+LINK = np.dtype([("weight", np.float32), ("eps_r", np.float32), ("cut", np.int64)])
+"""Weight and permittivity in the empty domain, and the number of the link's cut; −1: none."""
+NODE = np.dtype([("owner", np.int64), ("kink", np.bool_)])
+CUT = np.dtype(
+    [
+        ("half", np.float64, (2,)),
+        ("length", np.float64, (2,)),
+        ("owner", np.int64, (2,)),
+    ]
+)
+"""Weights of both half-links, their lengths as fractions of the link, what holds their ends."""
+TIE = np.dtype(
+    [
+        ("node", np.int64),
+        ("weight", np.float64),
+        ("conductor", np.int64),
+        ("point", np.int64, (4,)),
+        ("coef", np.float64, (4,)),
+        ("end", np.int64),
+        ("end_coef", np.float64),
+    ]
+)
+"""A conductance from a node (−1: a held end) to a conductor, at a place where the background
+potential is ``Σ_k coef[k] φ[point[k]] + end_coef φ_end``."""
+ENERGY = np.dtype(
+    [
+        ("a", np.int64),
+        ("b", np.int64),
+        ("end", np.int64),
+        ("weight", np.float64),
+        ("drives", np.bool_),
+    ]
+)
+"""Adds ``weight · Δφ_i Δφ_j`` over a link from a to b (−1: the held ``end``). Where it drives, it
+loads both ends too (a dielectric)."""
+COUPLE = np.dtype([("a", np.int64), ("b", np.int64), ("weight", np.float64)])
+"""Two conductors that face each other on one link."""
 
 
 @njit(cache=True)
-def _resolve(n, t0, t1, who, conductor, r0, r1, rwho, cuts, parent):
+def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
     """Turn overlapping stretches into disjoint ones, in order; join conductors that touch."""
     if n == 1:
         r0[0], r1[0], rwho[0] = t0[0], t1[0], who[0]
@@ -43,11 +93,12 @@ def _resolve(n, t0, t1, who, conductor, r0, r1, rwho, cuts, parent):
         best = -1
         for k in range(n):
             if t0[k] <= middle and middle <= t1[k]:
+                this = bodies[who[k]].conductor
                 if best < 0:
                     best = who[k]
-                elif conductor[who[k]] >= 0 and conductor[best] >= 0:
-                    _join(parent, conductor[who[k]], conductor[best])
-                elif conductor[who[k]] >= 0 or (conductor[best] < 0 and who[k] > best):
+                elif this >= 0 and bodies[best].conductor >= 0:
+                    _join(joined, this, bodies[best].conductor)
+                elif this >= 0 or (bodies[best].conductor < 0 and who[k] > best):
                     best = who[k]
         if best < 0:
             continue
@@ -56,86 +107,116 @@ def _resolve(n, t0, t1, who, conductor, r0, r1, rwho, cuts, parent):
             if last == best:
                 r1[out - 1] = b
                 continue
-            if conductor[last] >= 0 and conductor[best] >= 0:
-                _join(parent, conductor[last], conductor[best])
+            if bodies[last].conductor >= 0 and bodies[best].conductor >= 0:
+                _join(joined, bodies[last].conductor, bodies[best].conductor)
         r0[out], r1[out], rwho[out] = a, b, best
         out += 1
     return out
 
 
 @njit(cache=True)
-def _join(parent, a, b):
-    while parent[a] != a:
-        a = parent[a]
-    while parent[b] != b:
-        b = parent[b]
+def _join(joined, a, b):
+    while joined[a] != a:
+        a = joined[a]
+    while joined[b] != b:
+        b = joined[b]
     if a < b:
-        parent[b] = a
+        joined[b] = a
     elif b < a:
-        parent[a] = b
+        joined[a] = b
 
 
 @njit(cache=True)
-def trace(
-    x,
-    y,
-    z,
-    strides,
-    base_weight,
-    base_extra,
-    eps_r,
-    owner,
-    kink,
-    cut_index,
-    cut_lower,
-    cut_lower_owner,
-    cut_upper,
-    cut_upper_owner,
-    half_weight,
-    kinds,
-    params,
-    rotation,
-    position,
-    bounds,
-    conductor,
-    body_eps,
-    n_bodies,
-    grids,
-    grid_shape,
-    grid_first,
-    grid_origin,
-    grid_inv,
-    contact,
-    inside,
-    inside_nodes,
-    n_inside,
-    weight,
-    extra,
-    tie_node,
-    tie_weight,
-    tie_conductor,
-    tie_point,
-    tie_coef,
-    tie_end,
-    tie_end_coef,
-    energy_link,
-    energy_weight,
-    energy_kind,
-    energy_end,
-    couple,
-    couple_weight,
-    parent,
-    counts,
-):
-    """Scan a scene; fill link weights, ties, energy terms and couplings. Return 0, or an error.
+def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, inside_nodes, before):
+    """Mark free nodes inside conductors with the conductor's index, as seen along z.
 
-    Outputs: ``weight`` (3, n) and ``extra`` (n,) hold the changed operator. A tie i connects node
-    ``tie_node[i]`` (−1: a held end) to conductor ``tie_conductor[i]``; the background potential
-    there is ``Σ_k tie_coef[i, k] φ[tie_point[i, k]] + tie_end_coef[i] φ_end``. An energy term adds
-    ``energy_weight · Δφ_i Δφ_j`` over a link; of kind 1 it also drives its ends (dielectric).
-    ``counts``: numbers of ties, energy terms and couplings.
+    Clears the first ``before`` marks in ``inside_nodes``; returns how many nodes lie inside now.
     """
-    n_tie, n_energy, n_couple = 0, 0, 0
+    for i in range(before):
+        inside[inside_nodes[i]] = -1
+    out = np.empty((MESH_STRETCHES, 2))
+    n = 0
+    for s in range(storeys.shape[0]):
+        storey = storeys[s]
+        first, begin = storey.first, storey.begin
+        nx, ny, nz = storey.shape[0], storey.shape[1], storey.shape[2]
+        x, y = axes[begin[0] : begin[0] + nx], axes[begin[1] : begin[1] + ny]
+        z = axes[begin[2] : begin[2] + nz]
+        for m in range(bodies.shape[0]):
+            body = bodies[m]
+            bounds = body.bounds
+            if body.conductor < 0 or bounds[1, 2] < z[1] or bounds[0, 2] > z[nz - 2]:
+                continue
+            for i in range(1, nx - 1):
+                if x[i] < bounds[0, 0] or x[i] > bounds[1, 0]:
+                    continue
+                for j in range(1, ny - 1):
+                    if y[j] < bounds[0, 1] or y[j] > bounds[1, 1]:
+                        continue
+                    count = pierce(2, x[i], y[j], body, grids, out)
+                    for c in range(count):
+                        k = max(1, np.searchsorted(z, out[c, 0]))
+                        while k < nz - 1 and z[k] <= out[c, 1]:
+                            a = first + (i * ny + j) * nz + k
+                            if nodes[a].owner == -1 and inside[a] < 0:
+                                inside[a] = body.conductor
+                                inside_nodes[n] = a
+                                n += 1
+                            k += 1
+    for j in range(ceiling.shape[0]):
+        if inside[parent[j]] >= 0:
+            inside[ceiling[j]] = inside[parent[j]]
+            inside_nodes[n] = ceiling[j]
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, bodies, grids, contact,
+          joined, weight, extra, inside, inside_nodes, ties, energies, couples,
+          counts):  # fmt: skip
+    """Scan a scene: change ``weight`` (3, n) and ``extra`` (n,), list ties, energies and couples.
+
+    ``joined[c]`` leads from a conductor to one it touches. ``counts`` holds the numbers of ties,
+    energies, couples and nodes inside conductors. Returns ``FULL``, ``CROWDED`` or ``SHORT``.
+    """
+    counts[:3] = 0
+    counts[3] = mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside,
+                            inside_nodes, counts[3])  # fmt: skip
+    for s in range(storeys.shape[0]):
+        for axis in range(3):
+            status = _trace_axis(
+                storeys[s], axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
+                weight, extra, inside, ties, energies, couples, counts,
+            )  # fmt: skip
+            if status != FULL:
+                return status
+    if not _close_inside(storeys, nodes, links, weight, extra, inside, inside_nodes, ties,
+                         energies, couples, counts):  # fmt: skip
+        return SHORT
+    for i in range(counts[0]):
+        if ties[i].node >= 0:
+            ties[i].node = home[ties[i].node]
+    for i in range(counts[1]):
+        if energies[i].a >= 0:
+            energies[i].a = home[energies[i].a]
+        if energies[i].b >= 0:
+            energies[i].b = home[energies[i].b]
+    return FULL
+
+
+@njit(cache=True)
+def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
+                weight, extra, inside, ties, energies, couples, counts):  # fmt: skip
+    """Scan the lines of a storey along one axis; lines on the walls carry no unknowns."""
+    p, q = 1 if axis == 0 else 0, 1 if axis == 2 else 2
+    shape, begin = storey.shape, storey.begin
+    strides = (shape[1] * shape[2], shape[2], 1)
+    stride, sp, sq = strides[axis], strides[p], strides[q]
+    c = axes[begin[axis] : begin[axis] + shape[axis]]
+    cp, fp = axes[begin[p] : begin[p] + shape[p]], faces[begin[p] : begin[p] + shape[p]]
+    cq, fq = axes[begin[q] : begin[q] + shape[q]], faces[begin[q] : begin[q] + shape[q]]
+    lowest, highest = storey.lowest[axis], storey.highest[axis]
     t0, t1 = np.empty(MAX_STRETCHES), np.empty(MAX_STRETCHES)
     who = np.empty(MAX_STRETCHES, np.int64)
     cover = np.empty(MAX_STRETCHES)
@@ -143,326 +224,295 @@ def trace(
     uwho = np.empty(MAX_STRETCHES, np.int64)
     r0, r1 = np.empty(2 * MAX_STRETCHES), np.empty(2 * MAX_STRETCHES)
     rwho = np.empty(2 * MAX_STRETCHES, np.int64)
-    sorted_cuts = np.empty(2 * MAX_STRETCHES)
+    ends = np.empty(2 * MAX_STRETCHES)
     scratch = np.empty((MESH_STRETCHES, 2))
-    near = np.empty(n_bodies, np.int64)
-    for axis in range(3):
-        if axis == 0:
-            c, cp, cq, p, q = x, y, z, 1, 2
-        elif axis == 1:
-            c, cp, cq, p, q = y, x, z, 0, 2
-        else:
-            c, cp, cq, p, q = z, x, y, 0, 1
-        stride, sp, sq = strides[axis], strides[p], strides[q]
-        last = c.shape[0] - 1
-        low, high = math.inf, -math.inf
-        for body in range(n_bodies):
-            low = min(low, bounds[body, 0, p])
-            high = max(high, bounds[body, 1, p])
-        # lines on the walls carry no unknowns
-        for ip in range(1, cp.shape[0] - 1):
-            op = cp[ip]
-            pl, ph = 0.5 * (cp[ip - 1] + op), 0.5 * (op + cp[ip + 1])
-            if ph < low or pl > high:
+    near = np.empty(bodies.shape[0], np.int64)
+    for ip in range(1, cp.shape[0] - 1):
+        n_near = 0
+        for m in range(bodies.shape[0]):
+            bounds = bodies[m].bounds
+            if (
+                bounds[0, p] <= fp[ip] and fp[ip - 1] <= bounds[1, p]
+                and bounds[0, axis] <= c[c.shape[0] - 1] and c[0] <= bounds[1, axis]
+            ):  # fmt: skip
+                near[n_near] = m
+                n_near += 1
+        if n_near == 0:
+            continue
+        for iq in range(1, cq.shape[0] - 1):
+            total = covered_stretches(
+                axis, p, q, cp[ip], cq[iq], fp[ip - 1], fp[ip], fq[iq - 1], fq[iq], bodies, near,
+                n_near, grids, t0, t1, who, cover, scratch,
+            )  # fmt: skip
+            if total == 0:
                 continue
-            n_near = 0
-            for body in range(n_bodies):
-                if bounds[body, 0, p] <= ph and pl <= bounds[body, 1, p]:
-                    near[n_near] = body
-                    n_near += 1
-            if n_near == 0:
-                continue
-            for iq in range(1, cq.shape[0] - 1):
-                oq = cq[iq]
-                ql, qh = 0.5 * (cq[iq - 1] + oq), 0.5 * (oq + cq[iq + 1])
-                total = covered_stretches(
-                    axis, p, q, op, oq, pl, ph, ql, qh, kinds, params, rotation, position, bounds,
-                    conductor, near, n_near, grids, grid_shape, grid_first, grid_origin, grid_inv,
-                    t0, t1, who, cover, scratch,
-                )  # fmt: skip
-                if total == 0:
-                    continue
-                if total < 0:
-                    return 1
-                # bodies that fill different shares of the column are met layer by layer
-                level = 1.0
-                upper = 0.0
+            if total < 0:
+                return CROWDED
+            # bodies that fill different shares of the column are met layer by layer
+            level = 0.0
+            for k in range(total):
+                level = max(level, cover[k])
+            while level > 0.0:
+                below = 0.0
+                n = 0
                 for k in range(total):
-                    upper = max(upper, cover[k])
-                level = upper
-                while level > 0.0:
-                    below = 0.0
-                    n = 0
-                    for k in range(total):
-                        if cover[k] >= level:
-                            u0[n], u1[n], uwho[n] = t0[k], t1[k], who[k]
-                            n += 1
-                        else:
-                            below = max(below, cover[k])
-                    share = level - below
-                    level = below
-                    n = _resolve(n, u0, u1, uwho, conductor, r0, r1, rwho, sorted_cuts, parent)
-                    line = ip * sp + iq * sq
-                    m = max(0, np.searchsorted(c, r0[0]) - 1)
-                    seg = 0
-                    while m < last:
-                        ta, tb = c[m], c[m + 1]
-                        while seg < n and r1[seg] <= ta:
-                            seg += 1
-                        if seg == n:
-                            break
-                        if r0[seg] >= tb:
-                            m = max(m + 1, np.searchsorted(c, r0[seg]) - 1)
-                            continue
-                        node = line + m * stride
-                        # a held sheet between the nodes splits the link in two
-                        cut = cut_index[axis, node]
-                        if cut < 0 and inside[node] >= 0 and inside[node + stride] >= 0:
-                            m += 1
-                            continue  # the whole link lies inside
-                        if owner[node] != -1 and owner[node] == owner[node + stride]:
-                            m += 1
-                            continue  # both ends on one held sheet: no field between them
-                        parts = 1 if cut < 0 else 2
-                        for part in range(parts):
-                            if (
-                                n_tie + 8 > tie_node.shape[0]
-                                or n_energy + 4 > energy_weight.shape[0]
-                                or n_couple + 8 > couple_weight.shape[0]
-                            ):
-                                return 2
-                            pa, pb = ta, tb
-                            na, nb = node, node + stride
-                            ea, eb = -3, -3
-                            w = share * base_weight[axis, node]
-                            if cut >= 0:
-                                w = share * half_weight[cut, part]
-                                if part == 0:
-                                    pb = ta + cut_lower[cut] * (tb - ta)
-                                    nb, eb = -1, cut_lower_owner[cut]
-                                else:
-                                    pa = tb - cut_upper[cut] * (tb - ta)
-                                    na, ea = -1, cut_upper_owner[cut]
-                            length = pb - pa
-                            # series resistance up to the first conductor, and back from the last
-                            resist, pos, k = 0.0, pa, seg
-                            first_r, first_s, first_k, first_deep = -1.0, 0.0, -1, False
-                            last_t, last_k, last_deep = pa, -1, False
-                            touched = False
-                            while k < n and r0[k] < pb:
-                                s0, s1 = max(r0[k], pa), min(r1[k], pb)
-                                body = rwho[k]
-                                kappa = 1.0
-                                if s1 > s0:
-                                    touched = True
-                                    if s0 > pos:
-                                        resist += (s0 - pos) / length
-                                    if conductor[body] >= 0:
-                                        if first_k < 0:
-                                            first_r, first_k = resist, conductor[body]
-                                            first_s = (s0 - pa) / length
-                                            first_deep = r0[k] < pa - _SNAP * length
-                                        elif last_k != conductor[body] and resist > 0.0:
-                                            couple[n_couple, 0] = last_k
-                                            couple[n_couple, 1] = conductor[body]
-                                            couple_weight[n_couple] = w / max(resist, _LEAST)
-                                            n_couple += 1
-                                        last_k, last_t = conductor[body], s1
-                                        last_deep = r1[k] > pb + _SNAP * length
-                                        resist = 0.0
-                                    else:
-                                        kappa = body_eps[body] / eps_r[axis, node]
-                                        resist += (s1 - s0) / length / kappa
-                                    pos = s1
-                                k += 1
-                            if not touched:
-                                continue
-                            if pos < pb:
-                                resist += (pb - pos) / length
-                            if first_k < 0:
-                                # dielectric only
-                                if abs(resist - 1.0) > 1e-9:
-                                    change = w / resist - w
-                                    if cut < 0:
-                                        weight[axis, node] += change
-                                    else:
-                                        extra[na if na >= 0 else nb] += change
-                                    energy_link[n_energy, 0], energy_link[n_energy, 1] = na, nb
-                                    energy_end[n_energy] = ea if na < 0 else eb
-                                    energy_weight[n_energy], energy_kind[n_energy] = change, 1
-                                    n_energy += 1
-                                continue
-                            if (
-                                first_deep
-                                and last_deep
-                                and first_r <= 0.0
-                                and resist <= 0.0
-                                and (na < 0 or (owner[na] == -1 and inside[na] < 0))
-                                and (nb < 0 or (owner[nb] == -1 and inside[nb] < 0))
-                                and cut < 0
-                            ):
-                                continue  # the body runs beside the link, not across it
-                            if cut < 0:
-                                weight[axis, node] -= w
-                            else:
-                                extra[na if na >= 0 else nb] -= w
-                            inner = w
-                            for side in range(2):
-                                r, s = (
-                                    (first_r, first_s)
-                                    if side == 0
-                                    else (resist, (pb - last_t) / length)
-                                )
-                                tied = na if side == 0 else nb
-                                deep = first_deep if side == 0 else last_deep
-                                free = tied >= 0 and owner[tied] == -1
-                                if free and (inside[tied] >= 0 or (r <= 0.0 and deep)):
-                                    continue  # no field on this side
-                                least = _LEAST if free else min(contact / length, 1.0)
-                                r = max(r, least)
-                                inner -= w * r
-                                tie_node[n_tie] = tied if free else -1
-                                tie_weight[n_tie] = w / r
-                                tie_conductor[n_tie] = first_k if side == 0 else last_k
-                                if free:
-                                    extra[tied] += w / r
-                                _tie_value(
-                                    n_tie,
-                                    side,
-                                    s,
-                                    r,
-                                    na,
-                                    nb,
-                                    ea,
-                                    eb,
-                                    stride,
-                                    m,
-                                    last,
-                                    part,
-                                    cut,
-                                    pa,
-                                    pb,
-                                    c,
-                                    kink,
-                                    tie_point,
-                                    tie_coef,
-                                    tie_end,
-                                    tie_end_coef,
-                                )
-                                n_tie += 1
-                            energy_link[n_energy, 0], energy_link[n_energy, 1] = na, nb
-                            energy_end[n_energy] = ea if na < 0 else eb
-                            energy_weight[n_energy], energy_kind[n_energy] = inner, 0
-                            n_energy += 1
-                        m += 1
-    # links that are left between a node inside a conductor and one outside
-    for i in range(n_inside):
-        a = inside_nodes[i]
-        for axis in range(3):
-            stride = strides[axis]
-            for way in range(2):
-                lower = a if way == 0 else a - stride
-                b = a + stride if way == 0 else a - stride
-                if cut_index[axis, lower] >= 0:
-                    continue
-                if n_tie + 8 > tie_node.shape[0] or n_energy + 4 > energy_weight.shape[0]:
-                    return 2
-                if inside[b] >= 0:
-                    if way == 0:
-                        weight[axis, lower] = 0.0
-                        energy_link[n_energy, 0], energy_link[n_energy, 1] = a, b
-                        energy_end[n_energy] = -3
-                        energy_weight[n_energy] = base_weight[axis, lower]
-                        energy_kind[n_energy] = 0
-                        n_energy += 1
-                    continue
-                w = weight[axis, lower]
-                weight[axis, lower] = 0.0
-                if w <= 1e-5 * base_weight[axis, lower]:
-                    continue
-                free = owner[b] == -1
-                tie_node[n_tie] = b if free else -1
-                tie_weight[n_tie] = w
-                tie_conductor[n_tie] = inside[a]
-                for k in range(4):
-                    tie_point[n_tie, k], tie_coef[n_tie, k] = a, 0.0
-                tie_coef[n_tie, 0] = 1.0
-                tie_end[n_tie], tie_end_coef[n_tie] = -3, 0.0
-                if free:
-                    extra[b] += w
-                n_tie += 1
-    counts[0], counts[1], counts[2] = n_tie, n_energy, n_couple
-    return 0
+                    if cover[k] >= level:
+                        u0[n], u1[n], uwho[n] = t0[k], t1[k], who[k]
+                        n += 1
+                    else:
+                        below = max(below, cover[k])
+                n = _resolve(n, u0, u1, uwho, bodies, r0, r1, rwho, ends, joined)
+                line = storey.first + ip * sp + iq * sq
+                if not _lay_line(axis, line, stride, c, lowest, highest, level - below, n, r0, r1,
+                                 rwho, nodes, links, cuts, bodies, contact, weight, extra, inside,
+                                 ties, energies, couples, counts):  # fmt: skip
+                    return SHORT
+                level = below
+    return FULL
 
 
 @njit(cache=True)
-def _tie_value(
-    i,
-    side,
-    s,
-    r,
-    na,
-    nb,
-    ea,
-    eb,
-    stride,
-    m,
-    last,
-    part,
-    cut,
-    pa,
-    pb,
-    c,
-    kink,
-    tie_point,
-    tie_coef,
-    tie_end,
-    tie_end_coef,
-):
-    """Coefficients of the background potential at a crossing, from nodes along the line.
+def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, nodes, links, cuts,
+              bodies, contact, weight, extra, inside, ties, energies, couples,
+              counts):  # fmt: skip
+    """Lay ``n`` disjoint stretches over the links of a line; False: the findings do not fit."""
+    last = c.shape[0] - 1
+    m = max(0, np.searchsorted(c, r0[0]) - 1)
+    seg = 0
+    while m < last:
+        while seg < n and r1[seg] <= c[m]:
+            seg += 1
+        if seg == n:
+            break
+        if r0[seg] >= c[m + 1]:
+            m = max(m + 1, np.searchsorted(c, r0[seg]) - 1)
+            continue
+        a = line + m * stride
+        b = a + stride
+        link = links[axis, a]
+        whole_inside = link.cut < 0 and inside[a] >= 0 and inside[b] >= 0
+        one_sheet = nodes[a].owner != -1 and nodes[a].owner == nodes[b].owner
+        if not whole_inside and not one_sheet and (link.cut >= 0 or link.weight > 0.0):
+            if not _room(ties, energies, couples, counts):
+                return False
+            for part in range(1 if link.cut < 0 else 2):
+                _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1,
+                          rwho, nodes, cuts, bodies, contact, weight, extra, inside, ties,
+                          energies, couples, counts)  # fmt: skip
+        m += 1
+    return True
+
+
+@njit(cache=True)
+def _room(ties, energies, couples, counts):
+    """Whether the buffers hold what one link may add."""
+    return (
+        counts[0] + 8 <= ties.shape[0]
+        and counts[1] + 4 <= energies.shape[0]
+        and counts[2] + 8 <= couples.shape[0]
+    )
+
+
+@njit(cache=True)
+def _add_energy(energies, counts, a, b, end, weight, drives):
+    term = energies[counts[1]]
+    term.a, term.b, term.end, term.weight, term.drives = a, b, end, weight, drives
+    counts[1] += 1
+
+
+@njit(cache=True)
+def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, nodes,
+              cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
+              counts):  # fmt: skip
+    """Change a link, or one part of a cut link, by the stretches on it from number ``seg`` on."""
+    ta, tb = c[m], c[m + 1]
+    pa, pb = ta, tb
+    na, nb = a, b
+    end = -3
+    w = share * np.float64(link.weight)
+    if link.cut >= 0:
+        # a held sheet between the nodes splits the link in two
+        cut = cuts[link.cut]
+        w = share * cut.half[part]
+        end = cut.owner[part]
+        if part == 0:
+            pb = ta + cut.length[0] * (tb - ta)
+            nb = -1
+        else:
+            pa = tb - cut.length[1] * (tb - ta)
+            na = -1
+    length = pb - pa
+    # series resistance up to the first conductor, and back from the last
+    resist, pos, k = 0.0, pa, seg
+    first_r, first_t, first_c, first_deep = -1.0, pa, -1, False
+    last_t, last_c, last_deep = pa, -1, False
+    touched = False
+    while k < n and r0[k] < pb:
+        s0, s1 = max(r0[k], pa), min(r1[k], pb)
+        if s1 > s0:
+            who = bodies[rwho[k]].conductor
+            touched = True
+            if s0 > pos:
+                resist += (s0 - pos) / length
+            if who >= 0:
+                if first_c < 0:
+                    first_r, first_t, first_c = resist, s0, who
+                    first_deep = r0[k] < pa - _SNAP * length
+                elif last_c != who and resist > 0.0:
+                    pair = couples[counts[2]]
+                    pair.a, pair.b, pair.weight = last_c, who, w / max(resist, _LEAST)
+                    counts[2] += 1
+                last_c, last_t = who, s1
+                last_deep = r1[k] > pb + _SNAP * length
+                resist = 0.0
+            else:
+                resist += (s1 - s0) / length * link.eps_r / bodies[rwho[k]].eps_r
+            pos = s1
+        k += 1
+    if not touched:
+        return
+    if pos < pb:
+        resist += (pb - pos) / length
+    if first_c < 0:
+        # dielectric only
+        if abs(resist - 1.0) > 1e-9:
+            change = w / resist - w
+            if link.cut < 0:
+                weight[axis, a] += change
+            else:
+                extra[na if na >= 0 else nb] += change
+            _add_energy(energies, counts, na, nb, end, change, True)
+        return
+    inside_a = na >= 0 and inside[na] >= 0
+    inside_b = nb >= 0 and inside[nb] >= 0
+    free_a = na >= 0 and nodes[na].owner == -1
+    free_b = nb >= 0 and nodes[nb].owner == -1
+    if (
+        link.cut < 0 and first_deep and last_deep and first_r <= 0.0 and resist <= 0.0
+        and free_a and free_b and not inside_a and not inside_b
+    ):  # fmt: skip
+        return  # the body runs beside the link, not across it
+    if link.cut < 0:
+        weight[axis, a] -= w
+    else:
+        extra[na if na >= 0 else nb] -= w
+    inner = w
+    for side in range(2):
+        if side == 0:
+            r, t, tied, who = first_r, first_t, na, first_c
+            free, hidden = free_a, inside_a or (first_r <= 0.0 and first_deep)
+        else:
+            r, t, tied, who = resist, last_t, nb, last_c
+            free, hidden = free_b, inside_b or (resist <= 0.0 and last_deep)
+        if free and hidden:
+            continue  # no field on this side
+        r = max(r, _LEAST if free else min(contact / length, 1.0))
+        inner -= w * r
+        tie = ties[counts[0]]
+        tie.node = tied if free else -1
+        tie.weight = w / r
+        tie.conductor = who
+        if free:
+            extra[tied] += w / r
+        away = (t - pa) / length if side == 0 else (pb - t) / length
+        shift = (away - r) * (1.0 if side == 0 else -1.0)
+        if link.cut >= 0:
+            _value_beside_sheet(tie, na, nb, end, (t - pa) / length, shift)
+        else:
+            _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift)
+        counts[0] += 1
+    _add_energy(energies, counts, na, nb, end, inner, False)
+
+
+@njit(cache=True)
+def _value_beside_sheet(tie, na, nb, end, s, shift):
+    """Background potential at fraction s of a half-link from na or to nb: linear along it."""
+    point, coef = tie.point, tie.coef
+    for k in range(4):
+        point[k], coef[k] = na if na >= 0 else nb, 0.0
+    at_b = s - shift
+    coef[0] = 1.0 - at_b if na >= 0 else at_b
+    tie.end = end
+    tie.end_coef = at_b if na >= 0 else 1.0 - at_b
+
+
+@njit(cache=True)
+def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
+    """Coefficients of the background potential at t on the link from a to b.
 
     Cubic where both neighbours beyond the link are smooth, of lower order beside an electrode or
-    a layer's face. The drop over a dielectric in front of the conductor is added linearly.
+    a layer's face, and at the ends of the line at ``lowest`` and ``highest``. The drop over a
+    dielectric in front of the conductor is added linearly: ``phi(t) + shift (phi_a − phi_b)``.
     """
-    for k in range(4):
-        tie_point[i, k], tie_coef[i, k] = 0, 0.0
-    tie_end[i], tie_end_coef[i] = -3, 0.0
-    f = s if side == 0 else 1.0 - s
-    if cut >= 0:
-        node, end = (na, eb) if na >= 0 else (nb, ea)
-        g = f if na >= 0 else 1.0 - f
-        shift = s - r if side == 0 else r - s
-        sign = 1.0 if na >= 0 else -1.0
-        tie_point[i, 0], tie_coef[i, 0] = node, 1.0 - g + shift * sign
-        tie_end[i], tie_end_coef[i] = end, g - shift * sign
-        return
-    before = m > 0 and not kink[na]
-    after = m + 1 < last and not kink[nb]
-    t = pa + f * (pb - pa)
-    tie_point[i, 1], tie_point[i, 2] = na, nb
-    tie_point[i, 0] = na - stride if before else na
-    tie_point[i, 3] = nb + stride if after else nb
-    x1, x2 = pa, pb
-    x0 = c[m - 1] if before else 0.0
-    x3 = c[m + 2] if after else 0.0
-    l1, l2 = (t - x2) / (x1 - x2), (t - x1) / (x2 - x1)
+    stride = b - a
+    before = m > lowest and m < highest and not nodes[a].kink
+    after = m + 1 < highest and not nodes[b].kink
+    x1, x2 = c[m], c[m + 1]
+    l0, l1, l2, l3 = 0.0, (t - x2) / (x1 - x2), (t - x1) / (x2 - x1), 0.0
     if before:
+        x0 = c[m - 1]
+        l0 = (t - x1) * (t - x2) / ((x0 - x1) * (x0 - x2))
         l1 *= (t - x0) / (x1 - x0)
         l2 *= (t - x0) / (x2 - x0)
     if after:
+        x3 = c[m + 2]
+        l3 = (t - x1) * (t - x2) / ((x3 - x1) * (x3 - x2))
         l1 *= (t - x3) / (x1 - x3)
         l2 *= (t - x3) / (x2 - x3)
-    if before:
-        l0 = (t - x1) * (t - x2) / ((x0 - x1) * (x0 - x2))
-        if after:
-            l0 *= (t - x3) / (x0 - x3)
-        tie_coef[i, 0] = l0
-    if after:
-        l3 = (t - x1) * (t - x2) / ((x3 - x1) * (x3 - x2))
         if before:
-            l3 *= (t - x0) / (x3 - x0)
-        tie_coef[i, 3] = l3
-    # phi_eff = phi_c + (s - r)(phi_near - phi_far): zero unless a dielectric lies in between
-    shift = s - r if side == 0 else r - s
-    tie_coef[i, 1] = l1 + shift
-    tie_coef[i, 2] = l2 - shift
+            l0 *= (t - x3) / (c[m - 1] - x3)
+            l3 *= (t - c[m - 1]) / (x3 - c[m - 1])
+    point, coef = tie.point, tie.coef
+    point[0], point[1] = a - stride if before else a, a
+    point[2], point[3] = b, b + stride if after else b
+    coef[0], coef[1], coef[2], coef[3] = l0, l1 + shift, l2 - shift, l3
+    tie.end, tie.end_coef = -3, 0.0
+
+
+@njit(cache=True)
+def _close_inside(storeys, nodes, links, weight, extra, inside, inside_nodes, ties, energies,
+                  couples, counts):  # fmt: skip
+    """Turn what is left of links from a node inside a conductor to one outside into ties.
+
+    Returns False if the findings do not fit.
+    """
+    s = 0
+    for i in range(counts[3]):
+        a = inside_nodes[i]
+        while a < storeys[s].first:
+            s -= 1
+        while s + 1 < storeys.shape[0] and a >= storeys[s + 1].first:
+            s += 1
+        strides = (storeys[s].shape[1] * storeys[s].shape[2], storeys[s].shape[2], 1)
+        for axis in range(3):
+            for way in range(2):
+                lower = a if way == 0 else a - strides[axis]
+                b = a + strides[axis] if way == 0 else lower
+                link = links[axis, lower]
+                if link.cut >= 0 or link.weight == 0.0:
+                    continue
+                if not _room(ties, energies, couples, counts):
+                    return False
+                if inside[b] >= 0:
+                    if way == 0:
+                        weight[axis, lower] = 0.0
+                        _add_energy(energies, counts, a, b, -3, link.weight, False)
+                    continue
+                w = weight[axis, lower]
+                weight[axis, lower] = 0.0
+                if w <= 1e-5 * link.weight:
+                    continue
+                free = nodes[b].owner == -1
+                tie = ties[counts[0]]
+                tie.node = b if free else -1
+                tie.weight = w
+                tie.conductor = inside[a]
+                point, coef = tie.point, tie.coef
+                for k in range(4):
+                    point[k], coef[k] = a, 0.0
+                coef[0] = 1.0
+                tie.end, tie.end_coef = -3, 0.0
+                if free:
+                    extra[b] += w
+                counts[0] += 1
+    return True
