@@ -26,9 +26,6 @@ __all__ = ["FREE", "WALL", "Cuts", "Joints", "Lattice", "LatticeSettings", "Stor
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_LEAST_LINK = 0.2
-"""What is left at least of a link that a joint beside it relieves."""
-
 
 @dataclass(frozen=True, eq=False)
 class Storey:
@@ -199,9 +196,7 @@ def _join_storeys(
                 for i in lines[:-1]:
                     at, after = lower.axes[axis][i], lower.axes[axis][i + 1]
                     carried = carried + joint[i] * (upper.axes[axis][g] - at)
-                    link = weights[axis][top[i]]
-                    relieved = link - carried / (after - at)
-                    weights[axis][top[i]] = np.maximum(relieved, _LEAST_LINK * link)
+                    weights[axis][top[i]] -= carried / (after - at)
         ceiling = below[1:-1, 1:-1, -1]
         owner[ceiling] = FREE
         ceilings.append(ceiling.ravel())

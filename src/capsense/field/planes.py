@@ -19,6 +19,10 @@ from capsense.design.model import Design
 Array = NDArray[np.float64]
 Groups = list[list[int]]
 
+_LEAN = 2.5
+"""Width of merged lines, at most, over the height of the joint: it may lean so far that the links
+beside it keep a fifth of their weight (see ``lattice._join_storeys``)."""
+
 
 @dataclass(frozen=True)
 class LatticeSettings:
@@ -35,22 +39,22 @@ class LatticeSettings:
     growth_z: float = 0.3
     """Growth of the spacing across the plane per unit distance from the nearest face."""
     far_z: float = 0.014
-    """Largest spacing across the plane."""
+    """Largest spacing across the plane …"""
+    tall: float = 0.06
+    """… or, where that is more, this fraction of the distance from the nearest face."""
     merge: float = 0.0008
     """Edges closer to each other than this share one lattice plane."""
     storey: float = 0.03
     """Height of the first storey above the design's highest part; each one doubles it."""
     thinning: float = 0.6
     """In-plane spacing of a storey, at most, over its height above the design; 0: one storey."""
-    broad: float = 0.045
-    """Largest in-plane spacing of a storey that merged lines may leave."""
 
     def refined(self, factor: float) -> LatticeSettings:
         """Return settings with ``factor`` times as many nodes along each axis."""
         return LatticeSettings(
             self.edge / factor, self.growth / factor, self.far / factor, self.face / factor,
-            self.growth_z / factor, self.far_z / factor, self.merge / max(1.0, factor),
-            self.storey, self.thinning / factor, self.broad / factor,
+            self.growth_z / factor, self.far_z / factor, self.tall / factor,
+            self.merge / max(1.0, factor), self.storey, self.thinning / factor,
         )  # fmt: skip
 
 
@@ -79,7 +83,7 @@ def plan_storeys(design: Design, s: LatticeSettings) -> list[StoreyPlan]:
         last = int(np.searchsorted(z, top + height - 1e-9))
         if last > len(z) - 4:
             break
-        limit = min(s.thinning * (z[last + 1] - top), s.broad)
+        limit = min(s.thinning * (z[last + 1] - top), _LEAN * (z[last + 1] - z[last]))
         found = [_pair_up(faces, limit) for _, faces in lines]
         if last > first and any(len(g) > 1 for part in found for g in part):
             plans.append(_storey(lines, z, first, last, groups))
@@ -155,7 +159,8 @@ def plan_axes(design: Design, s: LatticeSettings) -> tuple[Array, Array, Array]:
             growth, far = s.growth, s.far
         else:
             size, growth, far = np.full(len(edges), s.face), s.growth_z, s.far_z
-        out.append(_graded(lower[axis], upper[axis], planes, edges, size, growth, far))
+        tall = s.tall if axis == 2 else 0.0
+        out.append(_graded(lower[axis], upper[axis], planes, edges, size, growth, far, tall))
     return out[0], out[1], out[2]
 
 
@@ -186,15 +191,27 @@ def _merge(values: Array, distance: float, lower: float, upper: float) -> Array:
 
 
 def _graded(
-    lower: float, upper: float, planes: Array, edges: Array, size: Array, growth: float, far: float
+    lower: float,
+    upper: float,
+    planes: Array,
+    edges: Array,
+    size: Array,
+    growth: float,
+    far: float,
+    tall: float,
 ) -> Array:
-    """Lay planes through ``planes``, spaced by ``size`` at ``edges`` and growing from there."""
+    """Lay planes through ``planes``, spaced by ``size`` at ``edges`` and growing from there.
+
+    The spacing is at most ``far``, or the fraction ``tall`` of the distance from the edges.
+    """
     stops = np.concatenate([[lower], planes, [upper]])
     out = [lower]
     for a, b in pairwise(stops):
         t = np.linspace(a, b, 801)
         mid = 0.5 * (t[1:] + t[:-1])
-        h = np.minimum((size[None] + growth * np.abs(mid[:, None] - edges[None])).min(axis=1), far)
+        away = np.abs(mid[:, None] - edges[None])
+        h = (size[None] + growth * away).min(axis=1)
+        h = np.minimum(h, np.maximum(far, tall * away.min(axis=1)))
         count = np.concatenate([[0.0], np.cumsum(np.diff(t) / h)])
         n = max(1, int(np.ceil(count[-1] - 0.1)))
         out.extend(np.interp(np.arange(1, n) * count[-1] / n, count, t))

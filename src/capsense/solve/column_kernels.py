@@ -6,9 +6,12 @@ line and the bodies near it; ``solve/trace_kernels.py`` lays the outcome over th
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
+from capsense.scene.approach_kernels import approach, slenderness
 from capsense.scene.kernels import body_line_interval, mesh_line_intervals
 from capsense.scene.shape import ShapeKind
 
@@ -17,6 +20,7 @@ MAX_STRETCHES = 64
 """Stretches of one line inside bodies, over all bodies."""
 MESH_STRETCHES = 4
 """Stretches of one line inside one mesh body."""
+
 RAMP = 4.0
 """Steepness with which a body's share of a line's column turns into its weight.
 
@@ -77,7 +81,8 @@ def pierce(axis, op, oq, body, grids, out):
 def _chord(axis, along, t, u, v, low, high, body, grids, out):
     """Part of [low, high] that a body covers around a point on a line along ``along``.
 
-    The point lies at t on ``axis``, u on ``along`` and v on the third axis.
+    The point lies at t on ``axis``, u on ``along`` and v on the third axis. Returns both ends of
+    the part, and the length of the whole stretch inside the body.
     """
     if axis < 3 - axis - along:
         n = pierce(along, t, v, body, grids, out)
@@ -85,24 +90,68 @@ def _chord(axis, along, t, u, v, low, high, body, grids, out):
         n = pierce(along, v, t, body, grids, out)
     for k in range(n):
         if out[k, 0] - 1e-12 <= u and u <= out[k, 1] + 1e-12:
-            return max(low, out[k, 0]), min(high, out[k, 1])
-    return u, u
+            return max(low, out[k, 0]), min(high, out[k, 1]), out[k, 1] - out[k, 0]
+    return u, u, 0.0
 
 
 @njit(cache=True)
-def _covered_share(axis, p, q, t, sp, sq, q_first, pl, ph, ql, qh, body, grids, out):
-    """Share of a column's cross-section at t that a body covers around (sp, sq), and its middle."""
-    share = 1.0
-    for turn in range(2):
-        if (turn == 0) == q_first:
-            a, b = _chord(axis, q, t, sq, sp, ql, qh, body, grids, out)
-            sq = 0.5 * (a + b)
-            share *= (b - a) / (qh - ql)
-        else:
-            a, b = _chord(axis, p, t, sp, sq, pl, ph, body, grids, out)
-            sp = 0.5 * (a + b)
-            share *= (b - a) / (ph - pl)
+def thin_factor(wide_p, wide_q, across_p, across_q):
+    """How much less than a wall a thin conductor inside a column takes from the column's field.
+
+    A wire across a column, or a speck in it, only draws in field lines from around. Taken as a
+    resistance between the line and the conductor: that of a wire in a screen of wires a column
+    apart, or that of a small ball (Smythe 1950), each zero from a third of the column on.
+    """
+    wide = 0.5 * (wide_p + wide_q)
+    thin, thick = min(across_p, across_q), max(across_p, across_q)
+    if math.pi * thin >= wide:
+        return 1.0
+    if math.pi * thick >= wide:
+        return 1.0 / (1.0 + 4.0 * math.log(wide / (math.pi * thin)) / (2.0 * math.pi))
+    return 1.0 / (1.0 + 2.0 * (wide / (math.pi * max(thin, 1e-9)) - 1.0))
+
+
+@njit(cache=True)
+def _covered_share(axis, p, q, t, sp, sq, pl, ph, ql, qh, body, grids, out):
+    """Weight of a body in a column at t around (sp, sq), and the middle of what it covers.
+
+    The share of the column's cross-section that it covers, steepened. Of a rod or a speck in the
+    column it counts how much of its own width the column holds.
+    """
+    least = slenderness(body.kind, body.params)
+    a, b, across_p = _chord(axis, p, t, sp, sq, pl, ph, body, grids, out)
+    sp = 0.5 * (a + b)
+    share = (b - a) / min(ph - pl, max(across_p, least))
+    a, b, across_q = _chord(axis, q, t, sq, sp, ql, qh, body, grids, out)
+    sq = 0.5 * (a + b)
+    share *= (b - a) / min(qh - ql, max(across_q, least))
+    share = 0.5 + RAMP * (share - 0.5)
+    if share > WHOLE:
+        share = 1.0
+    if least < ph - pl and least < qh - ql:
+        share *= thin_factor(ph - pl, qh - ql, max(across_p, least), max(across_q, least))
     return share, sp, sq
+
+
+@njit(cache=True)
+def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
+    """Look for a body in a column whose line it misses: a place (sp, sq), and stretches there."""
+    if body.kind == _MESH:
+        for trial in range(8):
+            sp = pl if trial in (0, 4, 5) else (ph if trial in (1, 6, 7) else op)
+            sq = ql if trial in (2, 4, 6) else (qh if trial in (3, 5, 7) else oq)
+            count = pierce(axis, sp, sq, body, grids, out)
+            if count > 0:
+                return sp, sq, count
+        return op, oq, 0
+    if axis == 0:
+        _, sp, sq = approach(body.kind, body.params, body.rotation, body.position, 0.0, op, oq, 0)
+    elif axis == 1:
+        sp, _, sq = approach(body.kind, body.params, body.rotation, body.position, op, 0.0, oq, 1)
+    else:
+        sp, sq, _ = approach(body.kind, body.params, body.rotation, body.position, op, oq, 0.0, 2)
+    sp, sq = min(max(sp, pl), ph), min(max(sq, ql), qh)
+    return sp, sq, pierce(axis, sp, sq, body, grids, out)
 
 
 @njit(cache=True)
@@ -125,30 +174,25 @@ def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, 
         count = pierce(axis, sp, sq, body, grids, out)
         share = 1.0
         if body.conductor >= 0:
-            trial = 0
-            while count == 0 and trial < 8:
-                # no hit in the middle: look at the column's edges and corners
-                sp = pl if trial in (0, 4, 5) else (ph if trial in (1, 6, 7) else op)
-                sq = ql if trial in (2, 4, 6) else (qh if trial in (3, 5, 7) else oq)
-                trial += 1
-                count = pierce(axis, sp, sq, body, grids, out)
-            if count == 0:
-                continue
+            centred = count > 0
+            if not centred:
+                sp, sq, count = _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out)
+                if count == 0:
+                    continue
             a, b = out[0, 0], out[0, 1]
             for k in range(1, count):
                 if out[k, 1] - out[k, 0] > b - a:
                     a, b = out[k, 0], out[k, 1]
             share, sp, sq = _covered_share(
-                axis, p, q, 0.5 * (a + b), sp, sq, trial in (3, 4), pl, ph, ql, qh, body, grids, out
+                axis, p, q, 0.5 * (a + b), sp, sq, pl, ph, ql, qh, body, grids, out
             )
-            share = 0.5 + RAMP * (share - 0.5)
             if share <= 0.0:
                 continue
-            if share > WHOLE:
-                share, sp, sq = 1.0, op, oq
-            if share == 1.0 and trial == 0 and count == 1:
+            if share == 1.0 and centred and count == 1:
                 out[0, 0], out[0, 1] = a, b
             else:
+                if share == 1.0 and centred:
+                    sp, sq = op, oq
                 count = pierce(axis, sp, sq, body, grids, out)
         for k in range(count):
             if out[k, 1] > out[k, 0]:

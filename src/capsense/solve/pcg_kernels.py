@@ -22,49 +22,27 @@ _RELAX = np.float32(0.97)
 """Share of the dropped fill-in that is moved to the diagonal."""
 
 
-@njit(cache=True)
-def operator_diagonal(weight, extra, owner, storeys, ceiling, parent, share, diagonal, active):
-    """Sum the links and ties at each unknown; nodes inside a conductor are off.
-
-    Adds ties of ceiling nodes to the nodes they stand for, and sets up the floor nodes: their links
-    upward, and in ``share`` the part that each column below has in one.
-    """
-    for j in range(ceiling.shape[0]):
-        c, b = ceiling[j], parent[j]
-        extra[b] += extra[c]
-        extra[c] = 0.0
-        weight[2, b - 1] = 0.0
-    for j in range(ceiling.shape[0]):
-        weight[2, parent[j] - 1] += weight[2, ceiling[j] - 1]
-    for j in range(ceiling.shape[0]):
-        total = weight[2, parent[j] - 1]
-        share[j] = weight[2, ceiling[j] - 1] / total if total > 0.0 else 0.0
-    wx, wy, wz = weight[0], weight[1], weight[2]
-    for s in range(storeys.shape[0]):
-        first, nx, ny, nz = storeys[s]
-        sx, sy = ny * nz, nz
-        for i in range(1, nx - 1):
-            for j in range(1, ny - 1):
-                start = first + i * sx + j * sy
-                for a in range(start + 1, start + nz - 1):
-                    active[a] = 0.0
-                    diagonal[a] = 1.0
-                    if owner[a] == -1:
-                        d = wx[a] + wx[a - sx] + wy[a] + wy[a - sy] + wz[a] + wz[a - 1] + extra[a]
-                        if d > 0.0:
-                            active[a] = 1.0
-                            diagonal[a] = d
-    for j in range(ceiling.shape[0]):
-        active[ceiling[j]] = active[parent[j]]
-
-
 @njit(cache=True, fastmath=True)
-def factorise(weight, diagonal, active, storeys, ceiling, parent, inverse):
-    """Write the inverse pivots of the incomplete factorisation; zero at nodes that are off.
+def factorise(weight, extra, owner, storeys, ceiling, parent, share, diagonal, active, inverse,
+              woken):  # fmt: skip
+    """Set up the operator and its incomplete factors, storey by storey.
 
-    A floor node's "pivot" is what the elimination of the columns below takes from the node above.
+    Sums the links and ties at each unknown; nodes inside a conductor are off: ``active`` 0. Writes
+    the inverse pivots, zero at nodes that are off. Ties of ceiling nodes go to the nodes they stand
+    for. A floor node's link upward is what leads to it from below, ``share`` holds each column's
+    part in it, and its "pivot" is what the elimination of these columns takes from the node above.
+    Lists the nodes that come on in ``woken`` and returns how many there are.
     """
     wx, wy, wz = weight[0], weight[1], weight[2]
+    for j in range(ceiling.shape[0]):
+        extra[parent[j]] += extra[ceiling[j]]
+        wz[parent[j] - 1] = 0.0
+    for j in range(ceiling.shape[0]):
+        wz[parent[j] - 1] += wz[ceiling[j] - 1]
+    for j in range(ceiling.shape[0]):
+        total = wz[parent[j] - 1]
+        share[j] = wz[ceiling[j] - 1] / total if total > 0.0 else 0.0
+    n_woken = 0
     done = 0
     for s in range(storeys.shape[0]):
         first, nx, ny, nz = storeys[s]
@@ -73,20 +51,21 @@ def factorise(weight, diagonal, active, storeys, ceiling, parent, inverse):
             for j in range(1, ny - 1):
                 start = first + i * sx + j * sy
                 for a in range(start + 1, start + nz - 1):
-                    if active[a] == 0.0:
-                        inverse[a] = 0.0
+                    full = wx[a] + wx[a - sx] + wy[a] + wy[a - sy] + wz[a] + wz[a - 1] + extra[a]
+                    if owner[a] != -1 or full <= 0.0:
+                        active[a], diagonal[a], inverse[a] = 0.0, 1.0, 0.0
                         continue
-                    d = diagonal[a]
-                    b = a - sx
-                    g = wx[b] * inverse[b]
-                    d -= g * (wx[b] + _RELAX * (wy[b] * active[b + sy] + wz[b] * active[b + 1]))
-                    b = a - sy
-                    g = wy[b] * inverse[b]
-                    d -= g * (wy[b] + _RELAX * (wx[b] * active[b + sx] + wz[b] * active[b + 1]))
-                    b = a - 1
-                    g = wz[b] * inverse[b]
-                    d -= g * (wz[b] + _RELAX * (wx[b] * active[b + sx] + wy[b] * active[b + sy]))
-                    inverse[a] = np.float32(1.0) / max(d, np.float32(0.02) * diagonal[a])
+                    if active[a] == 0.0:
+                        woken[n_woken] = a
+                        n_woken += 1
+                    active[a], diagonal[a] = 1.0, full
+                    b, c, d = a - sx, a - sy, a - 1
+                    gx, gy, gz = wx[b] * inverse[b], wy[c] * inverse[c], wz[d] * inverse[d]
+                    # fill-in towards nodes that are off is lost on ties, which are in the diagonal
+                    taken = gx * (wx[b] + _RELAX * (wy[b] + wz[b]))
+                    taken += gy * (wy[c] + _RELAX * (wx[c] + wz[c]))
+                    taken += gz * (wz[d] + _RELAX * (wx[d] + wy[d]))
+                    inverse[a] = np.float32(1.0) / max(full - taken, np.float32(0.02) * full)
         stop = first + nx * sx
         begin = done
         while done < ceiling.shape[0] and ceiling[done] < stop:
@@ -97,8 +76,10 @@ def factorise(weight, diagonal, active, storeys, ceiling, parent, inverse):
             total = wz[floor]
             if total > 0.0:
                 g = wz[b] * inverse[b]
-                lost = g * (wz[b] + _RELAX * (wx[b] * active[b + sx] + wy[b] * active[b + sy]))
-                inverse[floor] += lost / (total * total)
+                inverse[floor] += g * (wz[b] + _RELAX * (wx[b] + wy[b])) / (total * total)
+    for j in range(ceiling.shape[0]):
+        active[ceiling[j]] = active[parent[j]]
+    return n_woken
 
 
 @njit(cache=True)

@@ -75,7 +75,7 @@ class PerturbationSolver:
         self._base_weight, self._base_extra = self._base_operator()
         self._mesh = _Mesh(background, self._base_weight)
         self._diagonal, self._active = np.ones(n, np.float32), np.zeros(n, np.float32)
-        self._inverse = np.zeros(n, np.float32)
+        self._inverse, self._woken = np.zeros(n, np.float32), np.empty(n, np.int64)
         self._share = np.zeros(len(la.joints), np.float32)
         self._stamp, self._mark = np.zeros(n, np.int64), 0
         self._inside, self._inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
@@ -177,15 +177,10 @@ class PerturbationSolver:
     ) -> None:
         """Build diagonal and preconditioner; carry the last solution over."""
         la = self.background.lattice
-        before = self._active.copy()
         found, mesh = self._found, self._mesh
-        pcg.operator_diagonal(
+        n_woken = pcg.factorise(
             found.weight, found.extra, la.owner, mesh.storeys, mesh.ceiling, mesh.parent,
-            self._share, self._diagonal, self._active,
-        )  # fmt: skip
-        pcg.factorise(
-            found.weight, self._diagonal, self._active, mesh.storeys, mesh.ceiling, mesh.parent,
-            self._inverse,
+            self._share, self._diagonal, self._active, self._inverse, self._woken,
         )  # fmt: skip
         signature = (len(scene), *lanes.tolist())
         if signature != self._lanes or not self._blocks:
@@ -196,9 +191,9 @@ class PerturbationSolver:
                 if keep > 0:
                     block.u[:, :keep] = last.u[:, :keep]
             self._lanes = signature
-        woken = np.flatnonzero((before == 0) & (self._active != 0) & la.unknown)
+        woken = self._woken[:n_woken]
         for block in self._blocks:
-            if woken.size < la.n_nodes // 2:
+            if n_woken < la.n_nodes // 2:
                 block.u[woken] = -block.phi[woken]
 
     def _make_blocks(self, n_lanes: int) -> list[_Block]:

@@ -46,8 +46,9 @@ from numpy.typing import NDArray
 
 from capsense.field.background import BackgroundField
 from capsense.field.lattice import FREE, Storey
-from capsense.scene import Body, Scene
-from capsense.solve.column_kernels import RAMP, WHOLE
+from capsense.scene import Body, PackedScene, Scene, ShapeKind
+from capsense.scene.approach_kernels import approach, slenderness
+from capsense.solve.column_kernels import RAMP, WHOLE, thin_factor
 from capsense.solve.perturbation import CONTACT
 from capsense.solve.trace_kernels import _LEAST, _SNAP
 
@@ -135,7 +136,7 @@ class _Problem:
             beyond = int(la.beyond(la.cuts.axis[k], node))
             self._tie(node, float(bg.half_weights[k, 0]))
             self._tie(beyond, float(bg.half_weights[k, 1]))
-        self.bounds = self.scene.pack().bounds
+        self.packed = self.scene.pack()
         self.inside = self._nodes_inside()
 
     def _nodes_inside(self) -> dict[int, int]:
@@ -194,36 +195,47 @@ class _Problem:
     def _met(self, column: _Column, number: int) -> list[tuple[float, float, float]]:
         """How much a body weighs in a column, and its stretches there: (weight, start, end)."""
         body, axis = self.scene[number], column.axis
-        low, high = self.bounds[number]
+        low, high = self.packed.bounds[number]
         if any(end < low[a] or start > high[a] for a, (start, end) in column.bounds.items()):
             return []
         middle = column.at(*column.middle)
         if number not in self.same:
             return [(1.0, a, b) for a, b in _pierce(body, middle[None], axis)[0]]
-        trials = [middle, *(column.at(*uv) for uv in column.rim)]
-        hits = _pierce(body, np.array(trials), axis)
-        first = next((k for k, hit in enumerate(hits) if hit), None)
-        if first is None:
-            return []
-        a, b = max(hits[first], key=lambda ab: ab[1] - ab[0])
-        point, share = trials[first].copy(), 1.0
+        hit = _pierce(body, middle[None], axis)[0]
+        centred, point = bool(hit), middle.copy()
+        if not centred:
+            trials = np.array([column.at(*uv) for uv in column.trials(self.packed, number)])
+            hits = _pierce(body, trials, axis)
+            first = next((k for k, found in enumerate(hits) if found), None)
+            if first is None:
+                return []
+            hit, point = hits[first], trials[first].copy()
+        a, b = max(hit, key=lambda ab: ab[1] - ab[0])
         point[axis] = 0.5 * (a + b)
-        p, q = column.across
-        for along in (q, p) if first in (3, 4) else (p, q):
+        kind, params = body.shape.kind, self.packed.params[number]
+        slender = float(slenderness(kind, params))
+        share, widths, extents = 1.0, [], []
+        for along in column.across:
             low, high = column.bounds[along]
-            chord = [
-                (max(low, a), min(high, b))
+            chords = [
+                (a, b)
                 for a, b in _pierce(body, point[None], along)[0]
                 if a - 1e-12 <= point[along] <= b + 1e-12
             ]
-            a, b = chord[0] if chord else (point[along], point[along])
-            share *= (b - a) / (high - low)
-            point[along] = 0.5 * (a + b)
+            a, b = chords[0] if chords else (point[along], point[along])
+            inside = (max(low, a), min(high, b))
+            widths.append(high - low)
+            extents.append(max(b - a, slender))
+            share *= (inside[1] - inside[0]) / min(high - low, extents[-1])
+            point[along] = 0.5 * (inside[0] + inside[1])
         weight = 0.5 + RAMP * (share - 0.5)
-        if weight > WHOLE:
-            weight, point = 1.0, middle
+        weight = 1.0 if weight > WHOLE else weight
+        if slender < min(widths):
+            weight *= thin_factor(*widths, *extents)
         if weight <= 0.0:
             return []
+        if weight == 1.0 and centred:
+            point = middle
         return [(weight, a, b) for a, b in _pierce(body, point[None], axis)[0]]
 
     def _disjoint(self, raw: list[_Stretch]) -> list[_Stretch]:
@@ -494,11 +506,21 @@ class _Column:
         }
         return cls(axis, (p, q), (float(storey.axes[p][i]), float(storey.axes[q][j])), bounds)
 
-    @property
-    def rim(self) -> list[tuple[float, float]]:
-        """Middles of the column's sides, then its corners."""
+    def trials(self, packed: PackedScene, number: int) -> list[tuple[float, float]]:
+        """Where to look for a body that the middle misses.
+
+        Where it comes closest to the column's line, drawn into the column. For a mesh, the middles
+        of the column's sides, then its corners.
+        """
         (u, v), (p, q) = self.middle, self.across
         (pl, ph), (ql, qh) = self.bounds[p], self.bounds[q]
+        kind = packed.kinds[number]
+        if kind != ShapeKind.MESH:
+            near = approach(
+                kind, packed.params[number], packed.rotation[number], packed.position[number],
+                *self.at(u, v).tolist(), axis=self.axis,
+            )  # fmt: skip
+            return [(float(np.clip(near[p], pl, ph)), float(np.clip(near[q], ql, qh)))]
         return [
             (pl, v), (ph, v), (u, ql), (u, qh), (pl, ql), (pl, qh), (ph, ql), (ph, qh)
         ]  # fmt: skip
