@@ -357,9 +357,9 @@ def inner(left, right, out):
     """Add leftᵀ right over the nodes to ``out`` (8, 8)."""
     zero = splat(np.float32(0.0))
     part = np.zeros((LANES, LANES), np.float32)
-    for start in range(0, left.shape[0], 64):
+    for start in range(0, left.shape[0], 256):
         s0, s1, s2, s3, s4, s5, s6, s7 = zero, zero, zero, zero, zero, zero, zero, zero
-        for a in range(start, min(start + 64, left.shape[0])):
+        for a in range(start, min(start + 256, left.shape[0])):
             v = load(right, a)
             s0 = madd(left[a, 0], v, s0)
             s1 = madd(left[a, 1], v, s1)

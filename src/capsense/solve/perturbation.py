@@ -182,8 +182,9 @@ class PerturbationSolver:
             found.weight, found.extra, la.owner, mesh.storeys, mesh.ceiling, mesh.parent,
             self._share, self._diagonal, self._active, self._inverse, self._woken,
         )  # fmt: skip
+        fresh = not self._blocks
         signature = (len(scene), *lanes.tolist())
-        if signature != self._lanes or not self._blocks:
+        if fresh or signature != self._lanes:
             old = self._blocks
             self._blocks = self._make_blocks(n_lanes)
             for block, last in zip(self._blocks, old, strict=False):
@@ -191,9 +192,9 @@ class PerturbationSolver:
                 if keep > 0:
                     block.u[:, :keep] = last.u[:, :keep]
             self._lanes = signature
-        woken = self._woken[:n_woken]
-        for block in self._blocks:
-            if n_woken < la.n_nodes // 2:
+        if not fresh:
+            woken = self._woken[:n_woken]
+            for block in self._blocks:
                 block.u[woken] = -block.phi[woken]
 
     def _make_blocks(self, n_lanes: int) -> list[_Block]:
@@ -238,9 +239,9 @@ class PerturbationSolver:
             )
             rest = np.zeros(LANES)
             done = pcg.solve(
-                self._found.weight, self._diagonal, self._active, self._inverse, mesh.storeys, mesh.ceiling,
-                mesh.parent, self._share, block.rhs, block.u, block.r, block.z, block.p, block.ap,
-                wanted, self.max_iterations, rest,
+                self._found.weight, self._diagonal, self._active, self._inverse, mesh.storeys,
+                mesh.ceiling, mesh.parent, self._share, block.rhs, block.u, block.r, block.z,
+                block.p, block.ap, wanted, self.max_iterations, rest,
             )  # fmt: skip
             iterations = max(iterations, done)
             left, goal = max(left, rest.max() * _UNIT), max(goal, wanted.max() * _UNIT)

@@ -516,9 +516,10 @@ class _Column:
         (pl, ph), (ql, qh) = self.bounds[p], self.bounds[q]
         kind = packed.kinds[number]
         if kind != ShapeKind.MESH:
+            x, y, z = self.at(u, v).tolist()
             near = approach(
                 kind, packed.params[number], packed.rotation[number], packed.position[number],
-                *self.at(u, v).tolist(), axis=self.axis,
+                x, y, z, self.axis,
             )  # fmt: skip
             return [(float(np.clip(near[p], pl, ph)), float(np.clip(near[q], ql, qh)))]
         return [
