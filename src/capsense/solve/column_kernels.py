@@ -112,7 +112,20 @@ def thin_factor(wide_p, wide_q, across_p, across_q):
 
 
 @njit(cache=True)
-def _covered_share(axis, p, q, t, sp, sq, pl, ph, ql, qh, body, grids, out):
+def part_covered(low, node, high, a, b, extent):
+    """Part of a column's side [low, high] that [a, b] covers; an edge at the node covers half.
+
+    Of a body that is narrower than the side, the part of its own ``extent``.
+    """
+    if extent < high - low:
+        return (b - a) / extent
+    at_a = 0.5 * (a - low) / (node - low) if a < node else 1.0 - 0.5 * (high - a) / (high - node)
+    at_b = 0.5 * (b - low) / (node - low) if b < node else 1.0 - 0.5 * (high - b) / (high - node)
+    return at_b - at_a
+
+
+@njit(cache=True)
+def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, out):
     """Weight of a body in a column at t around (sp, sq), and the middle of what it covers.
 
     The share of the column's cross-section that it covers, steepened. Of a rod or a speck in the
@@ -121,10 +134,10 @@ def _covered_share(axis, p, q, t, sp, sq, pl, ph, ql, qh, body, grids, out):
     least = slenderness(body.kind, body.params)
     a, b, across_p = _chord(axis, p, t, sp, sq, pl, ph, body, grids, out)
     sp = 0.5 * (a + b)
-    share = (b - a) / min(ph - pl, max(across_p, least))
+    share = part_covered(pl, op, ph, a, b, max(across_p, least))
     a, b, across_q = _chord(axis, q, t, sq, sp, ql, qh, body, grids, out)
     sq = 0.5 * (a + b)
-    share *= (b - a) / min(qh - ql, max(across_q, least))
+    share *= part_covered(ql, oq, qh, a, b, max(across_q, least))
     share = 0.5 + RAMP * (share - 0.5)
     if share > WHOLE:
         share = 1.0
@@ -184,7 +197,7 @@ def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, 
                 if out[k, 1] - out[k, 0] > b - a:
                     a, b = out[k, 0], out[k, 1]
             share, sp, sq = _covered_share(
-                axis, p, q, 0.5 * (a + b), sp, sq, pl, ph, ql, qh, body, grids, out
+                axis, p, q, 0.5 * (a + b), op, oq, sp, sq, pl, ph, ql, qh, body, grids, out
             )
             if share <= 0.0:
                 continue

@@ -48,7 +48,7 @@ from capsense.field.background import BackgroundField
 from capsense.field.lattice import FREE, Storey
 from capsense.scene import Body, PackedScene, Scene, ShapeKind
 from capsense.scene.approach_kernels import approach, slenderness
-from capsense.solve.column_kernels import RAMP, WHOLE, thin_factor
+from capsense.solve.column_kernels import RAMP, WHOLE, part_covered, thin_factor
 from capsense.solve.perturbation import CONTACT
 from capsense.solve.trace_kernels import _LEAST, _SNAP
 
@@ -215,7 +215,7 @@ class _Problem:
         kind, params = body.shape.kind, self.packed.params[number]
         slender = float(slenderness(kind, params))
         share, widths, extents = 1.0, [], []
-        for along in column.across:
+        for along, node in zip(column.across, column.middle, strict=True):
             low, high = column.bounds[along]
             chords = [
                 (a, b)
@@ -226,7 +226,7 @@ class _Problem:
             inside = (max(low, a), min(high, b))
             widths.append(high - low)
             extents.append(max(b - a, slender))
-            share *= (inside[1] - inside[0]) / min(high - low, extents[-1])
+            share *= part_covered(low, node, high, *inside, extents[-1])
             point[along] = 0.5 * (inside[0] + inside[1])
         weight = 0.5 + RAMP * (share - 0.5)
         weight = 1.0 if weight > WHOLE else weight
