@@ -20,7 +20,7 @@ _LOWEST, _HIGHEST = -0.8, 4.0
 """Bounds on the relative change of a weight; weights stay positive."""
 
 
-def calibrate(lattice: Lattice, potentials: Array, strength: float = 0.36) -> tuple[Array, Array]:
+def calibrate(lattice: Lattice, potentials: Array, strength: float = 0.22) -> tuple[Array, Array]:
     """Return adapted link weights (3, n) and half-link weights (cuts, 2) [F].
 
     ``potentials`` are the accurate fields at the nodes [V], shape (n, terminals). Minimises

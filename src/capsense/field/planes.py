@@ -28,25 +28,25 @@ beside it keep a fifth of their weight (see ``lattice._join_storeys``)."""
 class LatticeSettings:
     """Spacings of the online lattice; all lengths in metres."""
 
-    edge: float = 0.006
+    edge: float = 0.0036
     """Largest spacing beside an electrode's edge, in the plane."""
-    growth: float = 0.45
+    growth: float = 0.53
     """Growth of the in-plane spacing per unit distance from the nearest edge."""
-    far: float = 0.035
+    far: float = 0.06
     """Largest in-plane spacing."""
-    face: float = 0.0015
+    face: float = 0.0024
     """Spacing beside an electrode's face, across the plane."""
-    growth_z: float = 0.3
+    growth_z: float = 0.207
     """Growth of the spacing across the plane per unit distance from the nearest face."""
-    far_z: float = 0.014
+    far_z: float = 0.013
     """Largest spacing across the plane …"""
-    tall: float = 0.06
+    tall: float = 0.074
     """… or, where that is more, this fraction of the distance from the nearest face."""
     merge: float = 0.0008
     """Edges closer to each other than this share one lattice plane."""
-    storey: float = 0.03
+    storey: float = 0.022
     """Height of the first storey above the design's highest part; each one doubles it."""
-    thinning: float = 0.6
+    thinning: float = 0.32
     """In-plane spacing of a storey, at most, over its height above the design; 0: one storey."""
 
     def refined(self, factor: float) -> LatticeSettings:

@@ -129,21 +129,24 @@ def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, o
     """Weight of a body in a column at t around (sp, sq), and the middle of what it covers.
 
     The share of the column's cross-section that it covers, steepened. Of a rod or a speck in the
-    column it counts how much of its own width the column holds.
+    column it counts how much of its own width the column holds. Last comes how far the covered
+    part lies aside of the column's line [m].
     """
     least = slenderness(body.kind, body.params)
     a, b, across_p = _chord(axis, p, t, sp, sq, pl, ph, body, grids, out)
     sp = 0.5 * (a + b)
     share = part_covered(pl, op, ph, a, b, max(across_p, least))
+    aside_p = max(a - op, max(op - b, 0.0))
     a, b, across_q = _chord(axis, q, t, sq, sp, ql, qh, body, grids, out)
     sq = 0.5 * (a + b)
     share *= part_covered(ql, oq, qh, a, b, max(across_q, least))
+    aside_q = max(a - oq, max(oq - b, 0.0))
     share = 0.5 + RAMP * (share - 0.5)
     if share > WHOLE:
         share = 1.0
     if least < ph - pl and least < qh - ql:
         share *= thin_factor(ph - pl, qh - ql, max(across_p, least), max(across_q, least))
-    return share, sp, sq
+    return share, sp, sq, math.hypot(aside_p, aside_q)
 
 
 @njit(cache=True)
@@ -169,13 +172,14 @@ def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
 
 @njit(cache=True)
 def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, grids, t0, t1,
-                      who, cover, out):  # fmt: skip
+                      who, cover, aside, out):  # fmt: skip
     """Stretches of a lattice line's column inside bodies, and the weight of each.
 
     The column of a line reaches about half-way to its neighbours, [pl, ph] x [ql, qh]. A
     conductor's stretch is taken at the middle of what it covers of the column, and weighted by the
     share it covers, so that an edge that moves across a line makes it enter gradually. Dielectrics
-    are met on the line itself. Returns the number of stretches, or −1 if they do not fit.
+    are met on the line itself. ``aside`` tells, for each body, how far what it covers lies from
+    the line [m]. Returns the number of stretches, or −1 if they do not fit.
     """
     n = 0
     for m in range(n_near):
@@ -186,6 +190,7 @@ def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, 
         sp, sq = op, oq
         count = pierce(axis, sp, sq, body, grids, out)
         share = 1.0
+        aside[near[m]] = 0.0
         if body.conductor >= 0:
             centred = count > 0
             if not centred:
@@ -196,7 +201,7 @@ def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, 
             for k in range(1, count):
                 if out[k, 1] - out[k, 0] > b - a:
                     a, b = out[k, 0], out[k, 1]
-            share, sp, sq = _covered_share(
+            share, sp, sq, aside[near[m]] = _covered_share(
                 axis, p, q, 0.5 * (a + b), op, oq, sp, sq, pl, ph, ql, qh, body, grids, out
             )
             if share <= 0.0:

@@ -17,7 +17,8 @@ resistance 1.
 
 - No conductor: the link's weight becomes w / Σ resistance. The change δ = w′ − w drives both ends,
   ``−δ (φ⁰_a − φ⁰_b)`` at a, and adds ``δ Δφ⁰_i Δφ⁰_j`` to the energy.
-- A conductor: the link is taken away. From each end a *tie* of weight w / r leads to the first
+- A conductor: the link is taken away (less of it, where the conductor ends beside the line and its
+  end comes abreast of a node). From each end a *tie* of weight w / r leads to the first
   conductor met, r being the resistance up to it. A node inside the conductor has none. The tie's
   far end is at −φ⁰ of that point (u = φ − φ⁰ and φ = 0 there). The rest of the link's empty-domain
   energy, weight w (1 − r_a − r_b), is added. Conductors that face each other on one link are joined
@@ -35,8 +36,9 @@ tie value −1. Floating conductors are then eliminated with what ties them to g
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -88,6 +90,8 @@ class _Stretch:
     start: float
     end: float
     body: int
+    aside: float = 0.0
+    """How far what the body covers of the line's column lies from the line [m]."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +175,8 @@ class _Problem:
     ) -> Iterator[tuple[_Line, list[tuple[float, list[_Stretch]]]]]:
         p, q = [a for a in range(3) if a != axis]
         grid, c = np.moveaxis(storey.nodes, axis, -1), storey.axes[axis]
+        low, high = self.packed.bounds[:, 0, axis], self.packed.bounds[:, 1, axis]
+        here = np.flatnonzero((low <= c[-1]) & (high >= c[0])).tolist()
         smooth = (0, len(c) - 1)
         if axis == 2:
             highest = storey.stop == self.background.lattice.n_nodes
@@ -179,9 +185,9 @@ class _Problem:
             for j in range(1, len(storey.axes[q]) - 1):
                 column = _Column.around(storey, axis, i, j)
                 found = [
-                    (cover, _Stretch(a, b, body))
-                    for body in range(len(self.scene))
-                    for cover, a, b in self._met(column, body)
+                    (cover, _Stretch(a, b, body, aside))
+                    for body in here
+                    for cover, a, b, aside in self._met(column, body)
                 ]
                 levels = sorted({cover for cover, _ in found})
                 steps = np.diff([0.0, *levels])
@@ -192,15 +198,15 @@ class _Problem:
                 if bundle:
                     yield _Line(axis, grid[i, j], c, smooth), bundle
 
-    def _met(self, column: _Column, number: int) -> list[tuple[float, float, float]]:
-        """How much a body weighs in a column, and its stretches there: (weight, start, end)."""
+    def _met(self, column: _Column, number: int) -> list[tuple[float, float, float, float]]:
+        """A body's stretches in a column: weight, start, end, and how far aside they lie."""
         body, axis = self.scene[number], column.axis
         low, high = self.packed.bounds[number]
         if any(end < low[a] or start > high[a] for a, (start, end) in column.bounds.items()):
             return []
         middle = column.at(*column.middle)
         if number not in self.same:
-            return [(1.0, a, b) for a, b in _pierce(body, middle[None], axis)[0]]
+            return [(1.0, a, b, 0.0) for a, b in _pierce(body, middle[None], axis)[0]]
         hit = _pierce(body, middle[None], axis)[0]
         centred, point = bool(hit), middle.copy()
         if not centred:
@@ -214,7 +220,7 @@ class _Problem:
         point[axis] = 0.5 * (a + b)
         kind, params = body.shape.kind, self.packed.params[number]
         slender = float(slenderness(kind, params))
-        share, widths, extents = 1.0, [], []
+        share, widths, extents, off = 1.0, [], [], []
         for along, node in zip(column.across, column.middle, strict=True):
             low, high = column.bounds[along]
             chords = [
@@ -228,6 +234,7 @@ class _Problem:
             extents.append(max(b - a, slender))
             share *= part_covered(low, node, high, *inside, extents[-1])
             point[along] = 0.5 * (inside[0] + inside[1])
+            off.append(max(inside[0] - node, node - inside[1], 0.0))
         weight = 0.5 + RAMP * (share - 0.5)
         weight = 1.0 if weight > WHOLE else weight
         if slender < min(widths):
@@ -236,7 +243,8 @@ class _Problem:
             return []
         if weight == 1.0 and centred:
             point = middle
-        return [(weight, a, b) for a, b in _pierce(body, point[None], axis)[0]]
+        aside = math.hypot(*off)
+        return [(weight, a, b, aside) for a, b in _pierce(body, point[None], axis)[0]]
 
     def _disjoint(self, raw: list[_Stretch]) -> list[_Stretch]:
         """Conductors win over dielectrics, later dielectrics over earlier ones."""
@@ -250,13 +258,14 @@ class _Problem:
             for other in metal[1:]:
                 self._join(metal[0], other)
             best = metal[0] if metal else max(here)
+            aside = next(s.aside for s in raw if s.body == best)
             touching = bool(out) and a - out[-1].end <= 1e-12
             if touching and out[-1].body == best:
-                out[-1] = _Stretch(out[-1].start, b, best)
+                out[-1] = _Stretch(out[-1].start, b, best, aside)
                 continue
             if touching and out[-1].body in self.same and best in self.same:
                 self._join(out[-1].body, best)
-            out.append(_Stretch(a, b, best))
+            out.append(_Stretch(a, b, best, aside))
         return out
 
     def _join(self, a: int, b: int) -> None:
@@ -331,13 +340,33 @@ class _Problem:
         )
         free = [n >= 0 and la.owner[n] == FREE for n in link.nodes]
         inside = [n in self.inside for n in link.nodes]
-        if max(resistances) <= 0.0 and all(deep) and all(free) and not any(inside):
+        pairs = [
+            (a, b, gap)
+            for a, b in pairwise(metal)
+            if (gap := self._resistance(axis, link, on, a.end, b.start)) > 0.0 and a.body != b.body
+        ]
+        beside = max(resistances) <= 0.0 and all(deep) and not pairs
+        if beside and all(free) and not any(inside):
             return  # the body runs beside the link, not across it
+        for a, b, gap in pairs:
+            pair = np.zeros(self.n_lanes)
+            pair[self.n_terminals + self.conductors.index(a.body)] = 1.0
+            pair[self.n_terminals + self.conductors.index(b.body)] = -1.0
+            self.energy += link.weight / max(gap, _LEAST) * np.outer(pair, pair)
+        hidden = [inside[k] or (resistances[k] <= 0.0 and deep[k]) for k in range(2)]
+        # a surface that ends beside the line draws less and less on a node it comes abreast of
+        ahead = [surfaces[0] - link.starts, link.ends - surfaces[1]]
+        off_line = max(s.aside for s in metal)
+        seen = [ahead[k] for k in range(2) if free[k] and not hidden[k]]
+        if off_line > 0.0 and seen:
+            link = replace(
+                link, weight=link.weight * min(seen) ** 2 / (min(seen) ** 2 + off_line**2)
+            )
         self._change(axis, link, -link.weight)
         rest = link.weight
         for side, stretch in enumerate((metal[0], metal[-1])):
             node, surface, r = link.nodes[side], surfaces[side], resistances[side]
-            if free[side] and (inside[side] or (r <= 0.0 and deep[side])):
+            if free[side] and hidden[side]:
                 continue  # no field on this side
             r = max(r, _LEAST if free[side] else min(CONTACT / length, 1.0))
             value = self._background_at(line, link, side, surface, r)
@@ -350,13 +379,6 @@ class _Problem:
                 self._tie(node, weight)
         drop = self._end_value(link, 0) - self._end_value(link, 1)
         self.energy += rest * np.outer(drop, drop)
-        for a, b in pairwise(metal):
-            gap = self._resistance(axis, link, on, a.end, b.start)
-            if a.body != b.body and gap > 0.0:
-                pair = np.zeros(self.n_lanes)
-                pair[self.n_terminals + self.conductors.index(a.body)] = 1.0
-                pair[self.n_terminals + self.conductors.index(b.body)] = -1.0
-                self.energy += link.weight / max(gap, _LEAST) * np.outer(pair, pair)
 
     def _resistance(self, axis: int, link: _Link, on: list[_Stretch], a: float, b: float) -> float:
         """Resistance of a link between two of its points, with no conductor in between."""

@@ -9,6 +9,8 @@ slow, readable twin.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -226,7 +228,7 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
     rwho = np.empty(2 * MAX_STRETCHES, np.int64)
     ends = np.empty(2 * MAX_STRETCHES)
     scratch = np.empty((MESH_STRETCHES, 2))
-    near = np.empty(bodies.shape[0], np.int64)
+    near, aside = np.empty(bodies.shape[0], np.int64), np.empty(bodies.shape[0])
     for ip in range(1, cp.shape[0] - 1):
         n_near = 0
         for m in range(bodies.shape[0]):
@@ -242,7 +244,7 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
         for iq in range(1, cq.shape[0] - 1):
             total = covered_stretches(
                 axis, p, q, cp[ip], cq[iq], fp[ip - 1], fp[ip], fq[iq - 1], fq[iq], bodies, near,
-                n_near, grids, t0, t1, who, cover, scratch,
+                n_near, grids, t0, t1, who, cover, aside, scratch,
             )  # fmt: skip
             if total == 0:
                 continue
@@ -264,16 +266,16 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
                 n = _resolve(n, u0, u1, uwho, bodies, r0, r1, rwho, ends, joined)
                 line = storey.first + ip * sp + iq * sq
                 if not _lay_line(axis, line, stride, c, lowest, highest, level - below, n, r0, r1,
-                                 rwho, nodes, links, cuts, bodies, contact, weight, extra, inside,
-                                 ties, energies, couples, counts):  # fmt: skip
+                                 rwho, aside, nodes, links, cuts, bodies, contact, weight, extra,
+                                 inside, ties, energies, couples, counts):  # fmt: skip
                     return SHORT
                 level = below
     return FULL
 
 
 @njit(cache=True)
-def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, nodes, links, cuts,
-              bodies, contact, weight, extra, inside, ties, energies, couples,
+def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, aside, nodes, links,
+              cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
     """Lay ``n`` disjoint stretches over the links of a line; False: the findings do not fit."""
     last = c.shape[0] - 1
@@ -297,7 +299,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, no
                 return False
             for part in range(1 if link.cut < 0 else 2):
                 _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1,
-                          rwho, nodes, cuts, bodies, contact, weight, extra, inside, ties,
+                          rwho, aside, nodes, cuts, bodies, contact, weight, extra, inside, ties,
                           energies, couples, counts)  # fmt: skip
         m += 1
     return True
@@ -321,8 +323,8 @@ def _add_energy(energies, counts, a, b, end, weight, drives):
 
 
 @njit(cache=True)
-def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, nodes,
-              cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
+def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, aside,
+              nodes, cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
     """Change a link, or one part of a cut link, by the stretches on it from number ``seg`` on."""
     ta, tb = c[m], c[m + 1]
@@ -346,7 +348,8 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     resist, pos, k = 0.0, pa, seg
     first_r, first_t, first_c, first_deep = -1.0, pa, -1, False
     last_t, last_c, last_deep = pa, -1, False
-    touched = False
+    off_line = 0.0
+    touched, parted = False, False
     while k < n and r0[k] < pb:
         s0, s1 = max(r0[k], pa), min(r1[k], pb)
         if s1 > s0:
@@ -355,10 +358,12 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
             if s0 > pos:
                 resist += (s0 - pos) / length
             if who >= 0:
+                off_line = max(off_line, aside[rwho[k]])
                 if first_c < 0:
                     first_r, first_t, first_c = resist, s0, who
                     first_deep = r0[k] < pa - _SNAP * length
                 elif last_c != who and resist > 0.0:
+                    parted = True
                     pair = couples[counts[2]]
                     pair.a, pair.b, pair.weight = last_c, who, w / max(resist, _LEAST)
                     counts[2] += 1
@@ -388,10 +393,22 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     free_a = na >= 0 and nodes[na].owner == -1
     free_b = nb >= 0 and nodes[nb].owner == -1
     if (
-        link.cut < 0 and first_deep and last_deep and first_r <= 0.0 and resist <= 0.0
+        link.cut < 0 and not parted
+        and first_deep and last_deep and first_r <= 0.0 and resist <= 0.0
         and free_a and free_b and not inside_a and not inside_b
     ):  # fmt: skip
         return  # the body runs beside the link, not across it
+    hidden_a = inside_a or (first_r <= 0.0 and first_deep)
+    hidden_b = inside_b or (resist <= 0.0 and last_deep)
+    if off_line > 0.0:
+        # a surface that ends beside the line draws less and less on a node that it comes abreast of
+        ahead = math.inf
+        if free_a and not hidden_a:
+            ahead = first_t - pa
+        if free_b and not hidden_b:
+            ahead = min(ahead, pb - last_t)
+        if ahead < math.inf:
+            w *= ahead * ahead / (ahead * ahead + off_line * off_line)
     if link.cut < 0:
         weight[axis, a] -= w
     else:
@@ -400,10 +417,10 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     for side in range(2):
         if side == 0:
             r, t, tied, who = first_r, first_t, na, first_c
-            free, hidden = free_a, inside_a or (first_r <= 0.0 and first_deep)
+            free, hidden = free_a, hidden_a
         else:
             r, t, tied, who = resist, last_t, nb, last_c
-            free, hidden = free_b, inside_b or (resist <= 0.0 and last_deep)
+            free, hidden = free_b, hidden_b
         if free and hidden:
             continue  # no field on this side
         r = max(r, _LEAST if free else min(contact / length, 1.0))
