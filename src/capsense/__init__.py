@@ -10,6 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from capsense import humans
+    from capsense.adapters import mujoco, pybullet
     from capsense.design.loader import available_designs, load_design
     from capsense.design.model import Design
     from capsense.errors import (
@@ -60,7 +62,10 @@ __all__ = [
     "__version__",
     "available_designs",
     "load_design",
+    "humans",
     "load_scenario",
+    "mujoco",
+    "pybullet",
 ]
 
 _HOMES = {
@@ -85,6 +90,11 @@ _HOMES = {
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Reading", "Simulator"),
 }
+_SUBMODULES = {
+    "humans": "capsense.humans",
+    "mujoco": "capsense.adapters.mujoco",
+    "pybullet": "capsense.adapters.pybullet",
+}
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 
@@ -97,6 +107,8 @@ def __getattr__(name: str) -> Any:
         value = version("capsense")
     elif name in _HOME_OF:
         value = getattr(import_module(_HOME_OF[name]), name)
+    elif name in _SUBMODULES:
+        value = import_module(_SUBMODULES[name])
     else:
         raise AttributeError(f"module 'capsense' has no attribute {name!r}")
     globals()[name] = value

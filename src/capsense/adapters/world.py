@@ -1,0 +1,120 @@
+"""The solids of a simulator: made once, placed in the sensor frame at every reading."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.adapters.rules import Names
+from capsense.design.model import Domain
+from capsense.errors import SceneError
+from capsense.scene import Body, Box, Material, Pose, Scene, Shape
+from capsense.scene.body import Grounding
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HalfSpace:
+    """Everything below the plane z = 0 of its own frame, such as a floor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """One solid of a simulator, fixed to one of its moving frames."""
+
+    label: str
+    """What it is called in scenes and messages."""
+    names: Names
+    """The names that patterns are tried on."""
+    shape: Shape | HalfSpace
+    frame: int
+    """Index of the frame that carries it, among those the simulator gives at every reading."""
+    pose: Pose
+    """Where it stands in that frame."""
+    material: Material
+    grounding: Grounding
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Where the moving frames of a simulator, and the sensor, are at one instant."""
+
+    position: Array
+    """Origins [m] in the simulator's world, shape (f, 3)."""
+    quaternion: Array
+    """Unit quaternions (x, y, z, w), shape (f, 4)."""
+    sensor_position: Array
+    """Origin of the sensor frame [m], shape (3,)."""
+    sensor_quaternion: Array
+    """Unit quaternion of the sensor frame, shape (4,)."""
+
+
+@dataclass(eq=False)
+class World:
+    """All solids that a sensor may see.
+
+    Args:
+        solids: The solids; labels that repeat are numbered.
+        domain: The box outside which nothing is seen.
+    """
+
+    solids: Sequence[Solid]
+    domain: Domain
+    _bodies: list[Body] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.solids)
+        edge = 4.0 * float(np.linalg.norm(self.domain.size))
+        self._frame = np.array([s.frame for s in self.solids], dtype=np.int64)
+        self._local_position = np.array([s.pose.position for s in self.solids]).reshape(n, 3)
+        self._local_quaternion = np.array([s.pose.quaternion for s in self.solids]).reshape(n, 4)
+        self._depth = np.array([edge * isinstance(s.shape, HalfSpace) for s in self.solids])
+        self._bodies = []
+        boxes = np.zeros((n, 2, 3))
+        taken: dict[str, int] = {}
+        for i, solid in enumerate(self.solids):
+            space = isinstance(solid.shape, HalfSpace)
+            shape = Box((edge, edge, edge)) if isinstance(solid.shape, HalfSpace) else solid.shape
+            boxes[i] = 0.0 if space else shape.bounds()
+            count = taken[solid.label] = taken.get(solid.label, 0) + 1
+            label = solid.label if count == 1 else f"{solid.label}#{count}"
+            self._bodies.append(Body(shape, Pose(), solid.material, solid.grounding, label))
+        self._centre = boxes.mean(axis=1)
+        self._half = 0.5 * (boxes[:, 1] - boxes[:, 0])
+        self._lower, self._upper = self.domain.lower, self.domain.upper
+        self._position = np.empty((n, 3))
+        self._quaternion = np.empty((n, 4))
+        self._seen = np.zeros(n, dtype=np.bool_)
+
+    def scene(self, frames: Frames) -> Scene:
+        """The solids that reach into the domain, in the sensor frame.
+
+        Raises:
+            SceneError: A frame stands at no finite place.
+        """
+        from capsense.adapters.kernels import place_solids
+
+        place_solids(
+            frames.position, frames.quaternion, self._frame, self._local_position,
+            self._local_quaternion, self._centre, self._half, self._depth,
+            frames.sensor_position, frames.sensor_quaternion, self._lower, self._upper,
+            self._position, self._quaternion, self._seen,
+        )  # fmt: skip
+        if not np.isfinite(self._position.sum() + self._quaternion.sum()):
+            bad = ~np.isfinite(self._position.sum(axis=1) + self._quaternion.sum(axis=1))
+            label = self.solids[int(np.flatnonzero(bad)[0])].label
+            raise SceneError(
+                f"{label!r} stands at a place that is not finite; has the simulation diverged?"
+            )
+        return Scene(
+            [
+                self._bodies[i].moved(
+                    Pose(self._position[i].tolist(), self._quaternion[i].tolist())
+                )
+                for i in np.flatnonzero(self._seen).tolist()
+            ]
+        )
