@@ -128,9 +128,7 @@ def test_excluded_things_are_left_out(sensor_in: SensorIn) -> None:
     assert len(sensor_in(things, cs.Pose(), exclude=["*/*"], exclude_own=False).scene()) == 0
 
 
-def test_materials_and_grounding_by_name(
-    sensor_in: SensorIn, tiny_simulator: cs.Simulator
-) -> None:
+def test_materials_and_grounding_by_name(sensor_in: SensorIn, tiny_simulator: cs.Simulator) -> None:
     """The first pattern that fits decides; a dielectric and a floating body read as such."""
     things = [
         Thing("left_arm", cs.Sphere(0.012), cs.Pose((-0.015, 0, 0.03))),
