@@ -153,6 +153,25 @@ def test_materials_and_grounding_by_name(sensor_in: SensorIn, tiny_simulator: cs
     assert difference(sensor.read(), plain) < SAME
 
 
+def test_a_capacitance_to_ground_is_shared(
+    sensor_in: SensorIn, tiny_simulator: cs.Simulator
+) -> None:
+    """The things of one pattern are one body; what is not seen has no share."""
+    half = cs.Box((0.02, 0.03, 0.01))
+    things = [
+        Thing("arm_a", half, cs.Pose((-0.0099, 0, 0.03))),
+        Thing("arm_b", half, cs.Pose((0.0099, 0, 0.03))),
+        Thing("arm_far", half, cs.Pose((0.5, 0, 0.03))),
+    ]
+    sensor = sensor_in(things, cs.Pose(), grounding={"arm_*": 3e-15})
+    assert [b.grounding for b in sensor.scene()] == pytest.approx([1.5e-15] * 2, abs=0)
+    reading = sensor.read()
+    pair = plain_reading(things[:2], cs.Pose(), tiny_simulator, grounding=1.5e-15)
+    assert difference(reading, pair) < SAME
+    each = plain_reading(things[:2], cs.Pose(), tiny_simulator, grounding=3e-15)
+    assert difference(reading, each) > 100 * SAME
+
+
 def test_two_sensors_at_once(
     adapter: str, sensor_in: SensorIn, tiny_simulator: cs.Simulator
 ) -> None:
@@ -171,7 +190,7 @@ def test_reading_shape_and_names(sensor_in: SensorIn, tiny_simulator: cs.Simulat
     sensor = sensor_in([Thing("ball", cs.Sphere(0.01), cs.Pose((0, 0, 0.03)))], cs.Pose())
     reading = sensor.read()
     assert sensor.electrode_names == tiny_simulator.electrode_names == reading.electrode_names
-    assert reading.capacitance == pytest.approx(sensor.baseline + reading.delta)
+    assert reading.capacitance == pytest.approx(sensor.baseline + reading.delta, abs=0)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 
 import capsense as cs
 from capsense.adapters.meshes import height_field, joined_hulls, load_triangles, round_cylinder
+from capsense.adapters.rules import Tie
 from capsense.adapters.world import Frames, HalfSpace, Solid, World
 from capsense.design.model import Domain
 
@@ -28,7 +29,7 @@ def random_pose(rng: np.random.Generator, spread: float) -> cs.Pose:
 
 
 def solid(shape: cs.Box | HalfSpace, frame: int, pose: cs.Pose, label: str = "it") -> Solid:
-    return Solid(label, (label,), shape, frame, pose, STEEL, "grounded")
+    return Solid(label, shape, frame, pose, STEEL, Tie("grounded", "test"))
 
 
 def frames_of(poses: list[cs.Pose], sensor: cs.Pose) -> Frames:

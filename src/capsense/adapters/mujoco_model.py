@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters.meshes import height_field, solid_mesh
-from capsense.adapters.rules import Names, Rules, matches, read_grounding, read_material
+from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
 from capsense.adapters.world import HalfSpace, Solid
 from capsense.errors import SceneError
 from capsense.scene import (
@@ -22,7 +22,6 @@ from capsense.scene import (
     Sphere,
     TriMesh,
 )
-from capsense.scene.body import Grounding
 
 if TYPE_CHECKING:
     import mujoco
@@ -49,7 +48,7 @@ class ModelReader:
         self.rules = rules
         self._names = [self._names_of(i) for i in range(model.ngeom)]
         self._materials: dict[str, Material] = {}
-        self._grounding: dict[str, Grounding] = {}
+        self._grounding: dict[str, Tie] = {}
         self._meshes: dict[tuple[int, bool], TriMesh] = {}
         self._read_texts()
         rules.check(self._names)
@@ -64,16 +63,15 @@ class ModelReader:
         if self.rules.excludes(names):
             return None
         own_material = next((m for p, m in self._materials.items() if matches(p, names)), None)
-        own_grounding = next((g for p, g in self._grounding.items() if matches(p, names)), None)
+        own_tie = next((t for p, t in self._grounding.items() if matches(p, names)), None)
         w, x, y, z = self.model.geom_quat[geom].tolist()
         return Solid(
             label=names[-1],
-            names=names,
             shape=self._shape(geom, names),
             frame=int(self.model.geom_bodyid[geom]),
             pose=Pose(self.model.geom_pos[geom].tolist(), (x, y, z, w)),
             material=self.rules.material_of(names, own_material),
-            grounding=self.rules.grounding_of(names, own_grounding),
+            tie=self.rules.tie_of(names, own_tie),
         )
 
     def _names_of(self, geom: int) -> Names:
@@ -93,7 +91,8 @@ class ModelReader:
             if name.startswith(MATERIAL_KEY):
                 self._materials[name.removeprefix(MATERIAL_KEY)] = read_material(text, where)
             elif name.startswith(GROUNDING_KEY):
-                self._grounding[name.removeprefix(GROUNDING_KEY)] = read_grounding(text, where)
+                tie = Tie(read_grounding(text, where), f"text {name}")
+                self._grounding[name.removeprefix(GROUNDING_KEY)] = tie
             elif name.startswith("capsense"):
                 raise SceneError(
                     f"{where} is not known; write {MATERIAL_KEY}PATTERN or {GROUNDING_KEY}PATTERN"

@@ -15,7 +15,7 @@ from capsense.adapters.meshes import (
     round_cylinder,
     solid_mesh,
 )
-from capsense.adapters.rules import Names, Rules, read_grounding, read_material
+from capsense.adapters.rules import Names, Rules, Tie, read_grounding, read_material
 from capsense.adapters.world import HalfSpace, Solid
 from capsense.errors import SceneError
 from capsense.scene import Box, Capsule, Cylinder, Pose, Shape, Sphere
@@ -84,22 +84,19 @@ class WorldReader:
         link = self.links[index]
         if self.rules.excludes(link.names):
             return
-        material = self._user_data(link, "capsense.material")
-        grounding = self._user_data(link, "capsense.grounding")
+        said = self._user_data(link, "capsense.material")
         where = f"user data of {link.names[-1]!r}"
+        material = None if said is None else read_material(said, where)
+        said = self._user_data(link, "capsense.grounding")
+        tie = None if said is None else Tie(read_grounding(said, where), f"body {link.body} {said}")
         for shape, pose in self._shapes_of(link):
             yield Solid(
                 label=link.names[-1],
-                names=link.names,
                 shape=shape,
                 frame=index,
                 pose=pose,
-                material=self.rules.material_of(
-                    link.names, None if material is None else read_material(material, where)
-                ),
-                grounding=self.rules.grounding_of(
-                    link.names, None if grounding is None else read_grounding(grounding, where)
-                ),
+                material=self.rules.material_of(link.names, material),
+                tie=self.rules.tie_of(link.names, tie),
             )
 
     def _user_data(self, link: Link, key: str) -> str | None:

@@ -15,6 +15,16 @@ Names = tuple[str, ...]
 """The names that one solid answers to, such as those of its geom and of its body."""
 
 
+@dataclass(frozen=True)
+class Tie:
+    """What ties solids to ground."""
+
+    grounding: Grounding
+    """``"grounded"``, ``"floating"`` or a capacitance [F]."""
+    owner: str
+    """The rule that says so. All solids of one rule share a capacitance: they are one body."""
+
+
 def matches(pattern: str, names: Names) -> bool:
     """Whether a shell pattern (``*``, ``?``, ``[…]``; case matters) fits one of the names."""
     return any(fnmatchcase(name, pattern) for name in names)
@@ -33,7 +43,7 @@ class Rules:
     materials: Mapping[str, Material | str] = field(default_factory=dict)
     """Name pattern → material."""
     grounding: Mapping[str, Grounding] = field(default_factory=dict)
-    """Name pattern → grounding."""
+    """Name pattern → grounding; a capacitance is that of all it fits together."""
     default_material: Material | str = "steel"
     """The material where neither a pattern fits nor the model itself says."""
     default_grounding: Grounding = "grounded"
@@ -80,12 +90,12 @@ class Rules:
                 return as_material(value)
         return as_material(self.default_material) if own is None else own
 
-    def grounding_of(self, names: Names, own: Grounding | None = None) -> Grounding:
-        """The grounding of something; ``own`` is what the model says of it."""
+    def tie_of(self, names: Names, own: Tie | None = None) -> Tie:
+        """What ties something to ground; ``own`` is what the model says of it."""
         for pattern, value in self.grounding.items():
             if matches(pattern, names):
-                return value
-        return self.default_grounding if own is None else own
+                return Tie(value, f"pattern {pattern}")
+        return Tie(self.default_grounding, "default") if own is None else own
 
     def excludes(self, names: Names) -> bool:
         """Whether something of these names is left out."""

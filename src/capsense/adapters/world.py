@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.rules import Names
+from capsense.adapters.rules import Tie
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
-from capsense.scene.body import Grounding
 
 Array = NDArray[np.float64]
 
@@ -28,15 +27,14 @@ class Solid:
 
     label: str
     """What it is called in scenes and messages."""
-    names: Names
-    """The names that patterns are tried on."""
     shape: Shape | HalfSpace
     frame: int
     """Index of the frame that carries it, among those the simulator gives at every reading."""
     pose: Pose
     """Where it stands in that frame."""
     material: Material
-    grounding: Grounding
+    tie: Tie
+    """What ties it to ground."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,16 @@ class World:
             boxes[i] = 0.0 if space else shape.bounds()
             count = taken[solid.label] = taken.get(solid.label, 0) + 1
             label = solid.label if count == 1 else f"{solid.label}#{count}"
-            self._bodies.append(Body(shape, Pose(), solid.material, solid.grounding, label))
+            self._bodies.append(Body(shape, Pose(), solid.material, solid.tie.grounding, label))
+        owners = list(dict.fromkeys(s.tie.owner for s in self.solids))
+        self._sharing = np.array(
+            [
+                -1 if isinstance(s.tie.grounding, str) else owners.index(s.tie.owner)
+                for s in self.solids
+            ],
+            dtype=np.int64,
+        )
+        self._tied: dict[tuple[int, int], Body] = {}
         self._centre = boxes.mean(axis=1)
         self._half = 0.5 * (boxes[:, 1] - boxes[:, 0])
         self._lower, self._upper = self.domain.lower, self.domain.upper
@@ -110,11 +117,21 @@ class World:
             raise SceneError(
                 f"{label!r} stands at a place that is not finite; has the simulation diverged?"
             )
-        return Scene(
-            [
-                self._bodies[i].moved(
-                    Pose(self._position[i].tolist(), self._quaternion[i].tolist())
-                )
-                for i in np.flatnonzero(self._seen).tolist()
-            ]
-        )
+        seen = np.flatnonzero(self._seen)
+        sharing = self._sharing[seen]
+        bodies = [self._bodies[i] for i in seen.tolist()]
+        if sharing.max(initial=-1) >= 0:
+            count = np.bincount(sharing + 1)[sharing + 1]
+            for k in np.flatnonzero(sharing >= 0).tolist():
+                bodies[k] = self._share(int(seen[k]), int(count[k]))
+        poses = zip(self._position[seen].tolist(), self._quaternion[seen].tolist(), strict=True)
+        return Scene([b.moved(Pose(*p)) for b, p in zip(bodies, poses, strict=True)])
+
+    def _share(self, index: int, count: int) -> Body:
+        """A body that has one of ``count`` equal shares of its capacitance to ground."""
+        key = index, count
+        if key not in self._tied:
+            b = self._bodies[index]
+            assert not isinstance(b.grounding, str)
+            self._tied[key] = Body(b.shape, b.pose, b.material, b.grounding / count, b.name)
+        return self._tied[key]
