@@ -50,7 +50,8 @@ class AttachedSensor(ABC):
         Raises:
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
-        return self.world.scene(self._frames())
+        frames = self._frames()  # may refresh the world
+        return self.world.scene(frames)
 
     @property
     def pose(self) -> Pose:
