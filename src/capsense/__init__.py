@@ -20,10 +20,14 @@ if TYPE_CHECKING:
         FieldError,
         MeshError,
         MissingDependencyError,
+        ReadOutError,
         ScenarioError,
         SceneError,
         SolveError,
     )
+    from capsense.readout.config import load_readout
+    from capsense.readout.counts import Counts
+    from capsense.readout.read_out import ReadOut
     from capsense.scenario import Scenario, load_scenario
     from capsense.scene.body import Body
     from capsense.scene.materials import MATERIALS, Material
@@ -41,6 +45,7 @@ __all__ = [
     "Box",
     "CapSenseError",
     "Capsule",
+    "Counts",
     "Cylinder",
     "Design",
     "DesignError",
@@ -50,6 +55,8 @@ __all__ = [
     "MeshError",
     "MissingDependencyError",
     "Pose",
+    "ReadOut",
+    "ReadOutError",
     "Reading",
     "Scenario",
     "ScenarioError",
@@ -61,8 +68,9 @@ __all__ = [
     "TriMesh",
     "__version__",
     "available_designs",
-    "load_design",
     "humans",
+    "load_design",
+    "load_readout",
     "load_scenario",
     "mujoco",
     "pybullet",
@@ -77,10 +85,14 @@ _HOMES = {
         "FieldError",
         "MeshError",
         "MissingDependencyError",
+        "ReadOutError",
         "ScenarioError",
         "SceneError",
         "SolveError",
     ),
+    "capsense.readout.config": ("load_readout",),
+    "capsense.readout.counts": ("Counts",),
+    "capsense.readout.read_out": ("ReadOut",),
     "capsense.scenario": ("Scenario", "load_scenario"),
     "capsense.scene.body": ("Body",),
     "capsense.scene.materials": ("MATERIALS", "Material"),

@@ -89,8 +89,8 @@ def test_matter_without_dispersion_is_the_same_at_any_frequency():
     ("kelvin", "eps_r"), [(0, 87.74), (20, 80.10), (25, 78.30), (50, 69.91), (100, 55.72)]
 )
 def test_water_against_temperature(kelvin, eps_r):
-    """Measured: Malmberg and Maryott 1956, good to 0.05; the series to 0.4 %."""
-    assert water(kelvin).eps_r == pytest.approx(eps_r, rel=4e-3)
+    """Measured: Malmberg and Maryott 1956, good to 0.05; the series to 0.5 %."""
+    assert water(kelvin).eps_r == pytest.approx(eps_r, rel=5e-3)
 
 
 @pytest.mark.parametrize("temperature", [-1.0, 101.0, float("nan")])
