@@ -1,7 +1,7 @@
 """MuJoCo: a robot arm carries six electrodes along a person's moving forearm.
 
-Run it: ``python examples/mujoco_forearm.py [FOLDER]``. It needs no display and no OpenGL. A plot and
-an animation go to the folder (``out`` by default).
+Run it: ``python examples/mujoco_forearm.py [FOLDER]``. It needs no display and no OpenGL. A plot
+and an animation go to the folder (``out`` by default).
 """
 
 from __future__ import annotations
