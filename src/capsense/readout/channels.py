@@ -97,10 +97,17 @@ def mutual_patterns(
     *,
     rest: Rest = "grounded",
 ) -> tuple[Pattern, ...]:
-    """Pairs (transmitter, receiver); by default every pair once, in the order of the electrodes."""
+    """Pairs (transmitter, receiver); by default every pair once, in the order of the electrodes.
+
+    Raises:
+        ReadOutError: A pair names one electrode twice.
+    """
     chosen = list(pairs) or [
         (one, two) for k, one in enumerate(electrodes) for two in electrodes[k + 1 :]
     ]
+    for tx, rx in chosen:
+        if tx == rx:
+            raise ReadOutError(f"pair {[tx, rx]} names one electrode twice; give two")
     return tuple(Pattern(rx, {tx: 1.0}, rest=rest) for tx, rx in chosen)
 
 
@@ -180,12 +187,12 @@ class ChannelBank:
     def _induced(self, matrix: Array, coupling: Array | None, k: int) -> Array:
         """Charge on the electrode read that the potentials of open electrodes add."""
         open_ = self._open[k]
-        charge = matrix[..., open_, :] @ self._volts[k]
+        charge = (matrix[..., open_, :] * self._volts[k]).sum(axis=-1)
         if coupling is not None:
             charge = charge + np.asarray(coupling)[..., open_] * self._shield[k]
         own = matrix[..., open_[:, None], open_]
         volts = -np.linalg.solve(own, charge[..., None])[..., 0]
-        return np.einsum("...f,...f->...", matrix[..., self._sense[k], open_], volts)
+        return (matrix[..., self._sense[k], open_] * volts).sum(axis=-1)
 
     def _potentials(self, pattern: Pattern, index: Mapping[str, int]) -> Array:
         volts = np.full(len(self.electrodes), 1.0 if pattern.rest == "guard" else 0.0)

@@ -89,7 +89,10 @@ def _patterns(top: Table, mode: str, electrodes: Sequence[str]) -> tuple[Pattern
         if "pairs" in top:
             raise top.error('pairs is for mode = "mutual"; remove one')
         return self_patterns(electrodes, rest=rest)
-    return mutual_patterns(electrodes, _pairs(top, electrodes), rest=rest)
+    try:
+        return mutual_patterns(electrodes, _pairs(top, electrodes), rest=rest)
+    except ReadOutError as error:
+        raise top.error(str(error)) from None
 
 
 def _pairs(top: Table, electrodes: Sequence[str]) -> list[tuple[str, str]]:

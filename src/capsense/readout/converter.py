@@ -241,10 +241,8 @@ class CapDac:
     def actual(self) -> Array:
         """What is subtracted at each code [F], shape (codes,)."""
         code = np.arange(self.codes)
-        out: Array = code * float(self.step)
-        for bit, error in enumerate(self.bit_errors):
-            out = out + error * ((code >> bit) & 1)
-        return out
+        errors = sum(error * ((code >> bit) & 1) for bit, error in enumerate(self.bit_errors))
+        return np.asarray(code * self.step + errors, dtype=float)
 
     def nearest(self, capacitance: Array) -> Ints:
         """Code nominally nearest to capacitances [F]."""

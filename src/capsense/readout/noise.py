@@ -68,8 +68,8 @@ class Flicker:
         require("flicker noise", "slowest", self.slowest, 0.0, "s", open_=True)
 
     def poles(self, period: float) -> tuple[Array, float]:
-        """Time constants [s] down to a fifth of the period, and the variance of each [F²]."""
-        fastest = min(0.2 * period, self.slowest)
+        """Time constants [s] down to half the period, and the variance of each [F²]."""
+        fastest = min(0.5 * period, 0.5 * self.slowest)
         decades = math.log10(self.slowest / fastest)
         taus = np.geomspace(
             fastest, self.slowest, max(2, 1 + math.ceil(decades * _POLES_PER_DECADE))

@@ -163,15 +163,15 @@ def charge_for(capacitance: float) -> ReciprocalLaw:
         for time in MPR121_TIMES
         for current in MPR121_CURRENTS
     ]
-    goal = laws[0].low + 0.9 * (laws[0].high - laws[0].low)
     wanted = np.array(capacitance)
-    best = min(laws, key=lambda law: abs(float(law.level(wanted)) - goal))
-    if not best.low <= float(best.level(wanted)) <= best.high:
+    fitting = [law for law in laws if law.low <= float(law.level(wanted)) <= law.high]
+    if not fitting:
         raise ReadOutError(
-            f"expected = {capacitance:g} F is outside of what an MPR121 can charge; give 0.5e-12 "
+            f"expected = {capacitance:g} F is outside of what an MPR121 can charge; give 0.2e-12 "
             "to 2800e-12 F"
         )
-    return best
+    goal = fitting[0].low + 0.9 * (fitting[0].high - fitting[0].low)
+    return min(fitting, key=lambda law: abs(float(law.level(wanted)) - goal))
 
 
 def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
