@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import AttachedSensor, make_simulator, refuse_missing
+from capsense.adapters.attached import GeometrySensor, check_world, make_simulator
+from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelReader
 from capsense.adapters.rules import Rules
-from capsense.adapters.world import Frames, Solid
+from capsense.adapters.world import Frames, World
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.scene import Material
-from capsense.scene.body import Grounding
+from capsense.scene.body import Grounding, checked_grounding
 from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-__all__ = ["MujocoSensor", "attach"]
+__all__ = ["MujocoDepthSensor", "MujocoSensor", "attach"]
 
 _SCALAR_LAST = [1, 2, 3, 0]
 
@@ -35,6 +36,7 @@ def attach(
     site: str,
     design: Design | str | Path | Simulator = "six_patch",
     *,
+    world: Literal["geometry", "depth"] = "geometry",
     materials: Mapping[str, Material | str] | None = None,
     grounding: Mapping[str, Grounding] | None = None,
     default_material: Material | str = "steel",
@@ -43,80 +45,107 @@ def attach(
     exclude_own: bool = True,
     hull: Sequence[str] = (),
     groups: Collection[int] | None = None,
-) -> MujocoSensor:
+    camera: str | None = None,
+    back: str | float = "fill",
+) -> MujocoSensor | MujocoDepthSensor:
     """Attach a sensor to a site of a model; call ``read()`` after every ``mj_step``.
 
     The site's frame is the sensor frame: origin at the centre of the electrode plane, z out of
-    the sensor. Geoms become solids once, at this call; only their poses are taken at a reading.
+    the sensor. With ``world="geometry"`` geoms become solids once, at this call, and only their
+    poses and the vertices of flexes are taken at a reading.
 
     Patterns are shell patterns. They are tried on a geom's name (``geom3`` for the unnamed
-    third, say), on its body's name, and on ``body/geom``. The model can say the same in its
-    ``<custom>`` section: ``<text name="capsense.material:arm*" data="human"/>`` and
+    third, say), on its body's name, and on ``body/geom``; on a flex's name. The model can say the
+    same in its ``<custom>`` section: ``<text name="capsense.material:arm*" data="human"/>`` and
     ``<text name="capsense.grounding:arm*" data="100e-12"/>``. What is given here comes first,
-    then the model's texts, then the defaults.
+    then the model's texts, then the defaults. A capacitance to ground is that of all geoms that
+    its pattern fits, together.
+
+    With ``world="depth"`` the sensor sees the image of an orthographic camera that a rangefinder
+    reads, which needs no OpenGL::
+
+        <camera name="eye" projection="orthographic" resolution="64 64" fovy="0.5"/>
+        <rangefinder camera="eye" data="depth"/>
+
+    The camera should sit on the body of the site and look along the site's z: its frame is the
+    site's, turned half round about x. It does not see the geoms of that body. Its rays tell no
+    materials: everything is of the default ones.
 
     Args:
         model: The model.
         data: Its state.
         site: Name of the site that carries the sensor.
         design: A design, a packaged name, a design file, or a ready simulator.
-        materials: Name pattern → material; the first that fits decides.
-        grounding: Name pattern → grounding; the first that fits decides.
+        world: ``"geometry"``, the shapes themselves, or ``"depth"``, the image of a camera.
+        materials: Name pattern → material; the first that fits decides. Geometry only.
+        grounding: Name pattern → grounding; the first that fits decides. Geometry only.
         default_material: Material of everything else.
         default_grounding: Grounding of everything else.
-        exclude: Name patterns of geoms that the sensor does not see.
+        exclude: Name patterns of geoms that the sensor does not see. Geometry only.
         exclude_own: Leave out the geoms of the body that carries the site, which the design
-            itself describes. The world's own geoms are never left out by this.
-        hull: Name patterns of mesh geoms that are taken as their convex hulls.
-        groups: See only geoms of these groups (MuJoCo's 0 to 5); default all.
+            itself describes. The world's own geoms are never left out by this. Geometry only.
+        hull: Name patterns of mesh geoms that are taken as their convex hulls. Geometry only.
+        groups: See only geoms of these groups (MuJoCo's 0 to 5); default all. Geometry only.
+        camera: Name of the camera; by default that of the site. Depth only.
+        back: Where what the camera sees ends: ``"fill"``, at the end of the domain, or after an
+            assumed thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
-        SceneError: There is no such site, a pattern fits nothing, a shape is not supported, or
-            the data belong to another model.
+        SceneError: There is no such site or camera, a pattern fits nothing, a shape is not
+            supported, the camera is not orthographic or nothing reads it, the data belong to
+            another model, or an option belongs to the other kind of world.
         DesignError: The design is wrong.
     """
     _require()
+    _check_pair(model, data)
+    only_geometry = {
+        "materials": materials, "grounding": grounding, "exclude": exclude, "hull": hull,
+        "groups": groups, "exclude_own=False": not exclude_own,
+    }  # fmt: skip
+    check_world(world, only_geometry, {"camera": camera, "back": back != "fill"})
+    number = find_site(model, site)
+    if world == "depth":
+        eye = find_camera(model, site if camera is None else camera)
+        return MujocoDepthSensor(
+            model, data, number, eye, make_simulator(design), default_material,
+            checked_grounding(default_grounding), back,
+        )  # fmt: skip
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
     )
-    _check_pair(model, data)
     return MujocoSensor(
-        model, data, site, make_simulator(design), rules, exclude_own=exclude_own, groups=groups
+        model, data, number, make_simulator(design), rules, exclude_own=exclude_own, groups=groups
     )
 
 
-class MujocoSensor(AttachedSensor):
+class MujocoSensor(GeometrySensor):
     """A sensor on a site of a MuJoCo model; made by :func:`attach`."""
 
     def __init__(
         self,
         model: mujoco.MjModel,
         data: mujoco.MjData,
-        site: str,
+        site: int,
         simulator: Simulator,
         rules: Rules,
         *,
         exclude_own: bool,
         groups: Collection[int] | None,
     ) -> None:
-        import mujoco
-
         self.model = model
         """The model."""
         self.data = data
         """The state that readings are taken of."""
         self._rules = rules
         self._groups = None if groups is None else frozenset(int(g) for g in groups)
-        self._site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), site)
-        if self._site < 0:
-            raise refuse_missing("site", site, [model.site(i).name for i in range(model.nsite)])
+        self._site = site
         self._body = int(model.site_bodyid[self._site])
         self._own = self._body if exclude_own and self._body else None
         self._turn = np.empty(4)
         super().__init__(simulator)
 
-    def _solids(self) -> list[Solid]:
+    def _world(self) -> World:
         reader = ModelReader(self.model, self._rules)
         solids = []
         for geom in range(self.model.ngeom):
@@ -127,16 +156,14 @@ class MujocoSensor(AttachedSensor):
             solid = reader.solid(geom)
             if solid is not None:
                 solids.append(solid)
-        return solids
+        soft = [reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
+        return World(solids, self.simulator.design.domain, [s for s in soft if s is not None])
 
     def _frames(self) -> Frames:
         import mujoco
 
         data = self.data
-        if not data.site_xmat[self._site].any():
-            raise SceneError(
-                "the data hold no poses yet; call mujoco.mj_forward(model, data) or mj_step first"
-            )
+        check_stepped(data, self._site)
         mujoco.mju_mulQuat(self._turn, data.xquat[self._body], self.model.site_quat[self._site])
         return Frames(
             data.xpos, data.xquat[:, _SCALAR_LAST], data.site_xpos[self._site],

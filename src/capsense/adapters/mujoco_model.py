@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters.meshes import height_field, solid_mesh
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
-from capsense.adapters.world import HalfSpace, Solid
+from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
 from capsense.scene import (
     Box,
@@ -47,11 +47,12 @@ class ModelReader:
         self.model = model
         self.rules = rules
         self._names = [self._names_of(i) for i in range(model.ngeom)]
+        self._flex_names = [self._names_of_flex(i) for i in range(model.nflex)]
         self._materials: dict[str, Material] = {}
         self._grounding: dict[str, Tie] = {}
         self._meshes: dict[tuple[int, bool], TriMesh] = {}
         self._read_texts()
-        rules.check(self._names)
+        rules.check([*self._names, *self._flex_names])
 
     def solid(self, geom: int) -> Solid | None:
         """A geom as a solid, or None where the rules leave it out.
@@ -62,17 +63,63 @@ class ModelReader:
         names = self._names[geom]
         if self.rules.excludes(names):
             return None
-        own_material = next((m for p, m in self._materials.items() if matches(p, names)), None)
-        own_tie = next((t for p, t in self._grounding.items() if matches(p, names)), None)
+        material, tie = self._matter(names)
         w, x, y, z = self.model.geom_quat[geom].tolist()
         return Solid(
             label=names[-1],
             shape=self._shape(geom, names),
             frame=int(self.model.geom_bodyid[geom]),
             pose=Pose(self.model.geom_pos[geom].tolist(), (x, y, z, w)),
-            material=self.rules.material_of(names, own_material),
-            tie=self.rules.tie_of(names, own_tie),
+            material=material,
+            tie=tie,
         )
+
+    def soft_solid(self, flex: int, data: mujoco.MjData) -> SoftSolid | None:
+        """A flex as a deformable, or None where the rules leave it out.
+
+        Args:
+            flex: Its number.
+            data: The state that its vertices are taken from.
+
+        Raises:
+            SceneError: The flex is a cable, which has no surface.
+        """
+        names, m = self._flex_names[flex], self.model
+        if self.rules.excludes(names):
+            return None
+        label, kind = names[0], int(m.flex_dim[flex])
+        if kind == 2:
+            faces = _part(m.flex_elem, m.flex_elemdataadr[flex], 3 * int(m.flex_elemnum[flex]))
+        elif kind == 3:
+            faces = _part(m.flex_shell, m.flex_shelldataadr[flex], 3 * int(m.flex_shellnum[flex]))
+        else:
+            raise SceneError(
+                f"flex {label!r} is a cable, which cannot be sensed; leave it out with "
+                f"exclude=[{label!r}]"
+            )
+        first = int(m.flex_vertadr[flex])
+        own = slice(first, first + int(m.flex_vertnum[flex]))
+        material, tie = self._matter(names)
+        return SoftSolid(
+            label=label,
+            faces=faces.reshape(-1, 3).astype(np.int64),
+            thickness=2 * float(m.flex_radius[flex]) if kind == 2 else None,
+            vertices=lambda: data.flexvert_xpos[own],
+            material=material,
+            tie=tie,
+        )
+
+    def _matter(self, names: Names) -> tuple[Material, Tie]:
+        """What something is made of, and its tie to ground."""
+        material = next((m for p, m in self._materials.items() if matches(p, names)), None)
+        tie = next((t for p, t in self._grounding.items() if matches(p, names)), None)
+        return self.rules.material_of(names, material), self.rules.tie_of(names, tie)
+
+    def _names_of_flex(self, flex: int) -> Names:
+        import mujoco
+
+        name = mujoco.mj_id2name(self.model, int(mujoco.mjtObj.mjOBJ_FLEX), flex)
+        return (name or f"flex{flex}",)
 
     def _names_of(self, geom: int) -> Names:
         name = self.model.geom(geom).name or f"geom{geom}"
@@ -98,7 +145,7 @@ class ModelReader:
                     f"{where} is not known; write {MATERIAL_KEY}PATTERN or {GROUNDING_KEY}PATTERN"
                 )
         for pattern in (*self._materials, *self._grounding):
-            if not any(matches(pattern, names) for names in self._names):
+            if not any(matches(pattern, names) for names in (*self._names, *self._flex_names)):
                 raise SceneError(f"the model's capsense texts: no geom or body fits {pattern!r}")
 
     def _shape(self, geom: int, names: Names) -> Shape | HalfSpace:
@@ -147,3 +194,7 @@ class ModelReader:
         heights = top * m.hfield_data[start : start + rows * columns].reshape(rows, columns)
         vertices, faces = height_field(heights, (half_x, half_y), base)
         return solid_mesh(vertices, faces, names[-1])
+
+
+def _part(array: Any, start: Any, count: int) -> NDArray[np.int32]:
+    return np.asarray(array)[int(start) : int(start) + count]

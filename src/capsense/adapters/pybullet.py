@@ -9,10 +9,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import AttachedSensor, make_simulator, refuse_missing
-from capsense.adapters.pybullet_model import Link, WorldReader, links_of
+from capsense.adapters.attached import GeometrySensor, check_world, make_simulator, refuse_missing
+from capsense.adapters.pybullet_depth import PybulletDepthSensor, check_image
+from capsense.adapters.pybullet_model import (
+    Link,
+    WorldReader,
+    body_numbers,
+    is_soft,
+    links_of,
+)
 from capsense.adapters.rules import Rules
-from capsense.adapters.world import Frames, Solid
+from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.scene import Material, Pose
@@ -22,7 +29,7 @@ from capsense.simulator import Simulator
 Array = NDArray[np.float64]
 Shapes = Literal["collision", "visual"]
 
-__all__ = ["PybulletSensor", "attach"]
+__all__ = ["PybulletDepthSensor", "PybulletSensor", "attach"]
 
 _NO_POSE = Pose()
 
@@ -34,6 +41,7 @@ def attach(
     pose_in_link: Pose = _NO_POSE,
     design: Design | str | Path | Simulator = "six_patch",
     *,
+    world: Literal["geometry", "depth"] = "geometry",
     shapes: Shapes = "collision",
     materials: Mapping[str, Material | str] | None = None,
     grounding: Mapping[str, Grounding] | None = None,
@@ -42,16 +50,25 @@ def attach(
     exclude: Sequence[str] = (),
     exclude_own: bool = True,
     hull: Sequence[str] = (),
-) -> PybulletSensor:
+    sheet_thickness: float = 1e-3,
+    size: float | None = None,
+    resolution: int = 64,
+    back: str | float = "fill",
+) -> PybulletSensor | PybulletDepthSensor:
     """Attach a sensor to a link; call ``read()`` after every ``stepSimulation``.
 
-    Shapes become solids once, at this call, and again when bodies were added or removed; only
-    poses are taken at a reading.
+    With ``world="geometry"`` shapes become solids once, at this call, and again when bodies were
+    added or removed; only poses and the vertices of soft bodies are taken at a reading.
 
     Patterns are shell patterns. They are tried on a link's name, on its body's name, and on
     ``body/link``; bodies without a name are called ``body3``, say. A body can say the same in its
     user data: ``addUserData(body, "capsense.material", "human", linkIndex=2)`` and the key
     ``"capsense.grounding"``. What is given here comes first, then user data, then the defaults.
+    A capacitance to ground is that of all links that its pattern fits, together.
+
+    With ``world="depth"`` the sensor sees what TinyRenderer draws from the sensor's origin along
+    its z, which needs no OpenGL: visual shapes, each with its material. All conductors in the
+    image are one body. What is left out still hides what stands behind it.
 
     Args:
         client: What ``pybullet.connect`` returned, or a ``BulletClient``.
@@ -60,38 +77,59 @@ def attach(
         pose_in_link: The sensor frame in the link's frame (the URDF frame, not the centre of
             mass): origin at the centre of the electrode plane, z out of the sensor.
         design: A design, a packaged name, a design file, or a ready simulator.
+        world: ``"geometry"``, the shapes themselves, or ``"depth"``, a rendered image.
         shapes: ``"collision"``: what Bullet collides with, where a mesh is the convex hull of
             each of its connected parts; or ``"visual"``: what it draws, meshes as they are.
+            Geometry only.
         materials: Name pattern → material; the first that fits decides.
-        grounding: Name pattern → grounding; the first that fits decides.
+        grounding: Name pattern → grounding; the first that fits decides. Geometry only.
         default_material: Material of everything else.
         default_grounding: Grounding of everything else.
         exclude: Name patterns of links that the sensor does not see.
         exclude_own: Leave out the link that carries the sensor, which the design itself
             describes.
         hull: Name patterns of links whose visual meshes are taken as their convex hulls.
+            Geometry only.
+        sheet_thickness: Thickness [m] of soft bodies that are open surfaces, such as cloth.
+        size: Width and height of the image [m]; by default the width of the domain. Depth only.
+        resolution: Pixels along each side of the image.
+        back: Where what is drawn ends: ``"fill"``, at the end of the domain, or after an assumed
+            thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
-        SceneError: There is no such client, body or link, a pattern fits nothing, or a shape is
-            not supported.
+        SceneError: There is no such client, body or link, a pattern fits nothing, a shape is
+            not supported, or an option is out of range or belongs to the other kind of world.
         DesignError: The design is wrong.
     """
     _require()
     if shapes not in ("collision", "visual"):
         raise SceneError(f'shapes is {shapes!r}; choose "collision" or "visual"')
+    only_geometry = {
+        "grounding": grounding, "hull": hull, 'shapes="visual"': shapes == "visual",
+    }  # fmt: skip
+    check_world(world, only_geometry, {"size": size, "back": back != "fill"})
+    if not isinstance(pose_in_link, Pose):
+        raise SceneError(f"pose_in_link is {pose_in_link!r}; give a Pose(position, quaternion)")
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
     )
     number = _client_number(client)
     index = _find_link(number, body, link)
+    simulator = make_simulator(design)
+    if world == "depth":
+        size, resolution = check_image(size, resolution, max(simulator.design.domain.size[:2]))
+        return PybulletDepthSensor(
+            number, body, index, pose_in_link, simulator, rules,
+            exclude_own=exclude_own, size=size, resolution=resolution, back=back,
+        )  # fmt: skip
     return PybulletSensor(
-        number, body, index, pose_in_link, make_simulator(design), rules,
-        shapes=shapes, exclude_own=exclude_own,
+        number, body, index, pose_in_link, simulator, rules,
+        shapes=shapes, exclude_own=exclude_own, sheet_thickness=sheet_thickness,
     )  # fmt: skip
 
 
-class PybulletSensor(AttachedSensor):
+class PybulletSensor(GeometrySensor):
     """A sensor on a link in PyBullet; made by :func:`attach`."""
 
     def __init__(
@@ -105,9 +143,8 @@ class PybulletSensor(AttachedSensor):
         *,
         shapes: Shapes,
         exclude_own: bool,
+        sheet_thickness: float,
     ) -> None:
-        if not isinstance(pose_in_link, Pose):
-            raise SceneError(f"pose_in_link is {pose_in_link!r}; give a Pose(position, quaternion)")
         self.client = client
         """Number of the physics client."""
         self.body = body
@@ -118,12 +155,13 @@ class PybulletSensor(AttachedSensor):
         self._rules = rules
         self._shapes: Shapes = shapes
         self._exclude_own = exclude_own
+        self._sheet_thickness = sheet_thickness
         super().__init__(simulator)
 
-    def _solids(self) -> list[Solid]:
+    def _world(self) -> World:
         import pybullet as p
 
-        self._bodies = _body_numbers(self.client)
+        self._bodies = body_numbers(self.client)
         self._links: list[Link] = [
             link for body in self._bodies for link in links_of(self.client, body)
         ]
@@ -135,19 +173,25 @@ class PybulletSensor(AttachedSensor):
         self._carrier = [(k.body, k.link) for k in self._links].index(own)
         inertial = p.getDynamicsInfo(*own, physicsClientId=self.client)[3:5]
         self._in_frame = Pose(*inertial).inverse() @ self._in_link
-        reader = WorldReader(self.client, self._links, self._rules, self._shapes)
-        return [
-            solid
-            for i, link in enumerate(self._links)
-            if not (self._exclude_own and (link.body, link.link) == own)
-            for solid in reader.solids(i)
-        ]
+        reader = WorldReader(
+            self.client, self._links, self._rules, self._shapes, self._sheet_thickness
+        )
+        solids: list[Solid] = []
+        soft: list[SoftSolid] = []
+        for i, link in enumerate(self._links):
+            if self._exclude_own and (link.body, link.link) == own:
+                continue
+            if is_soft(self.client, link):
+                soft += reader.soft_solids(i)
+            else:
+                solids += reader.solids(i)
+        return World(solids, self.simulator.design.domain, soft)
 
     def _frames(self) -> Frames:
         """Frames of the links' centres of mass, in the order of ``self._links``."""
         import pybullet as p
 
-        if _body_numbers(self.client) != self._bodies:
+        if body_numbers(self.client) != self._bodies:
             self.refresh()
         poses: list[Any] = []
         for body, links in self._groups:
@@ -185,15 +229,8 @@ def _client_number(client: Any) -> int:
     return number
 
 
-def _body_numbers(client: int) -> list[int]:
-    import pybullet as p
-
-    count = p.getNumBodies(physicsClientId=client)
-    return [p.getBodyUniqueId(i, physicsClientId=client) for i in range(count)]
-
-
 def _find_link(client: int, body: int, link: int | str) -> int:
-    known = _body_numbers(client)
+    known = body_numbers(client)
     if body not in known:
         raise SceneError(f"there is no body {body!r} in the world; there are {known}")
     links = {k.name: k.link for k in links_of(client, body)}

@@ -16,9 +16,9 @@ from capsense.adapters.meshes import (
     solid_mesh,
 )
 from capsense.adapters.rules import Names, Rules, Tie, read_grounding, read_material
-from capsense.adapters.world import HalfSpace, Solid
+from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
-from capsense.scene import Box, Capsule, Cylinder, Pose, Shape, Sphere
+from capsense.scene import Box, Capsule, Cylinder, Material, Pose, Shape, Sphere
 
 Array = NDArray[np.float64]
 
@@ -40,6 +40,14 @@ class Link:
     names: Names
 
 
+def body_numbers(client: int) -> list[int]:
+    """The numbers of all bodies in the world."""
+    import pybullet as p
+
+    count = p.getNumBodies(physicsClientId=client)
+    return [p.getBodyUniqueId(i, physicsClientId=client) for i in range(count)]
+
+
 def links_of(client: int, body: int) -> list[Link]:
     """The base and the links of a body, in order."""
     import pybullet as p
@@ -54,6 +62,91 @@ def links_of(client: int, body: int) -> list[Link]:
     ]
 
 
+def matter_of(client: int, link: Link, rules: Rules) -> tuple[Material, Tie]:
+    """What a link is made of, and its tie to ground.
+
+    Raises:
+        SceneError: Its user data name no known material or grounding.
+    """
+    said = _user_data(client, link, "capsense.material")
+    where = f"user data of {link.names[-1]!r}"
+    material = None if said is None else read_material(said, where)
+    said = _user_data(client, link, "capsense.grounding")
+    tie = None if said is None else Tie(read_grounding(said, where), f"body {link.body} {said}")
+    return rules.material_of(link.names, material), rules.tie_of(link.names, tie)
+
+
+def _user_data(client: int, link: Link, key: str) -> str | None:
+    import pybullet as p
+
+    found = p.getUserDataId(link.body, key, link.link, physicsClientId=client)
+    return None if found < 0 else p.getUserData(found, physicsClientId=client).decode()
+
+
+def is_soft(client: int, link: Link) -> bool:
+    """Whether a link is a soft body."""
+    import pybullet as p
+
+    dynamics = p.getDynamicsInfo(link.body, link.link, physicsClientId=client)
+    return bool(dynamics[10] == _SOFT_BODY)
+
+
+class SoftMesh:
+    """The surface of a soft body, as PyBullet draws it: three vertices for every triangle.
+
+    Before the first step the drawn vertices are those of the file, neither scaled nor placed.
+
+    Raises:
+        SceneError: It is not made of triangles.
+    """
+
+    def __init__(self, client: int, link: Link) -> None:
+        self._client, self._link = client, link
+        self._stepped = False
+        soup = self._mesh(0)
+        if not len(soup) or len(soup) % 3:
+            raise _refuse(link, "is a soft body whose surface is not made of triangles")
+        size = float(np.ptp(soup, axis=0).max())
+        _, self._first, corner = np.unique(
+            np.rint(soup / (1e-6 * size)), axis=0, return_index=True, return_inverse=True
+        )
+        self.faces: NDArray[np.int64] = corner.reshape(-1, 3)
+        """Indices of merged vertices, shape (m, 3)."""
+        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        _, count = np.unique(edges, axis=0, return_counts=True)
+        self.closed = bool(np.all(count % 2 == 0))
+        """Whether the surface has an inside."""
+
+    def vertices(self) -> Array:
+        """The merged vertices [m] at present, shape (n, 3).
+
+        Raises:
+            SceneError: The world has not been stepped since the soft body was loaded.
+        """
+        drawn = self._mesh(0)
+        if not self._stepped:
+            import pybullet as p
+
+            simulated = self._mesh(p.MESH_DATA_SIMULATION_MESH)
+            apart = [
+                np.abs(f(drawn, axis=0) - f(simulated, axis=0)).max() for f in (np.min, np.max)
+            ]
+            if max(apart) > 1e-3 * float(np.ptp(simulated, axis=0).max()):
+                raise SceneError(
+                    f"{self._link.names[-1]!r} is a soft body that has not been stepped yet; call "
+                    "stepSimulation first"
+                )
+            self._stepped = True
+        return drawn[self._first]
+
+    def _mesh(self, flags: int) -> Array:
+        import pybullet as p
+
+        link = self._link
+        _, vertices = p.getMeshData(link.body, -1, flags=flags, physicsClientId=self._client)
+        return np.array(vertices)
+
+
 class WorldReader:
     """Reads the shapes of all links of a world.
 
@@ -62,16 +155,20 @@ class WorldReader:
         links: The links; their order is that of the frames.
         rules: What is seen, and what it is made of.
         shapes: ``"collision"`` or ``"visual"``.
+        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
 
     Raises:
         SceneError: A pattern fits nothing.
     """
 
-    def __init__(self, client: int, links: Sequence[Link], rules: Rules, shapes: str) -> None:
+    def __init__(
+        self, client: int, links: Sequence[Link], rules: Rules, shapes: str, sheet_thickness: float
+    ) -> None:
         self.client = client
         self.links = links
         self.rules = rules
         self.shapes = shapes
+        self.sheet_thickness = sheet_thickness
         self._meshes: dict[tuple[object, ...], Shape] = {}
         rules.check([k.names for k in links])
 
@@ -84,36 +181,36 @@ class WorldReader:
         link = self.links[index]
         if self.rules.excludes(link.names):
             return
-        said = self._user_data(link, "capsense.material")
-        where = f"user data of {link.names[-1]!r}"
-        material = None if said is None else read_material(said, where)
-        said = self._user_data(link, "capsense.grounding")
-        tie = None if said is None else Tie(read_grounding(said, where), f"body {link.body} {said}")
+        material, tie = matter_of(self.client, link, self.rules)
         for shape, pose in self._shapes_of(link):
             yield Solid(
                 label=link.names[-1],
                 shape=shape,
                 frame=index,
                 pose=pose,
-                material=self.rules.material_of(link.names, material),
-                tie=self.rules.tie_of(link.names, tie),
+                material=material,
+                tie=tie,
             )
 
-    def _user_data(self, link: Link, key: str) -> str | None:
-        import pybullet as p
+    def soft_solids(self, index: int) -> list[SoftSolid]:
+        """A soft body as a deformable; none where the rules leave it out.
 
-        found = p.getUserDataId(link.body, key, link.link, physicsClientId=self.client)
-        if found < 0:
-            return None
-        return p.getUserData(found, physicsClientId=self.client).decode()
+        Raises:
+            SceneError: Its mesh is not made of triangles.
+        """
+        link = self.links[index]
+        if self.rules.excludes(link.names):
+            return []
+        mesh = SoftMesh(self.client, link)
+        material, tie = matter_of(self.client, link, self.rules)
+        thickness = None if mesh.closed else self.sheet_thickness
+        return [SoftSolid(link.names[-1], mesh.faces, thickness, mesh.vertices, material, tie)]
 
     def _shapes_of(self, link: Link) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
         """Shapes, and their poses in the frame of the link's centre of mass."""
         import pybullet as p
 
         dynamics = p.getDynamicsInfo(link.body, link.link, physicsClientId=self.client)
-        if dynamics[10] == _SOFT_BODY:
-            raise _refuse(link, "is a soft body, which cannot be sensed")
         drawn = p.getVisualShapeData(link.body, physicsClientId=self.client)
         drawn = [entry for entry in drawn if entry[1] == link.link]
         if any(entry[2] == _HEIGHT_FIELD for entry in drawn):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from capsense.adapters.rules import Tie
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
+
+if TYPE_CHECKING:
+    from capsense.scene.deformable import DeformableSurface
 
 Array = NDArray[np.float64]
 
@@ -38,6 +42,23 @@ class Solid:
 
 
 @dataclass(frozen=True, eq=False)
+class SoftSolid:
+    """A deformable of a simulator: its vertices are taken anew at every reading."""
+
+    label: str
+    """What it is called in scenes and messages."""
+    faces: NDArray[np.int64]
+    """Vertex indices, shape (m, 3)."""
+    thickness: float | None
+    """Thickness of a sheet [m]; None for a closed surface."""
+    vertices: Callable[[], Array]
+    """Gives the vertices [m] in the simulator's world at present, shape (n, 3)."""
+    material: Material
+    tie: Tie
+    """What ties it to ground."""
+
+
+@dataclass(frozen=True, eq=False)
 class Frames:
     """Where the moving frames of a simulator, and the sensor, are at one instant."""
 
@@ -58,10 +79,12 @@ class World:
     Args:
         solids: The solids; labels that repeat are numbered.
         domain: The box outside which nothing is seen.
+        soft: The deformables.
     """
 
     solids: Sequence[Solid]
     domain: Domain
+    soft: Sequence[SoftSolid] = ()
     _bodies: list[Body] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -89,6 +112,7 @@ class World:
             ],
             dtype=np.int64,
         )
+        self._surfaces: list[DeformableSurface | None] = [None] * len(self.soft)
         self._tied: dict[tuple[int, int], Body] = {}
         self._centre = boxes.mean(axis=1)
         self._half = 0.5 * (boxes[:, 1] - boxes[:, 0])
@@ -125,7 +149,33 @@ class World:
             for k in np.flatnonzero(sharing >= 0).tolist():
                 bodies[k] = self._share(int(seen[k]), int(count[k]))
         poses = zip(self._position[seen].tolist(), self._quaternion[seen].tolist(), strict=True)
-        return Scene([b.moved(Pose(*p)) for b, p in zip(bodies, poses, strict=True)])
+        placed = [b.moved(Pose(*p)) for b, p in zip(bodies, poses, strict=True)]
+        return Scene(placed + self._soft_bodies(frames) if self.soft else placed)
+
+    def _soft_bodies(self, frames: Frames) -> list[Body]:
+        """The deformables that reach into the domain, as they are now."""
+        from capsense.scene.deformable import DeformableSurface
+
+        rotation = Pose((0, 0, 0), frames.sensor_quaternion).rotation
+        out = []
+        for k, soft in enumerate(self.soft):
+            vertices = (soft.vertices() - frames.sensor_position) @ rotation
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+            if np.any(low >= self._upper) or np.any(high <= self._lower):
+                continue
+            surface = self._surfaces[k]
+            try:
+                if surface is None:
+                    surface = self._surfaces[k] = DeformableSurface(
+                        vertices, soft.faces, thickness=soft.thickness, material=soft.material,
+                        grounding=soft.tie.grounding, name=soft.label,
+                    )  # fmt: skip
+                else:
+                    surface.vertices = vertices
+                out.append(surface.body())
+            except SceneError as error:
+                raise SceneError(f"{soft.label!r}: {error}") from None
+        return out
 
     def _share(self, index: int, count: int) -> Body:
         """A body that has one of ``count`` equal shares of its capacitance to ground."""
