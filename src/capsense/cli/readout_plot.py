@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -95,7 +95,7 @@ def _draw_chip(
     one = counts[counts.channel == channel]
     change = 1e15 * sign * (one.capacitance - empty)
     axes.plot(recording.time, 1e15 * sign * (truth[:, channel] - empty), color=FAINT, lw=1.4)
-    style = {"ls": "", "marker": ".", "zorder": 3}
+    style: dict[str, Any] = {"ls": "", "marker": ".", "zorder": 3}
     inside = ~one.saturated
     size = 2.5 if len(one) > 100 else 4.0
     axes.plot(one.time[inside], change[inside], color=colour, ms=size, mew=0, **style)
@@ -105,5 +105,4 @@ def _draw_chip(
                       fontsize=8, color=OUTSIDE)  # fmt: skip
     axes.set_title(readout.name, fontsize=10, fontweight="bold", color=INK, loc="left")
     rate = 1 / readout.schedule.period
-    axes.annotate(f"{rate:.3g} samples/s", (0.02, 0.9), xycoords="axes fraction", fontsize=8,
-                  color=INK)  # fmt: skip
+    axes.set_title(f"{rate:.3g} samples/s", fontsize=8, color=INK, loc="right")

@@ -204,7 +204,7 @@ TEENSY = Chip(
 )  # fmt: skip
 
 SDR = Chip(
-    "sdr", "software radio (USRP X310 class) with shunt and amplifier", "mutual",
+    "sdr", "Radio, USRP X310 class", "mutual",
     law=ShuntLaw(ShuntFrontEnd(1e6, 1e3, 20.0, 1.0), 1.0),
     rates=(Rate(1000.0, 0.1 * FF),),
     order="by transmitter", flicker=0.1 * FF,
