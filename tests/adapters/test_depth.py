@@ -199,7 +199,7 @@ def test_wrong_cameras_are_refused(tiny_simulator: cs.Simulator) -> None:
         attach("eye").read()
     with pytest.raises(cs.SceneError, match='camera goes with world="depth"'):
         cs.mujoco.attach(model, data, "pad", tiny_simulator, camera="eye")
-    with pytest.raises(cs.SceneError, match="world is .image."):
+    with pytest.raises(cs.SceneError, match=r"world is .image."):
         cs.mujoco.attach(model, data, "pad", tiny_simulator, world="image")
     with pytest.raises(cs.SceneError, match='groups goes with world="geometry"'):
         attach("eye", groups=[0])

@@ -72,7 +72,7 @@ def to_urdf(limb: Limb) -> str:
         limb: The limb.
     """
     root = Element("robot", name=limb.name)
-    SubElement(root, "link", name=limb.name)
+    _urdf_link(root, limb.name, None)
     above = limb.name
     for segment in limb.segments:
         name = f"{limb.name}_{segment.name}"
