@@ -306,8 +306,10 @@ def quantise(law: Law, capacitance: ArrayLike) -> tuple[Ints, Flags]:
         Codes, and flags of :class:`Range`, of the capacitances' shape.
     """
     level = np.rint(law.level(np.asarray(capacitance, dtype=float)))
-    under, over = level < law.low, level > law.high
-    code = np.clip(level, law.low, law.high).astype(np.int64)
-    first, second = (Range.BELOW, Range.ABOVE) if law.rising else (Range.ABOVE, Range.BELOW)
-    flags = under * np.uint8(first) + over * np.uint8(second)
-    return code, flags.astype(np.uint8)
+    clipped = np.minimum(np.maximum(level, law.low), law.high)
+    flags = np.zeros(level.shape, dtype=np.uint8)
+    wrong = clipped != level
+    if wrong.any():
+        above = (level > clipped) == law.rising
+        flags[wrong] = np.where(above[wrong], Range.ABOVE, Range.BELOW)
+    return clipped.astype(np.int64), flags

@@ -124,10 +124,10 @@ class ReadOut:
         self._detect = None if self.detector is None else self.detector.start(k, rising)
         self._start = start
         self._seen = 0  # samples whose instant has passed
-        self._told = 0  # samples whose conversion is finished and reported
-        self._waiting = (np.empty(0), np.empty(0))  # instants [s], values [F] of those in between
+        # Instants [s], channels and values [F] of samples whose conversion is not finished.
+        self._waiting = (np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
         self._last: tuple[float, Array] | None = None
-        self._next_instant = self._first_instant(0)
+        self._next_instant = float(plan.instant(np.array(0))) - plan.slack
         self._next_stamp = self._next_instant + 0.5 * plan.conversion
         self._none = self._report(-math.inf)
 
@@ -197,7 +197,7 @@ class ReadOut:
         return self._report(now)
 
     def __call__(self, times: ArrayLike, capacitance: ArrayLike) -> Counts:
-        """Read a whole recording, from its first time on; resets first.
+        """Read a whole recording, from its first time on; resets before and after.
 
         Args:
             times: [s], rising, shape (n,).
@@ -221,39 +221,39 @@ class ReadOut:
         self.reset(start=float(t[0]))
         relative = t - t[0]
         self._seen = self.schedule.samples_until(float(relative[-1]))
-        number = np.arange(self._seen)
-        instant = self.schedule.instant(number)
-        channel = self.schedule.order[number % len(self.bank)]
+        instant, channel = self.schedule.samples(np.arange(self._seen))
         after = np.searchsorted(relative, instant - self.schedule.slack)
         before = np.maximum(after - 1, 0)
         span = relative[after] - relative[before]
         with np.errstate(invalid="ignore", divide="ignore"):
             share = np.where(span > 0, (instant - relative[before]) / span, 1.0)
         old = values[before, channel]
-        self._waiting = (instant, old + np.minimum(share, 1.0) * (values[after, channel] - old))
-        return self._report(float(relative[-1]))
-
-    def _first_instant(self, sample: int) -> float:
-        """Earliest time since the start that counts as after the instant of a sample [s]."""
-        return float(self.schedule.instant(np.array(sample))) - self.schedule.slack
+        value = old + np.minimum(share, 1.0) * (values[after, channel] - old)
+        self._waiting = (instant, channel, value)
+        counts = self._report(float(relative[-1]))
+        self.reset()
+        return counts
 
     def _take(self, now: float, before: tuple[float, Array], values: Array) -> None:
         """Sample the channels whose instants have come, between two sets of values [F]."""
         plan = self.schedule
         cycles = 2 + int((now - self._next_instant) / plan.period)
         number = np.arange(self._seen, self._seen + cycles * len(self.bank))
-        instant = plan.instant(number)
-        count = int(np.searchsorted(instant - plan.slack, now, side="right"))
+        instant, channel = plan.samples(number)
+        count = int((instant - plan.slack).searchsorted(now, "right"))
         self._next_instant = float(instant[count]) - plan.slack
         self._seen += count
-        instant = instant[:count]
-        channel = plan.order[number[:count] % len(self.bank)]
+        instant, channel = instant[:count], channel[:count]
         span = now - before[0]
         share = np.minimum((instant - before[0]) / span, 1.0) if span > 0 else 1.0
         old = before[1][channel]
         taken = old + share * (values[channel] - old)
         kept = self._waiting
-        self._waiting = (np.concatenate([kept[0], instant]), np.concatenate([kept[1], taken]))
+        if len(kept[0]):
+            instant = np.concatenate([kept[0], instant])
+            channel = np.concatenate([kept[1], channel])
+            taken = np.concatenate([kept[2], taken])
+        self._waiting = (instant, channel, taken)
 
     def _wired(self, values: Array) -> Array:
         """What the wiring makes of channel values [F], shape (..., K)."""
@@ -267,27 +267,31 @@ class ReadOut:
         plan, k = self.schedule, len(self.bank)
         if -math.inf < now < self._next_stamp:
             return self._none
-        instant, value = self._waiting
-        ready = int(np.searchsorted(instant + 0.5 * plan.conversion - plan.slack, now, "right"))
-        self._waiting = (instant[ready:], value[ready:])
+        instant, channel, value = self._waiting
+        late = 0.5 * plan.conversion - plan.slack
+        ready = int((instant + late).searchsorted(now, "right"))
+        self._waiting = (instant[ready:], channel[ready:], value[ready:])
+        left = self._next_instant + plan.slack if ready == len(instant) else float(instant[ready])
+        self._next_stamp = left + late
         instant, value = instant[:ready], value[:ready]
-        number = np.arange(self._told, self._told + ready)
-        self._told += ready
-        self._next_stamp = self._first_instant(self._told) + 0.5 * plan.conversion
         watched = self._detect is not None
         counts = Counts(
             self.bank.names,
             time=self._start + (instant + 0.5 * plan.conversion),
-            channel=plan.order[number % k],
+            channel=channel[:ready],
             code=np.empty(ready, dtype=np.int64),
             capacitance=np.empty(ready),
             flags=np.empty(ready, dtype=np.uint8),
             baseline=np.empty(ready) if watched else None,
             touched=np.empty(ready, dtype=bool) if watched else None,
         )
+        time = self._start + instant
+        if ready <= k:
+            self._fill(counts, time, value)
+            return counts
         for first in range(0, ready, k):
             part = slice(first, first + k)
-            self._fill(counts[part], self._start + instant[part], value[part])
+            self._fill(counts[part], time[part], value[part])
         return counts
 
     def _fill(self, counts: Counts, instant: Array, value: Array) -> None:

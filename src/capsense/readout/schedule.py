@@ -122,8 +122,12 @@ class Schedule:
 
     def instant(self, sample: NDArray[np.int64]) -> Array:
         """Instants [s] of samples by their number, from 0, the first cycle starting at 0."""
+        return self.samples(sample)[0]
+
+    def samples(self, sample: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+        """Instants [s] and channels of samples by their number, from 0."""
         cycle, place = np.divmod(sample, self.count)
-        return cycle * self.period + self.offsets[place]
+        return cycle * self.period + self.offsets[place], self.order[place]
 
     @property
     def slack(self) -> float:
