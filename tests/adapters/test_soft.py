@@ -138,7 +138,8 @@ def test_flexes_are_excluded_and_refused_by_name(tiny_simulator: cs.Simulator) -
         cloth_in_mujoco(tiny_simulator, materials={"cloht": "cotton"})
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><geom size=".01"/><site name="pad"/></body>'
-        '<flexcomp name="cable" type="grid" count="5 1 1" spacing=".01 .01 .01" dim="1"/>'
+        '<flexcomp name="cable" type="grid" count="5 1 1" spacing=".01 .01 .01" dim="1">'
+        '<edge equality="true"/></flexcomp>'
         "</worldbody></mujoco>"
     )
     with pytest.raises(cs.SceneError, match=r"'cable' is a cable.*exclude="):
