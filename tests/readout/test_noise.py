@@ -6,6 +6,7 @@ Bounds are some standard errors of the estimate, as computed beside them; seeds 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -199,6 +200,11 @@ def test_same_seed_same_bits_however_dealt(stage):
         for c in range(4)
     ]
     assert (together.ravel() == single).all()
+    process = stage.start(Context(4, PERIOD, PERIOD, np.random.default_rng(3)))
+    channel, time = np.tile(np.arange(4), 50), np.repeat(PERIOD * np.arange(50), 4)
+    cuts = [0, 1, 7, 8, 90, 200]
+    dealt = [process(channel[a:b], time[a:b], np.full(b - a, 1e-12)) for a, b in pairwise(cuts)]
+    assert (together.ravel() == np.concatenate(dealt)).all()
     assert (run(stage, 50, 4, value=1e-12, seed=3) == together).all()
     assert (run(stage, 50, 4, value=1e-12, seed=4) != together).any()
 

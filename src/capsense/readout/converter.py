@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadOutError
 from capsense.readout.front_end import ShuntFrontEnd
-from capsense.readout.stage import Array, Ints, require
+from capsense.readout.stage import Array, Ints, require, rounds
 
 Flags = NDArray[np.uint8]
 
@@ -259,35 +259,58 @@ class Conversion:
     """
 
     def __init__(self, law: Law, dac: CapDac | None, channels: int) -> None:
-        self._law, self._dac = law, dac
+        self._law, self._dac, self._channels = law, dac, channels
+        self._unset = True
         if dac is not None:
             self._actual = dac.actual()
             self.dac_codes = np.full(channels, -1 if dac.start == "auto" else dac.start)
 
     def __call__(self, channel: Ints, value: Array) -> tuple[Ints, Array, Flags]:
-        """Convert a batch of at most one sample a channel.
+        """Convert a batch.
 
         Args:
-            channel: Channel numbers, shape (n,).
+            channel: Channel numbers; any K in a row are all different; shape (n,).
             value: Capacitances [F], shape (n,).
 
         Returns:
             Codes; the capacitances that the chip's user makes of them [F]; flags of
             :class:`Range`. Each of shape (n,).
         """
-        law, dac = self._law, self._dac
-        if dac is None:
-            code, flags = quantise(law, value)
-            return code, law.capacitance(code), flags
+        if self._dac is None:
+            code, flags = quantise(self._law, value)
+            return code, self._law.capacitance(code), flags
+        whole = self._with_dac(self._dac, channel, value)
+        if whole is not None:
+            return whole
+        parts = [
+            self._in_turn(self._dac, channel[part], value[part])
+            for part in rounds(len(value), self._channels)
+        ]
+        code, reported, flags = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return code, reported, flags
+
+    def _with_dac(
+        self, dac: CapDac, channel: Ints, value: Array
+    ) -> tuple[Ints, Array, Flags] | None:
+        """Convert with the DAC's codes as they stand; None if any would change on the way."""
         used = self.dac_codes[channel]
-        fresh = used < 0
-        if fresh.any():
-            used = np.where(fresh, dac.nearest(value), used)
-            self.dac_codes[channel] = used
-        code, flags = quantise(law, value - self._actual[used])
-        reported = law.capacitance(code) + used * dac.step
+        if self._unset and (used < 0).any():
+            return None
+        code, flags = quantise(self._law, value - self._actual[used])
         if dac.follow and flags.any():
-            self.dac_codes[channel] = np.where(flags > 0, _next_code(dac, law, used, flags), used)
+            return None
+        return code, self._law.capacitance(code) + used * dac.step, flags
+
+    def _in_turn(self, dac: CapDac, channel: Ints, value: Array) -> tuple[Ints, Array, Flags]:
+        """Convert at most one sample a channel, and set the DAC's codes for the next one."""
+        used = self.dac_codes[channel]
+        used = np.where(used < 0, dac.nearest(value), used)
+        code, flags = quantise(self._law, value - self._actual[used])
+        reported = self._law.capacitance(code) + used * dac.step
+        if dac.follow:
+            used = np.where(flags > 0, _next_code(dac, self._law, used, flags), used)
+        self.dac_codes[channel] = used
+        self._unset = bool((self.dac_codes < 0).any())
         return code, reported, flags
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ReadOutError
-from capsense.readout.stage import Array, Ints, require
+from capsense.readout.stage import Array, Ints, require, rounds
 
 Bools = NDArray[np.bool_]
 
@@ -167,7 +167,14 @@ class Detection:
         self._run = np.zeros(channels, dtype=np.int64)
 
     def __call__(self, channel: Ints, code: Ints) -> tuple[Array, Bools]:
-        """Return baselines [codes] and states after a batch of codes, each of shape (n,)."""
+        """Return baselines [codes] and states after each code of a batch, each of shape (n,)."""
+        baseline, touched = np.empty(len(code)), np.empty(len(code), dtype=bool)
+        for part in rounds(len(code), len(self._run)):
+            baseline[part], touched[part] = self._in_turn(channel[part], code[part])
+        return baseline, touched
+
+    def _in_turn(self, channel: Ints, code: Ints) -> tuple[Array, Bools]:
+        """One code a channel at most."""
         fresh = ~self._seen[channel]
         if fresh.any():
             self._baseline[channel] = np.where(fresh, code, self._baseline[channel])

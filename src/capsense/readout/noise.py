@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadOutError
-from capsense.readout.stage import Array, Context, Ints, Process, require
+from capsense.readout.stage import Array, Context, Ints, Process, require, rounds
 
 _POLES_PER_DECADE = 2.0
 
@@ -80,15 +80,20 @@ class Flicker:
     def start(self, context: Context) -> Process:
         """Return the process, in its stationary state."""
         taus, variance = self.poles(context.period)
-        rng = context.rng
+        rng, channels = context.rng, context.channels
         keep = np.exp(-context.period / taus)
         kick = np.sqrt(variance * -np.expm1(-2 * context.period / taus))
-        state = math.sqrt(variance) * rng.standard_normal((context.channels, len(taus)))
+        state = math.sqrt(variance) * rng.standard_normal((channels, len(taus)))
 
         def process(channel: Ints, time: Array, value: Array) -> Array:
-            new = keep * state[channel] + kick * rng.standard_normal((len(value), len(taus)))
-            state[channel] = new
-            return value + new.sum(axis=1)
+            kicks = kick * rng.standard_normal((len(value), len(taus)))
+            noise = np.empty(len(value))
+            for part in rounds(len(value), channels):
+                of = channel[part]
+                new = state[of] * keep + kicks[part]
+                state[of] = new
+                noise[part] = new.sum(axis=1)
+            return value + noise
 
         return process
 
@@ -105,13 +110,18 @@ class RandomWalk:
 
     def start(self, context: Context) -> Process:
         """Return the process."""
-        rng = context.rng
+        rng, channels = context.rng, context.channels
         step = self.rate * math.sqrt(context.period)
-        state = np.zeros(context.channels)
+        state = np.zeros(channels)
 
         def process(channel: Ints, time: Array, value: Array) -> Array:
-            state[channel] += step * rng.standard_normal(len(value))
-            return value + state[channel]
+            steps = step * rng.standard_normal(len(value))
+            walked = np.empty(len(value))
+            for part in rounds(len(value), channels):
+                of = channel[part]
+                state[of] += steps[part]
+                walked[part] = state[of]
+            return value + walked
 
         return process
 

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from capsense.readout.presets import Options
 
 
+_BATCH = 4096
+"""Samples processed at a time."""
+
+
 class Reading(Protocol):
     """What a simulator's reading offers."""
 
@@ -264,7 +268,7 @@ class ReadOut:
 
     def _report(self, now: float) -> Counts:
         """Process the waiting samples whose conversion is finished at ``now`` [s]."""
-        plan, k = self.schedule, len(self.bank)
+        plan = self.schedule
         if -math.inf < now < self._next_stamp:
             return self._none
         instant, channel, value = self._waiting
@@ -286,11 +290,11 @@ class ReadOut:
             touched=np.empty(ready, dtype=bool) if watched else None,
         )
         time = self._start + instant
-        if ready <= k:
+        if ready <= _BATCH:
             self._fill(counts, time, value)
             return counts
-        for first in range(0, ready, k):
-            part = slice(first, first + k)
+        for first in range(0, ready, _BATCH):
+            part = slice(first, first + _BATCH)
             self._fill(counts[part], time[part], value[part])
         return counts
 

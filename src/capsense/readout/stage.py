@@ -2,14 +2,15 @@
 
 A stage is a small frozen description. When a read-out starts it makes a *process* of it, which
 holds what changes: random numbers, filters' memories. Stages are applied in their order; each takes
-the capacitances of a batch of samples and returns new ones. A batch holds at most one sample of a
-channel, and batches come in the order of time: a process gives the same numbers, to the last bit,
-however samples are dealt into batches.
+the capacitances of a batch of samples and returns new ones. A batch is a run of successive samples
+of the schedule, of any length; a process with a memory for each channel goes through it in
+:func:`rounds`. It gives the same numbers, to the last bit, however samples are dealt into batches.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -43,7 +44,7 @@ class Process(Protocol):
         """Return the new capacitances of a batch [F], shape (n,).
 
         Args:
-            channel: Channel numbers, all different, shape (n,).
+            channel: Channel numbers; any K in a row are all different; shape (n,).
             time: Instants [s], not falling, shape (n,).
             value: Capacitances [F], shape (n,).
         """
@@ -54,6 +55,12 @@ class Stage(Protocol):
 
     def start(self, context: Context) -> Process:
         """Return the stage's process, in its initial state."""
+
+
+def rounds(samples: int, channels: int) -> Iterator[slice]:
+    """Cut a batch into parts that hold each of the channels once at most."""
+    for first in range(0, samples, channels):
+        yield slice(first, first + channels)
 
 
 def require(
