@@ -120,7 +120,7 @@ def test_a_solid_flex_is_filled(tiny_simulator: cs.Simulator) -> None:
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><geom size=".01"/><site name="pad"/></body>'
         '<flexcomp name="block" type="grid" count="4 4 3" spacing=".015 .015 .01" pos="0 0 .03" '
-        'radius=".0001" dim="3" mass=".1"><elasticity young="1e4"/></flexcomp></worldbody></mujoco>'
+        'radius=".0001" dim="3" mass=".1"><edge equality="true"/></flexcomp></worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -119,7 +119,7 @@ def test_height_field_is_closed_and_of_the_right_volume() -> None:
 
 
 def test_hulls_are_taken_part_by_part() -> None:
-    """Two apart boxes stay two; a dent is filled."""
+    """Two apart boxes stay two; a dent is filled; a stray triangle is dropped."""
     box = cs.Box((0.1, 0.1, 0.1)).to_trimesh()
     dented = np.vstack([box.vertices, [[0, 0, 0]]])
     faces = box.faces[2:].tolist()
@@ -127,9 +127,13 @@ def test_hulls_are_taken_part_by_part() -> None:
     d = next(int(k) for k in box.faces[1] if k not in (a, b, c))
     ring = [a, b, c, d] if {a, c} <= set(box.faces[1]) else [a, b, d, c]
     faces += [[ring[k], ring[(k + 1) % 4], 8] for k in range(4)]
-    both = np.vstack([dented, np.add(dented, (0.5, 0, 0))])
-    shape = cs.TriMesh(*joined_hulls(both, np.vstack([faces, np.add(faces, 9)]), "boxes"))
+    stray = [[1, 0, 0], [1, 0.1, 0], [1, 0, 0.1]]
+    both = np.vstack([dented, np.add(dented, (0.5, 0, 0)), stray])
+    every = np.vstack([faces, np.add(faces, 9), [[18, 19, 20]]])
+    shape = cs.TriMesh(*joined_hulls(both, every, "boxes"))
     assert shape.volume == pytest.approx(2e-3)
+    with pytest.raises(cs.SceneError, match="'flat' has no part with a volume"):
+        joined_hulls(stray, [[0, 1, 2]], "flat")
 
 
 def test_a_prism_of_bullet_is_a_cylinder() -> None:

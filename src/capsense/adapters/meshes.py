@@ -98,10 +98,11 @@ def height_field(heights: ArrayLike, size: ArrayLike, base: float) -> tuple[Arra
 def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Array, Array]:
     """The convex hulls of the connected parts of a mesh, as one mesh.
 
-    Parts hang together by corners at the same place.
+    Parts hang together by corners at the same place. Flat ones, such as stray triangles, have
+    no inside and are dropped.
 
     Raises:
-        SceneError: A part has no volume.
+        SceneError: No part has a volume.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -116,10 +117,15 @@ def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Arr
     all_vertices, all_faces, count = [], [], 0
     for k in np.unique(part[corner[:, 0]]):
         points = v[np.unique(f[part[corner[:, 0]] == k])]
-        points, triangles = _hull(points, label)
+        try:
+            points, triangles = _hull(points, label)
+        except SceneError:
+            continue
         all_vertices.append(points)
         all_faces.append(triangles + count)
         count += len(points)
+    if not count:
+        raise SceneError(f"{label!r} has no part with a volume; is it flat?")
     return np.concatenate(all_vertices), np.concatenate(all_faces)
 
 
