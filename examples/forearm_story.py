@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -60,6 +59,12 @@ def person_angles(t: float) -> dict[str, float]:
     }
 
 
+Stick = tuple[np.ndarray, np.ndarray, float, str]
+"""A capsule to be drawn: its two ends [m] in the world, its radius [m], whose it is."""
+View = tuple[cs.Pose, list[Stick]]
+"""Where the sensor is in the world, and what is drawn around it."""
+
+
 @dataclass
 class Record:
     """What was seen."""
@@ -71,11 +76,14 @@ class Record:
     """Changes of the Maxwell matrix [F], shape (M, M) each."""
     along: list[float] = field(default_factory=list)
     """Position of the sensor along the forearm [m]."""
-    scenes: list[cs.Scene] = field(default_factory=list)
-    """Bodies in the sensor frame."""
+    views: list[View] = field(default_factory=list)
+    """What there is to be drawn."""
 
-    def add(self, t: float, reading: cs.Reading, pose: cs.Pose, scene: cs.Scene) -> None:
-        """Keep one reading, and print every tenth as a line of the table."""
+    def add(self, t: float, reading: cs.Reading, pose: cs.Pose, capsules: list[Stick]) -> None:
+        """Keep one reading, and print every tenth as a line of the table.
+
+        ``capsules`` are the robot's and the person's, in the world, to be drawn.
+        """
         if not self.time:
             print("   t    x " + "".join(f"{n:>9}" for n in self.names) + "   change, fF")
         if len(self.time) % 10 == 0:
@@ -84,7 +92,7 @@ class Record:
         self.time.append(t)
         self.delta.append(reading.delta)
         self.along.append(pose.position[0])
-        self.scenes.append(scene)
+        self.views.append((pose, capsules))
 
     @property
     def diagonal(self) -> np.ndarray:
@@ -142,48 +150,60 @@ def draw(record: Record, folder: Path, title: str) -> None:
     _animate(record, folder / "forearm.gif")
 
 
+COLOURS = {"robot": "#8090a0", "person": "#e0a080"}
+RIGHT = np.array((-0.94, -0.34, 0.0))
+UP = np.array((-0.10, 0.28, 0.95))
+"""Axes of the picture in the world: seen from the person's left, a little from above."""
+
+
 def _animate(record: Record, file: Path) -> None:
-    """Side view in the sensor's frame, and the electrodes as bars."""
+    """Robot and person, and the electrodes as bars."""
     from matplotlib import pyplot as plt
     from matplotlib.collections import PolyCollection
     from PIL import Image
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.6), dpi=70, width_ratios=(2, 1))
-    left.set(
-        xlim=(-0.25, 0.25), ylim=(0.25, -0.04), aspect="equal", xlabel="along the arm, m",
-        ylabel="below the sensor, m",
-    )  # fmt: skip
-    left.fill_between([-0.0575, 0.0575], 0.0, -0.03, color="0.3")
-    for x in (-0.038, 0.0, 0.038):
-        left.plot([x - 0.015, x + 0.015], [0, 0], color="C1", linewidth=4)
-    outlines = PolyCollection([], facecolor="#e0a080", edgecolor="#804020", linewidth=0.5)
-    left.add_collection(outlines)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 4), dpi=70, width_ratios=(3, 2))
+    left.set(xlim=(-0.66, 0.20), ylim=(0.28, 1.04), aspect="equal")
+    left.set_axis_off()
+    left.set_title("0.0 s")
+    shapes = PolyCollection([], edgecolor="0.25", linewidth=0.5)
+    left.add_collection(shapes)
     bars = right.bar(record.names, np.zeros(len(record.names)), color="C1")
-    right.set(ylim=(0, record.diagonal.max() * 1.1e15), ylabel="change, fF")
+    right.set(ylim=(0, record.diagonal.max() * 1.1e15), ylabel="change of capacitance, fF")
     figure.tight_layout()
     frames = []
     for k in range(0, len(record.time), max(1, len(record.time) // 50)):
-        outlines.set_verts([_outline(b) for b in record.scenes[k]])
+        polygons = _polygons(record.views[k])
+        shapes.set_verts([p for p, _ in polygons])
+        shapes.set_facecolor([c for _, c in polygons])
         for bar, value in zip(bars, record.diagonal[k], strict=True):
             bar.set_height(value * 1e15)
         left.set_title(f"{record.time[k]:.1f} s")
         figure.canvas.draw()
         picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba()))  # type: ignore[attr-defined]
         frames.append(picture.convert("RGB").quantize(64))
-    frames[0].save(file, save_all=True, append_images=frames[1:], duration=100, loop=0)
+    frames[0].save(file, save_all=True, append_images=frames[1:], duration=120, loop=0)
     plt.close(figure)
 
 
-def _outline(body: cs.Body) -> Sequence[tuple[float, float]]:
-    """Outline of a capsule or box seen along y, as (x, z) [m]."""
-    shape = body.shape
-    if isinstance(shape, cs.Capsule):
-        ends = body.pose.apply([[0, 0, -shape.length / 2], [0, 0, shape.length / 2]])
-        turn = np.linspace(0, 2 * np.pi, 40)
-        ring = shape.radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        points = np.concatenate([ends[0, [0, 2]] + ring, ends[1, [0, 2]] + ring])
-    else:
-        points = body.pose.apply(shape.to_trimesh().vertices)[:, [0, 2]]
+def _polygons(view: View) -> list[tuple[np.ndarray, str]]:
+    """Outlines in the picture [m] and colours, the farthest first."""
     from scipy.spatial import ConvexHull
 
-    return [(float(x), float(z)) for x, z in points[ConvexHull(points).vertices]]
+    pose, capsules = view
+    turn = np.linspace(0, 2 * np.pi, 30)
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    parts = [
+        (np.concatenate([_flat(a) + r * ring, _flat(b) + r * ring]), 0.5 * (a + b), COLOURS[whose])
+        for a, b, r, whose in capsules
+    ]
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    pad = pose.apply(0.5 * corners * PAD_SIZE - (0.0, 0.0, 0.5 * PAD_SIZE[2]))
+    parts.append((_flat(pad), pad.mean(axis=0), "C1"))
+    parts.sort(key=lambda part: float(np.cross(RIGHT, UP) @ part[1]))
+    return [(points[ConvexHull(points).vertices], colour) for points, _, colour in parts]
+
+
+def _flat(points: np.ndarray) -> np.ndarray:
+    """Points of the world in the picture [m], shape (..., 2)."""
+    return points @ np.stack([RIGHT, UP], axis=1)

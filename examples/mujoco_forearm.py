@@ -23,6 +23,7 @@ from forearm_story import (
     SECONDS,
     SHOULDER,
     Record,
+    Stick,
     check,
     draw,
     person_angles,
@@ -78,6 +79,17 @@ def step_towards(
     return data.qpos[joints] + jacobian.T @ np.linalg.solve(gain, error)
 
 
+def capsules(model: mujoco.MjModel, data: mujoco.MjData) -> list[Stick]:
+    """All capsules of the world, to be drawn."""
+    out = []
+    for k in np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)):
+        arm = data.geom_xmat[k].reshape(3, 3)[:, 2] * model.geom_size[k, 1]
+        whose = "person" if model.geom(k).name.startswith(PERSON.name) else "robot"
+        ends = data.geom_xpos[k] - arm, data.geom_xpos[k] + arm
+        out.append((*ends, float(model.geom_size[k, 0]), whose))
+    return out
+
+
 def main(folder: Path) -> Record:
     """Run the story, check it, and draw it."""
     model = mujoco.MjModel.from_xml_string(model_text())
@@ -103,7 +115,7 @@ def main(folder: Path) -> Record:
     stride = round(1 / (RATE * model.opt.timestep))
     for step in range(round(SECONDS / model.opt.timestep)):
         if step % stride == 0:
-            record.add(data.time, sensor.read(), sensor.pose, sensor.scene())
+            record.add(data.time, sensor.read(), sensor.pose, capsules(model, data))
             data.ctrl[joints] = step_towards(model, data, sensor_target(data.time), joints)
             for name, angle in person_angles(data.time).items():
                 data.ctrl[person[name]] = angle

@@ -24,6 +24,7 @@ from forearm_story import (
     SECONDS,
     SHOULDER,
     Record,
+    Stick,
     check,
     draw,
     person_angles,
@@ -70,6 +71,21 @@ def names_of_joints(client: int, body: int) -> list[str]:
     """Names in the order of the joints."""
     count = p.getNumJoints(body, physicsClientId=client)
     return [p.getJointInfo(body, k, physicsClientId=client)[1].decode() for k in range(count)]
+
+
+def capsules(client: int, robot: int, person: int) -> list[Stick]:
+    """All capsules of robot and person, to be drawn."""
+    out = []
+    for body, whose in ((robot, "robot"), (person, "person")):
+        for link in range(p.getNumJoints(body, physicsClientId=client)):
+            mass = cs.Pose(*p.getLinkState(body, link, physicsClientId=client)[:2])
+            for shape in p.getCollisionShapeData(body, link, physicsClientId=client):
+                if shape[2] == p.GEOM_CAPSULE:
+                    pose = mass @ cs.Pose(*shape[5:7])
+                    length, radius, _ = shape[3]
+                    ends = pose.apply([(0, 0, -length / 2), (0, 0, length / 2)])
+                    out.append((ends[0], ends[1], radius, whose))
+    return out
 
 
 def main(folder: Path) -> Record:
@@ -127,7 +143,7 @@ def main(folder: Path) -> Record:
     stride = round(1 / (RATE * STEP))
     for step in range(round(SECONDS / STEP)):
         if step % stride == 0:
-            record.add(step * STEP, sensor.read(), sensor.pose, sensor.scene())
+            record.add(step * STEP, sensor.read(), sensor.pose, capsules(client, robot, person))
             drive(step * STEP)
         p.stepSimulation(physicsClientId=client)
     p.disconnect(physicsClientId=client)
