@@ -14,7 +14,9 @@ from capsense.errors import ReadOutError
 from capsense.readout.imaging import (
     back_projection,
     electrode_pairs,
+    grounded_sensitivity,
     landweber,
+    resample,
     sensitivity,
     tikhonov,
     voxel_centres,
@@ -36,9 +38,15 @@ def electrode_nodes():
     return owner
 
 
-def solve(eps_r):
-    """Slow reference: 7-point fields and Maxwell matrix for cell permittivities."""
-    owner = electrode_nodes().ravel()
+def solve(eps_r, grounded=None):
+    """Slow reference: 7-point fields and Maxwell matrix for cell permittivities.
+
+    One more node may be grounded.
+    """
+    owner = electrode_nodes()
+    if grounded is not None:
+        owner[grounded] = -2
+    owner = owner.ravel()
     index = np.arange(np.prod(SHAPE)).reshape(SHAPE)
     steps = [np.diff(a) for a in AXES]
     rows, columns, weights = [], [], []
@@ -97,6 +105,34 @@ def test_derivative_by_permittivity(field):
         slope = (changed[0] - changed[1]) / 2e-3
         expected = np.array([slope[p] for p in PAIRS])
         assert np.abs(j[:, cell] - expected).max() < 1e-6 * np.abs(j[:, cell]).max() + 1e-20
+
+
+def test_grounded_matter(field):
+    """Differential: a node at ground adds c φ_i φ_j, c the same for all pairs; J is its mean."""
+    eps_r, potentials, capacitance, _ = field
+    node = (3, 2, 3)
+    change = solve(eps_r, grounded=node)[1] - capacitance
+    product = np.array([potentials[node][i] * potentials[node][j] for i, j in PAIRS])
+    ratio = np.array([change[p] for p in PAIRS]) / product
+    assert ratio == near(np.full(len(PAIRS), ratio[0]), rel=1e-8)
+    assert ratio[0] > 0
+    j = grounded_sensitivity(potentials, AXES, PAIRS).reshape(len(PAIRS), *CELLS)
+    corners = potentials[2:4, 1:3, 4:6].reshape(8, 3)
+    expected = [(corners[:, a] * corners[:, b]).mean() for a, b in PAIRS]
+    assert j[:, 2, 1, 4] == near(expected, rel=1e-12)
+
+
+def test_resampling():
+    """Analytic: cubics are met exactly; the grid's own nodes too; nothing is extrapolated."""
+    points = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1) / 0.05
+    phi = (points[..., 0] ** 3 - points[..., 1] ** 2 * points[..., 2])[..., None] + [0.0, 1.0]
+    finer = tuple(np.linspace(a[0], a[-1], 9) for a in AXES)
+    at = np.stack(np.meshgrid(*finer, indexing="ij"), axis=-1) / 0.05
+    expected = (at[..., 0] ** 3 - at[..., 1] ** 2 * at[..., 2])[..., None] + [0.0, 1.0]
+    assert resample(phi, AXES, finer) == pytest.approx(expected, abs=1e-12)
+    assert resample(phi, AXES, AXES) == pytest.approx(phi, abs=1e-12)
+    with pytest.raises(ReadOutError, match=r"axis y runs from 0 to 1 m, beyond"):
+        resample(phi, AXES, (AXES[0], [0.0, 1.0], AXES[2]))
 
 
 def test_uniform_field_is_exact():

@@ -27,6 +27,8 @@ def test_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert scope["muscle"].sigma == pytest.approx(0.503, abs=5e-4)  # type: ignore[attr-defined]
     assert scope["cold"].eps_r == pytest.approx(86, abs=0.5)  # type: ignore[attr-defined]
     assert scope["person"] == pytest.approx(97e-12, abs=0.5e-12)
+    assert abs(scope["brightest"][:2]).max() <= 0.0151  # type: ignore[index]
+    assert scope["J"].shape == (21, 2240)  # type: ignore[attr-defined]
     assert scope["fit"].gain == pytest.approx(1.03, rel=1e-6)  # type: ignore[attr-defined]
 
 

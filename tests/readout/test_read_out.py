@@ -178,6 +178,7 @@ class Reading:
 
     capacitance: np.ndarray
     self_capacitance: np.ndarray
+    electrode_names: tuple[str, ...] = NAMES
 
 
 def test_readings_of_a_simulator():
@@ -192,6 +193,9 @@ def test_readings_of_a_simulator():
     assert readout.channel_values(np.array(expected)).tolist() == expected
     readout.sample(0.0, reading)
     assert readout.sample(1.0, reading).capacitance[:3] == near(expected, rel=1e-8)
+    other = Reading(matrix, np.diag(matrix), ("A", "C", "B"))
+    with pytest.raises(ReadOutError, match="make it with the simulator's electrode_names"):
+        readout.sample(2.0, other)
 
 
 def test_counts_by_channel_and_in_rows():

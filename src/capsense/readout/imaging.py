@@ -48,20 +48,7 @@ def sensitivity(potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, in
     Raises:
         ReadOutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
     """
-    phi = np.asarray(potentials, dtype=float)
-    x, y, z = (_axis(name, a) for name, a in zip("xyz", axes, strict=True))
-    if phi.ndim != 4 or phi.shape[:3] != (len(x) + 1, len(y) + 1, len(z) + 1):
-        raise ReadOutError(
-            f"potentials have shape {phi.shape}; these axes need "
-            f"({len(x) + 1}, {len(y) + 1}, {len(z) + 1}, M)"
-        )
-    if not np.isfinite(phi).all():
-        raise ReadOutError("a potential is not finite; mend the field")
-    for pair in pairs:
-        if not all(0 <= k < phi.shape[3] for k in pair):
-            raise ReadOutError(
-                f"pair {pair} names an electrode beyond the {phi.shape[3]} there are"
-            )
+    phi, (x, y, z) = _field(potentials, axes, pairs)
     volume = EPS0 * x[:, None, None] * y[None, :, None] * z[None, None, :]
     out = np.zeros((len(pairs), *volume.shape))
     for axis, spacing in enumerate((x, y, z)):
@@ -74,10 +61,95 @@ def sensitivity(potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, in
     return out.reshape(len(pairs), -1)
 
 
+def grounded_sensitivity(
+    potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, int]]
+) -> Array:
+    """What a little grounded conductor in a voxel adds to Maxwell matrix entries.
+
+    A conductor held at 0 V that is small against its distance, of capacitance c by itself (4πε₀a
+    for a sphere), adds ``ΔC_ij = c φ_i φ_j`` to every entry: it takes the charge that brings it to
+    0 V. People and grounded machines are seen by this, and not by their permittivity.
+
+    Args:
+        potentials: As for :func:`sensitivity`.
+        axes: As for :func:`sensitivity`.
+        pairs: Pairs (i, j) of electrodes.
+
+    Returns:
+        J, without unit, shape (len(pairs), voxels); an image is capacitance in voxels [F].
+
+    Raises:
+        ReadOutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
+    """
+    phi, _ = _field(potentials, axes, pairs)
+    out = []
+    for i, j in pairs:
+        product = phi[..., i] * phi[..., j]
+        along = 0.5 * (product[1:] + product[:-1])
+        out.append(0.25 * _four_edges(along, 0).ravel())
+    return np.array(out).reshape(len(pairs), -1)
+
+
+def resample(potentials: ArrayLike, axes: Axes, voxel_axes: Axes) -> Array:
+    """Potentials at the nodes of another rectilinear grid, by cubic interpolation.
+
+    Between the nodes of a solver's lattice, whose cells grow with the distance from the sensor,
+    this is several times closer than differences over its cells. Keep clear of the electrodes'
+    plane, where potentials have kinks.
+
+    Args:
+        potentials: Potentials at the given nodes, shape (nx, ny, nz, M).
+        axes: Their coordinates along x, y and z [m], rising, at least four each.
+        voxel_axes: Coordinates of the nodes wanted [m], rising.
+
+    Returns:
+        Shape (len(x), len(y), len(z), M) of ``voxel_axes``.
+
+    Raises:
+        ReadOutError: A node wanted lies outside of the given ones.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    given = [np.asarray(a, dtype=float) for a in axes]
+    wanted = [np.asarray(a, dtype=float) for a in voxel_axes]
+    for name, old, new in zip("xyz", given, wanted, strict=True):
+        _axis(name, new)
+        if new[0] < old[0] or new[-1] > old[-1]:
+            raise ReadOutError(
+                f"axis {name} runs from {new[0]:g} to {new[-1]:g} m, beyond the potentials' "
+                f"{old[0]:g} to {old[-1]:g} m; make it smaller"
+            )
+    out = np.asarray(potentials, dtype=float)
+    for axis, (old, new) in enumerate(zip(given, wanted, strict=True)):
+        out = make_interp_spline(old, out, k=3, axis=axis)(new)
+    return out
+
+
 def voxel_centres(axes: Axes) -> Array:
     """Middles of the grid's cells [m], shape (voxels, 3), in the order of J's columns."""
     middle = [0.5 * (np.asarray(a)[1:] + np.asarray(a)[:-1]) for a in axes]
     return np.stack(np.meshgrid(*middle, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _field(
+    potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, int]]
+) -> tuple[Array, tuple[Array, ...]]:
+    """Checked potentials, and the spacings of the axes."""
+    phi = np.asarray(potentials, dtype=float)
+    steps = tuple(_axis(name, a) for name, a in zip("xyz", axes, strict=True))
+    if phi.ndim != 4 or phi.shape[:3] != tuple(len(s) + 1 for s in steps):
+        raise ReadOutError(
+            f"potentials have shape {phi.shape}; these axes need "
+            f"{(*(len(s) + 1 for s in steps), 'M')}"
+        )
+    if not np.isfinite(phi).all():
+        raise ReadOutError("a potential is not finite; mend the field")
+    for pair in pairs:
+        if not all(0 <= k < phi.shape[3] for k in pair):
+            raise ReadOutError(
+                f"pair {pair} names an electrode beyond the {phi.shape[3]} there are"
+            )
+    return phi, steps
 
 
 def _axis(name: str, nodes: ArrayLike) -> Array:

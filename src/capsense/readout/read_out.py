@@ -30,6 +30,10 @@ class Reading(Protocol):
     """What a simulator's reading offers."""
 
     @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Electrodes in matrix order."""
+
+    @property
     def capacitance(self) -> Array:
         """Maxwell matrix, shields at ground [F], shape (M, M)."""
 
@@ -156,6 +160,11 @@ class ReadOut:
         # Looked up by name: a check against the protocol takes longer than all the rest.
         if hasattr(capacitance, "self_capacitance"):
             reading = cast("Reading", capacitance)
+            if reading.electrode_names != self.bank.electrodes:
+                raise ReadOutError(
+                    f"the reading is of electrodes {reading.electrode_names}, the read-out for "
+                    f"{self.bank.electrodes}; make it with the simulator's electrode_names"
+                )
             matrix = reading.capacitance
             return self.bank.values(matrix, reading.self_capacitance - np.diag(matrix))
         array = np.asarray(cast("ArrayLike", capacitance), dtype=float)
