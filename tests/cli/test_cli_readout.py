@@ -206,3 +206,7 @@ def test_bad_recordings_are_refused(run, tmp_path):
         (broken / name).write_bytes(content)
         with pytest.raises(ReadOutError, match=words):
             load_recording(broken / name)
+    odd = tmp_path / "odd.csv"
+    odd.write_bytes(b"time_s,C_a_F,C_b_F,C_a_b_F\n0,1,1,1\n")
+    with pytest.raises(ReadOutError, match="may mean the pair or the electrode"):
+        load_recording(odd)

@@ -97,6 +97,14 @@ def test_confirmed_figures():
     assert plan.slots == ((0, 4), (1, 5), (2,), (3,))
 
 
+def test_rates_are_conversions_per_second():
+    """Invariant: one chip finishes as many conversions in a second as its rate says."""
+    for chip, rate in RATES:
+        readout = ReadOut.preset(chip.name, NAMES[:2], rate=rate.per_second, expected=LEVEL)
+        slots = len(readout.schedule.slots)
+        assert slots / readout.schedule.period == near(rate.per_second, rel=1e-9)
+
+
 def test_dac_jump_of_the_fdc1004():
     """Measured: 18.9 pF read with CAPDAC code 7 and 8 differ by the specimen's 1.38 pF."""
     actual = CHIPS["fdc1004"].dac.actual()

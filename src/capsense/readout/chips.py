@@ -60,8 +60,8 @@ FDC1004 = Chip(
     dac=CapDac(3.125 * PF, 32, bit_errors=(0.0, 0.0, -0.13 * PF, 1.25 * PF)),
     facts=(
         Fact("range", "±15 pF; 24-bit two's complement, 2^19 codes per pF, clipped at ±16 pF",
-             _CONFIRMED, _FDC1004 + "1 Features; 6.6.1.1 Capacitive Measurement Registers; "
-             "clipping: TI E2E forum thread 1178477"),
+             _CONFIRMED, _FDC1004 + "1 Features; 24 bit and clipping: TI E2E forum threads "
+             "793359 and 1178477; 2^19: published drivers"),
         Fact("output rate", "100, 200, 400 S/s, shared by the 4 inputs", _CONFIRMED,
              _FDC1004 + "1 Features; 6.5.3 Device Usage"),
         Fact("noise", "resolution 0.5 fF at 100 S/s, taken as rms", _CONFIRMED,
@@ -175,8 +175,10 @@ MPR121 = Chip(
         Fact("set-up", "I and T such that the expected capacitance charges to 90 % of the range",
              _CONFIRMED, _MPR121 + "auto-configuration aims close to the upper limit; the 90 % are "
              "assumed"),
-        Fact("filters", "second level: mean of 4 samples 16 ms apart, one value each 64 ms",
-             _CONFIRMED, _MPR121 + "2 Three levels of filtering; register defaults remembered"),
+        Fact("filters", "running averages on two levels; sampling every 16 ms", _CONFIRMED,
+             _MPR121 + "Features; 2 Three levels of filtering"),
+        Fact("filter settings", "second level: mean of 4 samples, one value each 64 ms",
+             _REMEMBERED, _MPR121 + "register defaults"),
         Fact("sequence", "12 electrodes within a few ms of each 16 ms; taken as simultaneous",
              _ASSUMED, ""),
         Fact("baseline", "MHD, NHD, NCL, FDL for rising, falling, touched", _CONFIRMED,

@@ -113,7 +113,7 @@ def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None =
     return ReadOut(
         patterns,
         electrodes,
-        schedule_of(part, patterns, 1.0 / rate.per_second),
+        schedule_of(part, patterns, 1.0 / rate.per_second - part.gap),
         law_of(part, chosen.expected),
         dac=part.dac,
         wiring=chosen.wiring,

@@ -194,11 +194,13 @@ class ReadOut:
             Conversions with time stamps up to ``time``, often none.
 
         Raises:
-            ReadOutError: Time goes back, or the capacitances do not fit.
+            ReadOutError: Time goes back or is not finite, or the capacitances do not fit.
         """
         values = self._wired(self.channel_values(capacitance))
         now = float(time) - self._start
-        if self._last is not None and not now >= self._last[0]:
+        if not math.isfinite(now):
+            raise ReadOutError(f"sample at {time!r} s; give a finite time")
+        if self._last is not None and now < self._last[0]:
             raise ReadOutError(
                 f"sample at {time!r} s, after one at {self._last[0] + self._start:g} s; time must "
                 "not go back: call reset() to begin anew"

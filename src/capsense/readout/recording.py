@@ -124,6 +124,14 @@ def _check(recording: Recording) -> None:
         raise ReadOutError(f"{path} holds no samples; record some")
     if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         raise ReadOutError(f"{path}: times do not rise; the file is damaged")
+    known = set(recording.electrodes)
+    for one in known:
+        for other in known:
+            if f"{one}_{other}" in known:
+                raise ReadOutError(
+                    f"{path}: column C_{one}_{other} may mean the pair or the electrode of that "
+                    "name; rename the electrode"
+                )
     for name, values in recording.columns.items():
         if values.shape != time.shape or not np.isfinite(values).all():
             raise ReadOutError(f"{path}: column {name!r} holds no number somewhere; it is damaged")
