@@ -10,7 +10,7 @@ import math
 
 from capsense.readout.chip import Chip, Fact, Rate, Status
 from capsense.readout.converter import CapDac, LinearLaw, ReciprocalLaw, ResonanceLaw, ShuntLaw
-from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
+from capsense.readout.detector import Detector, SteppingTracker
 from capsense.readout.front_end import ShuntFrontEnd
 
 PF, FF, AF = 1e-12, 1e-15, 1e-18
@@ -33,7 +33,6 @@ AD7147 = Chip(
         Rate(1 / 3.072e-3, 0.5 * 16 * PF / 2**16),
     ),
     inputs=12, dac=CapDac(0.32 * PF, 63, follow=False), flicker=0.1 * FF,
-    detector=Detector(400, 300, ExponentialTracker(2000)),
     facts=(
         Fact("conversion", "0.768, 1.536, 3.072 ms per stage at a decimation of 64, 128, 256",
              _CONFIRMED, _AD7147 + "Table 10, CDC Conversion Times for Full Power Mode"),
@@ -46,8 +45,6 @@ AD7147 = Chip(
         Fact("noise", "1.1, 0.8, 0.5 codes rms at a decimation of 64, 128, 256", _REMEMBERED,
              _AD7147 + "Specifications"),
         Fact("flicker floor", "0.1 fF", _ASSUMED, ""),
-        Fact("touch logic", "thresholds 400 and 300 codes, baseline over 2000 samples", _ASSUMED,
-             "the chip's own adaptive logic is richer and set by registers"),
     ),
 )  # fmt: skip
 

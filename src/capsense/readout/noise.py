@@ -86,14 +86,12 @@ class Flicker:
         state = math.sqrt(variance) * rng.standard_normal((channels, len(taus)))
 
         def process(channel: Ints, time: Array, value: Array) -> Array:
-            kicks = kick * rng.standard_normal((len(value), len(taus)))
-            noise = np.empty(len(value))
+            states = kick * rng.standard_normal((len(value), len(taus)))
             for part in rounds(len(value), channels):
                 of = channel[part]
-                new = state[of] * keep + kicks[part]
-                state[of] = new
-                noise[part] = new.sum(axis=1)
-            return value + noise
+                states[part] += keep * state[of]
+                state[of] = states[part]
+            return value + states.sum(axis=1)
 
         return process
 
