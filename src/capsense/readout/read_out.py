@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,9 +17,6 @@ from capsense.readout.detector import Detector
 from capsense.readout.schedule import Schedule
 from capsense.readout.stage import Array, Context, Process, Stage
 from capsense.readout.wiring import Wiring
-
-if TYPE_CHECKING:
-    from capsense.readout.presets import Options
 
 
 _BATCH = 4096
@@ -97,8 +94,7 @@ class ReadOut:
         """
         from capsense.readout.presets import Options, build
 
-        known: type[Options] = Options
-        return build(chip, electrodes, known.of(options))
+        return build(chip, electrodes, Options.of(options))
 
     @property
     def channel_names(self) -> tuple[str, ...]:
