@@ -18,7 +18,6 @@ from capsense.readout.schedule import Schedule
 from capsense.readout.stage import Array, Context, Process, Stage
 from capsense.readout.wiring import Wiring
 
-
 _BATCH = 4096
 """Samples processed at a time."""
 
