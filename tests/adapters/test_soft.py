@@ -155,6 +155,7 @@ def test_a_soft_sheet_reads_as_a_plate(
     )
     (body,) = sensor.scene()
     assert body.name.startswith("soft")
+    assert body.shape.volume == pytest.approx(SHEET * SHEET * 0.002, rel=0.01)
     box = plain(tiny_simulator, cs.Box((SHEET, SHEET, 0.002)))
     assert np.diag(sensor.read().delta) == pytest.approx(np.diag(box.delta), rel=0.03, abs=0)
 
@@ -168,6 +169,7 @@ def test_a_closed_soft_body_is_filled(
     sensor = soft_in_pybullet(
         soft_client, (mesh.vertices, mesh.faces), tmp_path, tiny_simulator, True
     )
+    assert sensor.scene()[0].shape.volume == pytest.approx(shape.volume, rel=0.05)
     found = np.diag(sensor.read().delta)
     assert found == pytest.approx(np.diag(plain(tiny_simulator, shape).delta), rel=0.03, abs=0)
 
