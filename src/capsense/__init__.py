@@ -10,6 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from capsense import humans
+    from capsense.adapters import mujoco, pybullet
     from capsense.design.loader import available_designs, load_design
     from capsense.design.model import Design
     from capsense.errors import (
@@ -18,10 +20,14 @@ if TYPE_CHECKING:
         FieldError,
         MeshError,
         MissingDependencyError,
+        ReadOutError,
         ScenarioError,
         SceneError,
         SolveError,
     )
+    from capsense.readout.config import load_readout
+    from capsense.readout.counts import Counts
+    from capsense.readout.read_out import ReadOut
     from capsense.scenario import Scenario, load_scenario
     from capsense.scene.body import Body
     from capsense.scene.materials import MATERIALS, Material
@@ -39,6 +45,7 @@ __all__ = [
     "Box",
     "CapSenseError",
     "Capsule",
+    "Counts",
     "Cylinder",
     "Design",
     "DesignError",
@@ -48,6 +55,8 @@ __all__ = [
     "MeshError",
     "MissingDependencyError",
     "Pose",
+    "ReadOut",
+    "ReadOutError",
     "Reading",
     "Scenario",
     "ScenarioError",
@@ -59,8 +68,12 @@ __all__ = [
     "TriMesh",
     "__version__",
     "available_designs",
+    "humans",
     "load_design",
+    "load_readout",
     "load_scenario",
+    "mujoco",
+    "pybullet",
 ]
 
 _HOMES = {
@@ -72,10 +85,14 @@ _HOMES = {
         "FieldError",
         "MeshError",
         "MissingDependencyError",
+        "ReadOutError",
         "ScenarioError",
         "SceneError",
         "SolveError",
     ),
+    "capsense.readout.config": ("load_readout",),
+    "capsense.readout.counts": ("Counts",),
+    "capsense.readout.read_out": ("ReadOut",),
     "capsense.scenario": ("Scenario", "load_scenario"),
     "capsense.scene.body": ("Body",),
     "capsense.scene.materials": ("MATERIALS", "Material"),
@@ -84,6 +101,11 @@ _HOMES = {
     "capsense.scene.scene": ("Scene",),
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Reading", "Simulator"),
+}
+_SUBMODULES = {
+    "humans": "capsense.humans",
+    "mujoco": "capsense.adapters.mujoco",
+    "pybullet": "capsense.adapters.pybullet",
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -97,6 +119,8 @@ def __getattr__(name: str) -> Any:
         value = version("capsense")
     elif name in _HOME_OF:
         value = getattr(import_module(_HOME_OF[name]), name)
+    elif name in _SUBMODULES:
+        value = import_module(_SUBMODULES[name])
     else:
         raise AttributeError(f"module 'capsense' has no attribute {name!r}")
     globals()[name] = value

@@ -31,3 +31,7 @@ class SolveError(CapSenseError, RuntimeError):
 
 class MissingDependencyError(CapSenseError, ImportError):
     """An optional dependency is missing; the message gives the command that installs it."""
+
+
+class ReadOutError(CapSenseError, ValueError):
+    """A read-out, its configuration or what is given to it is wrong."""

@@ -55,7 +55,7 @@ class Body:
         fields["shape"] = shape
         fields["pose"] = _checked_pose(pose)
         fields["material"] = material if isinstance(material, Material) else find_material(material)
-        fields["grounding"] = _checked_grounding(grounding)
+        fields["grounding"] = checked_grounding(grounding)
         fields["name"] = name
 
     def moved(self, pose: Pose) -> Body:
@@ -76,7 +76,12 @@ def _checked_pose(pose: object) -> Pose:
     return pose
 
 
-def _checked_grounding(grounding: object) -> Grounding:
+def checked_grounding(grounding: object) -> Grounding:
+    """Check a grounding.
+
+    Raises:
+        SceneError: Neither one of the two words nor a positive finite capacitance [F].
+    """
     mend = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
     if isinstance(grounding, str):
         if grounding == "grounded":

@@ -2,7 +2,8 @@
 
 The values are typical ones at room temperature; a sensor cares about the class of a material
 (conductor, tissue, plastic) more than about its second digit. Where a number matters, measure
-it and pass ``Material(name, eps_r, sigma)``.
+it and pass ``Material(name, eps_r, sigma)``. Tissues depend on frequency: their numbers are those
+at 250 kHz, and :meth:`Material.at` gives those at another frequency.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from capsense.constants import EPS0
 from capsense.errors import SceneError
+from capsense.scene.dispersion import GABRIEL, ColeCole
 
 CONDUCTOR_PERMITTIVITY = 1000.0
 """Magnitude of the complex relative permittivity from which matter counts as a conductor."""
@@ -38,6 +40,8 @@ class Material:
     """Conductivity [S/m] at the excitation frequency."""
     source: str = field(default="", compare=False)
     """Where the numbers come from."""
+    dispersion: ColeCole | None = None
+    """How they depend on frequency; None for matter whose numbers hold at any."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -59,12 +63,28 @@ class Material:
     def complex_permittivity(self, frequency: float = _DEFAULT_FREQUENCY) -> complex:
         """Complex relative permittivity eps_r − j sigma / (2π f ε₀) at ``frequency`` [Hz].
 
+        Matter with a ``dispersion`` follows that instead of ``eps_r`` and ``sigma``.
+
         Raises:
             SceneError: The frequency is not a positive finite number.
         """
-        if not (math.isfinite(frequency) and frequency > 0):
-            raise SceneError(f"frequency is {frequency!r} Hz; give a positive finite number")
+        _require_frequency(frequency)
+        if self.dispersion is not None:
+            return self.dispersion.permittivity(frequency)
         return complex(self.eps_r, -self.sigma / (2 * math.pi * frequency * EPS0))
+
+    def at(self, frequency: float) -> Material:
+        """The material with the numbers it has at ``frequency`` [Hz].
+
+        Raises:
+            SceneError: The frequency is not a positive finite number.
+        """
+        if self.dispersion is None:
+            _require_frequency(frequency)
+            return self
+        eps = self.complex_permittivity(frequency)
+        sigma = max(0.0, -eps.imag * 2 * math.pi * frequency * EPS0)
+        return replace(self, eps_r=eps.real, sigma=sigma)
 
     def is_conductor(self, frequency: float = _DEFAULT_FREQUENCY) -> bool:
         """Whether the material may be treated as an equipotential at ``frequency`` [Hz].
@@ -81,6 +101,11 @@ class Material:
             SceneError: The frequency is not a positive finite number.
         """
         return abs(self.complex_permittivity(frequency)) >= CONDUCTOR_PERMITTIVITY
+
+
+def _require_frequency(frequency: float) -> None:
+    if not (math.isfinite(frequency) and frequency > 0):
+        raise SceneError(f"frequency is {frequency!r} Hz; give a positive finite number")
 
 
 _METAL = "resistivity at 20 °C, common handbook value; any metal is an ideal conductor here"
@@ -105,14 +130,45 @@ _TABLE = (
     # Water: 78.54 (1 - 4.579e-3 (T - 25) + 1.19e-5 (T - 25)^2 - 2.8e-8 (T - 25)^3), T in °C.
     Material("water", 78.5, 0.05, "eps_r at 25 °C; sigma of tap water, common 0.005-0.08 S/m"),
     Material("deionised water", 78.5, 5.5e-6, "eps_r and sigma of pure water at 25 °C"),
-    # Tissues, at 250 kHz. All count as conductors there; fat no longer does at 1 MHz.
-    Material("skin", 1098.0, 1.26e-3, _GABRIEL + "dry skin"),
-    Material("wet skin", 7180.0, 0.131, _GABRIEL + "wet skin"),
-    Material("muscle", 5763.0, 0.396, _GABRIEL + "muscle"),
-    Material("fat", 67.79, 0.0436, _GABRIEL + "infiltrated fat"),
-    Material("blood", 4813.0, 0.715, _GABRIEL + "blood"),
-    Material("human", 5763.0, 0.396, _GABRIEL + "muscle, standing for a limb as a whole"),
+    # Tissues, at 250 kHz. All count as conductors there; fat and cortical bone not at 1 MHz.
+    Material("skin", 1098.0, 1.26e-3, _GABRIEL + "dry skin", GABRIEL["skin dry"]),
+    Material("wet skin", 7180.0, 0.131, _GABRIEL + "wet skin", GABRIEL["skin wet"]),
+    Material("muscle", 5763.0, 0.396, _GABRIEL + "muscle", GABRIEL["muscle"]),
+    Material("fat", 67.79, 0.0436, _GABRIEL + "infiltrated fat", GABRIEL["fat"]),
+    Material("blood", 4813.0, 0.715, _GABRIEL + "blood", GABRIEL["blood"]),
+    Material("cortical bone", 197.0, 0.0212, _GABRIEL + "cortical bone", GABRIEL["bone cortical"]),
+    Material(
+        "cancellous bone", 366.4, 0.0850, _GABRIEL + "cancellous bone", GABRIEL["bone cancellous"]
+    ),
+    Material(
+        "human",
+        5763.0,
+        0.396,
+        _GABRIEL + "muscle, standing for a limb as a whole",
+        GABRIEL["muscle"],
+    ),
 )
+
+
+def water(temperature: float, sigma: float = 0.05) -> Material:
+    """Water at a temperature; from below 1 GHz down its permittivity does not depend on frequency.
+
+    ``78.54 (1 − 4.579e-3 θ + 1.19e-5 θ² − 2.8e-8 θ³)``, θ = T − 25 °C (Handbook of Chemistry and
+    Physics).
+
+    Args:
+        temperature: T [°C], from 0 to 100.
+        sigma: Conductivity [S/m]; tap water by default.
+
+    Raises:
+        SceneError: The temperature is out of range, or the conductivity negative.
+    """
+    if not 0 <= temperature <= 100:
+        raise SceneError(f"temperature is {temperature!r} °C; give a number from 0 to 100")
+    t = temperature - 25.0
+    eps_r = 78.54 * (1 + t * (-4.579e-3 + t * (1.19e-5 - t * 2.8e-8)))
+    return Material(f"water at {temperature:g} °C", eps_r, sigma, "permittivity: handbook series")
+
 
 MATERIALS: Mapping[str, Material] = MappingProxyType({m.name: m for m in _TABLE})
 """The known materials by name."""

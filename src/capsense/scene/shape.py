@@ -33,6 +33,8 @@ class ShapeKind(IntEnum):
     """Three radii."""
     MESH = 5
     """Half edge lengths of the local bounding box."""
+    LAYERS = 6
+    """Half edge lengths of the local bounding box."""
 
 
 class Shape(ABC):

@@ -1,0 +1,152 @@
+"""A sensor attached to a simulator, whichever it is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense._validate import suggest
+from capsense.adapters.world import Frames, World
+from capsense.design.model import Design
+from capsense.errors import SceneError
+from capsense.scene import Pose, Scene
+from capsense.simulator import Reading, Simulator
+
+Array = NDArray[np.float64]
+
+
+class AttachedSensor(ABC):
+    """Reads a sensor that rides on a link of a simulated robot.
+
+    Made by the ``attach`` of an adapter.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+        """The sensor itself."""
+
+    def read(self) -> Reading:
+        """The reading of the simulator's present state.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+            SolveError: The solver did not reach its tolerance.
+        """
+        return self.simulator.step(self.scene())
+
+    @abstractmethod
+    def scene(self) -> Scene:
+        """What the sensor sees at the present state, in the sensor frame.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+        """
+
+    @property
+    @abstractmethod
+    def pose(self) -> Pose:
+        """Where the sensor frame stands in the simulator's world.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet.
+        """
+
+    @property
+    def baseline(self) -> Array:
+        """Maxwell matrix with nothing in the domain [F], shape (M, M)."""
+        return self.simulator.baseline
+
+    @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Electrode names in matrix order."""
+        return self.simulator.electrode_names
+
+    def reset(self) -> None:
+        """Forget the previous step, as after the simulator was set back."""
+        self.simulator.reset()
+
+
+class GeometrySensor(AttachedSensor):
+    """A sensor that sees the shapes of the simulator's model themselves.
+
+    The world's solids are taken over once; every reading takes only their poses.
+    """
+
+    world: World
+    """Everything it may see."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        super().__init__(simulator)
+        self.refresh()
+
+    def scene(self) -> Scene:
+        """The bodies within the sensor's domain, in the sensor frame, at the present state.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+        """
+        frames = self._frames()  # may refresh the world
+        return self.world.scene(frames)
+
+    @property
+    def pose(self) -> Pose:
+        frames = self._frames()
+        return Pose(frames.sensor_position, frames.sensor_quaternion)
+
+    def refresh(self) -> None:
+        """Take the world's solids over again, after their shapes, sizes or number changed.
+
+        Raises:
+            SceneError: A shape is not supported, or a name pattern fits nothing.
+        """
+        self.world = self._world()
+
+    @abstractmethod
+    def _world(self) -> World:
+        """Everything that the sensor may see, what is excluded left out."""
+
+    @abstractmethod
+    def _frames(self) -> Frames:
+        """Where everything is now."""
+
+
+def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
+    """The simulator of a design, or the one given.
+
+    Raises:
+        DesignError: The design is wrong.
+        FieldError: The background field could not be built.
+    """
+    return design if isinstance(design, Simulator) else Simulator(design)
+
+
+def check_world(
+    world: object, only_geometry: Mapping[str, object], only_depth: Mapping[str, object]
+) -> None:
+    """Refuse an unknown kind of world, and options that belong to the other kind.
+
+    Args:
+        world: What was asked for.
+        only_geometry: Options that only geometry has; those that are false were not given.
+        only_depth: Options that only depth has.
+
+    Raises:
+        SceneError: The first thing that is wrong.
+    """
+    if world not in ("geometry", "depth"):
+        raise SceneError(f'world is {world!r}; choose "geometry" or "depth"')
+    other, options = ("depth", only_depth) if world == "geometry" else ("geometry", only_geometry)
+    for name, value in options.items():
+        if value is not None and value is not False and value != () and value != {}:
+            raise SceneError(f'{name} goes with world="{other}"; leave it out of world="{world}"')
+
+
+def refuse_missing(what: str, name: str, known: Sequence[str]) -> SceneError:
+    """The error for a name that a model does not have."""
+    if not known:
+        return SceneError(f"there is no {what} named {name!r}; the model has none at all")
+    return SceneError(f"there is no {what} named {name!r}; {suggest(name, known)}")

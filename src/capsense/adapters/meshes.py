@@ -1,0 +1,158 @@
+"""Triangle meshes of simulators, made into solids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import SceneError
+from capsense.scene import Cylinder, TriMesh
+
+Array = NDArray[np.float64]
+
+
+def solid_mesh(vertices: ArrayLike, faces: ArrayLike, label: str, *, hull: bool = False) -> TriMesh:
+    """A solid from a triangle mesh.
+
+    Args:
+        vertices: Points [m], shape (n, 3).
+        faces: Vertex indices, shape (m, 3).
+        label: What it is called, for messages.
+        hull: Take the convex hull instead of the surface itself.
+
+    Raises:
+        SceneError: The mesh is not a closed surface of sound size.
+    """
+    if hull:
+        vertices, faces = _hull(np.asarray(vertices, dtype=float), label)
+    try:
+        return TriMesh(vertices, faces)
+    except SceneError as error:
+        raise SceneError(
+            f"{label!r}: {error}; or take its convex hull with hull=[{label!r}], or leave it "
+            f"out with exclude=[{label!r}]"
+        ) from None
+
+
+def load_triangles(path: str | Path, scale: ArrayLike, label: str) -> tuple[Array, Array]:
+    """Vertices [m] and faces of a mesh file, all its parts together.
+
+    Args:
+        path: The file, of any kind that trimesh reads.
+        scale: Factors along x, y, z that turn its unit into metres, shape (3,).
+        label: What it is called, for messages.
+
+    Raises:
+        SceneError: The file is missing or unreadable, or holds no triangles.
+    """
+    import trimesh
+
+    file = Path(path)
+    if not file.is_file():
+        raise SceneError(f"{label!r}: there is no mesh file {file}; exclude it, or mend its path")
+    try:
+        mesh = trimesh.load_mesh(file, process=False)
+        if isinstance(mesh, trimesh.Scene):
+            mesh = mesh.to_mesh()
+    except Exception as error:  # trimesh's readers raise whatever they meet
+        raise SceneError(f"{label!r}: {file} cannot be read: {error}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise SceneError(f"{label!r}: {file} holds no triangles")
+    return np.asarray(mesh.vertices) * np.asarray(scale, dtype=float), np.asarray(mesh.faces)
+
+
+def height_field(heights: ArrayLike, size: ArrayLike, base: float) -> tuple[Array, Array]:
+    """A closed surface around a terrain: its top, side walls and a flat bottom.
+
+    Args:
+        heights: Heights [m] over z = 0 of its frame, rows along y and columns along x,
+            shape (rows, columns), at least 2 × 2.
+        size: Half extents of the terrain along x and y [m], shape (2,).
+        base: Depth of the bottom below z = 0 [m], positive.
+
+    Returns:
+        Vertices [m], shape (2 · rows · columns, 3), and faces, normals out.
+    """
+    z = np.asarray(heights, dtype=float)
+    rows, columns = z.shape
+    half_x, half_y = np.asarray(size, dtype=float)
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
+    n = rows * columns
+    vertices = np.empty((2 * n, 3))
+    vertices[:, 0], vertices[:, 1] = np.tile(x.ravel(), 2), np.tile(y.ravel(), 2)
+    vertices[:n, 2], vertices[n:, 2] = z.ravel(), -base
+    index = np.arange(n).reshape(rows, columns)
+    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
+    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    top = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    rim = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
+    ahead = np.roll(rim, -1)
+    walls = np.concatenate(
+        [np.stack([rim, rim + n, ahead], axis=1), np.stack([ahead, rim + n, ahead + n], axis=1)]
+    )
+    return vertices, np.concatenate([top, top[:, ::-1] + n, walls])
+
+
+def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Array, Array]:
+    """The convex hulls of the connected parts of a mesh, as one mesh.
+
+    Parts hang together by corners at the same place. Flat ones, such as stray triangles, have
+    no inside and are dropped.
+
+    Raises:
+        SceneError: No part has a volume.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    v, f = np.asarray(vertices, dtype=float), np.asarray(faces)
+    _, same = np.unique(v.round(9), axis=0, return_inverse=True)
+    corner = same.reshape(-1)[f]
+    rows, columns = corner[:, [0, 1]].ravel(), corner[:, [1, 2]].ravel()
+    n = int(corner.max()) + 1
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    _, part = connected_components(graph, directed=False)
+    all_vertices, all_faces, count = [], [], 0
+    for k in np.unique(part[corner[:, 0]]):
+        points = v[np.unique(f[part[corner[:, 0]] == k])]
+        try:
+            points, triangles = _hull(points, label)
+        except SceneError:
+            continue
+        all_vertices.append(points)
+        all_faces.append(triangles + count)
+        count += len(points)
+    if not count:
+        raise SceneError(f"{label!r} has no part with a volume; is it flat?")
+    return np.concatenate(all_vertices), np.concatenate(all_faces)
+
+
+def round_cylinder(vertices: ArrayLike) -> Cylinder | None:
+    """The cylinder along z that a prism stands for, or None for anything else.
+
+    Bullet makes prisms of the cylinders of a URDF, with 32 corners on either end.
+
+    Args:
+        vertices: Points [m], shape (n, 3).
+    """
+    v = np.asarray(vertices, dtype=float)
+    radius, half = np.hypot(v[:, 0], v[:, 1]), np.abs(v[:, 2])
+    size = max(float(radius.max()), float(half.max()))
+    slack = 1e-3 * size
+    if len(v) != 64 or np.ptp(radius) > slack or np.ptp(half) > slack or half.max() <= slack:
+        return None
+    return Cylinder(float(radius.max()), 2 * float(half.max()))
+
+
+def _hull(vertices: Array, label: str) -> tuple[Array, Array]:
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(vertices)
+    except (QhullError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        raise SceneError(f"{label!r} has no convex hull with a volume: {reason}") from None
+    kept = np.unique(hull.simplices)
+    return vertices[kept], np.searchsorted(kept, hull.simplices)

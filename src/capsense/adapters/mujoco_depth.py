@@ -1,0 +1,164 @@
+"""Depth images of MuJoCo's rangefinder cameras: rays in C, no OpenGL."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.adapters.attached import AttachedSensor, refuse_missing
+from capsense.errors import SceneError
+from capsense.scene import Material, Pose, Scene
+from capsense.scene.body import Grounding
+from capsense.scene.camera import OrthographicCamera
+from capsense.scene.depth import DepthFrame
+from capsense.simulator import Simulator
+
+if TYPE_CHECKING:
+    import mujoco
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A camera and where its depths lie among the sensor data."""
+
+    number: int
+    """The camera's number."""
+    start: int
+    """First entry of ``sensordata``."""
+    rows: int
+    columns: int
+    height: float
+    """Height of the image [m]."""
+
+
+class MujocoDepthSensor(AttachedSensor):
+    """A sensor that sees a depth image; made by :func:`capsense.adapters.mujoco.attach`."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        site: int,
+        eye: Eye,
+        simulator: Simulator,
+        material: Material | str,
+        grounding: Grounding,
+        back: str | float,
+    ) -> None:
+        super().__init__(simulator)
+        self.model = model
+        """The model."""
+        self.data = data
+        """The state that readings are taken of."""
+        self._site, self._eye = site, eye
+        self._material, self._grounding, self._back = material, grounding, back
+        width = eye.height * eye.columns / eye.rows
+        far = float(simulator.design.domain.upper[2])
+        self._camera = OrthographicCamera.opengl(width, eye.height, Pose(), far=far)
+        self._same_body = model.site_bodyid[site] == model.cam_bodyid[eye.number]
+        self._placed: OrthographicCamera | None = None
+        DepthFrame(np.zeros((1, 1)), material, grounding=grounding, back=back)  # checks them
+
+    def frame(self) -> DepthFrame:
+        """The depth image of the present state.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet.
+        """
+        check_stepped(self.data, self._site)
+        eye = self._eye
+        depth = self.data.sensordata[eye.start : eye.start + eye.rows * eye.columns]
+        return DepthFrame(
+            depth.reshape(eye.rows, eye.columns), self._material, self._camera_now(),
+            grounding=self._grounding, back=self._back,
+        )  # fmt: skip
+
+    def scene(self) -> Scene:
+        return self.frame().scene()
+
+    @property
+    def pose(self) -> Pose:
+        check_stepped(self.data, self._site)
+        return _pose(self.data.site_xpos[self._site], self.data.site_xmat[self._site])
+
+    def _camera_now(self) -> OrthographicCamera:
+        """The camera in the sensor frame; a fixed one on the site's own body is placed once."""
+        if self._placed is not None:
+            return self._placed
+        number = self._eye.number
+        view = self.pose.inverse() @ _pose(self.data.cam_xpos[number], self.data.cam_xmat[number])
+        c = self._camera
+        camera = OrthographicCamera.opengl(c.width, c.height, view, far=c.far)
+        if self._same_body and int(self.model.cam_mode[number]) == 0:
+            self._placed = camera
+        return camera
+
+
+def find_site(model: mujoco.MjModel, name: str) -> int:
+    """The number of a site.
+
+    Raises:
+        SceneError: There is none of that name.
+    """
+    import mujoco
+
+    site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), name)
+    if site < 0:
+        raise refuse_missing("site", name, [model.site(i).name for i in range(model.nsite)])
+    return int(site)
+
+
+def find_camera(model: mujoco.MjModel, name: str) -> Eye:
+    """An orthographic camera that a rangefinder reads.
+
+    Raises:
+        SceneError: There is no such camera, it is in perspective, or nothing reads its depths.
+    """
+    import mujoco
+
+    number = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_CAMERA), name)
+    if number < 0:
+        raise refuse_missing("camera", name, [model.camera(i).name for i in range(model.ncam)])
+    if int(model.cam_projection[number]) != 1:
+        raise SceneError(
+            f"camera {name!r} is in perspective, but depth frames need parallel rays; give it "
+            'projection="orthographic"'
+        )
+    columns, rows = (int(v) for v in model.cam_resolution[number])
+    for k in range(model.nsensor):
+        reads = (
+            int(model.sensor_type[k]),
+            int(model.sensor_objtype[k]),
+            int(model.sensor_objid[k]),
+        )
+        wanted = (int(mujoco.mjtSensor.mjSENS_RANGEFINDER), int(mujoco.mjtObj.mjOBJ_CAMERA), number)
+        if reads == wanted and int(model.sensor_dim[k]) == rows * columns:
+            height = float(model.cam_fovy[number])
+            return Eye(int(number), int(model.sensor_adr[k]), rows, columns, height)
+    raise SceneError(
+        f'nothing reads the depths of camera {name!r}; add <rangefinder camera="{name}" '
+        'data="depth"/> to the <sensor> section'
+    )
+
+
+def check_stepped(data: mujoco.MjData, site: int) -> None:
+    """Refuse data that hold no poses.
+
+    Raises:
+        SceneError: Such data.
+    """
+    if not data.site_xmat[site].any():
+        raise SceneError(
+            "the data hold no poses yet; call mujoco.mj_forward(model, data) or mj_step first"
+        )
+
+
+def _pose(position: Array, matrix: Array) -> Pose:
+    whole = np.eye(4)
+    whole[:3, :3], whole[:3, 3] = matrix.reshape(3, 3), position
+    return Pose.from_matrix(whole)

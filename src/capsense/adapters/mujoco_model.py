@@ -1,0 +1,200 @@
+"""MuJoCo's geoms as solids, with the materials that the model gives them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.adapters.meshes import height_field, solid_mesh
+from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
+from capsense.adapters.world import HalfSpace, SoftSolid, Solid
+from capsense.errors import SceneError
+from capsense.scene import (
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    Material,
+    Pose,
+    Shape,
+    Sphere,
+    TriMesh,
+)
+
+if TYPE_CHECKING:
+    import mujoco
+
+Array = NDArray[np.float64]
+
+MATERIAL_KEY = "capsense.material:"
+GROUNDING_KEY = "capsense.grounding:"
+
+
+class ModelReader:
+    """Reads the geoms of one model.
+
+    Args:
+        model: The model.
+        rules: What is seen, and what it is made of.
+
+    Raises:
+        SceneError: A pattern fits nothing, or one of the model's own texts is wrong.
+    """
+
+    def __init__(self, model: mujoco.MjModel, rules: Rules) -> None:
+        self.model = model
+        self.rules = rules
+        self._names = [self._names_of(i) for i in range(model.ngeom)]
+        self._flex_names = [self._names_of_flex(i) for i in range(model.nflex)]
+        self._materials: dict[str, Material] = {}
+        self._grounding: dict[str, Tie] = {}
+        self._meshes: dict[tuple[int, bool], TriMesh] = {}
+        self._read_texts()
+        rules.check([*self._names, *self._flex_names])
+
+    def solid(self, geom: int) -> Solid | None:
+        """A geom as a solid, or None where the rules leave it out.
+
+        Raises:
+            SceneError: Its shape is not supported.
+        """
+        names = self._names[geom]
+        if self.rules.excludes(names):
+            return None
+        material, tie = self._matter(names)
+        w, x, y, z = self.model.geom_quat[geom].tolist()
+        return Solid(
+            label=names[-1],
+            shape=self._shape(geom, names),
+            frame=int(self.model.geom_bodyid[geom]),
+            pose=Pose(self.model.geom_pos[geom].tolist(), (x, y, z, w)),
+            material=material,
+            tie=tie,
+        )
+
+    def soft_solid(self, flex: int, data: mujoco.MjData) -> SoftSolid | None:
+        """A flex as a deformable, or None where the rules leave it out.
+
+        Args:
+            flex: Its number.
+            data: The state that its vertices are taken from.
+
+        Raises:
+            SceneError: The flex is a cable, which has no surface.
+        """
+        names, m = self._flex_names[flex], self.model
+        if self.rules.excludes(names):
+            return None
+        label, kind = names[0], int(m.flex_dim[flex])
+        if kind == 2:
+            faces = _part(m.flex_elem, m.flex_elemdataadr[flex], 3 * int(m.flex_elemnum[flex]))
+        elif kind == 3:
+            faces = _part(m.flex_shell, m.flex_shelldataadr[flex], 3 * int(m.flex_shellnum[flex]))
+        else:
+            raise SceneError(
+                f"flex {label!r} is a cable, which cannot be sensed; leave it out with "
+                f"exclude=[{label!r}]"
+            )
+        first = int(m.flex_vertadr[flex])
+        own = slice(first, first + int(m.flex_vertnum[flex]))
+        material, tie = self._matter(names)
+        return SoftSolid(
+            label=label,
+            faces=faces.reshape(-1, 3).astype(np.int64),
+            thickness=2 * float(m.flex_radius[flex]) if kind == 2 else None,
+            vertices=lambda: data.flexvert_xpos[own],
+            material=material,
+            tie=tie,
+        )
+
+    def _matter(self, names: Names) -> tuple[Material, Tie]:
+        """What something is made of, and its tie to ground."""
+        material = next((m for p, m in self._materials.items() if matches(p, names)), None)
+        tie = next((t for p, t in self._grounding.items() if matches(p, names)), None)
+        return self.rules.material_of(names, material), self.rules.tie_of(names, tie)
+
+    def _names_of_flex(self, flex: int) -> Names:
+        import mujoco
+
+        name = mujoco.mj_id2name(self.model, int(mujoco.mjtObj.mjOBJ_FLEX), flex)
+        return (name or f"flex{flex}",)
+
+    def _names_of(self, geom: int) -> Names:
+        name = self.model.geom(geom).name or f"geom{geom}"
+        body = self.model.body(int(self.model.geom_bodyid[geom])).name or "body"
+        return name, body, f"{body}/{name}"
+
+    def _read_texts(self) -> None:
+        import mujoco
+
+        raw = bytes(self.model.text_data)
+        for i in range(self.model.ntext):
+            name = mujoco.mj_id2name(self.model, int(mujoco.mjtObj.mjOBJ_TEXT), i)
+            start = int(self.model.text_adr[i])
+            text = raw[start : start + int(self.model.text_size[i])].rstrip(b"\0").decode()
+            where = f'<text name="{name}">'
+            if name.startswith(MATERIAL_KEY):
+                self._materials[name.removeprefix(MATERIAL_KEY)] = read_material(text, where)
+            elif name.startswith(GROUNDING_KEY):
+                tie = Tie(read_grounding(text, where), f"text {name}")
+                self._grounding[name.removeprefix(GROUNDING_KEY)] = tie
+            elif name.startswith("capsense"):
+                raise SceneError(
+                    f"{where} is not known; write {MATERIAL_KEY}PATTERN or {GROUNDING_KEY}PATTERN"
+                )
+        for pattern in (*self._materials, *self._grounding):
+            if not any(matches(pattern, names) for names in (*self._names, *self._flex_names)):
+                raise SceneError(f"the model's capsense texts: no geom or body fits {pattern!r}")
+
+    def _shape(self, geom: int, names: Names) -> Shape | HalfSpace:
+        import mujoco
+
+        kinds = mujoco.mjtGeom
+        kind = int(self.model.geom_type[geom])
+        a, b, c = self.model.geom_size[geom].tolist()
+        if kind == int(kinds.mjGEOM_PLANE):
+            return HalfSpace()
+        if kind == int(kinds.mjGEOM_SPHERE):
+            return Sphere(a)
+        if kind == int(kinds.mjGEOM_CAPSULE):
+            return Capsule(a, 2 * b) if b > 0 else Sphere(a)
+        if kind == int(kinds.mjGEOM_CYLINDER):
+            return Cylinder(a, 2 * b)
+        if kind == int(kinds.mjGEOM_ELLIPSOID):
+            return Ellipsoid((a, b, c))
+        if kind == int(kinds.mjGEOM_BOX):
+            return Box((2 * a, 2 * b, 2 * c))
+        if kind in (int(kinds.mjGEOM_MESH), int(kinds.mjGEOM_SDF)):
+            return self._mesh(int(self.model.geom_dataid[geom]), names)
+        if kind == int(kinds.mjGEOM_HFIELD):
+            return self._terrain(int(self.model.geom_dataid[geom]), names)
+        raise SceneError(
+            f"geom {names[-1]!r} is of a type that cannot be sensed ({kinds(kind).name}); leave "
+            f"it out with exclude=[{names[-1]!r}]"
+        )
+
+    def _mesh(self, mesh: int, names: Names) -> TriMesh:
+        """Geoms share the distance grid of a mesh. MuJoCo keeps meshes in the geom's frame."""
+        hull = self.rules.takes_hull(names)
+        if (mesh, hull) not in self._meshes:
+            m = self.model
+            v, f = int(m.mesh_vertadr[mesh]), int(m.mesh_faceadr[mesh])
+            vertices = m.mesh_vert[v : v + int(m.mesh_vertnum[mesh])]
+            faces = m.mesh_face[f : f + int(m.mesh_facenum[mesh])]
+            self._meshes[mesh, hull] = solid_mesh(vertices, faces, names[-1], hull=hull)
+        return self._meshes[mesh, hull]
+
+    def _terrain(self, field: int, names: Names) -> TriMesh:
+        m = self.model
+        rows, columns = int(m.hfield_nrow[field]), int(m.hfield_ncol[field])
+        start = int(m.hfield_adr[field])
+        half_x, half_y, top, base = m.hfield_size[field].tolist()
+        heights = top * m.hfield_data[start : start + rows * columns].reshape(rows, columns)
+        vertices, faces = height_field(heights, (half_x, half_y), base)
+        return solid_mesh(vertices, faces, names[-1])
+
+
+def _part(array: Any, start: Any, count: int) -> NDArray[np.int32]:
+    return np.asarray(array)[int(start) : int(start) + count]

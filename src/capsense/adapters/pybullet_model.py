@@ -1,0 +1,300 @@
+"""PyBullet's collision and visual shapes as solids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.adapters.meshes import (
+    joined_hulls,
+    load_triangles,
+    round_cylinder,
+    solid_mesh,
+)
+from capsense.adapters.rules import Names, Rules, Tie, read_grounding, read_material
+from capsense.adapters.world import HalfSpace, SoftSolid, Solid
+from capsense.errors import SceneError
+from capsense.scene import Box, Capsule, Cylinder, Material, Pose, Shape, Sphere
+
+Array = NDArray[np.float64]
+
+_SOFT_BODY = 3
+"""Bullet's body type of deformables, entry 10 of ``getDynamicsInfo``."""
+_HEIGHT_FIELD = 9
+"""Shape type of height fields."""
+_NO_FILE = b"unknown_file"
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link of one body."""
+
+    body: int
+    link: int
+    """-1 is the base."""
+    name: str
+    names: Names
+
+
+def body_numbers(client: int) -> list[int]:
+    """The numbers of all bodies in the world."""
+    import pybullet as p
+
+    count = p.getNumBodies(physicsClientId=client)
+    return [p.getBodyUniqueId(i, physicsClientId=client) for i in range(count)]
+
+
+def links_of(client: int, body: int) -> list[Link]:
+    """The base and the links of a body, in order."""
+    import pybullet as p
+
+    base, title = (n.decode() for n in p.getBodyInfo(body, physicsClientId=client))
+    title = title or f"body{body}"
+    names = [base or "base"]
+    for joint in range(p.getNumJoints(body, physicsClientId=client)):
+        names.append(p.getJointInfo(body, joint, physicsClientId=client)[12].decode())
+    return [
+        Link(body, i - 1, name, (name, title, f"{title}/{name}")) for i, name in enumerate(names)
+    ]
+
+
+def matter_of(client: int, link: Link, rules: Rules) -> tuple[Material, Tie]:
+    """What a link is made of, and its tie to ground.
+
+    Raises:
+        SceneError: Its user data name no known material or grounding.
+    """
+    said = _user_data(client, link, "capsense.material")
+    where = f"user data of {link.names[-1]!r}"
+    material = None if said is None else read_material(said, where)
+    said = _user_data(client, link, "capsense.grounding")
+    tie = None if said is None else Tie(read_grounding(said, where), f"body {link.body} {said}")
+    return rules.material_of(link.names, material), rules.tie_of(link.names, tie)
+
+
+def _user_data(client: int, link: Link, key: str) -> str | None:
+    import pybullet as p
+
+    found = p.getUserDataId(link.body, key, link.link, physicsClientId=client)
+    return None if found < 0 else p.getUserData(found, physicsClientId=client).decode()
+
+
+def is_soft(client: int, link: Link) -> bool:
+    """Whether a link is a soft body."""
+    import pybullet as p
+
+    dynamics = p.getDynamicsInfo(link.body, link.link, physicsClientId=client)
+    return bool(dynamics[10] == _SOFT_BODY)
+
+
+class SoftMesh:
+    """The surface of a soft body, as PyBullet draws it: three vertices for every triangle.
+
+    Before the first step the drawn vertices are those of the file, neither scaled nor placed.
+
+    Raises:
+        SceneError: It is not made of triangles.
+    """
+
+    def __init__(self, client: int, link: Link) -> None:
+        self._client, self._link = client, link
+        self._stepped = False
+        soup = self._mesh(0)
+        if not len(soup) or len(soup) % 3:
+            raise _refuse(link, "is a soft body whose surface is not made of triangles")
+        size = float(np.ptp(soup, axis=0).max())
+        _, self._first, corner = np.unique(
+            np.rint(soup / (1e-6 * size)), axis=0, return_index=True, return_inverse=True
+        )
+        self.faces: NDArray[np.int64] = corner.reshape(-1, 3)
+        """Indices of merged vertices, shape (m, 3)."""
+        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        _, count = np.unique(edges, axis=0, return_counts=True)
+        self.closed = bool(np.all(count % 2 == 0))
+        """Whether the surface has an inside."""
+
+    def vertices(self) -> Array:
+        """The merged vertices [m] at present, shape (n, 3).
+
+        Raises:
+            SceneError: The world has not been stepped since the soft body was loaded.
+        """
+        drawn = self._mesh(0)
+        if not self._stepped:
+            import pybullet as p
+
+            simulated = self._mesh(p.MESH_DATA_SIMULATION_MESH)
+            apart = [
+                np.abs(f(drawn, axis=0) - f(simulated, axis=0)).max() for f in (np.min, np.max)
+            ]
+            if max(apart) > 1e-3 * float(np.ptp(simulated, axis=0).max()):
+                raise SceneError(
+                    f"{self._link.names[-1]!r} is a soft body that has not been stepped yet; call "
+                    "stepSimulation first"
+                )
+            self._stepped = True
+        return drawn[self._first]
+
+    def _mesh(self, flags: int) -> Array:
+        import pybullet as p
+
+        link = self._link
+        _, vertices = p.getMeshData(link.body, -1, flags=flags, physicsClientId=self._client)
+        return np.array(vertices)
+
+
+class WorldReader:
+    """Reads the shapes of all links of a world.
+
+    Args:
+        client: Number of the physics client.
+        links: The links; their order is that of the frames.
+        rules: What is seen, and what it is made of.
+        shapes: ``"collision"`` or ``"visual"``.
+        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
+
+    Raises:
+        SceneError: A pattern fits nothing.
+    """
+
+    def __init__(
+        self, client: int, links: Sequence[Link], rules: Rules, shapes: str, sheet_thickness: float
+    ) -> None:
+        self.client = client
+        self.links = links
+        self.rules = rules
+        self.shapes = shapes
+        self.sheet_thickness = sheet_thickness
+        self._meshes: dict[tuple[object, ...], Shape] = {}
+        rules.check([k.names for k in links])
+
+    def solids(self, index: int) -> Iterator[Solid]:
+        """The solids of one link.
+
+        Raises:
+            SceneError: A shape is not supported.
+        """
+        link = self.links[index]
+        if self.rules.excludes(link.names):
+            return
+        material, tie = matter_of(self.client, link, self.rules)
+        for shape, pose in self._shapes_of(link):
+            yield Solid(
+                label=link.names[-1],
+                shape=shape,
+                frame=index,
+                pose=pose,
+                material=material,
+                tie=tie,
+            )
+
+    def soft_solids(self, index: int) -> list[SoftSolid]:
+        """A soft body as a deformable; none where the rules leave it out.
+
+        Raises:
+            SceneError: Its mesh is not made of triangles.
+        """
+        link = self.links[index]
+        if self.rules.excludes(link.names):
+            return []
+        mesh = SoftMesh(self.client, link)
+        material, tie = matter_of(self.client, link, self.rules)
+        thickness = None if mesh.closed else self.sheet_thickness
+        return [SoftSolid(link.names[-1], mesh.faces, thickness, mesh.vertices, material, tie)]
+
+    def _shapes_of(self, link: Link) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
+        """Shapes, and their poses in the frame of the link's centre of mass."""
+        import pybullet as p
+
+        dynamics = p.getDynamicsInfo(link.body, link.link, physicsClientId=self.client)
+        drawn = p.getVisualShapeData(link.body, physicsClientId=self.client)
+        drawn = [entry for entry in drawn if entry[1] == link.link]
+        if any(entry[2] == _HEIGHT_FIELD for entry in drawn):
+            raise _refuse(link, "is a height field, of which PyBullet tells nothing but its bounds")
+        if self.shapes == "visual":
+            to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
+            for entry in drawn:
+                yield self._visual(link, entry), to_mass @ Pose(entry[5], entry[6])
+            return
+        # entries 0 and 1 are sound in the first record of a link only
+        data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
+        for number, entry in enumerate(data):
+            yield self._collision(link, number, entry)
+
+    def _visual(self, link: Link, entry: Any) -> Shape:
+        import pybullet as p
+
+        kind, sizes, file = entry[2:5]
+        shape = _primitive(kind, sizes)
+        if shape is not None:
+            return shape
+        if kind != p.GEOM_MESH or not file:
+            what = "mesh without a file" if kind == p.GEOM_MESH else f"shape of type {kind}"
+            raise _refuse(link, f"has a visual {what}, which cannot be sensed")
+        hull = self.rules.takes_hull(link.names)
+        key = (file, sizes, hull)
+        if key not in self._meshes:
+            label = link.names[-1]
+            vertices, faces = load_triangles(file.decode(), sizes, label)
+            self._meshes[key] = solid_mesh(vertices, faces, label, hull=hull)
+        return self._meshes[key]
+
+    def _collision(self, link: Link, number: int, entry: Any) -> tuple[Shape | HalfSpace, Pose]:
+        import pybullet as p
+
+        kind, sizes, file = entry[2:5]
+        pose = Pose(entry[5], entry[6])
+        shape = _primitive(kind, sizes)
+        if shape is not None:
+            return shape, pose
+        if kind == p.GEOM_PLANE:
+            return HalfSpace(), pose @ _turned_to(sizes)
+        if kind != p.GEOM_MESH:
+            raise _refuse(link, f"has a collision shape of type {kind}, which cannot be sensed")
+        label = link.names[-1]
+        if file != _NO_FILE:
+            key = (file, sizes, "parts")
+            if key not in self._meshes:
+                vertices, faces = joined_hulls(*load_triangles(file.decode(), sizes, label), label)
+                self._meshes[key] = solid_mesh(vertices, faces, label)
+            return self._meshes[key], pose
+        _, vertices = p.getMeshData(
+            link.body, link.link, collisionShapeIndex=number, physicsClientId=self.client
+        )
+        if not vertices:
+            raise _refuse(link, "has a concave collision mesh that PyBullet does not give out")
+        corners = pose.inverse().apply(vertices)  # given in the frame of the centre of mass
+        return round_cylinder(corners) or solid_mesh(corners, (), label, hull=True), pose
+
+
+def _primitive(kind: int, sizes: tuple[float, float, float]) -> Shape | None:
+    """The shape that one of Bullet's types and its sizes [m] stand for."""
+    import pybullet as p
+
+    a, b, c = sizes
+    if kind == p.GEOM_BOX:
+        return Box((a, b, c))
+    if kind == p.GEOM_SPHERE:
+        return Sphere(a)
+    if kind == p.GEOM_CAPSULE:
+        return Capsule(b, a) if a > 0 else Sphere(b)
+    if kind == p.GEOM_CYLINDER:
+        return Cylinder(b, a)
+    return None
+
+
+def _turned_to(normal: Sequence[float]) -> Pose:
+    """The rotation that turns z to a unit normal, the short way."""
+    x, y, z = normal
+    if z < -1 + 1e-9:
+        return Pose((0, 0, 0), (1, 0, 0, 0))
+    return Pose((0, 0, 0), (-y, x, 0, 1 + z))
+
+
+def _refuse(link: Link, what: str) -> SceneError:
+    label = link.names[-1]
+    return SceneError(f"{label!r} {what}; leave it out with exclude=[{label!r}]")

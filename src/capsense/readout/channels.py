@@ -1,0 +1,209 @@
+"""Excitation patterns: which electrodes are driven, which one is read, what the others do.
+
+A pattern turns a Maxwell matrix into the one capacitance that a channel measures: the charge on the
+electrode read, per volt of the transmitter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense._validate import suggest
+from capsense.errors import ReadOutError
+
+Array = NDArray[np.float64]
+Rest = Literal["grounded", "floating", "guard"]
+RESTS: tuple[Rest, ...] = ("grounded", "floating", "guard")
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """One measurement: potentials on some electrodes, and the electrode whose charge is read.
+
+    Raises:
+        ReadOutError: Nothing is driven, a weight is not a finite number, an electrode is both
+            driven and floating, or a receiver other than the transmitter is driven.
+    """
+
+    sense: str
+    """Electrode whose charge is measured."""
+    drive: Mapping[str, float] = field(default_factory=dict)
+    """Potential of each driven electrode in units of the transmitter's, such as 1 or −1; empty
+    for the electrode read itself: a self measurement."""
+    floating: tuple[str, ...] = ()
+    """Electrodes left open: they carry no charge and take the potential that follows."""
+    rest: Rest = "grounded"
+    """What electrodes named nowhere do; ``"guard"`` drives them at the transmitter's potential."""
+    shield: float = 0.0
+    """Potential of the design's driven shields in units of the transmitter's."""
+    name: str = ""
+    """Channel name; by default that of the electrodes."""
+
+    def __post_init__(self) -> None:
+        drive = dict(self.drive) or {self.sense: 1.0}
+        label = self.name or _default_name(self.sense, drive)
+        where = f"channel {label!r}"
+        for electrode, weight in (*drive.items(), ("shield", self.shield)):
+            if not math.isfinite(weight):
+                raise ReadOutError(
+                    f"{where}: the drive of {electrode!r} is {weight}; give a number"
+                )
+        if all(weight == 0.0 for weight in drive.values()):
+            raise ReadOutError(f"{where}: nothing is driven; give one electrode a weight")
+        if self.rest not in RESTS:
+            raise ReadOutError(f"{where}: rest = {self.rest!r}; {suggest(str(self.rest), RESTS)}")
+        for electrode in self.floating:
+            if electrode in drive or electrode == self.sense:
+                raise ReadOutError(
+                    f"{where}: electrode {electrode!r} is floating, and driven or read; keep one"
+                )
+        if self.sense in drive and len(drive) > 1:
+            raise ReadOutError(
+                f"{where}: {self.sense!r} is read and driven together with other electrodes; "
+                'read it alone, with the others as rest = "guard"'
+            )
+        object.__setattr__(self, "drive", MappingProxyType(drive))
+        object.__setattr__(self, "name", label)
+
+    @property
+    def is_self(self) -> bool:
+        """Whether the electrode read is the one driven."""
+        return self.sense in self.drive
+
+
+def _default_name(sense: str, drive: Mapping[str, float]) -> str:
+    if sense in drive:
+        return sense
+    return "+".join(drive) + f"-{sense}"
+
+
+def self_patterns(
+    electrodes: Sequence[str], *, rest: Rest = "grounded", shield: float = 1.0
+) -> tuple[Pattern, ...]:
+    """Each electrode by itself: driven and read; shields follow it unless ``shield`` is 0."""
+    return tuple(Pattern(name, rest=rest, shield=shield) for name in electrodes)
+
+
+def mutual_patterns(
+    electrodes: Sequence[str],
+    pairs: Iterable[tuple[str, str]] = (),
+    *,
+    rest: Rest = "grounded",
+) -> tuple[Pattern, ...]:
+    """Pairs (transmitter, receiver); by default every pair once, in the order of the electrodes.
+
+    Raises:
+        ReadOutError: A pair names one electrode twice.
+    """
+    chosen = list(pairs) or [
+        (one, two) for k, one in enumerate(electrodes) for two in electrodes[k + 1 :]
+    ]
+    for tx, rx in chosen:
+        if tx == rx:
+            raise ReadOutError(f"pair {[tx, rx]} names one electrode twice; give two")
+    return tuple(Pattern(rx, {tx: 1.0}, rest=rest) for tx, rx in chosen)
+
+
+class ChannelBank:
+    """Patterns, ready to be applied to the Maxwell matrices of a sensor.
+
+    Args:
+        patterns: What is measured, in channel order.
+        electrodes: Electrode names in matrix order.
+
+    Raises:
+        ReadOutError: A pattern names an electrode that is not there, or two have one name.
+    """
+
+    def __init__(self, patterns: Sequence[Pattern], electrodes: Sequence[str]) -> None:
+        if not patterns:
+            raise ReadOutError("a read-out needs at least one channel; none is given")
+        self.patterns = tuple(patterns)
+        self.electrodes = tuple(electrodes)
+        self.names = tuple(p.name for p in patterns)
+        for name in self.names:
+            if self.names.count(name) > 1:
+                raise ReadOutError(f"two channels are named {name!r}; give them names")
+        index = {name: k for k, name in enumerate(self.electrodes)}
+        for pattern in self.patterns:
+            for name in (pattern.sense, *pattern.drive, *pattern.floating):
+                if name not in index:
+                    raise ReadOutError(
+                        f"channel {pattern.name!r} names no electrode {name!r} of the sensor; "
+                        f"{suggest(name, self.electrodes)}"
+                    )
+        self._sense = np.array([index[p.sense] for p in self.patterns])
+        self._sign = np.array([1.0 if p.is_self else -1.0 for p in self.patterns])
+        self._volts = np.array([self._potentials(p, index) for p in self.patterns])
+        self._shield = np.array([p.shield for p in self.patterns])
+        self._open = [self._floating_of(p, index) for p in self.patterns]
+        self._with_floating = [k for k, f in enumerate(self._open) if len(f)]
+
+    def __len__(self) -> int:
+        return len(self.patterns)
+
+    def values(self, capacitance: Array, shield_coupling: Array | None = None) -> Array:
+        """Capacitance of every channel.
+
+        A channel's value is ``±Σ_j C[sense, j] v_j``: plus for a self measurement, minus for a
+        mutual one, so that both are positive. Open electrodes first get the potentials at which
+        they carry no charge, ``v_f = −C_ff⁻¹ (C_fd v_d)``.
+
+        Args:
+            capacitance: Maxwell matrices [F], shields at ground, shape (..., M, M).
+            shield_coupling: Charge on each electrode per volt on all shields together [F],
+                shape (..., M); None where the sensor has no shields.
+
+        Returns:
+            Channel capacitances [F], shape (..., K).
+
+        Raises:
+            ReadOutError: The shape does not fit the electrodes, or a number is not finite.
+        """
+        matrix = np.asarray(capacitance, dtype=float)
+        m = len(self.electrodes)
+        if matrix.shape[-2:] != (m, m):
+            raise ReadOutError(
+                f"capacitance has shape {matrix.shape}; {m} electrodes need (..., {m}, {m})"
+            )
+        rows = matrix[..., self._sense, :]
+        out = (rows * self._volts).sum(axis=-1)
+        if shield_coupling is not None:
+            out = out + np.asarray(shield_coupling)[..., self._sense] * self._shield
+        for k in self._with_floating:
+            out[..., k] += self._induced(matrix, shield_coupling, k)
+        out = self._sign * out
+        if not np.isfinite(out).all():
+            raise ReadOutError("capacitance holds a number that is not finite; mend the readings")
+        return out
+
+    def _induced(self, matrix: Array, coupling: Array | None, k: int) -> Array:
+        """Charge on the electrode read that the potentials of open electrodes add."""
+        open_ = self._open[k]
+        charge = (matrix[..., open_, :] * self._volts[k]).sum(axis=-1)
+        if coupling is not None:
+            charge = charge + np.asarray(coupling)[..., open_] * self._shield[k]
+        own = matrix[..., open_[:, None], open_]
+        volts = -np.linalg.solve(own, charge[..., None])[..., 0]
+        return (matrix[..., self._sense[k], open_] * volts).sum(axis=-1)
+
+    def _potentials(self, pattern: Pattern, index: Mapping[str, int]) -> Array:
+        volts = np.full(len(self.electrodes), 1.0 if pattern.rest == "guard" else 0.0)
+        volts[[index[f] for f in pattern.floating]] = 0.0
+        volts[index[pattern.sense]] = 0.0
+        for name, weight in pattern.drive.items():
+            volts[index[name]] = weight
+        return volts
+
+    def _floating_of(self, pattern: Pattern, index: Mapping[str, int]) -> NDArray[np.int64]:
+        names = set(pattern.floating)
+        if pattern.rest == "floating":
+            names = set(self.electrodes) - {pattern.sense, *pattern.drive}
+        return np.array(sorted(index[n] for n in names), dtype=np.int64)

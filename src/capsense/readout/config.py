@@ -1,0 +1,197 @@
+"""Read-outs from TOML files that lie beside a design."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from capsense import _validate
+from capsense._validate import read_toml, suggest
+from capsense.errors import ReadOutError
+from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
+from capsense.readout.chips import CHIPS
+from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
+from capsense.readout.presets import Options, build, chip_of
+from capsense.readout.read_out import ReadOut
+from capsense.readout.wiring import Wiring
+
+TOP_KEYS = (
+    "chip", "rate", "seed", "random", "expected", "mode", "pairs", "rest", "channel", "wiring",
+    "noise", "climate", "detector",
+)  # fmt: skip
+
+
+class Table(_validate.Table):
+    """One table of a read-out file; whatever is wrong raises :class:`ReadOutError`."""
+
+    error_type = ReadOutError
+
+
+def load_readout(path: str | Path, electrodes: Sequence[str]) -> ReadOut:
+    """Load a read-out file.
+
+    Args:
+        path: The ``.toml`` file.
+        electrodes: Electrode names of the sensor, in matrix order.
+
+    Raises:
+        ReadOutError: There is no such file, or anything in it is wrong; the message names the
+            file, the item, the value and the mend.
+    """
+    file = Path(path)
+    return parse_readout(read_toml(file, "read-out", ReadOutError), electrodes, source=file.name)
+
+
+def parse_readout(
+    data: Mapping[str, Any], electrodes: Sequence[str], *, source: str = "read-out"
+) -> ReadOut:
+    """Build a read-out from the content of its file, given as nested dicts.
+
+    Raises:
+        ReadOutError: Anything is wrong.
+    """
+    top = Table(data, source, "read-out")
+    top.only(TOP_KEYS)
+    chip = chip_of(top.choice("chip", tuple(CHIPS)))
+    options: dict[str, Any] = {"patterns": _patterns(top, chip.mode, electrodes)}
+    if "rate" in top:
+        options["rate"] = top.number("rate", 1e-3, 1e7, unit="Hz")
+    if "expected" in top:
+        options["expected"] = top.number("expected", 1e-15, 1e-6, unit="F")
+    options["seed"] = top.integer("seed", 0, 2**63 - 1, 0)
+    options["noise"] = top.boolean("random", True)
+    for key, read in (
+        ("wiring", _wiring), ("noise", _noise), ("climate", _climate), ("detector", _detector),
+    ):  # fmt: skip
+        if key in top:
+            table = Table(top.data[key], source, key)
+            options.update(read(table))
+    try:
+        return build(chip, electrodes, Options.of(options))
+    except ReadOutError as error:
+        raise top.error(str(error)) from None
+
+
+def _patterns(top: Table, mode: str, electrodes: Sequence[str]) -> tuple[Pattern, ...]:
+    """Channels from [[channel]], or from ``mode``, ``pairs`` and ``rest``."""
+    if "channel" in top:
+        for key in ("mode", "pairs", "rest"):
+            if key in top:
+                raise top.error(f"{key} and [[channel]] both choose the channels; keep one")
+        return tuple(
+            _pattern(Table(raw, top.source, f"channel {number}"), electrodes)
+            for number, raw in enumerate(top.tables("channel"), start=1)
+        )
+    mode = top.choice("mode", ("self", "mutual"), mode)
+    rest = cast("Rest", top.choice("rest", RESTS, "grounded"))
+    if mode == "self":
+        if "pairs" in top:
+            raise top.error('pairs is for mode = "mutual"; remove one')
+        return self_patterns(electrodes, rest=rest)
+    try:
+        return mutual_patterns(electrodes, _pairs(top, electrodes), rest=rest)
+    except ReadOutError as error:
+        raise top.error(str(error)) from None
+
+
+def _pairs(top: Table, electrodes: Sequence[str]) -> list[tuple[str, str]]:
+    what = 'a list of [transmitter, receiver] names, like [["E1", "E2"]]'
+    if "pairs" not in top:
+        return []
+    value = top.raw("pairs", what)
+    if not isinstance(value, list) or not value:
+        raise top.error(f"pairs = {value!r} must be {what}")
+    for number, pair in enumerate(value):
+        if not (
+            isinstance(pair, list) and len(pair) == 2 and all(isinstance(n, str) for n in pair)
+        ):
+            raise top.error(f"pairs[{number}] = {pair!r} must be {what}")
+        for name in pair:
+            _require_electrode(top, f"pairs[{number}]", name, electrodes)
+    return [(tx, rx) for tx, rx in value]
+
+
+def _pattern(table: Table, electrodes: Sequence[str]) -> Pattern:
+    table.only(("name", "sense", "drive", "floating", "rest", "shield"))
+    sense = table.string("sense")
+    _require_electrode(table, "sense", sense, electrodes)
+    drive_table = Table(table.data.get("drive", {}), table.source, f"{table.item}: drive")
+    drive = {}
+    for name in drive_table.data:
+        _require_electrode(table, "drive", name, electrodes)
+        drive[name] = drive_table.number(name, -1e3, 1e3)
+    floating = table.data.get("floating", [])
+    if not isinstance(floating, list) or not all(isinstance(n, str) for n in floating):
+        raise table.error(f"floating = {floating!r} must be a list of electrode names")
+    for name in floating:
+        _require_electrode(table, "floating", name, electrodes)
+    rest = cast("Rest", table.choice("rest", RESTS, "grounded"))
+    shield = table.number("shield", -1e3, 1e3, 0.0 if drive else 1.0)
+    try:
+        return Pattern(sense, drive, tuple(floating), rest, shield, table.text("name"))
+    except ReadOutError as error:
+        raise table.error(str(error)) from None
+
+
+def _require_electrode(table: Table, key: str, name: str, electrodes: Sequence[str]) -> None:
+    if name not in electrodes:
+        raise table.error(f"{key} names no electrode {name!r}; {suggest(name, electrodes)}")
+
+
+def _wiring(table: Table) -> dict[str, Any]:
+    table.only(("trace", "cable", "shield_gain", "crosstalk"))
+    return {
+        "wiring": Wiring(
+            table.series("trace", 0.0, 1e-6, "F") if "trace" in table else 0.0,
+            table.series("cable", 0.0, 1e-6, "F") if "cable" in table else 0.0,
+            table.number("shield_gain", 0.0, 1.0, 0.0),
+            table.number("crosstalk", -1.0, 1.0, 0.0),
+        )
+    }
+
+
+def _noise(table: Table) -> dict[str, Any]:
+    limits = {
+        "flicker": (0.0, 1e-9, "F"), "walk": (0.0, 1e-9, "F/√s"), "mains": (0.0, 1e-9, "F"),
+        "mains_frequency": (1.0, 1e3, "Hz"),
+    }  # fmt: skip
+    table.only(limits)
+    return {
+        key: table.number(key, low, high, unit=unit)
+        for key, (low, high, unit) in limits.items()
+        if key in table
+    }
+
+
+def _climate(table: Table) -> dict[str, Any]:
+    coefficients = {
+        "offset_per_kelvin": (1e-9, "F/K"), "gain_per_kelvin": (1.0, "1/K"),
+        "offset_per_percent": (1e-9, "F"),
+    }  # fmt: skip
+    table.only(("temperature", "humidity", *coefficients))
+    out: dict[str, Any] = {
+        key: table.number(key, -limit, limit, unit=unit)
+        for key, (limit, unit) in coefficients.items()
+        if key in table
+    }
+    for key in ("temperature", "humidity"):
+        value = table.data.get(key)
+        if isinstance(value, list):
+            out[key] = table.vectors(key, 2, "[time in s, value]")
+        elif value is not None:
+            out[key] = table.number(key, -273.15, 1000.0)
+    return out
+
+
+def _detector(table: Table) -> dict[str, Any]:
+    table.only(("touch", "release", "debounce", "tracker", "samples"))
+    kind = table.choice("tracker", ("exponential", "stepping"), "exponential")
+    tracker: Tracker = SteppingTracker()
+    if kind == "exponential":
+        tracker = ExponentialTracker(table.number("samples", 1e-3, 1e9, 1000.0))
+    elif "samples" in table:
+        raise table.error('samples is for tracker = "exponential"; remove one')
+    touch = table.number("touch", 1e-9, 1e12, unit="codes")
+    release = table.number("release", 1e-9, touch, 0.5 * touch, unit="codes")
+    return {"detector": Detector(touch, release, tracker, table.integer("debounce", 1, 10**6, 1))}

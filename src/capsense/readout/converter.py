@@ -1,0 +1,338 @@
+"""Converters: from a capacitance to an integer code, and what a user makes of the code."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import ReadOutError
+from capsense.readout.front_end import ShuntFrontEnd
+from capsense.readout.stage import Array, Ints, require, rounds
+
+Flags = NDArray[np.uint8]
+
+
+class Range(IntFlag):
+    """Saturation of a sample."""
+
+    INSIDE = 0
+    BELOW = 1
+    """The capacitance was below what the converter can tell; its code is the last it has."""
+    ABOVE = 2
+    """The capacitance was above what the converter can tell."""
+
+
+class Law(Protocol):
+    """How code and capacitance belong together."""
+
+    @property
+    def low(self) -> int:
+        """Smallest code."""
+
+    @property
+    def high(self) -> int:
+        """Largest code."""
+
+    @property
+    def rising(self) -> bool:
+        """Whether the code grows with the capacitance."""
+
+    def level(self, capacitance: Array) -> Array:
+        """Code before rounding, of capacitances [F] of any shape."""
+
+    def capacitance(self, code: Ints) -> Array:
+        """Capacitance [F] that a code stands for."""
+
+
+@dataclass(frozen=True)
+class LinearLaw:
+    """``code = C/lsb + zero``: sigma-delta converters with a reference capacitor, and counters."""
+
+    lsb: float
+    """Capacitance of one code [F]."""
+    low: int
+    high: int
+    zero: int = 0
+    """Code at 0 F."""
+    rising = True
+
+    def __post_init__(self) -> None:
+        require("linear law", "lsb", self.lsb, 0.0, "F", open_=True)
+        _require_codes(self.low, self.high)
+
+    def level(self, capacitance: Array) -> Array:
+        """Code before rounding."""
+        return capacitance / self.lsb + self.zero
+
+    def capacitance(self, code: Ints) -> Array:
+        """Capacitance of a code [F]."""
+        return self.lsb * (np.asarray(code) - self.zero).astype(float)
+
+
+@dataclass(frozen=True)
+class ReciprocalLaw:
+    """``code = 2^bits · I T/(C V_dd)``: charge with a current I for a time T, read the voltage.
+
+    The charger needs a headroom to either rail; codes beyond it are out of range.
+    """
+
+    current: float
+    """I [A]."""
+    time: float
+    """T [s]."""
+    supply: float
+    """V_dd [V]."""
+    bits: int = 10
+    headroom: float = 0.7
+    """[V]"""
+    rising = False
+
+    def __post_init__(self) -> None:
+        for name, unit in (("current", "A"), ("time", "s"), ("supply", "V")):
+            require("reciprocal law", name, getattr(self, name), 0.0, unit, open_=True)
+        require("reciprocal law", "headroom", self.headroom, 0.0, "V")
+        _require_codes(self.low, self.high)
+
+    @property
+    def low(self) -> int:
+        """Smallest code in range: at the largest capacitance."""
+        return math.ceil(self.headroom / self.supply * 2**self.bits)
+
+    @property
+    def high(self) -> int:
+        """Largest code in range."""
+        full = 2**self.bits
+        return min(math.floor((self.supply - self.headroom) / self.supply * full), full - 1)
+
+    @property
+    def _product(self) -> float:
+        return 2**self.bits * self.current * self.time / self.supply
+
+    def level(self, capacitance: Array) -> Array:
+        """Code before rounding; beyond all codes for a capacitance of zero or less."""
+        with np.errstate(divide="ignore"):
+            return np.where(capacitance > 0, self._product / np.maximum(capacitance, 0.0), np.inf)
+
+    def capacitance(self, code: Ints) -> Array:
+        """Capacitance of a code [F]; infinite at code 0."""
+        with np.errstate(divide="ignore"):
+            return self._product / np.asarray(code, dtype=float)
+
+
+@dataclass(frozen=True)
+class ResonanceLaw:
+    """``code = 2^bits f/f_ref`` with ``f = 1/(2π √(L (C_fixed + C)))``: an LC tank's frequency."""
+
+    inductance: float
+    """L [H]."""
+    fixed: float
+    """C_fixed, the tank's own capacitor [F]."""
+    reference: float
+    """f_ref [Hz]."""
+    bits: int = 28
+    low: int = 1
+    rising = False
+
+    def __post_init__(self) -> None:
+        for name, unit in (("inductance", "H"), ("fixed", "F"), ("reference", "Hz")):
+            require("resonance law", name, getattr(self, name), 0.0, unit, open_=True)
+
+    @property
+    def high(self) -> int:
+        """Largest code: a quarter of the reference frequency, beyond which it is not counted."""
+        return 2**self.bits // 4
+
+    def level(self, capacitance: Array) -> Array:
+        """Code before rounding; beyond all codes where the tank has no capacitance left."""
+        total = np.maximum(self.fixed + capacitance, 0.0)
+        with np.errstate(divide="ignore"):
+            frequency = 1 / (2 * math.pi * np.sqrt(self.inductance * total))
+        return frequency / self.reference * 2**self.bits
+
+    def capacitance(self, code: Ints) -> Array:
+        """Capacitance of a code [F]."""
+        frequency = np.asarray(code, dtype=float) * (self.reference / 2**self.bits)
+        return 1 / (self.inductance * (2 * math.pi * frequency) ** 2) - self.fixed
+
+
+@dataclass(frozen=True)
+class ShuntLaw:
+    """``code = 2^(bits−1) |V_o|/full_scale``: a front end's IQ magnitude, sampled by a radio.
+
+    The phase tells the sign, so that noise about zero stays noise about zero. The capacitance is
+    what the recovery formula makes of the magnitude, as in Schöffmann et al. 2022; see
+    :mod:`capsense.readout.front_end` for its error.
+    """
+
+    front_end: ShuntFrontEnd
+    full_scale: float
+    """Largest amplitude [V]."""
+    bits: int = 16
+    rising = True
+
+    def __post_init__(self) -> None:
+        require("shunt law", "full_scale", self.full_scale, 0.0, "V", open_=True)
+
+    @property
+    def low(self) -> int:
+        """Smallest code."""
+        return -self.high - 1
+
+    @property
+    def high(self) -> int:
+        """Largest code."""
+        return 2 ** (self.bits - 1) - 1
+
+    def level(self, capacitance: Array) -> Array:
+        """Code before rounding."""
+        size = np.abs(self.front_end.output(np.abs(capacitance)))
+        scale = 2 ** (self.bits - 1) / self.full_scale
+        return np.asarray(np.sign(capacitance) * size * scale, dtype=float)
+
+    def capacitance(self, code: Ints) -> Array:
+        """Capacitance of a code [F]."""
+        volts = np.abs(code) * (self.full_scale / 2 ** (self.bits - 1))
+        return np.asarray(np.sign(code) * self.front_end.recover(volts), dtype=float)
+
+
+def _require_codes(low: int, high: int) -> None:
+    if not low < high:
+        raise ReadOutError(
+            f"the codes run from {low} to {high}; widen the range (at a reciprocal law, raise the "
+            "supply or lower the headroom)"
+        )
+
+
+@dataclass(frozen=True)
+class CapDac:
+    """A capacitor array in the chip that is subtracted from the input, in steps.
+
+    The chip's user adds ``code · step`` to the result. Where the capacitors of the bits differ
+    from that, the sum jumps when the code changes.
+    """
+
+    step: float
+    """Nominal capacitance of one step [F]."""
+    codes: int
+    """Number of codes, from 0."""
+    bit_errors: tuple[float, ...] = ()
+    """What each bit's capacitor has too much [F], the least significant first."""
+    start: int | Literal["auto"] = "auto"
+    """Code at the start; ``"auto"`` takes that nearest to each channel's first sample."""
+    follow: bool = True
+    """Whether a channel whose sample saturated gets a new code, for its next sample."""
+
+    def __post_init__(self) -> None:
+        require("CAPDAC", "step", self.step, 0.0, "F", open_=True)
+        if self.codes < 1:
+            raise ReadOutError(f"CAPDAC: codes is {self.codes}; give one or more")
+        if self.start != "auto" and not 0 <= self.start < self.codes:
+            raise ReadOutError(
+                f'CAPDAC: start is {self.start!r}; give "auto" or a code from 0 to {self.codes - 1}'
+            )
+        for error in self.bit_errors:
+            require("CAPDAC", "bit_errors", error, -math.inf, "F")
+
+    def actual(self) -> Array:
+        """What is subtracted at each code [F], shape (codes,)."""
+        code = np.arange(self.codes)
+        errors = sum(error * ((code >> bit) & 1) for bit, error in enumerate(self.bit_errors))
+        return np.asarray(code * self.step + errors, dtype=float)
+
+    def nearest(self, capacitance: Array) -> Ints:
+        """Code nominally nearest to capacitances [F]."""
+        return np.clip(np.rint(capacitance / self.step), 0, self.codes - 1).astype(np.int64)
+
+
+class Conversion:
+    """A converter at work: holds the codes of its offset DAC.
+
+    Args:
+        law: How code and capacitance belong together.
+        dac: The offset DAC, if it has one.
+        channels: Number of channels.
+    """
+
+    def __init__(self, law: Law, dac: CapDac | None, channels: int) -> None:
+        self._law, self._dac, self._channels = law, dac, channels
+        self._unset = True
+        if dac is not None:
+            self._actual = dac.actual()
+            self.dac_codes = np.full(channels, -1 if dac.start == "auto" else dac.start)
+
+    def __call__(self, channel: Ints, value: Array) -> tuple[Ints, Array, Flags]:
+        """Convert a batch.
+
+        Args:
+            channel: Channel numbers; any K in a row are all different; shape (n,).
+            value: Capacitances [F], shape (n,).
+
+        Returns:
+            Codes; the capacitances that the chip's user makes of them [F]; flags of
+            :class:`Range`. Each of shape (n,).
+        """
+        if self._dac is None:
+            code, flags = quantise(self._law, value)
+            return code, self._law.capacitance(code), flags
+        whole = self._with_dac(self._dac, channel, value)
+        if whole is not None:
+            return whole
+        parts = [
+            self._in_turn(self._dac, channel[part], value[part])
+            for part in rounds(len(value), self._channels)
+        ]
+        code, reported, flags = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return code, reported, flags
+
+    def _with_dac(
+        self, dac: CapDac, channel: Ints, value: Array
+    ) -> tuple[Ints, Array, Flags] | None:
+        """Convert with the DAC's codes as they stand; None if any would change on the way."""
+        used = self.dac_codes[channel]
+        if self._unset and (used < 0).any():
+            return None
+        code, flags = quantise(self._law, value - self._actual[used])
+        if dac.follow and flags.any():
+            return None
+        return code, self._law.capacitance(code) + used * dac.step, flags
+
+    def _in_turn(self, dac: CapDac, channel: Ints, value: Array) -> tuple[Ints, Array, Flags]:
+        """Convert at most one sample a channel, and set the DAC's codes for the next one."""
+        used = self.dac_codes[channel]
+        used = np.where(used < 0, dac.nearest(value), used)
+        code, flags = quantise(self._law, value - self._actual[used])
+        reported = self._law.capacitance(code) + used * dac.step
+        if dac.follow:
+            used = np.where(flags > 0, _next_code(dac, self._law, used, flags), used)
+        self.dac_codes[channel] = used
+        self._unset = bool((self.dac_codes < 0).any())
+        return code, reported, flags
+
+
+def _next_code(dac: CapDac, law: Law, used: Ints, flags: Flags) -> Ints:
+    """Half a converter's range up or down, at least one step."""
+    span = abs(float(law.capacitance(np.array(law.high)) - law.capacitance(np.array(law.low))))
+    stride = max(1, round(0.5 * span / dac.step))
+    direction = np.where(flags & Range.ABOVE, 1, -1)
+    return np.clip(used + direction * stride, 0, dac.codes - 1)
+
+
+def quantise(law: Law, capacitance: ArrayLike) -> tuple[Ints, Flags]:
+    """Round capacitances [F] to codes, halves to even, and clip them to the law's range.
+
+    Returns:
+        Codes, and flags of :class:`Range`, of the capacitances' shape.
+    """
+    level = np.rint(law.level(np.asarray(capacitance, dtype=float)))
+    clipped = np.minimum(np.maximum(level, law.low), law.high)
+    flags = np.zeros(level.shape, dtype=np.uint8)
+    wrong = clipped != level
+    if wrong.any():
+        above = (level > clipped) == law.rising
+        flags[wrong] = np.where(above[wrong], Range.ABOVE, Range.BELOW)
+    return clipped.astype(np.int64), flags

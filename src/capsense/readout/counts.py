@@ -1,0 +1,110 @@
+"""What a read-out reports: integer codes with time stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense._validate import suggest
+from capsense.errors import ReadOutError
+from capsense.readout.stage import Array, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """Finished conversions in the order of time, n of them."""
+
+    channel_names: tuple[str, ...]
+    """Names of the read-out's channels."""
+    time: Array
+    """Time stamps: when the result could be read [s], shape (n,)."""
+    channel: Ints
+    """Number of each conversion's channel, shape (n,)."""
+    code: Ints
+    """What the converter put out, shape (n,)."""
+    capacitance: Array
+    """What its user makes of the code and the offset DAC [F], shape (n,)."""
+    flags: NDArray[np.uint8]
+    """Saturation, of :class:`~capsense.readout.converter.Range`, shape (n,)."""
+    baseline: Array | None = None
+    """Tracked baselines [codes], shape (n,); None without a detector."""
+    touched: NDArray[np.bool_] | None = None
+    """Touch or proximity states, shape (n,); None without a detector."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def saturated(self) -> NDArray[np.bool_]:
+        """Conversions that were out of range, shape (n,)."""
+        return self.flags != 0
+
+    def __getitem__(self, which: slice | NDArray[np.bool_] | Ints) -> Counts:
+        """Some of the conversions."""
+        return Counts(
+            self.channel_names, self.time[which], self.channel[which], self.code[which],
+            self.capacitance[which], self.flags[which],
+            None if self.baseline is None else self.baseline[which],
+            None if self.touched is None else self.touched[which],
+        )  # fmt: skip
+
+    def of(self, name: str) -> Counts:
+        """The conversions of one channel.
+
+        Raises:
+            ReadOutError: There is no such channel.
+        """
+        if name not in self.channel_names:
+            raise ReadOutError(f"no channel {name!r}; {suggest(name, self.channel_names)}")
+        return self[self.channel == self.channel_names.index(name)]
+
+    def latest(self) -> dict[str, float]:
+        """The last capacitance of each channel that has one [F], by name."""
+        return {
+            self.channel_names[k]: float(c)
+            for k, c in zip(self.channel.tolist(), self.capacitance, strict=True)
+        }
+
+    def table(self) -> tuple[Array, Array]:
+        """Whole cycles side by side.
+
+        Returns:
+            Time stamps [s] and capacitances [F], both of shape (cycles, K), columns in the order
+            of the channels; an unfinished last cycle is left out. The conversions must start
+            with a cycle, as those of a whole recording do.
+
+        Raises:
+            ReadOutError: The conversions do not start with a cycle or leave some out.
+        """
+        k = len(self.channel_names)
+        cycles = len(self) // k
+        whole = slice(0, cycles * k)
+        order = np.argsort(self.channel[whole].reshape(cycles, k), axis=1)
+        ranked = np.take_along_axis(self.channel[whole].reshape(cycles, k), order, axis=1)
+        if (ranked != np.arange(k)).any():
+            raise ReadOutError("the conversions are not whole cycles; use of(name) instead")
+        shape = (cycles, k)
+        return (
+            np.take_along_axis(self.time[whole].reshape(shape), order, axis=1),
+            np.take_along_axis(self.capacitance[whole].reshape(shape), order, axis=1),
+        )
+
+
+def join(parts: Sequence[Counts]) -> Counts:
+    """Successive conversions of one read-out, one after another.
+
+    Raises:
+        ReadOutError: There are no parts.
+    """
+    if not parts:
+        raise ReadOutError("there are no counts to join; give at least one")
+
+    def column(name: str) -> NDArray | None:
+        columns = [getattr(p, name) for p in parts]
+        return None if columns[0] is None else np.concatenate(columns)
+
+    names = ("time", "channel", "code", "capacitance", "flags", "baseline", "touched")
+    return Counts(parts[0].channel_names, *(column(n) for n in names))  # type: ignore[arg-type]

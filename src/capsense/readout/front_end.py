@@ -1,0 +1,141 @@
+"""Analogue front end: a shunt, an amplifier, and IQ demodulation.
+
+The transmitter drives one plate of the capacitance C with an amplitude V and an angular frequency
+ω; the other plate goes to ground through the shunt R_S, over which lies the parasitic capacitance
+C_p of traces and cable. The amplifier, of gain A and one pole at its bandwidth, sees the shunt's
+voltage. As phasors
+
+    V_o = A/(1 + jf/f_b) · V · jωC / (1/R_S + jω(C + C_p)).
+
+Without C_p and with a fast amplifier, A V/V_o − 1 = 1/(jω R_S C), and hence
+``C = 1/(ω R_S |A V/V_o − 1|)``, the recovery formula of Schöffmann et al. 2022 (there V is called
+V_RX). Given the phasor V_o it is exact. Given its magnitude only, it is too large by the factor
+1 + ω R_S C, to first order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.readout.stage import Array, require
+
+Phasors = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class ShuntFrontEnd:
+    """Voltage divider of capacitance and shunt, with amplifier.
+
+    Raises:
+        ReadOutError: A number is not finite or not positive (``parasitic`` may be zero,
+            ``bandwidth`` infinite).
+    """
+
+    frequency: float = 1e6
+    """Excitation frequency [Hz]."""
+    shunt: float = 1e3
+    """R_S [Ω]."""
+    gain: float = 100.0
+    """A, at low frequency."""
+    amplitude: float = 1.0
+    """V, of the transmitter [V]."""
+    bandwidth: float = math.inf
+    """Frequency of the amplifier's pole, −3 dB [Hz]."""
+    parasitic: float = 0.0
+    """C_p [F]."""
+
+    def __post_init__(self) -> None:
+        for name, unit in (("frequency", "Hz"), ("shunt", "Ω"), ("gain", ""), ("amplitude", "V")):
+            require("front end", name, getattr(self, name), 0.0, unit, open_=True)
+        require("front end", "parasitic", self.parasitic, 0.0, "F")
+        if self.bandwidth != math.inf:
+            require("front end", "bandwidth", self.bandwidth, 0.0, "Hz", open_=True)
+
+    @property
+    def omega(self) -> float:
+        """Angular frequency [rad/s]."""
+        return 2 * math.pi * self.frequency
+
+    def output(self, capacitance: ArrayLike) -> Phasors:
+        """Phasor at the amplifier's output [V], for capacitances [F] of any shape."""
+        c = np.asarray(capacitance, dtype=float)
+        admittance = 1j * self.omega * c
+        divider = admittance / (1 / self.shunt + admittance + 1j * self.omega * self.parasitic)
+        amplifier = self.gain / (1 + 1j * self.frequency / self.bandwidth)
+        return amplifier * self.amplitude * divider
+
+    def recover(self, output: ArrayLike) -> Array:
+        """Capacitance [F] by the recovery formula, from phasors V_o or from magnitudes [V].
+
+        The formula knows neither the parasitic capacitance nor the bandwidth; what they change
+        is the error that calibration is there to take out. An output of zero gives 0 F.
+        """
+        v_o = np.asarray(output)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.abs(self.gain * self.amplitude / v_o - 1.0)
+            return 1.0 / (self.omega * self.shunt * distance)
+
+    def waveform(self, capacitance: float, sample_rate: float, count: int) -> Array:
+        """Samples of the amplifier's output [V], from phase 0 of the transmitter on, (count,)."""
+        phase = self.omega * np.arange(count) / sample_rate
+        return np.real(self.output(capacitance) * np.exp(1j * phase))
+
+
+def demodulate(samples: ArrayLike, frequency: float, sample_rate: float) -> Phasors:
+    """IQ demodulation of sampled waveforms: mix with the transmitter, average.
+
+    I and Q are twice the means of the signal times cos ωt and −sin ωt over the window; the
+    average is the low-pass filter ("integrate and dump"). Magnitude and phase are those of I + jQ.
+
+    Args:
+        samples: Signals [V], shape (..., N), from phase 0 of the transmitter on.
+        frequency: Of the transmitter [Hz].
+        sample_rate: Samples per second [Hz].
+
+    Returns:
+        Phasors I + jQ [V], shape (...).
+    """
+    signal = np.asarray(samples, dtype=float)
+    phase = 2 * math.pi * frequency * np.arange(signal.shape[-1]) / sample_rate
+    return 2 * (signal @ np.exp(-1j * phase)) / signal.shape[-1]
+
+
+def demodulated(
+    phasor: ArrayLike, signal_frequency: float, frequency: float, sample_rate: float, count: int
+) -> Phasors:
+    """Closed form of :func:`demodulate` for a sine.
+
+    For a signal Re(P e^{jω_s t}) sampled N times, I + jQ = P D(ω_s − ω) + P* D(−ω_s − ω), where
+    D(Ω) is the mean of e^{jΩt} over the window, a Dirichlet kernel. A signal at the transmitter's
+    own frequency over a whole number of half periods comes out as P itself; otherwise its image
+    at 2ω leaks, and so does an interferer at another frequency.
+
+    White noise of variance σ² per sample leaves a variance of 2σ²/N on each of I and Q.
+
+    Args:
+        phasor: P [V], of any shape.
+        signal_frequency: Of the signal [Hz].
+        frequency: Of the transmitter [Hz].
+        sample_rate: Samples per second [Hz].
+        count: Number of samples N in the window.
+
+    Returns:
+        I + jQ [V], of the shape of ``phasor``.
+    """
+    p = np.asarray(phasor, dtype=complex)
+    near = _window_mean((signal_frequency - frequency) / sample_rate, count)
+    image = _window_mean((-signal_frequency - frequency) / sample_rate, count)
+    return p * near + np.conj(p) * image
+
+
+def _window_mean(cycles: float, count: int) -> complex:
+    """Mean of e^{2πj·cycles·n} over n = 0 … count − 1."""
+    turn = cycles - round(cycles)
+    if abs(turn) * count < 1e-12:
+        return 1.0 + 0.0j
+    size = math.sin(math.pi * turn * count) / (count * math.sin(math.pi * turn))
+    return complex(size * np.exp(1j * math.pi * turn * (count - 1)))

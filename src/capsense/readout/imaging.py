@@ -1,0 +1,269 @@
+"""Sensitivity of capacitances to permittivity in space, and images from capacitances.
+
+For two electrodes with unit potentials φ_i and φ_j the Maxwell matrix has the derivative
+``∂C_ij/∂ε = ∫ ∇φ_i · ∇φ_j dV`` (Geselowitz 1971; in capacitance tomography, the sensitivity
+theorem). On a rectilinear grid the energy of a cell is that of its twelve edges, each with a
+quarter of the cell's cross-section; so discretised, the derivative is exact for 7-point fields.
+
+A sensitivity matrix J has a row for each pair of electrodes and a column for each voxel. An image
+is the voxels' change of permittivity that explains a change of capacitances d = J g. There are far
+fewer pairs than voxels: what an image shows is where something is, not what.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from capsense.constants import EPS0
+from capsense.errors import ReadOutError
+from capsense.readout.stage import Array
+
+Axes = tuple[ArrayLike, ArrayLike, ArrayLike]
+
+
+def electrode_pairs(count: int, *, diagonal: bool = False) -> tuple[tuple[int, int], ...]:
+    """Pairs i < j of ``count`` electrodes, row by row; with ``diagonal`` also i = j."""
+    shift = 0 if diagonal else 1
+    return tuple((i, j) for i in range(count) for j in range(i + shift, count))
+
+
+def sensitivity(potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, int]]) -> Array:
+    """Derivatives of Maxwell matrix entries by the relative permittivity of voxels.
+
+    Args:
+        potentials: Potential at the grid's nodes with each electrode at 1 V in turn, others at
+            0 V, shape (nx, ny, nz, M).
+        axes: Node coordinates along x, y and z [m], rising.
+        pairs: Pairs (i, j) of electrodes.
+
+    Returns:
+        J [F], shape (len(pairs), (nx−1)(ny−1)(nz−1)): voxels are the grid's cells, z fastest.
+        For two electrodes side by side J is negative between them, where matter adds to their
+        (negative) entry of C, and positive above, where both fields point the same way.
+
+    Raises:
+        ReadOutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
+    """
+    phi, (x, y, z) = _field(potentials, axes, pairs)
+    volume = EPS0 * x[:, None, None] * y[None, :, None] * z[None, None, :]
+    out = np.zeros((len(pairs), *volume.shape))
+    for axis, spacing in enumerate((x, y, z)):
+        shape = [1, 1, 1]
+        shape[axis] = len(spacing)
+        weight = 0.25 * volume / spacing.reshape(shape) ** 2
+        rise = np.diff(phi, axis=axis)
+        for row, (i, j) in enumerate(pairs):
+            out[row] += weight * _four_edges(rise[..., i] * rise[..., j], axis)
+    return out.reshape(len(pairs), -1)
+
+
+def grounded_sensitivity(
+    potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, int]]
+) -> Array:
+    """What a little grounded conductor in a voxel adds to Maxwell matrix entries.
+
+    A conductor held at 0 V that is small against its distance, of capacitance c by itself (4πε₀a
+    for a sphere), adds ``ΔC_ij = c φ_i φ_j`` to every entry: it takes the charge that brings it to
+    0 V. People and grounded machines are seen by this, and not by their permittivity.
+
+    Args:
+        potentials: As for :func:`sensitivity`.
+        axes: As for :func:`sensitivity`.
+        pairs: Pairs (i, j) of electrodes.
+
+    Returns:
+        J, without unit, shape (len(pairs), voxels); an image is capacitance in voxels [F].
+
+    Raises:
+        ReadOutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
+    """
+    phi, _ = _field(potentials, axes, pairs)
+    out = []
+    for i, j in pairs:
+        product = phi[..., i] * phi[..., j]
+        along = 0.5 * (product[1:] + product[:-1])
+        out.append(0.25 * _four_edges(along, 0).ravel())
+    return np.array(out).reshape(len(pairs), -1)
+
+
+def resample(potentials: ArrayLike, axes: Axes, voxel_axes: Axes) -> Array:
+    """Potentials at the nodes of another rectilinear grid, by cubic interpolation.
+
+    Between the nodes of a solver's lattice, whose cells grow with the distance from the sensor,
+    this is several times closer than differences over its cells. Keep clear of the electrodes'
+    plane, where potentials have kinks.
+
+    Args:
+        potentials: Potentials at the given nodes, shape (nx, ny, nz, M).
+        axes: Their coordinates along x, y and z [m], rising, at least four each.
+        voxel_axes: Coordinates of the nodes wanted [m], rising.
+
+    Returns:
+        Shape (len(x), len(y), len(z), M) of ``voxel_axes``.
+
+    Raises:
+        ReadOutError: A node wanted lies outside of the given ones.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    given = [np.asarray(a, dtype=float) for a in axes]
+    wanted = [np.asarray(a, dtype=float) for a in voxel_axes]
+    for name, old, new in zip("xyz", given, wanted, strict=True):
+        _axis(name, new)
+        if new[0] < old[0] or new[-1] > old[-1]:
+            raise ReadOutError(
+                f"axis {name} runs from {new[0]:g} to {new[-1]:g} m, beyond the potentials' "
+                f"{old[0]:g} to {old[-1]:g} m; make it smaller"
+            )
+    out = np.asarray(potentials, dtype=float)
+    for axis, (old, new) in enumerate(zip(given, wanted, strict=True)):
+        out = make_interp_spline(old, out, k=3, axis=axis)(new)
+    return out
+
+
+def voxel_centres(axes: Axes) -> Array:
+    """Middles of the grid's cells [m], shape (voxels, 3), in the order of J's columns."""
+    middle = [0.5 * (np.asarray(a)[1:] + np.asarray(a)[:-1]) for a in axes]
+    return np.stack(np.meshgrid(*middle, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _field(
+    potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, int]]
+) -> tuple[Array, tuple[Array, ...]]:
+    """Checked potentials, and the spacings of the axes."""
+    phi = np.asarray(potentials, dtype=float)
+    steps = tuple(_axis(name, a) for name, a in zip("xyz", axes, strict=True))
+    if phi.ndim != 4 or phi.shape[:3] != tuple(len(s) + 1 for s in steps):
+        raise ReadOutError(
+            f"potentials have shape {phi.shape}; these axes need "
+            f"{(*(len(s) + 1 for s in steps), 'M')}"
+        )
+    if not np.isfinite(phi).all():
+        raise ReadOutError("a potential is not finite; mend the field")
+    for pair in pairs:
+        if not all(0 <= k < phi.shape[3] for k in pair):
+            raise ReadOutError(
+                f"pair {pair} names an electrode beyond the {phi.shape[3]} there are"
+            )
+    return phi, steps
+
+
+def _axis(name: str, nodes: ArrayLike) -> Array:
+    """Spacings of an axis."""
+    array = np.asarray(nodes, dtype=float)
+    if array.ndim != 1 or len(array) < 2 or not (np.diff(array) > 0).all():
+        raise ReadOutError(f"axis {name} must hold at least two rising coordinates in metres")
+    return np.diff(array)
+
+
+def _four_edges(product: Array, axis: int) -> Array:
+    """Sum over a cell's four edges along ``axis``."""
+    first, second = (a for a in range(3) if a != axis)
+    ahead = np.take(product, range(1, product.shape[first]), axis=first)
+    both = ahead + np.take(product, range(product.shape[first] - 1), axis=first)
+    ahead = np.take(both, range(1, both.shape[second]), axis=second)
+    return ahead + np.take(both, range(both.shape[second] - 1), axis=second)
+
+
+def back_projection(matrix: ArrayLike) -> Array:
+    """Linear back-projection: the image is R d with R = Jᵀ, rows and columns scaled.
+
+    Each pair first counts relative to its largest sensitivity; each voxel is then divided by the
+    sum of the sensitivities that reach it. One matrix product a frame; blurred, without a scale.
+
+    Args:
+        matrix: J, shape (pairs, voxels).
+
+    Returns:
+        R, shape (voxels, pairs).
+    """
+    j = _checked(matrix)
+    rows = np.abs(j).max(axis=1)
+    scaled = j / np.where(rows > 0, rows, 1.0)[:, None]
+    reach = np.abs(scaled).sum(axis=0)
+    inverse = scaled / np.where(reach > 0, reach, 1.0)
+    return (inverse / np.where(rows > 0, rows, 1.0)[:, None]).T
+
+
+def tikhonov(matrix: ArrayLike, strength: float = 1e-3, *, depth_weight: float = 0.5) -> Array:
+    """Tikhonov regularisation: R = W Jᵀ (J W Jᵀ + λ I)⁻¹, one matrix product a frame.
+
+    The image minimises ``|J g − d|² + λ gᵀ W⁻¹ g``. W weighs voxels by a power of their
+    sensitivity, against the pull of images towards the electrodes.
+
+    Args:
+        matrix: J, shape (pairs, voxels).
+        strength: λ as a share of the largest eigenvalue of J W Jᵀ, above zero.
+        depth_weight: 0 for W = I, 1 for voxels that are all equally sensitive after weighting.
+
+    Returns:
+        R, shape (voxels, pairs).
+
+    Raises:
+        ReadOutError: ``strength`` is not above zero, or ``depth_weight`` not from 0 to 1.
+    """
+    j = _checked(matrix)
+    if not (math.isfinite(strength) and strength > 0):
+        raise ReadOutError(f"strength is {strength!r}; give a number above zero, such as 1e-3")
+    if not 0 <= depth_weight <= 1:
+        raise ReadOutError(f"depth_weight is {depth_weight!r}; give a number from 0 to 1")
+    power = (j**2).sum(axis=0)
+    floor = 1e-12 * power.max(initial=0.0)
+    weight = np.maximum(power, floor) ** -depth_weight if floor > 0 else np.ones(j.shape[1])
+    weighted = weight[:, None] * j.T
+    normal = j @ weighted
+    largest = float(np.linalg.eigvalsh(normal)[-1])
+    if largest <= 0:
+        raise ReadOutError("the sensitivity matrix is zero; check the potentials")
+    return np.linalg.solve(normal + strength * largest * np.eye(len(j)), weighted.T).T
+
+
+def landweber(
+    matrix: ArrayLike, change: ArrayLike, iterations: int = 50, *, low: float = 0.0,
+    high: float = math.inf,
+) -> Array:  # fmt: skip
+    """Projected Landweber iteration: ``g ← clip(g + α Jᵀ (d − J g), low, high)``.
+
+    α is 1/λ_max(J Jᵀ), below the 2/λ_max that converges. The projection onto what matter can be
+    (no permittivity below vacuum's) sharpens images well beyond a linear method's.
+
+    Args:
+        matrix: J, shape (pairs, voxels); better with rows scaled alike.
+        change: d, changes of capacitance [F], shape (pairs,) or (n, pairs).
+        iterations: Number of steps.
+        low: Least change of relative permittivity; 0 keeps images positive.
+        high: Largest change.
+
+    Returns:
+        Images, changes of relative permittivity, shape (voxels,) or (n, voxels).
+
+    Raises:
+        ReadOutError: Shapes do not fit, or bounds or iterations are out of range.
+    """
+    j = _checked(matrix)
+    d = np.asarray(change, dtype=float)
+    if d.shape[-1:] != (len(j),) or not np.isfinite(d).all():
+        raise ReadOutError(f"change has shape {d.shape}; give {len(j)} finite numbers an image")
+    if iterations < 1 or not low < high:
+        raise ReadOutError(
+            f"iterations = {iterations!r}, low = {low!r}, high = {high!r}; give at least one "
+            "iteration and low < high"
+        )
+    largest = float(np.linalg.eigvalsh(j @ j.T)[-1])
+    if largest <= 0:
+        raise ReadOutError("the sensitivity matrix is zero; check the potentials")
+    image = np.clip(np.zeros((*d.shape[:-1], j.shape[1])), low, high)
+    for _ in range(iterations):
+        image = np.clip(image + (d - image @ j.T) @ j / largest, low, high)
+    return image
+
+
+def _checked(matrix: ArrayLike) -> Array:
+    j = np.asarray(matrix, dtype=float)
+    if j.ndim != 2 or not j.size or not np.isfinite(j).all():
+        raise ReadOutError(f"J has shape {j.shape}; give finite numbers of shape (pairs, voxels)")
+    return j

@@ -1,0 +1,251 @@
+"""Noise and drift, added to the capacitance that a conversion sees.
+
+Levels are stated the way data sheets and Allan plots state them. With conversions back to back and
+averaged over a time τ, the Allan deviation is
+
+- white noise of rms r per conversion, period T: r √(T/τ);
+- flicker (1/f) noise: a floor that does not depend on τ;
+- random walk of rate k [F/√s]: k √(τ/3).
+
+References: IEEE Std 1139 for the relation of spectra and Allan variance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import ReadOutError
+from capsense.readout.stage import Array, Context, Ints, Process, require, rounds
+
+_POLES_PER_DECADE = 2.0
+
+
+@dataclass(frozen=True)
+class White:
+    """Gaussian noise, independent from conversion to conversion."""
+
+    rms: float = 0.0
+    """Standard deviation of one conversion [F]."""
+    relative: float = 0.0
+    """A further part, proportional to the capacitance; added in quadrature."""
+
+    def __post_init__(self) -> None:
+        require("white noise", "rms", self.rms, 0.0, "F")
+        require("white noise", "relative", self.relative, 0.0, "")
+
+    def start(self, context: Context) -> Process:
+        """Return the process."""
+        rng, rms, relative = context.rng, self.rms, self.relative
+
+        def process(channel: Ints, time: Array, value: Array) -> Array:
+            scale = np.hypot(rms, relative * value) if relative else rms
+            return value + scale * rng.standard_normal(len(value))
+
+        return process
+
+
+@dataclass(frozen=True)
+class Flicker:
+    """1/f noise: a sum of relaxation processes, two to a decade of frequency.
+
+    Each is an Ornstein–Uhlenbeck process of time constant τ_i and variance h ln r, where r is the
+    ratio of successive time constants; the sum of their one-sided spectra 4 σ² τ/(1 + (2πfτ)²) is
+    h/f between the slowest and the fastest, and h = floor²/(2 ln 2).
+    """
+
+    floor: float
+    """Allan deviation of the floor [F]."""
+    slowest: float = 3e4
+    """Longest time constant [s]; the noise is white below 1/(2π slowest)."""
+
+    def __post_init__(self) -> None:
+        require("flicker noise", "floor", self.floor, 0.0, "F")
+        require("flicker noise", "slowest", self.slowest, 0.0, "s", open_=True)
+
+    def poles(self, period: float) -> tuple[Array, float]:
+        """Time constants [s] down to half the period, and the variance of each [F²]."""
+        fastest = min(0.5 * period, 0.5 * self.slowest)
+        decades = math.log10(self.slowest / fastest)
+        taus = np.geomspace(
+            fastest, self.slowest, max(2, 1 + math.ceil(decades * _POLES_PER_DECADE))
+        )
+        h = self.floor**2 / (2 * math.log(2))
+        return taus, h * math.log(taus[1] / taus[0])
+
+    def start(self, context: Context) -> Process:
+        """Return the process, in its stationary state."""
+        taus, variance = self.poles(context.period)
+        rng, channels = context.rng, context.channels
+        keep = np.exp(-context.period / taus)
+        kick = np.sqrt(variance * -np.expm1(-2 * context.period / taus))
+        state = math.sqrt(variance) * rng.standard_normal((channels, len(taus)))
+
+        def process(channel: Ints, time: Array, value: Array) -> Array:
+            states = kick * rng.standard_normal((len(value), len(taus)))
+            for part in rounds(len(value), channels):
+                of = channel[part]
+                states[part] += keep * state[of]
+                state[of] = states[part]
+            return value + states.sum(axis=1)
+
+        return process
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """Drift without memory: each channel walks at random, from 0."""
+
+    rate: float
+    """Standard deviation after one second [F/√s]."""
+
+    def __post_init__(self) -> None:
+        require("random walk", "rate", self.rate, 0.0, "F/√s")
+
+    def start(self, context: Context) -> Process:
+        """Return the process."""
+        rng, channels = context.rng, context.channels
+        step = self.rate * math.sqrt(context.period)
+        state = np.zeros(channels)
+
+        def process(channel: Ints, time: Array, value: Array) -> Array:
+            steps = step * rng.standard_normal(len(value))
+            walked = np.empty(len(value))
+            for part in rounds(len(value), channels):
+                of = channel[part]
+                state[of] += steps[part]
+                walked[part] = state[of]
+            return value + walked
+
+        return process
+
+
+@dataclass(frozen=True)
+class Mains:
+    """Pick-up from the mains: a sine that each conversion averages over its window.
+
+    A window of length T passes a frequency f with the factor sinc(fT)^order; order 1 is a plain
+    average, 3 the filter of a third-order sigma-delta converter. What is left is sampled, and so
+    folded to low frequency. The phase is drawn at the start.
+    """
+
+    amplitude: float
+    """Before averaging, as a capacitance [F]."""
+    frequency: float = 50.0
+    """[Hz]"""
+    order: int = 1
+    """Order of the averaging filter."""
+
+    def __post_init__(self) -> None:
+        require("mains", "amplitude", self.amplitude, 0.0, "F")
+        require("mains", "frequency", self.frequency, 0.0, "Hz", open_=True)
+        if self.order not in (1, 2, 3, 4):
+            raise ReadOutError(f"mains: order is {self.order!r}; give 1, 2, 3 or 4")
+
+    def start(self, context: Context) -> Process:
+        """Return the process."""
+        phase = 2 * math.pi * context.rng.random()
+        passed = self.amplitude * float(np.sinc(self.frequency * context.conversion)) ** self.order
+        omega = 2 * math.pi * self.frequency
+
+        def process(channel: Ints, time: Array, value: Array) -> Array:
+            return value + passed * np.sin(omega * time + phase)
+
+        return process
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A quantity that changes with time, linear between points, constant beyond them."""
+
+    times: tuple[float, ...]
+    """[s], rising."""
+    values: tuple[float, ...]
+
+    @classmethod
+    def of(cls, value: float | Sequence[tuple[float, float]], name: str) -> Profile:
+        """From a constant, or from (time [s], value) points.
+
+        Raises:
+            ReadOutError: The points are none, not pairs, not finite, or times do not rise.
+        """
+        points = np.atleast_2d(np.asarray([(0.0, value)] if np.isscalar(value) else value, float))
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+            raise ReadOutError(f"{name} is {value!r}; give a number or [[time, value], …]")
+        if (np.diff(points[:, 0]) <= 0).any():
+            raise ReadOutError(f"{name} is {value!r}; times must rise from point to point")
+        return cls(tuple(points[:, 0].tolist()), tuple(points[:, 1].tolist()))
+
+    def at(self, time: Array) -> Array:
+        """Values at times [s]."""
+        return np.interp(time, self.times, self.values)
+
+
+@dataclass(frozen=True)
+class ClimateDrift:
+    """Offset and gain that follow temperature and relative humidity."""
+
+    offset_per_kelvin: float = 0.0
+    """[F/K]"""
+    gain_per_kelvin: float = 0.0
+    """[1/K]"""
+    offset_per_percent: float = 0.0
+    """[F] per percent of relative humidity."""
+    gain_per_percent: float = 0.0
+    """Per percent of relative humidity."""
+    temperature: Profile = Profile((0.0,), (25.0,))
+    """[°C]"""
+    humidity: Profile = Profile((0.0,), (50.0,))
+    """[%]"""
+    reference: tuple[float, float] = (25.0, 50.0)
+    """Temperature [°C] and relative humidity [%] at which there is no error."""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "offset_per_kelvin", "gain_per_kelvin", "offset_per_percent", "gain_per_percent",
+        ):  # fmt: skip
+            require("climate", name, getattr(self, name), -math.inf, "")
+
+    def start(self, context: Context) -> Process:
+        """Return the process."""
+
+        def process(channel: Ints, time: Array, value: Array) -> Array:
+            warmer = self.temperature.at(time) - self.reference[0]
+            damper = self.humidity.at(time) - self.reference[1]
+            gain = 1 + self.gain_per_kelvin * warmer + self.gain_per_percent * damper
+            offset = self.offset_per_kelvin * warmer + self.offset_per_percent * damper
+            return gain * value + offset
+
+        return process
+
+
+def allan_deviation(values: ArrayLike, averages: Sequence[int] | NDArray[np.int64]) -> Array:
+    """Overlapping Allan deviation of evenly spaced samples.
+
+    ``σ²(m T) = ½ ⟨(ȳ_{k+m} − ȳ_k)²⟩``, ȳ_k being the mean of m samples from k on.
+
+    Args:
+        values: Samples, shape (n, ...); time runs along the first axis.
+        averages: Numbers m of samples averaged, each from 1 to n/2.
+
+    Returns:
+        Deviations in the unit of the samples, shape (len(averages), ...).
+
+    Raises:
+        ReadOutError: A number m is out of range.
+    """
+    samples = np.asarray(values, dtype=float)
+    total = np.concatenate([np.zeros((1, *samples.shape[1:])), np.cumsum(samples, axis=0)])
+    out = []
+    for m in averages:
+        if not 1 <= m <= len(samples) // 2:
+            raise ReadOutError(
+                f"averages hold {m}; {len(samples)} samples allow 1 to {len(samples) // 2}"
+            )
+        change = (total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]) / m
+        out.append(np.sqrt(0.5 * np.mean(change**2, axis=0)))
+    return np.array(out)

@@ -1,0 +1,205 @@
+"""Read-outs built from a chip's figures and a few options."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from capsense._validate import suggest
+from capsense.errors import ReadOutError
+from capsense.readout.channels import Pattern, mutual_patterns, self_patterns
+from capsense.readout.chip import Chip
+from capsense.readout.chips import CHIPS, MPR121_CURRENTS, MPR121_SUPPLY, MPR121_TIMES
+from capsense.readout.converter import Law, ReciprocalLaw
+from capsense.readout.detector import Detector
+from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
+from capsense.readout.read_out import ReadOut
+from capsense.readout.schedule import Schedule
+from capsense.readout.stage import Stage
+from capsense.readout.wiring import Wiring
+
+EXPECTED = 10e-12
+"""Capacitance that chips which adapt to it are set up for by default [F]."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may be chosen about a chip."""
+
+    patterns: Sequence[Pattern] = ()
+    """Channels; by default all electrodes, or all pairs, as the chip measures."""
+    rate: float | None = None
+    """Conversions per second [Hz], one of the chip's; by default its first."""
+    seed: int = 0
+    noise: bool = True
+    """Whether the chip's noise is on; quantisation and saturation stay."""
+    flicker: float | None = None
+    """Allan deviation of the floor [F], instead of the chip's."""
+    walk: float = 0.0
+    """Random walk [F/√s]."""
+    mains: float = 0.0
+    """Amplitude of mains pick-up before averaging [F]."""
+    mains_frequency: float = 50.0
+    """[Hz]"""
+    temperature: Any = None
+    """[°C]: a number, or (time, value) points; None for no drift with temperature."""
+    humidity: Any = None
+    """[%]: a number, or (time, value) points; None for no drift with humidity."""
+    offset_per_kelvin: float | None = None
+    """[F/K], instead of the chip's."""
+    gain_per_kelvin: float | None = None
+    """[1/K], instead of the chip's."""
+    offset_per_percent: float = 0.0
+    """[F] per percent of relative humidity."""
+    wiring: Wiring | None = None
+    expected: float | None = None
+    """Capacitance that a chip which adapts to it is set up for [F]."""
+    stages: Sequence[Stage] = ()
+    """Further analogue stages, before the chip's noise."""
+    detector: Detector | None = None
+    """Digital logic, instead of the chip's."""
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> Options:
+        """Options by name.
+
+        Raises:
+            ReadOutError: There is no such option.
+        """
+        known = [f.name for f in dataclasses.fields(cls)]
+        for name in options:
+            if name not in known:
+                raise ReadOutError(f"no option {name!r} of a read-out; {suggest(name, known)}")
+        return cls(**options)
+
+
+def chip_of(name: str) -> Chip:
+    """The chip of a name; upper and lower case are the same.
+
+    Raises:
+        ReadOutError: There is no such chip.
+    """
+    key = name.strip().lower() if isinstance(name, str) else ""
+    if key not in CHIPS:
+        raise ReadOutError(f"unknown chip {name!r}; {suggest(str(name), CHIPS)}")
+    return CHIPS[key]
+
+
+def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None = None) -> ReadOut:
+    """A read-out with a chip's figures.
+
+    Args:
+        chip: A known chip's name, or a chip.
+        electrodes: Electrode names in matrix order.
+        options: What is chosen.
+
+    Raises:
+        ReadOutError: No such chip, a rate it does not have, or an option is wrong.
+    """
+    part = chip if isinstance(chip, Chip) else chip_of(chip)
+    chosen = options or Options()
+    patterns = tuple(chosen.patterns) or default_patterns(part, electrodes)
+    rate = part.rate(chosen.rate)
+    if rate is None:
+        rates = ", ".join(f"{r.per_second:.4g}" for r in part.rates)
+        raise ReadOutError(
+            f"{part.name} has no rate of {chosen.rate!r} conversions per second; it has {rates}"
+        )
+    return ReadOut(
+        patterns,
+        electrodes,
+        schedule_of(part, patterns, 1.0 / rate.per_second - part.gap),
+        law_of(part, chosen.expected),
+        dac=part.dac,
+        wiring=chosen.wiring,
+        stages=(*chosen.stages, *_stages(part, rate.rms, chosen)),
+        detector=chosen.detector or part.detector,
+        seed=chosen.seed,
+        name=part.title,
+    )
+
+
+def default_patterns(chip: Chip, electrodes: Sequence[str]) -> tuple[Pattern, ...]:
+    """All electrodes of a self-measuring chip, with its shield; all pairs of a mutual one."""
+    return self_patterns(electrodes) if chip.mode == "self" else mutual_patterns(electrodes)
+
+
+def schedule_of(chip: Chip, patterns: Sequence[Pattern], conversion: float) -> Schedule:
+    """The order in which a chip takes its channels; ``conversion`` in seconds."""
+    count = len(patterns)
+    if chip.order == "together":
+        return Schedule.simultaneous(count, conversion)
+    if chip.order == "by transmitter":
+        groups: dict[frozenset[tuple[str, float]], list[int]] = {}
+        for number, pattern in enumerate(patterns):
+            groups.setdefault(frozenset(pattern.drive.items()), []).append(number)
+        return Schedule(tuple(tuple(g) for g in groups.values()), conversion, chip.gap)
+    return Schedule.sequential(count, conversion, inputs=chip.inputs, gap=chip.gap)
+
+
+def law_of(chip: Chip, expected: float | None) -> Law:
+    """The chip's law; one that charges is set up for the capacitance expected [F]."""
+    if not isinstance(chip.law, ReciprocalLaw):
+        return chip.law
+    capacitance = EXPECTED if expected is None else expected
+    if not (math.isfinite(capacitance) and capacitance > 0):
+        raise ReadOutError(f"expected is {capacitance!r} F; give a capacitance above zero")
+    return charge_for(capacitance)
+
+
+def charge_for(capacitance: float) -> ReciprocalLaw:
+    """MPR121 current and time with which a capacitance [F] reads nearest to 90 % of the range.
+
+    Raises:
+        ReadOutError: No setting brings it into the range.
+    """
+    laws = [
+        ReciprocalLaw(current, time, MPR121_SUPPLY)
+        for time in MPR121_TIMES
+        for current in MPR121_CURRENTS
+    ]
+    wanted = np.array(capacitance)
+    fitting = [law for law in laws if law.low <= float(law.level(wanted)) <= law.high]
+    if not fitting:
+        raise ReadOutError(
+            f"expected = {capacitance:g} F is outside of what an MPR121 can charge; give 0.2e-12 "
+            "to 2800e-12 F"
+        )
+    goal = fitting[0].low + 0.9 * (fitting[0].high - fitting[0].low)
+    return min(fitting, key=lambda law: abs(float(law.level(wanted)) - goal))
+
+
+def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
+    """Climate, random walk, flicker, mains and white noise, those that are not zero."""
+    out: list[Stage] = []
+    if options.temperature is not None or options.humidity is not None:
+        temperature = 25.0 if options.temperature is None else options.temperature
+        humidity = 50.0 if options.humidity is None else options.humidity
+        out.append(
+            ClimateDrift(
+                _first(options.offset_per_kelvin, chip.offset_per_kelvin),
+                _first(options.gain_per_kelvin, chip.gain_per_kelvin),
+                options.offset_per_percent,
+                temperature=Profile.of(temperature, "temperature"),
+                humidity=Profile.of(humidity, "humidity"),
+            )
+        )
+    if options.walk:
+        out.append(RandomWalk(options.walk))
+    floor = _first(options.flicker, chip.flicker if options.noise else 0.0)
+    if floor:
+        out.append(Flicker(floor))
+    if options.mains:
+        out.append(Mains(options.mains, options.mains_frequency))
+    if options.noise and (rms or chip.relative_noise):
+        out.append(White(rms, chip.relative_noise))
+    return out
+
+
+def _first(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value

@@ -1,0 +1,315 @@
+"""The read-out: channels, schedule, wiring, analogue stages, converter and detector in a row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from capsense.errors import ReadOutError
+from capsense.readout.channels import ChannelBank, Pattern
+from capsense.readout.converter import CapDac, Conversion, Law
+from capsense.readout.counts import Counts
+from capsense.readout.detector import Detector
+from capsense.readout.schedule import Schedule
+from capsense.readout.stage import Array, Context, Process, Stage
+from capsense.readout.wiring import Wiring
+
+_BATCH = 4096
+"""Samples processed at a time."""
+
+
+class Reading(Protocol):
+    """What a simulator's reading offers."""
+
+    @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Electrodes in matrix order."""
+
+    @property
+    def capacitance(self) -> Array:
+        """Maxwell matrix, shields at ground [F], shape (M, M)."""
+
+    @property
+    def self_capacitance(self) -> Array:
+        """Diagonal with the shields driven along [F], shape (M,)."""
+
+
+class ReadOut:
+    """Turns capacitances into what a chip reports: late, quantised, noisy, one after another.
+
+    The chain, in its order: *channels* pick one capacitance each from the Maxwell matrix;
+    *wiring* adds parasitics and crosstalk; the *schedule* samples each channel at its own instant;
+    analogue *stages* add drift and noise; the *converter* makes an integer code; the *detector*
+    tracks baselines and decides on touch.
+
+    Between the capacitances it is given it interpolates linearly. Give them at the instants that
+    :meth:`due` names, and nothing is interpolated.
+
+    Args:
+        patterns: The channels.
+        electrodes: Electrode names in matrix order.
+        schedule: When each channel is sampled.
+        law: The converter.
+        dac: The converter's offset DAC.
+        wiring: Parasitics; none by default.
+        stages: Drift and noise, in order.
+        detector: Digital logic; none by default.
+        seed: Of all random numbers. The same seed gives the same numbers, to the last bit.
+        name: For titles.
+
+    Raises:
+        ReadOutError: The parts do not fit each other.
+    """
+
+    def __init__(
+        self, patterns: Sequence[Pattern], electrodes: Sequence[str], schedule: Schedule, law: Law,
+        *, dac: CapDac | None = None, wiring: Wiring | None = None, stages: Sequence[Stage] = (),
+        detector: Detector | None = None, seed: int = 0, name: str = "read-out",
+    ) -> None:  # fmt: skip
+        self.bank = ChannelBank(patterns, electrodes)
+        if schedule.count != len(self.bank):
+            raise ReadOutError(
+                f"the schedule samples {schedule.count} channels and there are {len(self.bank)}; "
+                "make them the same"
+            )
+        self.schedule, self.law, self.dac = schedule, law, dac
+        self.stages, self.detector, self.name = tuple(stages), detector, name
+        self.wiring = wiring or Wiring()
+        mixing, self._offset = self.wiring.start(len(self.bank))
+        self._mixing = None if np.array_equal(mixing, np.eye(len(self.bank))) else mixing
+        self._seed = seed
+        self.reset()
+
+    @classmethod
+    def preset(cls, chip: str, electrodes: Sequence[str], **options: Any) -> ReadOut:
+        """A read-out with the figures of a known chip; see :func:`~capsense.readout.presets.build`.
+
+        Raises:
+            ReadOutError: No such chip, or an option is wrong.
+        """
+        from capsense.readout.presets import Options, build
+
+        return build(chip, electrodes, Options.of(options))
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return self.bank.names
+
+    def reset(self, *, start: float = 0.0, seed: int | None = None) -> None:
+        """Begin anew: the first cycle starts at ``start`` [s].
+
+        Args:
+            start: Time at which the chip is switched on [s].
+            seed: A new seed; by default random numbers repeat.
+
+        Raises:
+            ReadOutError: ``start`` is not finite, or the seed no integer from 0 on.
+        """
+        if not math.isfinite(start):
+            raise ReadOutError(f"start is {start!r} s; give a finite number")
+        self._seed = self._seed if seed is None else seed
+        if isinstance(self._seed, bool) or not isinstance(self._seed, int) or self._seed < 0:
+            raise ReadOutError(f"seed is {self._seed!r}; give an integer, zero or more")
+        seeds = np.random.SeedSequence(self._seed).spawn(len(self.stages))
+        k = len(self.bank)
+        plan = self.schedule
+        self._processes: list[Process] = [
+            stage.start(Context(k, plan.conversion, plan.period, np.random.default_rng(s)))
+            for stage, s in zip(self.stages, seeds, strict=True)
+        ]
+        self._convert = Conversion(self.law, self.dac, k)
+        rising = self.law.rising
+        self._detect = None if self.detector is None else self.detector.start(k, rising)
+        self._start = start
+        self._seen = 0  # samples whose instant has passed
+        # Instants [s], channels and values [F] of samples whose conversion is not finished.
+        self._waiting = (np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
+        self._last: tuple[float, Array] | None = None
+        self._next_instant = float(plan.instant(np.array(0))) - plan.slack
+        self._next_stamp = self._next_instant + 0.5 * plan.conversion
+        self._none = self._report(-math.inf)
+
+    def due(self, until: float) -> Array:
+        """Instants at which capacitances are wanted next [s], up to ``until`` [s], rising."""
+        last = self.schedule.samples_until(until - self._start)
+        return self._start + np.unique(self.schedule.instant(np.arange(self._seen, last)))
+
+    def channel_values(self, capacitance: Reading | ArrayLike) -> Array:
+        """Capacitance of each channel before anything distorts it [F].
+
+        Args:
+            capacitance: A reading; or Maxwell matrices [F], shape (M, M) or (n, M, M); or the
+                channels themselves [F], shape (K,).
+
+        Returns:
+            Shape (K,), or (n, K).
+
+        Raises:
+            ReadOutError: The shape does not fit, or a number is not finite.
+        """
+        # Looked up by name: a check against the protocol takes longer than all the rest.
+        if hasattr(capacitance, "self_capacitance"):
+            reading = cast("Reading", capacitance)
+            if reading.electrode_names != self.bank.electrodes:
+                raise ReadOutError(
+                    f"the reading is of electrodes {reading.electrode_names}, the read-out for "
+                    f"{self.bank.electrodes}; make it with the simulator's electrode_names"
+                )
+            matrix = reading.capacitance
+            return self.bank.values(matrix, reading.self_capacitance - np.diag(matrix))
+        array = np.asarray(cast("ArrayLike", capacitance), dtype=float)
+        if array.ndim != 1:
+            return self.bank.values(array)
+        return self._checked(array)
+
+    def _checked(self, values: Array) -> Array:
+        k = len(self.bank)
+        if values.shape[-1:] != (k,):
+            raise ReadOutError(f"channel values have shape {values.shape}; give {k} per instant")
+        if not np.isfinite(values).all():
+            raise ReadOutError("a channel value is not finite; mend the readings")
+        return values
+
+    def sample(self, time: float, capacitance: Reading | ArrayLike) -> Counts:
+        """Tell the capacitances of an instant; get the conversions finished since the last call.
+
+        Channels whose instants lie between the last call and this one see capacitances
+        interpolated linearly in time; before the first call they see those of the first call.
+
+        Args:
+            time: [s], not before the last call's.
+            capacitance: As of :meth:`channel_values`.
+
+        Returns:
+            Conversions with time stamps up to ``time``, often none.
+
+        Raises:
+            ReadOutError: Time goes back or is not finite, or the capacitances do not fit.
+        """
+        values = self._wired(self.channel_values(capacitance))
+        now = float(time) - self._start
+        if not math.isfinite(now):
+            raise ReadOutError(f"sample at {time!r} s; give a finite time")
+        if self._last is not None and now < self._last[0]:
+            raise ReadOutError(
+                f"sample at {time!r} s, after one at {self._last[0] + self._start:g} s; time must "
+                "not go back: call reset() to begin anew"
+            )
+        before = self._last or (now, values)
+        self._last = (now, values)
+        if self._next_instant <= now:
+            self._take(now, before, values)
+        return self._report(now)
+
+    def __call__(self, times: ArrayLike, capacitance: ArrayLike) -> Counts:
+        """Read a whole recording, from its first time on; resets before and after.
+
+        Args:
+            times: [s], rising, shape (n,).
+            capacitance: Maxwell matrices [F], shape (n, M, M), or channels [F], shape (n, K).
+
+        Returns:
+            All conversions finished by the last time: the same, to the last bit, as sampling one
+            by one gives.
+
+        Raises:
+            ReadOutError: Times do not rise, or shapes do not fit.
+        """
+        t = np.asarray(times, dtype=float)
+        if t.ndim != 1 or not len(t) or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
+            raise ReadOutError("times must be finite numbers that rise, of shape (n,)")
+        array = np.asarray(capacitance, dtype=float)
+        if len(array) != len(t):
+            raise ReadOutError(f"{len(t)} times for {len(array)} capacitances; make them the same")
+        truth = self._checked(array) if array.ndim == 2 else self.bank.values(array)
+        values = self._wired(truth)
+        self.reset(start=float(t[0]))
+        relative = t - t[0]
+        self._seen = self.schedule.samples_until(float(relative[-1]))
+        instant, channel = self.schedule.samples(np.arange(self._seen))
+        after = np.searchsorted(relative, instant - self.schedule.slack)
+        before = np.maximum(after - 1, 0)
+        span = relative[after] - relative[before]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.where(span > 0, (instant - relative[before]) / span, 1.0)
+        old = values[before, channel]
+        value = old + np.minimum(share, 1.0) * (values[after, channel] - old)
+        self._waiting = (instant, channel, value)
+        counts = self._report(float(relative[-1]))
+        self.reset()
+        return counts
+
+    def _take(self, now: float, before: tuple[float, Array], values: Array) -> None:
+        """Sample the channels whose instants have come, between two sets of values [F]."""
+        plan = self.schedule
+        cycles = 2 + int((now - self._next_instant) / plan.period)
+        number = np.arange(self._seen, self._seen + cycles * len(self.bank))
+        instant, channel = plan.samples(number)
+        count = int((instant - plan.slack).searchsorted(now, "right"))
+        self._next_instant = float(instant[count]) - plan.slack
+        self._seen += count
+        instant, channel = instant[:count], channel[:count]
+        span = now - before[0]
+        share = np.minimum((instant - before[0]) / span, 1.0) if span > 0 else 1.0
+        old = before[1][channel]
+        taken = old + share * (values[channel] - old)
+        kept = self._waiting
+        if len(kept[0]):
+            instant = np.concatenate([kept[0], instant])
+            channel = np.concatenate([kept[1], channel])
+            taken = np.concatenate([kept[2], taken])
+        self._waiting = (instant, channel, taken)
+
+    def _wired(self, values: Array) -> Array:
+        """What the wiring makes of channel values [F], shape (..., K)."""
+        if self._mixing is not None:
+            # A sum, not a matrix product: that rounds differently for one row and for many.
+            values = (self._mixing * values[..., None, :]).sum(axis=-1)
+        return values + self._offset
+
+    def _report(self, now: float) -> Counts:
+        """Process the waiting samples whose conversion is finished at ``now`` [s]."""
+        plan = self.schedule
+        if -math.inf < now < self._next_stamp:
+            return self._none
+        instant, channel, value = self._waiting
+        late = 0.5 * plan.conversion - plan.slack
+        ready = int((instant + late).searchsorted(now, "right"))
+        self._waiting = (instant[ready:], channel[ready:], value[ready:])
+        left = self._next_instant + plan.slack if ready == len(instant) else float(instant[ready])
+        self._next_stamp = left + late
+        instant, value = instant[:ready], value[:ready]
+        watched = self._detect is not None
+        counts = Counts(
+            self.bank.names,
+            time=self._start + (instant + 0.5 * plan.conversion),
+            channel=channel[:ready],
+            code=np.empty(ready, dtype=np.int64),
+            capacitance=np.empty(ready),
+            flags=np.empty(ready, dtype=np.uint8),
+            baseline=np.empty(ready) if watched else None,
+            touched=np.empty(ready, dtype=bool) if watched else None,
+        )
+        time = self._start + instant
+        if ready <= _BATCH:
+            self._fill(counts, time, value)
+            return counts
+        for first in range(0, ready, _BATCH):
+            part = slice(first, first + _BATCH)
+            self._fill(counts[part], time[part], value[part])
+        return counts
+
+    def _fill(self, counts: Counts, instant: Array, value: Array) -> None:
+        """Send one batch through stages, converter and detector, into its place."""
+        for process in self._processes:
+            value = process(counts.channel, instant, value)
+        counts.code[:], counts.capacitance[:], counts.flags[:] = self._convert(
+            counts.channel, value
+        )
+        if self._detect is not None and counts.baseline is not None and counts.touched is not None:
+            counts.baseline[:], counts.touched[:] = self._detect(counts.channel, counts.code)

@@ -1,0 +1,210 @@
+"""Recorded capacitances: what ``capsense run`` writes, as the channels of a read-out."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from capsense.errors import ReadOutError
+from capsense.readout.channels import ChannelBank, Pattern
+from capsense.readout.stage import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Capacitances against time, by the columns of ``readings.csv``."""
+
+    path: Path
+    """The file read."""
+    time: Array
+    """[s], shape (n,)."""
+    electrodes: tuple[str, ...]
+    """Electrode names in matrix order."""
+    columns: dict[str, Array]
+    """Capacitances [F] by column, each of shape (n,): ``C_E1_E2`` an entry of the Maxwell matrix,
+    ``C_E1`` a self capacitance, ``Cm_E1_E2`` a mutual one."""
+    empty: dict[str, float]
+    """The same with an empty scene [F]; holds nothing where the file does not."""
+
+    def channels(self, bank: ChannelBank) -> Array:
+        """Channel values of a read-out [F], shape (n, K).
+
+        From the whole Maxwell matrix if the recording has it; otherwise each channel must be
+        recorded itself, as a self or mutual capacitance with all other electrodes grounded.
+
+        Raises:
+            ReadOutError: The recording does not hold what a channel needs.
+        """
+        return self._values({k: v[:, None] for k, v in self.columns.items()}, bank)
+
+    def empty_channels(self, bank: ChannelBank) -> Array:
+        """Channel values with an empty scene [F], shape (K,); the first sample's if unknown.
+
+        Raises:
+            ReadOutError: The recording does not hold what a channel needs.
+        """
+        if not self.empty:
+            return self.channels(bank)[0]
+        return self._values({k: np.array([[v]]) for k, v in self.empty.items()}, bank)[0]
+
+    def _values(self, columns: dict[str, Array], bank: ChannelBank) -> Array:
+        matrix = self._matrix(columns)
+        if matrix is not None:
+            shields = [columns.get(f"C_{name}") for name in self.electrodes]
+            coupling = None
+            if all(s is not None for s in shields):
+                own = np.concatenate([s for s in shields if s is not None], axis=1)
+                coupling = own - np.diagonal(matrix, axis1=1, axis2=2)
+            return bank.values(matrix, coupling)
+        return np.concatenate([self._simple(columns, p) for p in bank.patterns], axis=1)
+
+    def _matrix(self, columns: dict[str, Array]) -> Array | None:
+        names = self.electrodes
+        entries = [
+            [columns.get(f"C_{a}_{b}", columns.get(f"C_{b}_{a}")) for b in names] for a in names
+        ]
+        if any(entry is None for row in entries for entry in row):
+            return None
+        rows = [np.concatenate([e for e in row if e is not None], axis=1) for row in entries]
+        return np.stack(rows, axis=1)
+
+    def _simple(self, columns: dict[str, Array], pattern: Pattern) -> Array:
+        plain = not pattern.floating and pattern.rest == "grounded"
+        if plain and len(pattern.drive) == 1:
+            ((driven, weight),) = pattern.drive.items()
+            names = [f"C_{pattern.sense}"]
+            if driven != pattern.sense:
+                names = [f"Cm_{driven}_{pattern.sense}", f"Cm_{pattern.sense}_{driven}"]
+            for name in names:
+                if name in columns:
+                    return weight * columns[name]
+        raise ReadOutError(
+            f"{self.path} does not hold what channel {pattern.name!r} needs; it has "
+            f'{", ".join(list(columns)[:8])}…; record with excitation = "matrix" to have all'
+        )
+
+
+def load_recording(path: str | Path) -> Recording:
+    """Load what ``capsense run`` wrote.
+
+    Args:
+        path: The output folder, or ``readings.npz`` or ``readings.csv`` in it. Of a folder, the
+            arrays are read if they are there.
+
+    Raises:
+        ReadOutError: There is no such recording, or it is damaged or empty.
+    """
+    given = Path(path)
+    if given.is_dir():
+        files = [given / name for name in ("readings.npz", "readings.csv")]
+        present = [f for f in files if f.is_file()]
+        if not present:
+            raise ReadOutError(
+                f"folder {given} holds no readings.npz and no readings.csv; give the output "
+                "folder of capsense run"
+            )
+        given = present[0]
+    if not given.is_file():
+        raise ReadOutError(f"there is no recording {given}; check the path")
+    if given.suffix not in (".npz", ".csv"):
+        raise ReadOutError(f"{given} is no recording; give a .npz, a .csv, or their folder")
+    recording = _load_arrays(given) if given.suffix == ".npz" else _load_table(given)
+    _check(recording)
+    return recording
+
+
+def _check(recording: Recording) -> None:
+    path, time = recording.path, recording.time
+    if not len(time):
+        raise ReadOutError(f"{path} holds no samples; record some")
+    if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+        raise ReadOutError(f"{path}: times do not rise; the file is damaged")
+    known = set(recording.electrodes)
+    for one in known:
+        for other in known:
+            if f"{one}_{other}" in known:
+                raise ReadOutError(
+                    f"{path}: column C_{one}_{other} may mean the pair or the electrode of that "
+                    "name; rename the electrode"
+                )
+    for name, values in recording.columns.items():
+        if values.shape != time.shape or not np.isfinite(values).all():
+            raise ReadOutError(f"{path}: column {name!r} holds no number somewhere; it is damaged")
+
+
+def _load_arrays(path: Path) -> Recording:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        names = tuple(str(n) for n in arrays["electrode_names"])
+        matrix, baseline = arrays["capacitance"], arrays["baseline"]
+        channels = [str(n) for n in arrays["channel_names"]]
+        columns = {
+            f"C_{a}_{b}": matrix[:, i, j] for i, a in enumerate(names) for j, b in enumerate(names)
+        }
+        empty = {
+            f"C_{a}_{b}": float(baseline[i, j])
+            for i, a in enumerate(names)
+            for j, b in enumerate(names)
+        }
+        columns.update(zip(channels, arrays["channels"].T, strict=True))
+        empty.update(zip(channels, arrays["channel_baseline"].tolist(), strict=True))
+        return Recording(path, arrays["time"], names, columns, empty)
+    except (KeyError, IndexError, ValueError, OSError, BadZipFile, EOFError) as error:
+        raise ReadOutError(f"{path} is no readings.npz of capsense run: {error}") from None
+
+
+def _load_table(path: Path) -> Recording:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *rows = list(csv.reader(file))
+        # A run that was killed may leave half a line behind.
+        whole = [row for row in rows if len(row) == len(header)]
+        values = np.array(whole, dtype=float).reshape(len(whole), len(header))
+    except (ValueError, OSError, UnicodeDecodeError) as error:
+        raise ReadOutError(f"{path} is no readings.csv of capsense run: {error}") from None
+    if not header or header[0] != "time_s":
+        raise ReadOutError(f"{path} is no readings.csv of capsense run: no column time_s")
+    table = {name: values[:, k] for k, name in enumerate(header)}
+    columns = {
+        name[:-2]: column
+        for name, column in table.items()
+        if name.startswith(("C_", "Cm_")) and name.endswith("_F")
+    }
+    empty = {
+        name: float(column[0] - table[f"d{name}_F"][0])
+        for name, column in columns.items()
+        if len(column) and f"d{name}_F" in table
+    }
+    return Recording(path, values[:, 0], _electrodes(path, list(columns)), columns, empty)
+
+
+def _electrodes(path: Path, columns: list[str]) -> tuple[str, ...]:
+    """Electrode names: from the summary beside the table, or as the columns tell them."""
+    summary = path.with_name("summary.json")
+    try:
+        names = json.loads(summary.read_text(encoding="utf-8"))["electrodes"]
+        return tuple(str(n) for n in names)
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    found: list[str] = []
+    for column in columns:
+        rest = column.partition("_")[2]
+        half = len(rest) // 2
+        if rest[:half] == rest[half + 1 :] and rest[half : half + 1] == "_":
+            parts = [rest[:half]]  # C_E1_E1
+        else:
+            parts = rest.split("_") if column.startswith("Cm_") else [rest]
+        if column.startswith("Cm_") and len(parts) != 2:
+            raise ReadOutError(
+                f"{path}: the electrodes of column {column!r} are not clear; keep summary.json "
+                "beside it"
+            )
+        found += [p for p in parts if p not in found]
+    diagonal = [n for n in found if f"C_{n}_{n}" in columns]
+    return tuple(diagonal or found)

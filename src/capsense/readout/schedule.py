@@ -1,0 +1,142 @@
+"""Schedules: which channel is sampled when.
+
+Time runs in cycles. A cycle is a row of slots, one after another; the channels of a slot are
+converted at the same time. A conversion is an average over its window. For a world that moves
+evenly that is the value at the middle of the window, which is therefore the channel's *instant*;
+the result can be read at the end of the window, the sample's *time stamp*. The neglected term is
+T²/24 times the second derivative of the capacitance, T being the conversion time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import ReadOutError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """A repeated sequence of conversions.
+
+    Raises:
+        ReadOutError: A time is negative or not finite, or channels are left out or repeated.
+    """
+
+    slots: tuple[tuple[int, ...], ...]
+    """Channels of each slot, by number; every channel once."""
+    conversion: float
+    """Length of a conversion's window [s]."""
+    gap: float = 0.0
+    """Time before each conversion, to switch over and to settle [s]."""
+    idle: float = 0.0
+    """Pause at the end of a cycle [s]."""
+
+    def __post_init__(self) -> None:
+        for name, value, least in (
+            ("conversion", self.conversion, "above zero"), ("gap", self.gap, "zero or more"),
+            ("idle", self.idle, "zero or more"),
+        ):  # fmt: skip
+            if not math.isfinite(value) or value < 0 or (name == "conversion" and value == 0):
+                raise ReadOutError(f"schedule: {name} is {value!r} s; give a time {least}")
+        channels = sorted(c for slot in self.slots for c in slot)
+        if not channels or channels != list(range(len(channels))):
+            raise ReadOutError(
+                f"schedule: the slots hold channels {channels}; list each of 0, 1, 2, … once"
+            )
+
+    @classmethod
+    def sequential(
+        cls, channels: int, conversion: float, *, inputs: int | None = None, gap: float = 0.0,
+        period: float | None = None,
+    ) -> Schedule:  # fmt: skip
+        """One channel after another.
+
+        Args:
+            channels: Number of channels.
+            conversion: Time of a conversion [s].
+            inputs: Inputs of one converter. More channels are taken by further converters that
+                run side by side: the first ``inputs`` channels by the first one, and so on.
+            gap: Time to switch over before each conversion [s].
+            period: Time from one cycle to the next [s]; default as soon as it is done.
+
+        Raises:
+            ReadOutError: A count is below one, a time out of range, or the period too short.
+        """
+        per_chip = channels if inputs is None else inputs
+        if channels < 1 or per_chip < 1:
+            raise ReadOutError(
+                f"schedule: {channels} channels on {per_chip} inputs; give one or more"
+            )
+        slots = tuple(
+            tuple(range(first, channels, per_chip)) for first in range(min(per_chip, channels))
+        )
+        busy = len(slots) * (conversion + gap)
+        idle = 0.0 if period is None else period - busy
+        if idle < -1e-12 * busy:
+            raise ReadOutError(
+                f"schedule: a period of {period} s is too short for {len(slots)} conversions, "
+                f"which take {busy:g} s"
+            )
+        return cls(slots, conversion, gap, max(idle, 0.0))
+
+    @classmethod
+    def simultaneous(
+        cls, channels: int, conversion: float, *, period: float | None = None
+    ) -> Schedule:
+        """All channels at once, every ``period`` [s], by default back to back."""
+        idle = 0.0 if period is None else period - conversion
+        if idle < -1e-12 * conversion:
+            raise ReadOutError(
+                f"schedule: a period of {period} s is too short for a conversion of {conversion} s"
+            )
+        return cls((tuple(range(channels)),), conversion, 0.0, max(idle, 0.0))
+
+    @cached_property
+    def period(self) -> float:
+        """Time from one sample of a channel to its next [s]."""
+        return len(self.slots) * (self.conversion + self.gap) + self.idle
+
+    @cached_property
+    def count(self) -> int:
+        """Number of channels, and of samples in a cycle."""
+        return len(self.order)
+
+    @cached_property
+    def order(self) -> NDArray[np.int64]:
+        """Channels in the order they are sampled in, shape (K,)."""
+        return np.array([c for slot in self.slots for c in slot], dtype=np.int64)
+
+    @cached_property
+    def offsets(self) -> Array:
+        """Instants in a cycle, in sampling order, from the cycle's start [s], shape (K,)."""
+        step = self.conversion + self.gap
+        starts = [k * step + self.gap for k, slot in enumerate(self.slots) for _ in slot]
+        return np.array(starts) + 0.5 * self.conversion
+
+    def instant(self, sample: NDArray[np.int64]) -> Array:
+        """Instants [s] of samples by their number, from 0, the first cycle starting at 0."""
+        return self.samples(sample)[0]
+
+    def samples(self, sample: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+        """Instants [s] and channels of samples by their number, from 0."""
+        cycle, place = np.divmod(sample, self.count)
+        return cycle * self.period + self.offsets[place], self.order[place]
+
+    @property
+    def slack(self) -> float:
+        """Two times closer than this [s] count as the same."""
+        return 1e-9 * self.conversion
+
+    def samples_until(self, time: float) -> int:
+        """Number of samples whose instant is not after ``time`` [s]."""
+        cycle = max(0, int(time // self.period) - 1)
+        # Rounding may put the time a hair into the wrong cycle: look at the neighbours too.
+        near = np.arange(cycle * self.count, (cycle + 3) * self.count, dtype=np.int64)
+        return int(near[0] + np.count_nonzero(self.instant(near) - self.slack <= time))

@@ -1,0 +1,91 @@
+"""What the analogue stages of a read-out have in common.
+
+A stage is a small frozen description. When a read-out starts it makes a *process* of it, which
+holds what changes: random numbers, filters' memories. Stages are applied in their order; each takes
+the capacitances of a batch of samples and returns new ones. A batch is a run of successive samples
+of the schedule, of any length; a process with a memory for each channel goes through it in
+:func:`rounds`. It gives the same numbers, to the last bit, however samples are dealt into batches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import ReadOutError
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What a stage is told when a read-out starts."""
+
+    channels: int
+    """Number of channels K."""
+    conversion: float
+    """Length of a conversion's window [s]."""
+    period: float
+    """Time from one sample of a channel to its next [s]."""
+    rng: np.random.Generator
+    """Random numbers of this stage alone."""
+
+
+class Process(Protocol):
+    """A stage at work."""
+
+    def __call__(self, channel: Ints, time: Array, value: Array) -> Array:
+        """Return the new capacitances of a batch [F], shape (n,).
+
+        Args:
+            channel: Channel numbers; any K in a row are all different; shape (n,).
+            time: Instants [s], not falling, shape (n,).
+            value: Capacitances [F], shape (n,).
+        """
+
+
+class Stage(Protocol):
+    """One link of the analogue chain."""
+
+    def start(self, context: Context) -> Process:
+        """Return the stage's process, in its initial state."""
+
+
+def rounds(samples: int, channels: int) -> Iterator[slice]:
+    """Cut a batch into parts that hold each of the channels once at most."""
+    for first in range(0, samples, channels):
+        yield slice(first, first + channels)
+
+
+def require(
+    owner: str, name: str, value: float, low: float, unit: str, *, open_: bool = False
+) -> None:
+    """Refuse a number that is not finite or below ``low`` (or at it, if ``open_``)."""
+    good = math.isfinite(value) and (value > low if open_ else value >= low)
+    if not good:
+        bound = f"above {low:g}" if open_ else f"at least {low:g}"
+        raise ReadOutError(f"{owner}: {name} is {value!r}; give a number {bound} {unit}".rstrip())
+
+
+def per_channel(owner: str, name: str, value: object, channels: int) -> Array:
+    """One number for all channels, or one per channel, as an array of shape (K,).
+
+    Raises:
+        ReadOutError: The count does not fit, or a number is not finite.
+    """
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.array(math.nan)
+    if array.shape not in ((), (channels,)) or not np.isfinite(array).all():
+        raise ReadOutError(
+            f"{owner}: {name} is {value!r}; give a finite number, or a list of {channels}, one "
+            "per channel"
+        )
+    return np.broadcast_to(array, (channels,)).copy()

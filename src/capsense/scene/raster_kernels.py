@@ -1,0 +1,185 @@
+"""Compiled orthographic rasteriser that keeps every surface a pixel's ray meets.
+
+Rays run along z through pixel centres, which lie at whole numbers of (u, v). A pixel belongs to a
+triangle by half-open spans whose ends are computed per edge, so that triangles that share an edge
+leave neither gaps nor overlaps: a closed surface is met an even number of times everywhere. The
+readable twin is :mod:`capsense.scene.layer_reference`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+LEAST_COSINE = 0.2
+"""A sheet more inclined to the image than this cosine tells is not thickened any further."""
+
+
+@njit(cache=True, error_model="numpy")
+def _order(
+    x0: float, y0: float, x1: float, y1: float, x2: float, y2: float
+) -> tuple[float, float, float, float, float, float]:
+    """Three points by their y."""
+    if y0 > y1:
+        x0, y0, x1, y1 = x1, y1, x0, y0
+    if y1 > y2:
+        x1, y1, x2, y2 = x2, y2, x1, y1
+    if y0 > y1:
+        x0, y0, x1, y1 = x1, y1, x0, y0
+    return x0, y0, x1, y1, x2, y2
+
+
+@njit(cache=True, error_model="numpy")
+def _edge_at(x0: float, y0: float, x1: float, y1: float, y: float) -> float:
+    """Where an edge, lower end first, crosses the line at y; between its ends to the last bit."""
+    x = x0 + (y - y0) * ((x1 - x0) / (y1 - y0))
+    return min(max(x, min(x0, x1)), max(x0, x1))
+
+
+@njit(cache=True, error_model="numpy")
+def _span(
+    x0: float, y0: float, x1: float, y1: float, x2: float, y2: float, y: float
+) -> tuple[float, float]:
+    """Ends of a triangle, points by their y, on the line at y; lower end first."""
+    a = _edge_at(x0, y0, x2, y2, y)
+    b = _edge_at(x0, y0, x1, y1, y) if y < y1 else _edge_at(x1, y1, x2, y2, y)
+    return min(a, b), max(a, b)
+
+
+@njit(cache=True, error_model="numpy")
+def _whole(x: float, last: int) -> int:
+    """First whole number not below x, from 0 to ``last``."""
+    return int(math.ceil(min(max(x, 0.0), float(last))))
+
+
+@njit(cache=True, error_model="numpy")
+def _note(cuts: Array32, j: int, i: int, way: int, x0: float, x1: float, last: int) -> None:
+    """Note the ends of a span on a row (way 0, line j) or column (way 1, line i) of pixels.
+
+    An end at a whole number belongs to the link before it, as spans are closed below.
+    """
+    if -1.0 < x0 <= last:
+        link = int(math.ceil(x0))
+        s = np.float32(x0 - link + 1.0)
+        if way == 0:
+            cuts[j, link, 0] = min(cuts[j, link, 0], s)
+        else:
+            cuts[link, i, 0] = min(cuts[link, i, 0], s)
+    if -1.0 < x1 <= last:
+        link = int(math.ceil(x1))
+        s = np.float32(x1 - link + 1.0)
+        if way == 0:
+            cuts[j, link, 1] = max(cuts[j, link, 1], s)
+        else:
+            cuts[link, i, 1] = max(cuts[link, i, 1], s)
+
+
+@njit(cache=True, error_model="numpy")
+def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Array32, count: Ints,
+         cut_x: Array32, cut_y: Array32) -> int:  # fmt: skip
+    """Meet every pixel's ray with every triangle.
+
+    Args:
+        p: Vertices: u, v in pixels, z [m], shape (n, 3).
+        faces: Vertex indices, shape (m, 3).
+        dx, dy: Size of a pixel [m].
+        thickness: Thickness of a sheet along its normal [m], 0 for a closed surface.
+        met: Receives for every triangle met, in no order, its depth [m], and half its thickness
+            along z [m] or the side it was met from, ±1; shape (rows, columns, room, 2).
+        count: Receives how many there are, shape (rows, columns); must be zero.
+        cut_x, cut_y: Receive the outlines, see :func:`~capsense.scene.layer_build.build_values`.
+
+    Returns:
+        The largest number met by a pixel; if above the room, some were dropped.
+    """
+    ny, nx, room, _ = met.shape
+    cut_x[:, :, 0] = 2.0
+    cut_x[:, :, 1] = -1.0
+    cut_y[:, :, 0] = 2.0
+    cut_y[:, :, 1] = -1.0
+    most = 0
+    for face in range(faces.shape[0]):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        xa, ya, za = p[a, 0], p[a, 1], p[a, 2]
+        xb, yb, zb = p[b, 0], p[b, 1], p[b, 2]
+        xc, yc, zc = p[c, 0], p[c, 1], p[c, 2]
+        normal = (xb - xa) * (yc - ya) - (yb - ya) * (xc - xa)
+        if normal == 0.0:
+            continue
+        x0, y0, x1, y1, x2, y2 = _order(ya, xa, yb, xb, yc, xc)
+        for i in range(_whole(y0, nx), _whole(y2, nx)):
+            low, high = _span(x0, y0, x1, y1, x2, y2, float(i))
+            _note(cut_y, 0, i, 1, low, high, ny)
+        x0, y0, x1, y1, x2, y2 = _order(xa, ya, xb, yb, xc, yc)
+        first, last = _whole(y0, ny), _whole(y2, ny)
+        if first == last:
+            continue
+        gx = ((zb - za) * (yc - ya) - (yb - ya) * (zc - za)) / normal
+        gy = ((xb - xa) * (zc - za) - (zb - za) * (xc - xa)) / normal
+        near, deep = min(za, zb, zc), max(za, zb, zc)
+        value = 1.0 if normal > 0.0 else -1.0
+        if thickness > 0.0:
+            slope = math.sqrt(1.0 + (gx / dx) ** 2 + (gy / dy) ** 2)
+            value = 0.5 * thickness * min(slope, 1.0 / LEAST_COSINE)
+        for j in range(first, last):
+            low, high = _span(x0, y0, x1, y1, x2, y2, float(j))
+            _note(cut_x, j, 0, 0, low, high, nx)
+            for i in range(_whole(low, nx), _whole(high, nx)):
+                n = count[j, i]
+                count[j, i] = n + 1
+                most = max(most, n + 1)
+                if n < room:
+                    depth = za + gx * (i - xa) + gy * (j - ya)
+                    met[j, i, n, 0] = min(max(depth, near), deep)
+                    met[j, i, n, 1] = value
+    return most
+
+
+@njit(cache=True, error_model="numpy")
+def pair(met: Array32, count: Ints, sheet: bool, front: Array, back: Array) -> None:
+    """Turn the depths that rays met into intervals.
+
+    A closed surface is inside where its winding number is not zero; where the numbers do not add
+    up to zero (faces of mixed orientation), every second stretch is inside.
+
+    Args:
+        met, count: As :func:`scan` leaves them; ``met`` is sorted in place.
+        sheet: Whether every depth is a sheet of its own.
+        front, back: Receive the intervals [m], shape (layers, rows, columns); NaN where none.
+    """
+    ny, nx = count.shape
+    front[:] = math.nan
+    back[:] = math.nan
+    for j in range(ny):
+        for i in range(nx):
+            n = count[j, i]
+            total = 0.0
+            for k in range(n):
+                depth, value = met[j, i, k, 0], met[j, i, k, 1]
+                at = k
+                while at > 0 and met[j, i, at - 1, 0] > depth:
+                    met[j, i, at, 0] = met[j, i, at - 1, 0]
+                    met[j, i, at, 1] = met[j, i, at - 1, 1]
+                    at -= 1
+                met[j, i, at, 0], met[j, i, at, 1] = depth, value
+                total += value
+            winding, layer = 0, 0
+            for k in range(n):
+                depth, value = met[j, i, k, 0], met[j, i, k, 1]
+                if sheet:
+                    front[k, j, i], back[k, j, i] = depth - value, depth + value
+                    continue
+                before = winding
+                winding = winding + int(value) if total == 0.0 else 1 - winding
+                if before == 0:
+                    front[layer, j, i] = depth
+                elif winding == 0:
+                    back[layer, j, i] = depth
+                    layer += 1

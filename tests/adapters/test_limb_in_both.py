@@ -1,0 +1,70 @@
+"""One bent arm, through MJCF in MuJoCo, through URDF in PyBullet, and as plain bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from adapter_worlds import load
+
+import capsense as cs
+from capsense.humans import arm
+
+ANGLES = {"elbow_flexion": 0.6, "forearm_pronation": 0.5, "wrist_flexion": 0.3}
+SHOULDER = cs.Pose((0.42, 0.01, 0.14), (0.0, 0.7071, 0.0, 0.7071))
+
+
+def test_an_arm_reads_the_same(simulators: Callable[..., cs.Simulator], tmp_path: Path) -> None:
+    """Differential: to 0.1 % of the largest change, tied to ground by 100 pF in all three."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    limb = arm()
+    simulator = simulators("six_patch_bare")
+    inside = simulator.design.domain
+
+    spec = mujoco.MjSpec.from_string(limb.mjcf(SHOULDER))
+    spec.worldbody.add_site(name="pad")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for name, angle in ANGLES.items():
+        data.joint(f"{limb.name}_{name}").qpos[0] = angle
+    mujoco.mj_forward(model, data)
+    in_mujoco = cs.mujoco.attach(model, data, "pad", simulator)
+
+    client = p.connect(p.DIRECT)
+    try:
+        body = load(client, limb.urdf(), SHOULDER, tmp_path)
+        for k in range(p.getNumJoints(body, physicsClientId=client)):
+            name = p.getJointInfo(body, k, physicsClientId=client)[1].decode()
+            angle = ANGLES.get(name.removeprefix(f"{limb.name}_"), 0.0)
+            p.resetJointState(body, k, angle, physicsClientId=client)
+        pad = p.createMultiBody(0, physicsClientId=client)
+        in_pybullet = cs.pybullet.attach(
+            client, pad, design=simulator, default_material="human",
+            grounding={"right_arm": 100e-12},
+        )  # fmt: skip
+        scenes = [in_mujoco.scene(), in_pybullet.scene()]
+    finally:
+        p.disconnect(physicsClientId=client)
+
+    seen = [b for b in limb.bodies(SHOULDER, ANGLES) if _reaches_into(b, inside)]
+    plain = [cs.Body(b.shape, b.pose, b.material, 100e-12 / len(seen), name=b.name) for b in seen]
+    readings = []
+    for scene in (*scenes, cs.Scene(plain)):
+        assert len(scene) == len(seen) > 3
+        simulator.reset()
+        readings.append(simulator.step(scene).delta)
+    for found in readings[:2]:
+        assert np.abs(found - readings[2]).max() < 1e-3 * np.abs(readings[2]).max()
+    assert np.diag(readings[2]).min() > 5e-15
+
+
+def _reaches_into(body: cs.Body, domain: object) -> bool:
+    """Whether the bounding box of a capsule reaches into the domain."""
+    corners = np.stack(np.meshgrid(*body.shape.bounds().T, indexing="ij"), axis=-1).reshape(-1, 3)
+    box = body.pose.apply(corners)
+    return bool(
+        np.all(box.min(axis=0) < domain.upper) and np.all(box.max(axis=0) > domain.lower)  # type: ignore[attr-defined]
+    )

@@ -1,0 +1,225 @@
+"""What is MuJoCo's own: its geoms, its texts, its state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import capsense as cs
+
+mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+
+PAD = '<body name="link"><geom name="own" type="sphere" size=".02"/><site name="pad"/></body>'
+
+
+def sensor_in(
+    world: str, simulator: cs.Simulator, *, top: str = "", forward: bool = True, **options: Any
+) -> Any:
+    """A sensor at the world's origin."""
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco>{top}<worldbody>{PAD}{world}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    if forward:
+        mujoco.mj_forward(model, data)
+    return cs.mujoco.attach(model, data, options.pop("site", "pad"), simulator, **options)
+
+
+def test_every_primitive_has_its_size(tiny_simulator: cs.Simulator) -> None:
+    """MuJoCo's half sizes become full ones."""
+    kinds = {
+        "box": (".01 .02 .03", cs.Box((0.02, 0.04, 0.06))),
+        "sphere": (".01", cs.Sphere(0.01)),
+        "capsule": (".01 .02", cs.Capsule(0.01, 0.04)),
+        "cylinder": (".01 .02", cs.Cylinder(0.01, 0.04)),
+        "ellipsoid": (".01 .02 .03", cs.Ellipsoid((0.01, 0.02, 0.03))),
+    }
+    world = "".join(
+        f'<geom name="{kind}" type="{kind}" size="{size}" pos="0 0 .04"/>'
+        for kind, (size, _) in kinds.items()
+    )
+    scene = sensor_in(world, tiny_simulator).scene()
+    assert {str(b.name).removeprefix("world/"): b.shape for b in scene} == {
+        kind: shape for kind, (_, shape) in kinds.items()
+    }
+
+
+def test_a_floor_has_no_end(tiny_simulator: cs.Simulator) -> None:
+    """Analytic: a plane reads as a slab that fills the domain beyond it, wherever its middle."""
+    slab = tiny_simulator.step(cs.Scene([cs.Body(cs.Box((1, 1, 0.2)), cs.Pose((0, 0, 0.14)))]))
+    tiny_simulator.reset()
+    for middle in ("0 0 .04", "50 -80 .04"):
+        floor = f'<geom type="plane" size="1 1 .1" pos="{middle}" euler="180 0 0"/>'
+        found = sensor_in(floor, tiny_simulator).read()
+        assert found.delta == pytest.approx(slab.delta, abs=1e-18)
+    behind = sensor_in('<geom type="plane" size="0 0 .1" pos="0 0 -.5"/>', tiny_simulator)
+    assert len(behind.scene()) == 0
+
+
+def test_a_terrain_stands_where_mujoco_has_it(tiny_simulator: cs.Simulator) -> None:
+    """Differential: height above the terrain, as rays of MuJoCo find it."""
+    rng = np.random.default_rng(0)
+    heights = " ".join(f"{v:.3f}" for v in rng.uniform(0, 1, 35))
+    sensor = sensor_in(
+        '<geom name="hill" type="hfield" hfield="hill" pos="0 .01 .02" euler="0 0 30"/>',
+        tiny_simulator,
+        top=f'<asset><hfield name="hill" nrow="5" ncol="7" size=".1 .08 .04 .01" '
+        f'elevation="{heights}"/></asset>',
+    )
+    (body,) = sensor.scene()
+    points = np.column_stack([rng.uniform(-0.04, 0.04, (60, 2)), np.full(60, 0.2)])
+    geom = np.zeros(1, np.int32)
+    only = np.zeros(6, np.uint8)
+    only[0] = 1
+    for point in points:
+        down = np.array([0.0, 0.0, -1.0])
+        try:
+            depth = mujoco.mj_ray(sensor.model, sensor.data, point, down, only, 1, 1, geom)
+        except TypeError:
+            depth = mujoco.mj_ray(sensor.model, sensor.data, point, down, only, 1, 1, geom, None)
+        hit = point + depth * down
+        assert body.shape.signed_distance(body.pose.inverse().apply([hit]))[0] == pytest.approx(
+            0.0, abs=0.5 * body.shape.cell
+        )
+
+
+def test_signed_distance_geoms_and_shared_meshes(tiny_simulator: cs.Simulator) -> None:
+    """An SDF plugin's surface is taken; geoms of one mesh share one distance grid."""
+    top = (
+        '<asset><mesh name="m" vertex="0 0 0 .03 0 0 0 .03 0 0 0 .03"/></asset>'
+        if not _has_torus()
+        else '<extension><plugin plugin="mujoco.sdf.torus"><instance name="t">'
+        '<config key="radius1" value="0.03"/><config key="radius2" value="0.01"/>'
+        '</instance></plugin></extension><asset><mesh name="torus"><plugin instance="t"/></mesh>'
+        '<mesh name="m" vertex="0 0 0 .03 0 0 0 .03 0 0 0 .03"/></asset>'
+    )
+    world = '<geom type="mesh" mesh="m" pos="0 0 .04"/><geom type="mesh" mesh="m" pos="0 0 .05"/>'
+    if _has_torus():
+        world += (
+            '<geom name="ring" type="sdf" mesh="torus" pos="0 0 .04"><plugin instance="t"/></geom>'
+        )
+    scene = sensor_in(world, tiny_simulator, top=top).scene()
+    assert scene[0].shape is scene[1].shape
+    assert scene[0].shape.volume == pytest.approx(0.03**3 / 6, rel=1e-5)
+    if _has_torus():
+        ring = scene["world/ring"].shape
+        assert ring.volume == pytest.approx(2 * np.pi**2 * 0.03 * 0.01**2, rel=0.01)
+
+
+def _has_torus() -> bool:
+    """Whether the wheel carries the plugin."""
+    try:
+        mujoco.MjSpec.from_string(
+            '<mujoco><extension><plugin plugin="mujoco.sdf.torus"/></extension></mujoco>'
+        ).compile()
+    except ValueError:
+        return False
+    return True
+
+
+def test_texts_of_the_model_say_what_things_are(tiny_simulator: cs.Simulator) -> None:
+    """The call's patterns come before the model's, and those before the defaults."""
+    world = "".join(f'<geom name="{n}" size=".01" pos="0 0 .04"/>' for n in ("a1", "a2", "b"))
+    top = (
+        '<custom><text name="capsense.material:a*" data="human"/>'
+        '<text name="capsense.grounding:a2" data="100e-12"/></custom>'
+    )
+    sensor = sensor_in(
+        world, tiny_simulator, top=top, materials={"a1": "copper"}, default_grounding="floating"
+    )
+    found = {str(b.name): (b.material.name, b.grounding) for b in sensor.scene()}
+    assert found == {
+        "world/a1": ("copper", "floating"),
+        "world/a2": ("human", 100e-12),
+        "world/b": ("steel", "floating"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name="capsense.material:z*" data="human"', "no geom or body fits 'z\\*'"),
+        ('name="capsense.material:b" data="humam"', 'text name="capsense.material:b">: unknown'),
+        ('name="capsense.grounding:b" data="-3"', "grounding is -3.0 F"),
+        ('name="capsense.grounding:b" data="loose"', "grounding is 'loose'"),
+        ('name="capsense.grouding:b" data="floating"', "is not known; write capsense.material"),
+    ],
+)
+def test_wrong_texts_are_refused(text: str, message: str, tiny_simulator: cs.Simulator) -> None:
+    """By name, before anything is read."""
+    with pytest.raises(cs.SceneError, match=message):
+        sensor_in(
+            '<geom name="b" size=".01"/>', tiny_simulator, top=f"<custom><text {text}/></custom>"
+        )
+
+
+def test_groups_select_geoms(tiny_simulator: cs.Simulator) -> None:
+    """Visual copies of collision geoms can be left out."""
+    world = "".join(f'<geom name="g{g}" size=".01" pos="0 0 .04" group="{g}"/>' for g in range(4))
+    scene = sensor_in(world, tiny_simulator, groups=(1, 3)).scene()
+    assert [b.name for b in scene] == ["world/g1", "world/g3"]
+
+
+def test_a_site_of_the_world_keeps_the_world(tiny_simulator: cs.Simulator) -> None:
+    """The world body is no link of the sensor's."""
+    world = '<site name="desk"/><geom name="lamp" size=".01" pos="0 0 .04"/>'
+    scene = sensor_in(world, tiny_simulator, site="desk").scene()
+    assert [b.name for b in scene] == ["world/lamp", "link/own"]
+
+
+def test_wrong_calls_are_refused(tiny_simulator: cs.Simulator) -> None:
+    """A missing site, a state of no pose, foreign data, foreign objects."""
+    with pytest.raises(cs.SceneError, match="no site named 'pat'; did you mean 'pad'"):
+        sensor_in("", tiny_simulator, site="pat")
+    with pytest.raises(cs.SceneError, match=r"hold no poses yet; call mujoco\.mj_forward"):
+        sensor_in("", tiny_simulator, forward=False).read()
+    sensor = sensor_in("", tiny_simulator)
+    other = sensor_in('<body name="more"/>', tiny_simulator)
+    with pytest.raises(cs.SceneError, match="data belong to another model"):
+        cs.mujoco.attach(sensor.model, other.data, "pad", tiny_simulator)
+    with pytest.raises(cs.SceneError, match="model is a str"):
+        cs.mujoco.attach("model.xml", other.data, "pad", tiny_simulator)
+    with pytest.raises(cs.SceneError, match="data is a MjModel"):
+        cs.mujoco.attach(sensor.model, other.model, "pad", tiny_simulator)
+    with pytest.raises(cs.DesignError, match="six_pach"):
+        cs.mujoco.attach(sensor.model, sensor.data, "pad", "six_pach")
+
+
+def test_sizes_changed_later_are_taken_by_refresh(tiny_simulator: cs.Simulator) -> None:
+    """Shapes are taken once; ``refresh`` takes them again."""
+    sensor = sensor_in('<geom name="ball" size=".01" pos="0 0 .04"/>', tiny_simulator)
+    sensor.model.geom("ball").size[0] = 0.012
+    assert sensor.scene()[0].shape == cs.Sphere(0.01)
+    sensor.refresh()
+    assert sensor.scene()[0].shape == cs.Sphere(0.012)
+
+
+def test_readings_follow_the_simulation(tiny_simulator: cs.Simulator) -> None:
+    """A ball that falls towards the sensor is felt more and more."""
+    sensor = sensor_in(
+        '<body name="ball" pos="0 0 .09"><freejoint/><geom size=".01"/></body>', tiny_simulator
+    )
+    felt = []
+    for _ in range(5):
+        felt.append(sensor.read().delta[0, 0])
+        mujoco.mj_step(sensor.model, sensor.data, 10)
+    assert np.all(np.diff(felt) > 0)
+
+
+def test_example_models_load(tmp_path: Path, tiny_simulator: cs.Simulator) -> None:
+    """A mesh file goes through MuJoCo's own frame of inertia and comes back where it was."""
+    box = cs.Box((0.02, 0.03, 0.04)).to_trimesh()
+    box.apply_translation((0.01, -0.005, 0.05))
+    file = tmp_path / "box.stl"
+    box.export(file)
+    sensor = sensor_in(
+        '<geom type="mesh" mesh="b"/>', tiny_simulator,
+        top=f'<asset><mesh name="b" file="{file}"/></asset>',
+    )  # fmt: skip
+    (body,) = sensor.scene()
+    corners = body.pose.apply(body.shape.vertices)
+    assert corners.min(axis=0) == pytest.approx(box.bounds[0], abs=1e-7)
+    assert corners.max(axis=0) == pytest.approx(box.bounds[1], abs=1e-7)

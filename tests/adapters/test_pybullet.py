@@ -1,0 +1,224 @@
+"""What is PyBullet's own: its shapes, its user data, articulated bodies, its clients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from adapter_worlds import load, numbers, urdf
+
+import capsense as cs
+
+p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+
+AHEAD = (0.0, 0.0, 0.04)
+
+
+@pytest.fixture
+def client() -> Iterator[int]:
+    """An empty world."""
+    number = p.connect(p.DIRECT)
+    yield number
+    if p.isConnected(physicsClientId=number):
+        p.disconnect(physicsClientId=number)
+
+
+@pytest.fixture
+def attach(client: int, tmp_path: Path, tiny_simulator: cs.Simulator) -> Callable[..., Any]:
+    """``attach(**options)``: a sensor at the world's origin."""
+
+    def make(**options: Any) -> Any:
+        body = load(client, urdf("pad", '<sphere radius="0.01"/>'), cs.Pose(), tmp_path)
+        tiny_simulator.reset()
+        return cs.pybullet.attach(client, body, design=tiny_simulator, **options)
+
+    return make
+
+
+def place(client: int, pose: cs.Pose | None = None, **shape: Any) -> int:
+    """A body of one collision shape."""
+    kind = p.createCollisionShape(physicsClientId=client, **shape)
+    pose = pose or cs.Pose(AHEAD)
+    return p.createMultiBody(0, kind, -1, pose.position, pose.quaternion, physicsClientId=client)
+
+
+def same(found: Any, expected: Any) -> None:
+    """Two primitives of one kind and size."""
+    assert found.kind is expected.kind
+    assert found.params == pytest.approx(expected.params, rel=1e-9)
+
+
+def test_every_primitive_has_its_size(client: int, attach: Callable[..., Any]) -> None:
+    """Radius and height come in an order of their own for each."""
+    place(client, shapeType=p.GEOM_BOX, halfExtents=(0.01, 0.015, 0.02))
+    place(client, shapeType=p.GEOM_SPHERE, radius=0.011)
+    place(client, shapeType=p.GEOM_CAPSULE, radius=0.012, height=0.03)
+    place(client, shapeType=p.GEOM_CYLINDER, radius=0.013, height=0.02)
+    expected = (
+        cs.Box((0.02, 0.03, 0.04)),
+        cs.Sphere(0.011),
+        cs.Capsule(0.012, 0.03),
+        cs.Cylinder(0.013, 0.02),
+    )
+    for body, shape in zip(attach().scene(), expected, strict=True):
+        same(body.shape, shape)
+
+
+@pytest.mark.parametrize("shapes", ["collision", "visual"])
+def test_a_urdf_stands_where_its_file_says(
+    shapes: str, client: int, attach: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Differential: origins of shapes, joints and centres of mass chained by ``Pose``."""
+    rng = np.random.default_rng(6)
+    rpy = rng.uniform(-1, 1, (5, 3))
+    xyz = rng.uniform(-0.01, 0.01, (5, 3))
+    origin = [
+        f'<origin xyz="{numbers(x)}" rpy="{numbers(r)}"/>' for x, r in zip(xyz, rpy, strict=True)
+    ]
+    inertia = '<mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+
+    def link(name: str, mass: int, shape: int, geometry: str) -> str:
+        drawn = f"{origin[shape]}<geometry>{geometry}</geometry>"
+        return (
+            f'<link name="{name}"><inertial>{origin[mass]}{inertia}</inertial>'
+            f"<visual>{drawn}</visual><collision>{drawn}</collision></link>"
+        )
+
+    text = (
+        '<robot name="arm">'
+        + link("upper", 0, 1, '<box size="0.01 0.02 0.03"/>')
+        + link("fore", 2, 3, '<cylinder radius="0.008" length="0.02"/>')
+        + '<joint name="elbow" type="revolute"><parent link="upper"/><child link="fore"/>'
+        f'{origin[4]}<axis xyz="0 0 1"/>'
+        '<limit lower="-3" upper="3" effort="1" velocity="1"/></joint></robot>'
+    )
+    base = cs.Pose(AHEAD, rng.normal(size=4))
+    body = load(client, text, base, tmp_path)
+    p.resetJointState(body, 0, 0.7, physicsClientId=client)
+
+    def pose(k: int) -> cs.Pose:
+        return cs.Pose.from_euler(xyz[k], rpy[k])
+
+    joint = base @ pose(4) @ cs.Pose.from_euler((0, 0, 0), (0, 0, 0.7))
+    expected = {"arm/upper": base @ pose(1), "arm/fore": joint @ pose(3)}
+    scene = attach(shapes=shapes).scene()
+    assert {b.name for b in scene} == set(expected)
+    for name, where in expected.items():
+        assert scene[name].pose.matrix == pytest.approx(where.matrix, abs=1e-6)
+    fore = scene["arm/fore"].shape
+    assert isinstance(fore, cs.Cylinder)
+    assert (fore.radius, fore.length) == pytest.approx((0.008, 0.02), rel=1e-5)
+
+
+def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
+    """All shapes of a compound are seen, each in its place."""
+    array = p.createCollisionShapeArray(
+        [p.GEOM_SPHERE, p.GEOM_BOX], radii=[0.01, 0.01], halfExtents=[[0.005] * 3] * 2,
+        collisionFramePositions=[[0.01, 0, 0], [-0.01, 0, 0.01]], physicsClientId=client,
+    )  # fmt: skip
+    p.createMultiBody(0, array, -1, AHEAD, physicsClientId=client)
+    ball, box = attach().scene()
+    same(ball.shape, cs.Sphere(0.01))
+    same(box.shape, cs.Box((0.01, 0.01, 0.01)))
+    assert ball.pose.position == pytest.approx((0.01, 0, 0.04))
+    assert box.pose.position == pytest.approx((-0.01, 0, 0.05))
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (0.6, 0, 0.8), (0, 1, 0)])
+def test_planes(normal: Any, client: int, attach: Callable[..., Any]) -> None:
+    """A plane fills its back side."""
+    place(client, cs.Pose((0.01, 0.01, 0.05)), shapeType=p.GEOM_PLANE, planeNormal=normal)
+    (body,) = attach().scene()
+    points = np.random.default_rng(0).uniform((-0.05, -0.05, 0), (0.05, 0.05, 0.09), (200, 3))
+    side = (points - (0.01, 0.01, 0.05)) @ np.array(normal)
+    inside = body.shape.signed_distance(body.pose.inverse().apply(points))
+    assert np.array_equal(inside < 0, side < 0)
+
+
+def test_meshes_without_a_file(client: int, attach: Callable[..., Any]) -> None:
+    """Corners given in code make a hull; a concave surface is refused by name."""
+    corners = [[0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02]]
+    place(client, shapeType=p.GEOM_MESH, vertices=corners)
+    (body,) = attach().scene()
+    assert body.shape.volume == pytest.approx(0.02**3 / 6, rel=1e-4)
+    assert body.pose.apply(body.shape.bounds()) == pytest.approx(
+        np.array([AHEAD, (0.02, 0.02, 0.06)]), abs=1e-7
+    )
+    faces = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
+    body_number = place(client, shapeType=p.GEOM_MESH, vertices=corners, indices=faces)
+    with pytest.raises(cs.SceneError, match=f"'body{body_number}/.*' has a concave collision mesh"):
+        attach()
+
+
+def test_a_height_field_is_refused(client: int, attach: Callable[..., Any]) -> None:
+    """PyBullet gives neither its heights nor its type away, but for the visual record."""
+    place(
+        client, shapeType=p.GEOM_HEIGHTFIELD, meshScale=[0.1, 0.1, 1],
+        heightfieldData=[0.0] * 9, numHeightfieldRows=3, numHeightfieldColumns=3,
+    )  # fmt: skip
+    with pytest.raises(cs.SceneError, match=r"is a height field.*exclude="):
+        attach()
+    attach(exclude=["body0"])
+
+
+def test_user_data_says_what_things_are(client: int, attach: Callable[..., Any]) -> None:
+    """The call's patterns come before user data, and those before the defaults."""
+    for number in range(3):
+        place(client, shapeType=p.GEOM_SPHERE, radius=0.01)
+        if number:
+            p.addUserData(number, "capsense.material", "human", physicsClientId=client)
+    p.addUserData(2, "capsense.grounding", "100e-12", physicsClientId=client)
+    scene = attach(materials={"body1": "copper"}, default_grounding="floating").scene()
+    assert [(b.material.name, b.grounding) for b in scene] == [
+        ("steel", "floating"),
+        ("copper", "floating"),
+        ("human", 100e-12),
+    ]
+    p.addUserData(2, "capsense.material", "humam", physicsClientId=client)
+    with pytest.raises(cs.SceneError, match=r"user data of 'body2/.*unknown material 'humam'"):
+        attach()
+
+
+def test_bodies_that_come_and_go(client: int, attach: Callable[..., Any]) -> None:
+    """A world that gains or loses bodies is taken over again by itself."""
+    ball = place(client, shapeType=p.GEOM_SPHERE, radius=0.01)
+    sensor = attach()
+    near = sensor.read().delta[0, 0]
+    assert near > 0
+    p.removeBody(ball, physicsClientId=client)
+    assert sensor.read().delta[0, 0] == 0
+    place(client, shapeType=p.GEOM_SPHERE, radius=0.01)
+    assert sensor.read().delta[0, 0] == pytest.approx(near, rel=1e-3, abs=0)
+
+
+def test_clients_are_kept_apart(attach: Callable[..., Any], client: int) -> None:
+    """A second physics client has a world of its own."""
+    sensor = attach()
+    other = p.connect(p.DIRECT)
+    try:
+        place(other, shapeType=p.GEOM_SPHERE, radius=0.01)
+        assert len(sensor.scene()) == 0
+    finally:
+        p.disconnect(physicsClientId=other)
+
+
+def test_wrong_calls_are_refused(
+    attach: Callable[..., Any], client: int, tiny_simulator: cs.Simulator
+) -> None:
+    """A missing client, body or link; a choice that there is not."""
+    sensor = attach()
+    for options, message in (
+        ({"link": "pad_lnk"}, "no link named 'pad_lnk'; did you mean 'pad_link'"),
+        ({"link": 3}, "has no link 3; give a name, or an index from -1"),
+        ({"body": 7}, r"no body 7 in the world; there are \[0\]"),
+        ({"client": 77}, "no physics client 77; call pybullet"),
+        ({"client": "direct"}, "client is 'direct'"),
+        ({"shapes": "drawn"}, "shapes is 'drawn'; choose"),
+        ({"pose_in_link": (0, 0, 0)}, "pose_in_link is"),
+    ):
+        call = {"client": client, "body": sensor.body, "design": tiny_simulator, **options}
+        with pytest.raises(cs.SceneError, match=message):
+            cs.pybullet.attach(**call)

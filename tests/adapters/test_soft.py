@@ -1,0 +1,188 @@
+"""Deformables: what bends is seen as it is at every reading."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import capsense as cs
+
+SHEET = 0.06
+"""Edge of the sheets [m]."""
+
+
+def cloth_in_mujoco(simulator: cs.Simulator, gravity: str = "0 0 0", **options: Any) -> Any:
+    """A square sheet of 2 mm, 30 mm in front of a sensor that looks up."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option gravity="{gravity}"/><worldbody>'
+        '<body name="link"><geom size=".01"/><site name="pad"/></body>'
+        '<flexcomp name="cloth" type="grid" count="5 5 1" spacing=".015 .015 .015" pos="0 0 .03" '
+        'radius=".001" dim="2" mass=".1"><edge equality="true"/></flexcomp>'
+        "</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    simulator.reset()
+    return cs.mujoco.attach(model, data, "pad", simulator, **options)
+
+
+@pytest.fixture
+def soft_client() -> Iterator[int]:
+    """A world of PyBullet that takes soft bodies."""
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    number = p.connect(p.DIRECT)
+    p.resetSimulation(p.RESET_USE_DEFORMABLE_WORLD, physicsClientId=number)
+    yield number
+    p.disconnect(physicsClientId=number)
+
+
+def write_obj(file: Path, vertices: Any, faces: Any) -> str:
+    """A mesh file, with the material file that Bullet asks for."""
+    lines = ["v " + " ".join(repr(float(x)) for x in v) for v in vertices]
+    lines += ["f " + " ".join(str(int(i) + 1) for i in f) for f in faces]
+    file.write_text("\n".join(lines) + "\n")
+    return str(file)
+
+
+def grid(n: int = 5, edge: float = SHEET) -> tuple[np.ndarray, np.ndarray]:
+    """A square sheet in the plane z = 0."""
+    axis = np.linspace(-edge / 2, edge / 2, n)
+    x, y = np.meshgrid(axis, axis)
+    index = np.arange(n * n).reshape(n, n)
+    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
+    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    vertices = np.column_stack([x.ravel(), y.ravel(), np.zeros(n * n)])
+    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def soft_in_pybullet(
+    client: int,
+    mesh: tuple[Any, Any],
+    folder: Path,
+    simulator: cs.Simulator,
+    step: bool,
+    **options: Any,
+) -> Any:
+    """A soft body 30 mm in front of a sensor that looks up."""
+    import pybullet as p
+
+    ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.01, physicsClientId=client)
+    pad = p.createMultiBody(0, ball, physicsClientId=client)
+    p.loadSoftBody(
+        write_obj(folder / "soft.obj", *mesh), basePosition=(0, 0, 0.03), mass=0.1,
+        useMassSpring=1, springElasticStiffness=40, useBendingSprings=1, collisionMargin=1e-4,
+        physicsClientId=client,
+    )  # fmt: skip
+    if step:
+        p.setTimeStep(1e-6, physicsClientId=client)
+        p.stepSimulation(physicsClientId=client)
+    simulator.reset()
+    return cs.pybullet.attach(client, pad, design=simulator, **options)
+
+
+def plain(simulator: cs.Simulator, shape: Any, **body: Any) -> cs.Reading:
+    """The reading of one rigid body 30 mm in front of the sensor."""
+    simulator.reset()
+    out = simulator.step(cs.Scene([cs.Body(shape, cs.Pose((0, 0, 0.03)), **body)]))
+    simulator.reset()
+    return out
+
+
+def test_a_flat_flex_reads_as_a_plate(tiny_simulator: cs.Simulator) -> None:
+    """Differential: within 3 % of the box that it is, as a conductor and as a dielectric."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    for material in ("steel", "glass"):
+        found = cloth_in_mujoco(tiny_simulator, materials={"cloth": material}).read()
+        box = plain(tiny_simulator, cs.Box((SHEET, SHEET, 0.002)), material=material)
+        assert np.diag(found.delta) == pytest.approx(np.diag(box.delta), rel=0.03, abs=0)
+
+
+def test_a_falling_flex_is_followed(tiny_simulator: cs.Simulator) -> None:
+    """It comes closer, and the sensor feels more and more."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    sensor = cloth_in_mujoco(tiny_simulator, gravity="0 0 -9.81")
+    felt = []
+    for _ in range(4):
+        felt.append(sensor.read().delta[0, 0])
+        mujoco.mj_step(sensor.model, sensor.data, 8)
+    assert np.all(np.diff(felt) > 0)
+
+
+def test_a_solid_flex_is_filled(tiny_simulator: cs.Simulator) -> None:
+    """A flex of tetrahedra has an inside: within 3 % of the box that it is."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><geom size=".01"/><site name="pad"/></body>'
+        '<flexcomp name="block" type="grid" count="4 4 3" spacing=".015 .015 .01" pos="0 0 .03" '
+        'radius=".0001" dim="3" mass=".1"><edge equality="true"/></flexcomp></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    tiny_simulator.reset()
+    found = cs.mujoco.attach(model, data, "pad", tiny_simulator).read()
+    box = plain(tiny_simulator, cs.Box((0.045, 0.045, 0.02)))
+    assert np.diag(found.delta) == pytest.approx(np.diag(box.delta), rel=0.03, abs=0)
+
+
+def test_flexes_are_excluded_and_refused_by_name(tiny_simulator: cs.Simulator) -> None:
+    """A cable has no surface; names are known to the patterns."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    assert len(cloth_in_mujoco(tiny_simulator, exclude=["clo*"]).scene()) == 0
+    with pytest.raises(cs.SceneError, match="nothing is named 'cloht'; did you mean 'cloth'"):
+        cloth_in_mujoco(tiny_simulator, materials={"cloht": "cotton"})
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><geom size=".01"/><site name="pad"/></body>'
+        '<flexcomp name="cable" type="grid" count="5 1 1" spacing=".01 .01 .01" dim="1">'
+        '<edge equality="true"/></flexcomp>'
+        "</worldbody></mujoco>"
+    )
+    with pytest.raises(cs.SceneError, match=r"'cable' is a cable.*exclude="):
+        cs.mujoco.attach(model, mujoco.MjData(model), "pad", tiny_simulator)
+
+
+def test_a_soft_sheet_reads_as_a_plate(
+    soft_client: int, tmp_path: Path, tiny_simulator: cs.Simulator
+) -> None:
+    """Differential: within 3 % of the box that it is."""
+    sensor = soft_in_pybullet(
+        soft_client, grid(), tmp_path, tiny_simulator, True, sheet_thickness=0.002
+    )
+    (body,) = sensor.scene()
+    assert body.name.startswith("soft")
+    assert body.shape.volume == pytest.approx(SHEET * SHEET * 0.002, rel=0.01)
+    box = plain(tiny_simulator, cs.Box((SHEET, SHEET, 0.002)))
+    assert np.diag(sensor.read().delta) == pytest.approx(np.diag(box.delta), rel=0.03, abs=0)
+
+
+def test_a_closed_soft_body_is_filled(
+    soft_client: int, tmp_path: Path, tiny_simulator: cs.Simulator
+) -> None:
+    """Differential: a soft box within 3 % of the rigid one."""
+    shape = cs.Box((0.04, 0.04, 0.02))
+    mesh = shape.to_trimesh()
+    sensor = soft_in_pybullet(
+        soft_client, (mesh.vertices, mesh.faces), tmp_path, tiny_simulator, True
+    )
+    assert sensor.scene()[0].shape.volume == pytest.approx(shape.volume, rel=0.05)
+    found = np.diag(sensor.read().delta)
+    assert found == pytest.approx(np.diag(plain(tiny_simulator, shape).delta), rel=0.03, abs=0)
+
+
+def test_a_soft_body_must_have_been_stepped(
+    soft_client: int, tmp_path: Path, tiny_simulator: cs.Simulator
+) -> None:
+    """Before the first step Bullet draws it in another place."""
+    import pybullet as p
+
+    sensor = soft_in_pybullet(soft_client, grid(), tmp_path, tiny_simulator, False)
+    with pytest.raises(cs.SceneError, match=r"'soft.* has not been stepped yet; call stepSim"):
+        sensor.read()
+    p.setTimeStep(1e-6, physicsClientId=soft_client)
+    p.stepSimulation(physicsClientId=soft_client)
+    assert sensor.read().delta[0, 0] > 0

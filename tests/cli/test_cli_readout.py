@@ -1,0 +1,212 @@
+"""``capsense readout``: recordings in, tables and pictures out, refusals."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from maxwell import random_maxwell
+
+from capsense.cli.main import BAD_INPUT, OK, main
+from capsense.errors import ReadOutError
+from capsense.readout.channels import ChannelBank, mutual_patterns, self_patterns
+from capsense.readout.chips import CHIPS
+from capsense.readout.read_out import ReadOut
+from capsense.readout.recording import load_recording
+
+SCENARIO = """
+name = "ball over six electrodes"
+design = "six_patch"
+sample_rate = 20.0
+excitation = "{excitation}"
+[[body]]
+name = "ball"
+shape = "sphere"
+radius = 0.02
+material = "steel"
+[body.trajectory]
+waypoints = [[-0.06, 0.0, 0.04], [0.06, 0.0, 0.04]]
+speed = 0.1
+"""
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where runs are kept, so that each is made once."""
+    return tmp_path_factory.mktemp("originals")
+
+
+@pytest.fixture
+def run(fake: object, originals: Path, tmp_path: Path):
+    """Runs a scenario with the stand-in for the simulator; gives a copy of its output folder."""
+
+    def make(excitation: str = "matrix") -> Path:
+        original, folder = originals / excitation, tmp_path / excitation
+        if not original.exists():
+            scenario = originals / f"{excitation}.toml"
+            scenario.write_text(SCENARIO.format(excitation=excitation), encoding="utf-8")
+            assert main(["run", str(scenario), "-o", str(original), "-q"]) == OK
+        shutil.copytree(original, folder)
+        return folder
+
+    return make
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_tables_hold_what_python_gives(run, capsys):
+    """Differential: the command's table against the read-out called directly."""
+    folder = run()
+    assert main(["readout", str(folder), "--chip", "fdc1004", "--rate", "400", "--seed", "3"]) == OK
+    rows = table(folder / "counts_fdc1004.csv")
+    data = np.load(folder / "readings.npz")
+    names = tuple(str(n) for n in data["electrode_names"])
+    readout = ReadOut.preset("fdc1004", names, rate=400, seed=3)
+    counts = readout(data["time"], data["capacitance"])
+    assert len(rows) == len(counts) > 300
+    assert [int(r["code"]) for r in rows] == counts.code.tolist()
+    assert [r["channel"] for r in rows] == [names[c] for c in counts.channel]
+    assert [float(r["time_s"]) for r in rows] == pytest.approx(counts.time, abs=1e-9)
+    assert "E1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("excitation", ["matrix", "self", "mutual"])
+def test_arrays_and_table_are_the_same_recording(run, excitation):
+    """Differential: .npz, .csv and folder; the empty scene too. Excitations keep their channels."""
+    folder = run(excitation)
+    arrays, rows = load_recording(folder), load_recording(folder / "readings.csv")
+    assert arrays.path.name == "readings.npz"
+    assert arrays.electrodes == rows.electrodes
+    patterns = mutual_patterns if excitation == "mutual" else self_patterns
+    bank = ChannelBank(patterns(arrays.electrodes), arrays.electrodes)
+    assert np.abs(arrays.channels(bank) - rows.channels(bank)).max() < 1e-9 * 5e-12
+    assert np.abs(arrays.empty_channels(bank) - rows.empty_channels(bank)).max() < 1e-9 * 5e-12
+
+
+def test_matrices_are_put_together_right(tmp_path):
+    """Round trip: a table of the upper triangle, with names that hold underscores."""
+    names = ("top_left", "b", "top")
+    rng = np.random.default_rng(0)
+    matrices = [random_maxwell(rng, 3) for _ in range(4)]
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
+    lines = ["time_s," + ",".join(f"C_{names[i]}_{names[j]}_F" for i, j in pairs)]
+    lines += [
+        f"{0.1 * k}," + ",".join(repr(float(c[p])) for p in pairs) for k, c in enumerate(matrices)
+    ]
+    path = tmp_path / "readings.csv"
+    path.write_text("\n".join(lines) + "\n0.4,1e-1", encoding="utf-8")  # and half a line
+    recording = load_recording(path)
+    assert recording.electrodes == names
+    bank = ChannelBank(mutual_patterns(names), names)
+    expected = [[-c[i, j] for i, j in pairs if i != j] for c in matrices]
+    assert recording.channels(bank) == pytest.approx(np.array(expected), rel=1e-12, abs=0)
+    assert (recording.empty_channels(bank) == recording.channels(bank)[0]).all()
+
+
+def test_shields_count_as_recorded(run):
+    """A self recording holds what shields do; self channels are read from it."""
+    folder = run("self")
+    recording = load_recording(folder)
+    bank = ChannelBank(self_patterns(recording.electrodes), recording.electrodes)
+    columns = np.stack([recording.columns[f"C_{n}"] for n in recording.electrodes], axis=1)
+    assert recording.channels(bank) == pytest.approx(columns, rel=1e-12, abs=0)
+
+
+def test_all_chips_write_and_draw(run, tmp_path, capsys):
+    folder = run()
+    assert main(["readout", str(folder), "--chip", "all", "-o", str(tmp_path / "counts")]) == OK
+    written = {p.name for p in (tmp_path / "counts").iterdir()}
+    assert written == {f"counts_{name}.csv" for name in CHIPS}
+    picture = tmp_path / "chips.png"
+    assert main(["readout", str(folder), "--chip", "all", "--plot", str(picture)]) == OK
+    assert picture.stat().st_size > 20_000
+    assert main(["readout", str(folder), "--chip", "mpr121", "--plot", str(picture),
+                 "--electrode", "E5"]) == OK  # fmt: skip
+
+
+def test_a_file_of_options(run, tmp_path):
+    folder = run()
+    config = tmp_path / "mine.toml"
+    config.write_text('chip = "fdc1004"\nrandom = false\n[detector]\ntouch = 9000\n', "utf-8")
+    assert main(["readout", str(folder), "--config", str(config)]) == OK
+    rows = table(folder / "counts_mine.csv")
+    assert {"baseline", "touched"} <= rows[0].keys()
+    assert {r["touched"] for r in rows} == {"0", "1"}
+
+
+def test_tables_are_not_replaced_by_accident(run, capsys):
+    folder = run()
+    command = ["readout", str(folder), "--chip", "teensy"]
+    assert main(command) == OK
+    assert main(command) == BAD_INPUT
+    assert "--force" in capsys.readouterr().err
+    assert main([*command, "--force"]) == OK
+
+
+def test_listings(capsys):
+    assert main(["readout", "--list"]) == OK
+    listing = capsys.readouterr().out
+    assert all(name in listing for name in CHIPS)
+    assert main(["readout", "--list", "--chip", "fdc1004"]) == OK
+    figures = capsys.readouterr().out
+    assert "3.125 pF" in figures
+    assert "confirmed" in figures
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "no recording given"),
+        (["{}"], "give --chip NAME or --config"),
+        (["{}", "--chip", "fdc1005"], "did you mean 'fdc1004'"),
+        (["{}", "--chip", "fdc1004", "--rate", "3"], "no rate of 3.0"),
+        (["{}", "--chip", "fdc1004", "--seed", "-1"], "--seed -1"),
+        (["{}", "--chip", "fdc1004", "--plot", "x.txt"], "is no picture"),
+        (["{}", "--chip", "fdc1004", "--plot", "none/x.png"], "there is no folder none"),
+        (["{}", "--chip", "fdc1004", "--electrode", "E1"], "goes with --plot"),
+        (["{}", "--config", "none.toml"], "there is no read-out file"),
+        (["{}", "--config", "none.toml", "--rate", "3"], "write them in the file"),
+        (["{}", "--chip", "fdc1004", "--plot", "{}/x.png", "--electrode", "E9"], "electrode 'E9'"),
+        (["{}/none", "--chip", "fdc1004"], "there is no recording"),
+        (["{}/summary.json", "--chip", "fdc1004"], "is no recording"),
+    ],
+)
+def test_bad_usage_is_refused(run, capsys, arguments, words):
+    folder = run()
+    code = main(["readout", *(a.format(folder) for a in arguments)])
+    assert code == BAD_INPUT
+    assert words in capsys.readouterr().err
+
+
+def test_bad_recordings_are_refused(run, tmp_path):
+    folder = run("mutual")
+    recording = load_recording(folder / "readings.csv")
+    bank = ChannelBank(self_patterns(recording.electrodes), recording.electrodes)
+    with pytest.raises(ReadOutError, match=r"does not hold what channel 'E1' needs"):
+        recording.channels(bank)
+    with pytest.raises(ReadOutError, match="holds no readings"):
+        load_recording(tmp_path / "mutual" / "..")
+    broken = tmp_path / "broken"
+    shutil.copytree(folder, broken)
+    for name, content, words in (
+        ("readings.npz", b"PK broken", "no readings.npz"),
+        ("readings.csv", b"time_s,C_E1_F\n", "holds no samples"),
+        ("readings.csv", b"time_s,C_E1_F\n0,1e-12\n0,1e-12\n", "do not rise"),
+        ("readings.csv", b"time_s,C_E1_F\n0,nan\n", "no number somewhere"),
+        ("readings.csv", b"time_s,C_E1_F\n0,one\n", "is no readings.csv"),
+        ("readings.csv", b"t,C_E1_F\n0,1\n", "no column time_s"),
+        ("readings.csv", b"", "is no readings.csv"),
+    ):
+        (broken / name).write_bytes(content)
+        with pytest.raises(ReadOutError, match=words):
+            load_recording(broken / name)
+    odd = tmp_path / "odd.csv"
+    odd.write_bytes(b"time_s,C_a_F,C_b_F,C_a_b_F\n0,1,1,1\n")
+    with pytest.raises(ReadOutError, match="may mean the pair or the electrode"):
+        load_recording(odd)

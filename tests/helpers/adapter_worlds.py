@@ -1,0 +1,179 @@
+"""One world of things, made in plain CapSense, in MuJoCo and in PyBullet.
+
+Every builder takes things in the world's frame and the pose of the sensor in it, and returns a
+function that gives the sensor's reading. The link that carries the sensor has a box of its own
+that would hide the electrodes if it were seen.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import capsense as cs
+
+CARRIER_BOX = (0.05, 0.04, 0.03)
+_COUNT = itertools.count()
+
+
+@dataclass(frozen=True)
+class Thing:
+    """Something that stands in the world."""
+
+    name: str
+    shape: cs.Box | cs.Sphere | cs.Capsule | cs.Cylinder | cs.TriMesh
+    pose: cs.Pose
+
+
+def plain_reading(
+    things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simulator, **body: Any
+) -> cs.Reading:
+    """The reading of :meth:`capsense.Simulator.step`, for comparison."""
+    world = sensor.inverse()
+    simulator.reset()
+    return simulator.step(
+        cs.Scene([cs.Body(t.shape, world @ t.pose, name=t.name, **body) for t in things])
+    )
+
+
+# -- MuJoCo ------------------------------------------------------------------------------------
+
+
+def numbers(values: Any) -> str:
+    """Numbers as XML attributes hold them, to the last digit."""
+    return " ".join(repr(float(v)) for v in np.ravel(values))
+
+
+def mjcf_geom(thing: Thing) -> tuple[str, str]:
+    """The geom of a thing, and the asset it needs."""
+    shape, asset = thing.shape, ""
+    match shape:
+        case cs.Box():
+            geom = f'type="box" size="{numbers(shape.params)}"'
+        case cs.Sphere():
+            geom = f'type="sphere" size="{shape.radius!r}"'
+        case cs.Capsule():
+            geom = f'type="capsule" size="{numbers((shape.radius, shape.length / 2))}"'
+        case cs.Cylinder():
+            geom = f'type="cylinder" size="{numbers((shape.radius, shape.length / 2))}"'
+        case cs.TriMesh():
+            geom = f'type="mesh" mesh="{thing.name}_mesh"'
+            asset = (
+                f'<mesh name="{thing.name}_mesh" inertia="exact" '
+                f'vertex="{numbers(shape.vertices)}" '
+                f'face="{" ".join(map(str, shape.faces.ravel()))}"/>'
+            )
+    return f'<geom name="{thing.name}_geom" {geom}/>', asset
+
+
+def mjcf(things: Sequence[Thing], sensor: cs.Pose, extra: str = "") -> str:
+    """A model of the things, each a free body, and of the sensor's carrier."""
+
+    def frame(pose: cs.Pose) -> str:
+        x, y, z, w = pose.quaternion
+        return f'pos="{numbers(pose.position)}" quat="{numbers((w, x, y, z))}"'
+
+    parts = [(t, *mjcf_geom(t)) for t in things]
+    bodies = "".join(
+        f'<body name="{t.name}" {frame(t.pose)}><freejoint/>{geom}</body>' for t, geom, _ in parts
+    )
+    offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
+    return (
+        '<mujoco><option gravity="0 0 0"/><default><geom contype="0" conaffinity="0"/></default>'
+        f"<asset>{''.join(a for _, _, a in parts)}</asset>{extra}<worldbody>{bodies}"
+        f'<body name="carrier" {frame(sensor @ offset.inverse())}><freejoint/>'
+        f'<geom name="carrier_geom" type="box" size="{numbers(np.divide(CARRIER_BOX, 2))}" '
+        f"{frame(offset)}/>"
+        f'<site name="pad" {frame(offset)}/></body></worldbody></mujoco>'
+    )
+
+
+def mujoco_sensor(
+    things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simulator, folder: Path, **options: Any
+) -> Any:
+    """A sensor in MuJoCo, after one step."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(mjcf(things, sensor))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    return cs.mujoco.attach(model, data, "pad", simulator, **options)
+
+
+# -- PyBullet ----------------------------------------------------------------------------------
+
+
+def urdf(name: str, geometry: str, origin: cs.Pose | None = None) -> str:
+    """A body of one link, its centre of mass off the origin."""
+    origin = origin or cs.Pose()
+    x, y, z, w = origin.quaternion
+    rpy = np.array(
+        [
+            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+            np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]
+    )
+    place = f'<origin xyz="{numbers(origin.position)}" rpy="{numbers(rpy)}"/>'
+    shape = f"{place}<geometry>{geometry}</geometry>"
+    return (
+        f'<robot name="{name}"><link name="{name}_link"><inertial>'
+        '<origin xyz="0.01 0.02 -0.03" rpy="0.1 0.2 0.3"/><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+        f"<visual>{shape}</visual><collision>{shape}</collision></link></robot>"
+    )
+
+
+def urdf_geometry(thing: Thing, folder: Path) -> str:
+    """The geometry of a thing; a mesh is written beside."""
+    shape = thing.shape
+    match shape:
+        case cs.Box():
+            return f'<box size="{numbers(shape.size)}"/>'
+        case cs.Sphere():
+            return f'<sphere radius="{shape.radius!r}"/>'
+        case cs.Capsule():
+            return f'<capsule radius="{shape.radius!r}" length="{shape.length!r}"/>'
+        case cs.Cylinder():
+            return f'<cylinder radius="{shape.radius!r}" length="{shape.length!r}"/>'
+    assert isinstance(shape, cs.TriMesh)
+    file = folder / f"{thing.name}.obj"
+    lines = [f"v {numbers(v)}" for v in shape.vertices]
+    lines += ["f " + " ".join(str(i + 1) for i in f) for f in shape.faces]
+    file.write_text("\n".join(lines))
+    return f'<mesh filename="{file}"/>'
+
+
+def load(client: int, text: str, pose: cs.Pose, folder: Path) -> int:
+    """Load a URDF so that its link frame stands at a pose."""
+    import pybullet as p
+
+    file = folder / f"{next(_COUNT)}.urdf"
+    file.write_text(text)
+    return p.loadURDF(str(file), pose.position, pose.quaternion, physicsClientId=client)
+
+
+def pybullet_sensor(
+    things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simulator, folder: Path, **options: Any
+) -> Any:
+    """A sensor in PyBullet, after one step; the caller disconnects ``sensor.client``."""
+    import pybullet as p
+
+    client = p.connect(p.DIRECT)
+    for thing in things:
+        load(client, urdf(thing.name, urdf_geometry(thing, folder)), thing.pose, folder)
+    offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
+    box = f'<box size="{numbers(CARRIER_BOX)}"/>'
+    carrier = load(client, urdf("carrier", box, offset), sensor @ offset.inverse(), folder)
+    for body in range(p.getNumBodies(physicsClientId=client)):
+        p.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=client)
+    p.stepSimulation(physicsClientId=client)
+    return cs.pybullet.attach(client, carrier, "carrier_link", offset, simulator, **options)
+
+
+SENSORS: dict[str, Callable[..., Any]] = {"mujoco": mujoco_sensor, "pybullet": pybullet_sensor}

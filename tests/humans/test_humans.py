@@ -1,0 +1,302 @@
+"""Arms and legs: sizes against the tables, joints against anatomy, exports against simulators."""
+
+from __future__ import annotations
+
+import math
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import capsense as cs
+from capsense.humans import Build, Limb, arm, leg, load_smplx
+from capsense.humans.export import mjcf_body
+from capsense.humans.smplx import close_openings
+
+LIMBS = [make(side=side) for make in (arm, leg) for side in ("left", "right")]  # type: ignore[arg-type]
+
+
+def random_angles(limb: Limb, seed: int) -> dict[str, float]:
+    """Angles [rad] anywhere within the ranges."""
+    rng = np.random.default_rng(seed)
+    return {j.name: float(rng.uniform(j.lower, j.upper)) for j in limb.joints}
+
+
+def lowest(limb: Limb) -> float:
+    """Height [m] of the lowest point, hanging at rest."""
+    return min(
+        float(b.pose.apply(b.shape.to_trimesh().vertices)[:, 2].min()) for b in limb.bodies()
+    )
+
+
+# -- sizes ---------------------------------------------------------------------------------------
+
+
+def test_stature_by_percentile() -> None:
+    """The 5th and 95th percentile that the spread was made from, to their rounding."""
+    for sex, low, high in (("male", 1.649, 1.869), ("female", 1.518, 1.724)):
+        found = [Build(sex, percentile=q).height for q in (5, 95)]  # type: ignore[arg-type]
+        assert found[1] - found[0] == pytest.approx(high - low, abs=5e-4)
+        assert found == pytest.approx([low, high], abs=0.01)
+
+
+def test_sizes_follow_the_tables() -> None:
+    """Measured back from the capsules: lengths, circumferences, the hand's section."""
+    build = Build("female", stature=1.70, girth=1.1)
+    segments = {s.name: s for s in arm(build).segments}
+    assert -segments["forearm"].origin[2] == pytest.approx(0.186 * 1.70)
+    assert -segments["hand"].origin[2] == pytest.approx(0.146 * 1.70)
+    around = max(p.radius for p in segments["forearm"].parts) * 2 * math.pi
+    assert around == pytest.approx(0.2641 * 1.1 * 1.70 / 1.6285)
+    fingers = segments["hand"].parts[:4]
+    thickness = 2 * fingers[0].radius
+    breadth = fingers[3].start[0] - fingers[0].start[0] + thickness
+    assert breadth == pytest.approx(0.0782 * 1.1 * 1.70 / 1.6285)
+    section = 2 * (breadth - thickness) + math.pi * thickness
+    assert section == pytest.approx(0.1866 * 1.1 * 1.70 / 1.6285)
+    assert lowest(arm(build)) == pytest.approx(-(0.186 + 0.146 + 0.108) * 1.70, abs=2e-4)
+    assert lowest(leg(build)) == pytest.approx(-(0.245 + 0.246 + 0.039) * 1.70, abs=2e-4)
+
+
+@pytest.mark.parametrize("sex", ["female", "male"])
+def test_densities_are_those_of_tissue(sex: Any) -> None:
+    """A check between independent tables: mass of a limb over the volume of its capsules."""
+    for make in (arm, leg):
+        limb = make(Build(sex))
+        hull = 0.0
+        for segment in limb.segments[:2]:  # hands and feet are rough
+            profile = [
+                max(p.radius for p in segment.parts if p.start[2] >= z >= p.end[2])
+                for z in np.linspace(0, -abs(segment.parts[-1].end[2]), 200)
+            ]
+            hull += np.mean(np.square(profile)) * math.pi * abs(segment.parts[-1].end[2])
+        mass = sum(s.mass for s in limb.segments[:2])
+        assert 700 < mass / hull < 1400
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sex": "m"}, "sex is 'm'; choose \"female\""),
+        ({"stature": 176}, "stature is 176; give a number from 0.8 to 2.3 m"),
+        ({"percentile": 0}, "percentile is 0"),
+        ({"girth": "wide"}, "girth is 'wide'"),
+    ],
+)
+def test_wrong_builds_are_refused(options: Any, message: str) -> None:
+    """By name, value and range."""
+    with pytest.raises(cs.SceneError, match=message):
+        Build(**options)
+
+
+# -- joints --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("joint", "segment", "point", "direction"),
+    [
+        ("shoulder_flexion", "upper_arm", (0, 0, -1), (1, 0, 0)),
+        ("shoulder_abduction", "upper_arm", (0, 0, -1), "out"),
+        ("shoulder_rotation", "upper_arm", (1, 0, 0), "in"),
+        ("elbow_flexion", "forearm", (0, 0, -1), (1, 0, 0)),
+        ("forearm_pronation", "forearm", (1, 0, 0), "in"),
+        ("wrist_flexion", "hand", (0, 0, -1), "in"),
+        ("wrist_deviation", "hand", (0, 0, -1), (1, 0, 0)),
+        ("hip_flexion", "thigh", (0, 0, -1), (1, 0, 0)),
+        ("hip_abduction", "thigh", (0, 0, -1), "out"),
+        ("hip_rotation", "thigh", (1, 0, 0), "in"),
+        ("knee_flexion", "shank", (0, 0, -1), (-1, 0, 0)),
+        ("ankle_flexion", "foot", (1, 0, 0), (0, 0, 1)),
+        ("ankle_inversion", "foot", (0, 0, -1), "in"),
+    ],
+)
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_joints_bend_as_they_are_called(
+    joint: str, segment: str, point: Any, direction: Any, side: Any
+) -> None:
+    """Anatomy: which way a small positive angle moves a point of the segment."""
+    inwards = np.array((0, 1, 0) if side == "right" else (0, -1, 0))
+    towards = {"in": inwards, "out": -inwards}.get(str(direction), direction)
+    limb = next(k for k in (arm(side=side), leg(side=side)) if joint in {j.name for j in k.joints})
+    move = [limb.forward({joint: a})[segment].apply(point) for a in (0.0, 0.1)]
+    assert np.dot(move[1] - move[0], np.asarray(towards, dtype=float)) > 0.09
+
+
+@pytest.mark.parametrize("limb", LIMBS, ids=lambda k: k.name)
+def test_sides_mirror(limb: Limb) -> None:
+    """The left limb is the right one's mirror image, at any angles."""
+    other = next(k for k in LIMBS if k.name != limb.name and k.name[-3:] == limb.name[-3:])
+    angles = random_angles(limb, 1)
+    for a, b in zip(limb.bodies(angles=angles), other.bodies(angles=angles), strict=True):
+        assert b.shape == a.shape
+        ends = [k.pose.apply([[0, 0, h * k.shape.length / 2] for h in (-1, 1)]) for k in (a, b)]
+        assert ends[1] * (1, -1, 1) == pytest.approx(ends[0], abs=1e-12)
+
+
+def test_wrong_angles_are_refused() -> None:
+    """A joint there is not, or one bent too far, in degrees."""
+    with pytest.raises(cs.SceneError, match="no joint 'elbow'; did you mean 'elbow_flexion'"):
+        arm().forward({"elbow": 0.1})
+    with pytest.raises(cs.SceneError, match="elbow_flexion is 160 degrees; it bends from 0 to 150"):
+        arm().forward({"elbow_flexion": 160}, degrees=True)
+    with pytest.raises(cs.SceneError, match="elbow_flexion is nan degrees"):
+        arm().forward({"elbow_flexion": math.nan})
+    with pytest.raises(cs.SceneError, match="side is 'middle'"):
+        leg(side="middle")  # type: ignore[arg-type]
+    with pytest.raises(cs.SceneError, match="pose is"):
+        arm().bodies((0, 0, 0))  # type: ignore[arg-type]
+
+
+def test_a_person_is_tied_to_ground_once() -> None:
+    """The bodies of a limb share the capacitance."""
+    bodies = arm().bodies(grounding=100e-12)
+    assert sum(b.grounding for b in bodies) == pytest.approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
+    assert {b.grounding for b in arm().bodies(grounding="floating")} == {"floating"}
+    assert {b.material.name for b in arm().bodies(material="skin")} == {"skin"}
+
+
+# -- exports -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("limb", LIMBS, ids=lambda k: k.name)
+def test_mjcf_stands_as_the_limb_does(limb: Limb) -> None:
+    """Differential: MuJoCo's kinematics against ours, all joints bent; masses add up."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    base = cs.Pose((0.1, 0.2, 1.4), (0.1, 0.2, 0.3, 0.9))
+    model = mujoco.MjModel.from_xml_string(limb.mjcf(base))
+    data = mujoco.MjData(model)
+    angles = random_angles(limb, 2)
+    for name, angle in angles.items():
+        data.joint(f"{limb.name}_{name}").qpos[0] = angle
+    mujoco.mj_forward(model, data)
+    for body in limb.bodies(base, angles):
+        geom = data.geom(str(body.name))
+        assert geom.xpos == pytest.approx(np.array(body.pose.position), abs=1e-9)
+        axis = geom.xmat.reshape(3, 3)[:, 2]
+        assert abs(axis @ body.pose.rotation[:, 2]) == pytest.approx(1, abs=1e-9)
+        size = model.geom(str(body.name)).size
+        assert isinstance(body.shape, cs.Capsule)
+        assert (size[0], 2 * size[1]) == pytest.approx((body.shape.radius, body.shape.length))
+    assert model.body_mass.sum() == pytest.approx(sum(s.mass for s in limb.segments))
+    ranges = [model.joint(f"{limb.name}_{j.name}").range for j in limb.joints]
+    assert np.array(ranges) == pytest.approx(np.array([(j.lower, j.upper) for j in limb.joints]))
+    pasted = f"<mujoco><worldbody>{mjcf_body(limb, base)}</worldbody></mujoco>"
+    assert mujoco.MjModel.from_xml_string(pasted).nq == model.nq
+
+
+@pytest.mark.parametrize("limb", LIMBS, ids=lambda k: k.name)
+def test_urdf_stands_as_the_limb_does(limb: Limb, tmp_path: Path) -> None:
+    """Differential: PyBullet's kinematics and shapes against ours, all joints bent."""
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    file = tmp_path / "limb.urdf"
+    file.write_text(limb.urdf())
+    client = p.connect(p.DIRECT)
+    try:
+        base = cs.Pose((0.1, 0.2, 1.4), (0.1, 0.2, 0.3, 0.9))
+        body = p.loadURDF(
+            str(file), base.position, base.quaternion, useFixedBase=True, physicsClientId=client
+        )
+        angles = random_angles(limb, 3)
+        links = {}
+        for k in range(p.getNumJoints(body, physicsClientId=client)):
+            info = p.getJointInfo(body, k, physicsClientId=client)
+            links[info[12].decode()] = k
+            name = info[1].decode().removeprefix(f"{limb.name}_")
+            p.resetJointState(body, k, angles[name], physicsClientId=client)
+        where = limb.forward(angles)
+        for segment in limb.segments:
+            link = links[f"{limb.name}_{segment.name}"]
+            state = p.getLinkState(body, link, computeForwardKinematics=1, physicsClientId=client)
+            expected = base @ where[segment.name]
+            assert cs.Pose(*state[4:6]).matrix == pytest.approx(expected.matrix, abs=1e-5)
+            shapes = p.getCollisionShapeData(body, link, physicsClientId=client)
+            for found, part in zip(shapes, segment.parts, strict=True):
+                assert found[3][:2] == pytest.approx((part.shape.length, part.radius))
+                middle = cs.Pose(*state[:2]) @ cs.Pose(*found[5:7])
+                assert middle.position == pytest.approx((expected @ part.pose).position, abs=1e-5)
+                axes = middle.rotation[:, 2] @ (expected @ part.pose).rotation[:, 2]
+                assert axes == pytest.approx(1, abs=1e-5)
+    finally:
+        p.disconnect(physicsClientId=client)
+
+
+def test_an_attached_sensor_knows_a_limb(simulators: Any) -> None:
+    """The texts of the MJCF carry over: human, 100 pF in all."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjSpec.from_string(arm().mjcf(cs.Pose((0, 0, 0.1))))
+    model.worldbody.add_site(name="pad", pos=(0.0, 0.1, -0.1), quat=(0.7071, 0.7071, 0, 0))
+    compiled = model.compile()
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    scene = cs.mujoco.attach(compiled, data, "pad", simulators("six_patch_bare")).scene()
+    assert len(scene) > 2
+    assert {b.material.name for b in scene} == {"human"}
+    assert sum(b.grounding for b in scene) == pytest.approx(100e-12, rel=1e-9, abs=0)  # type: ignore[misc]
+
+
+# -- meshes --------------------------------------------------------------------------------------
+
+
+def open_box() -> tuple[np.ndarray, np.ndarray]:
+    """A box of 0.4 x 0.5 x 0.6 m without its lid and its floor."""
+    mesh = cs.Box((0.4, 0.5, 0.6)).to_trimesh()
+    keep = np.abs(mesh.face_normals[:, 2]) < 0.5
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)[keep]
+
+
+def test_openings_are_closed() -> None:
+    """A box without lid and floor has its volume again."""
+    shape = cs.TriMesh(*close_openings(*open_box()))
+    assert shape.volume == pytest.approx(0.4 * 0.5 * 0.6)
+
+
+def test_smplx_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error gives the command."""
+    monkeypatch.setitem(sys.modules, "smplx", None)
+    with pytest.raises(cs.MissingDependencyError, match="pip install smplx"):
+        load_smplx("models")
+
+
+def test_smplx_with_a_stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The calls that the loader makes, on a stand-in of the package."""
+    vertices = open_box()[0]
+    asked: dict[str, Any] = {}
+
+    class Tensor:
+        def __init__(self, array: np.ndarray) -> None:
+            self.array = array
+
+        def detach(self) -> Tensor:
+            return self
+
+        cpu = detach
+
+        def numpy(self) -> np.ndarray:
+            return self.array
+
+    class Model:
+        faces = open_box()[1]
+
+        def __call__(self, return_verts: bool, betas: Tensor) -> Any:
+            assert return_verts
+            assert betas.array.shape == (1, 10)
+            return types.SimpleNamespace(vertices=Tensor(vertices[None].astype(np.float32)))
+
+    def create(path: str, **options: Any) -> Model:
+        asked.update(options, path=path)
+        return Model()
+
+    monkeypatch.setitem(sys.modules, "smplx", types.SimpleNamespace(create=create))
+    monkeypatch.setitem(sys.modules, "torch", types.SimpleNamespace(from_numpy=Tensor))
+    shape = load_smplx(tmp_path, gender="female", cell=0.05, betas=np.zeros(10))
+    assert asked == {"path": str(tmp_path), "model_type": "smplx", "gender": "female"}
+    assert shape.volume == pytest.approx(0.12, rel=1e-5)
+    with pytest.raises(cs.SceneError, match="betas holds a number"):
+        load_smplx(tmp_path, betas=[math.nan] * 10)
+    with pytest.raises(cs.SceneError, match=r"refuses \['bets'\]"):
+        load_smplx(tmp_path, bets=[0.0] * 10)
+    with pytest.raises(cs.SceneError, match="there are no model files"):
+        load_smplx(tmp_path / "gone")

@@ -1,0 +1,148 @@
+"""Calibration: recovery of known figures, and uncertainties that mean what they say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from relative import near
+from scipy import stats
+
+from capsense.errors import ReadOutError
+from capsense.readout.calibration import (
+    base_capacitance,
+    calibrate,
+    cross_correlation,
+    relative_to,
+    tare,
+    unit_range,
+)
+from capsense.readout.channels import self_patterns
+from capsense.readout.converter import LinearLaw
+from capsense.readout.noise import White
+from capsense.readout.read_out import ReadOut
+from capsense.readout.schedule import Schedule
+
+GAIN, OFFSET, DRIFT = (
+    np.array([1.02, 0.95]),
+    np.array([3e-13, -2e-14]),
+    np.array([1e-16, -4e-16]),
+)
+
+
+def recording(rng, count=200, rms=0.0):
+    """True and measured capacitances of two channels, and times: mean time 50 s."""
+    time = np.linspace(0, 100, count)
+    true = (2 + rng.uniform(0, 1, (count, 2))) * 1e-12
+    drifted = GAIN * true + OFFSET + DRIFT * (time[:, None] - 50)
+    return true, drifted + rms * rng.standard_normal((count, 2)), time
+
+
+def test_figures_are_found():
+    """Analytic: without noise, gain, offset and drift come out, with no uncertainty to speak of."""
+    true, measured, time = recording(np.random.default_rng(0))
+    fit = calibrate(true, measured, time)
+    assert fit.gain == near(GAIN, rel=1e-9)
+    assert fit.offset == near(OFFSET, rel=1e-6)
+    assert fit.drift == near(DRIFT, rel=1e-6)
+    assert (fit.residual < 1e-24).all()
+    assert np.abs(fit.correct(measured, time) - true).max() < 1e-23
+    assert np.abs(fit.distort(true, time) - measured).max() < 1e-23
+
+
+def test_without_drift():
+    true, measured, _ = recording(np.random.default_rng(0))
+    fit = calibrate(true, GAIN * true + OFFSET, drift=False)
+    assert fit.gain == near(GAIN, rel=1e-9)
+    assert (fit.drift == 0).all()
+    assert (fit.uncertainty[:, 2] == 0).all()
+    assert np.abs(fit.correct(fit.distort(true)) - true).max() < 1e-23
+    assert measured.shape == true.shape
+
+
+def test_intervals_cover_as_often_as_they_state():
+    """Statistical: 95 % intervals of all three figures cover the truth in 95 % of recordings."""
+    rng = np.random.default_rng(1)
+    trials, count = 1500, 12
+    quantile = stats.t.ppf(0.975, count - 3)
+    hits = np.zeros((2, 3))
+    for _ in range(trials):
+        fit = calibrate(*recording(rng, count, 2e-15))
+        found = np.stack([fit.gain, fit.offset, fit.drift], axis=1)
+        truth = np.stack([GAIN, OFFSET, DRIFT], axis=1)
+        hits += np.abs(found - truth) <= quantile * fit.uncertainty
+    spread = np.sqrt(0.95 * 0.05 / trials)
+    assert np.abs(hits / trials - 0.95).max() < 4 * spread
+
+
+def test_residual_is_the_noise():
+    fit = calibrate(*recording(np.random.default_rng(2), 5000, 2e-15))
+    assert fit.residual == near(np.full(2, 2e-15), rel=0.05)
+    assert fit.samples == 5000
+
+
+def test_a_calibrated_model_measures_like_the_sensor():
+    """Round trip: as a stage it distorts; calibrating the read-out's counts finds it again."""
+    true, measured, time = recording(np.random.default_rng(3))
+    sensor = calibrate(true, measured, time)
+    readout = ReadOut(
+        self_patterns(("A", "B"), shield=0.0), ("A", "B"), Schedule.simultaneous(2, 0.1),
+        LinearLaw(1e-21, -(10**12), 10**12), stages=(sensor, White(1e-16)),
+    )  # fmt: skip
+    counts = readout(time, true)
+    stamps, rows = counts.table()
+    instants = stamps[:, 0] - 0.05
+    world = np.stack([np.interp(instants, time, c) for c in true.T], axis=1)
+    again = calibrate(world, rows, instants)
+    assert np.abs(again.gain - GAIN).max() < 5 * again.uncertainty[:, 0].max()
+    drift_between = DRIFT * (again.epoch - sensor.epoch)
+    assert again.offset == pytest.approx(OFFSET + drift_between, abs=5e-17)
+    assert again.drift == near(DRIFT, rel=0.05)
+    with pytest.raises(ReadOutError, match="2 channels and the read-out 3"):
+        ReadOut(self_patterns(("A", "B", "C")), ("A", "B", "C"), Schedule.simultaneous(3, 0.1),
+                LinearLaw(1e-15, 0, 9), stages=(sensor,))  # fmt: skip
+
+
+def test_normalisations():
+    """Analytic: base, tare, relative and unit range."""
+    empty = np.array([[1e-12, 2e-12], [3e-12, 2e-12]])
+    base = base_capacitance(empty)
+    assert base == near([2e-12, 2e-12], rel=1e-12)
+    values = np.array([[2e-12, 1e-12], [4e-12, 3e-12]])
+    assert tare(values, base) == pytest.approx(np.array([[0, -1e-12], [2e-12, 1e-12]]), abs=1e-24)
+    assert relative_to(values, base) == near(np.array([[1, 0.5], [2, 1.5]]), rel=1e-12)
+    assert unit_range(values).tolist() == [[0, 0], [1, 1]]
+
+
+def test_cross_correlation():
+    """Differential: Pearson's coefficient; insensitive to gain and offset."""
+    rng = np.random.default_rng(4)
+    a, b = rng.standard_normal((2, 300))
+    assert cross_correlation(a, b) == near(np.corrcoef(a, b)[0, 1], rel=1e-9)
+    assert cross_correlation(a, 3e-15 * a + 1e-12) == near(1.0, rel=1e-6)
+    assert cross_correlation(a, -a) == near(-1.0, rel=1e-12)
+
+
+ONES = np.ones((10, 1))
+RISING = np.linspace(1, 2, 10)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: calibrate(ONES, np.ones((9, 1)), np.arange(10)), r"shape \(10, 1\), measured"),
+        (lambda: calibrate(RISING * np.nan, RISING, np.arange(10)), "not finite"),
+        (lambda: calibrate(RISING, RISING), "drift needs the times"),
+        (lambda: calibrate(RISING, RISING, np.arange(9)), "time has shape"),
+        (lambda: calibrate(RISING[:3], RISING[:3], np.arange(3)), "3 samples for 3 unknowns"),
+        (lambda: calibrate(ONES, ONES, drift=False), "channel 0: the recording does not tell"),
+        (lambda: calibrate(RISING, RISING, np.arange(10)), "not along with time only"),
+        (lambda: base_capacitance([]), "at least one"),
+        (lambda: relative_to([1.0], [0.0]), "a base is 0"),
+        (lambda: unit_range([[1.0], [1.0]]), "constant"),
+        (lambda: cross_correlation([1.0, 1.0], [1.0, 2.0]), "constant"),
+        (lambda: cross_correlation([1.0], [1.0, 2.0]), "make them the same"),
+    ],
+)
+def test_bad_recordings_are_refused(make, words):
+    with pytest.raises(ReadOutError, match=words):
+        make()

@@ -1,0 +1,174 @@
+"""The known chips: their models against the figures they state."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from relative import near
+
+from capsense.errors import ReadOutError
+from capsense.readout.chip import Status
+from capsense.readout.chips import CHIPS
+from capsense.readout.converter import Range
+from capsense.readout.noise import allan_deviation
+from capsense.readout.presets import Options, charge_for, schedule_of
+from capsense.readout.presets import build as build_chip
+from capsense.readout.read_out import ReadOut
+
+COUNT = 12
+NAMES = tuple(f"E{k}" for k in range(COUNT))
+LEVEL = 2e-12
+RATES = [(chip, rate) for chip in CHIPS.values() for rate in chip.rates]
+
+
+def still(chip, cycles, **options):
+    """A read-out of a still scene of 2 pF everywhere: counts of so many cycles."""
+    readout = ReadOut.preset(chip, NAMES, expected=LEVEL, **options)
+    k = len(readout.bank)
+    end = (cycles + 0.5) * readout.schedule.period
+    return readout, readout([0.0, end], np.full((2, k), LEVEL))
+
+
+@pytest.mark.parametrize("chip", CHIPS.values(), ids=lambda c: c.name)
+def test_every_figure_has_a_status_and_a_source(chip):
+    assert len(chip.facts) >= 4
+    for fact in chip.facts:
+        assert fact.quantity
+        assert fact.value
+        assert fact.source or fact.status is Status.ASSUMED, fact
+
+
+@pytest.mark.parametrize(("chip", "rate"), RATES, ids=lambda v: getattr(v, "name", ""))
+def test_noise_is_as_stated(chip, rate):
+    """Statistical: rms of one conversion, white noise and rounding together."""
+    readout, counts = still(chip.name, 40, rate=rate.per_second, flicker=0.0)
+    step = abs(readout.law.capacitance(np.array(1000)) - readout.law.capacitance(np.array(1001)))
+    if chip.name == "mpr121":  # the step of a 1/C law depends on where one is
+        code = int(counts.code[0])
+        step = readout.law.capacitance(np.array(code)) / code
+    if chip.name in ("fdc2214", "sdr"):
+        step = 0.0 if chip.name == "fdc2214" else step
+    expected = math.sqrt(rate.rms**2 + (chip.relative_noise * LEVEL) ** 2 + step**2 / 12)
+    deviation = counts.capacitance.std()
+    assert deviation == near(expected, rel=5 / math.sqrt(2 * len(counts)) + 0.02)
+    assert counts.code.dtype == np.int64
+
+
+@pytest.mark.parametrize("name", ["ad7147", "fdc1004", "fdc2214", "ad7746", "ad7747", "sdr"])
+def test_allan_deviation_is_as_specified(name):
+    """Statistical: the whole chain falls as white noise does, to its flicker floor."""
+    chip = CHIPS[name]
+    _, counts = still(name, 1200)
+    _, rows = counts.table()
+    averages = np.array([1, 4, 16, 64, 256])
+    measured = np.sqrt((allan_deviation(rows, averages) ** 2).mean(axis=1))
+    lsb = 16e-12 / 2**16 if name == "ad7147" else 1e-12 * 2.4e-4 if name == "sdr" else 0.0
+    white = math.sqrt(chip.rates[0].rms ** 2 + lsb**2 / 12) / np.sqrt(averages)
+    assert measured == near(np.hypot(white, chip.flicker), rel=0.12)
+
+
+def test_noise_off_leaves_rounding():
+    for name in CHIPS:
+        _, counts = still(name, 5, noise=False)
+        assert not counts.saturated.any()
+        _, rows = counts.table()
+        assert len(rows) >= 3
+        assert (rows == rows[0]).all()
+
+
+def test_confirmed_figures():
+    """The figures as their sources state them."""
+    fdc = CHIPS["fdc1004"]
+    assert fdc.law.level(np.array(1e-12)) == near(2.0**19, rel=1e-12)
+    assert [r.per_second for r in fdc.rates] == [100.0, 200.0, 400.0]
+    assert fdc.dac.step * 32 == near(100e-12, rel=1e-12)
+    plan = schedule_of(CHIPS["ad7147"], [None] * 12, 1 / CHIPS["ad7147"].rates[0].per_second)
+    assert plan.period == near(9.216e-3, rel=1e-9)
+    ad = CHIPS["ad7746"].law
+    assert ad.level(np.array(0.0)) == 0x800000
+    assert ad.capacitance(np.array(2**24)) == near(4.096e-12, rel=1e-12)
+    rates = [round(r.per_second) for r in CHIPS["ad7746"].rates]
+    assert rates == [91, 84, 50, 26, 16, 13, 11, 9]
+    assert CHIPS["teensy"].law.level(np.array(1e-12)) == near(50.0, rel=1e-12)
+    # The FDC1004's inputs in turn, two chips side by side for six electrodes.
+    plan = schedule_of(fdc, [None] * 6, 1 / 400)
+    assert plan.slots == ((0, 4), (1, 5), (2,), (3,))
+
+
+def test_rates_are_conversions_per_second():
+    """Invariant: one chip finishes as many conversions in a second as its rate says."""
+    for chip, rate in RATES:
+        readout = ReadOut.preset(chip.name, NAMES[:2], rate=rate.per_second, expected=LEVEL)
+        slots = len(readout.schedule.slots)
+        assert slots / readout.schedule.period == near(rate.per_second, rel=1e-9)
+
+
+def test_dac_jump_of_the_fdc1004():
+    """Measured: 18.9 pF read with CAPDAC code 7 and 8 differ by the specimen's 1.38 pF."""
+    actual = CHIPS["fdc1004"].dac.actual()
+    jump = (8 * 3.125e-12 - actual[8]) - (7 * 3.125e-12 - actual[7])
+    assert jump == near(-1.38e-12, rel=0.01)
+
+
+def test_saturation_reaches_the_flags():
+    """Each chip's range, with its CAPDAC where the host left it."""
+    for name, limit in (("ad7147", 8e-12), ("ad7746", 4.096e-12), ("ad7747", 8.192e-12)):
+        readout = ReadOut.preset(name, NAMES[:2], noise=False)
+        k = len(readout.bank)
+        for change, flag in ((0.9, Range.INSIDE), (1.1, Range.ABOVE), (-1.1, Range.BELOW)):
+            levels = np.array([[10e-12], [10e-12], [10e-12 + change * limit]]) * np.ones(k)
+            counts = readout([0.0, 1.0, 1.0001], levels)
+            assert not counts.flags.any()
+            readout.reset()
+            readout.sample(0.0, levels[0])
+            readout.sample(0.9, levels[0])
+            readout.sample(0.9001, levels[2])
+            assert readout.sample(3.0, levels[2]).flags[-1] == flag
+
+
+def test_charge_set_up():
+    """The MPR121's charge is chosen so that the expected capacitance reads near 90 %."""
+    for capacitance in np.geomspace(0.6e-12, 2e-9, 40):
+        law = charge_for(capacitance)
+        code = float(law.level(np.array(capacitance)))
+        assert law.low <= code <= law.high
+        if 10e-12 < capacitance < 800e-12:
+            assert code == near(law.low + 0.9 * (law.high - law.low), rel=0.05)
+    with pytest.raises(ReadOutError, match="outside of what an MPR121 can charge"):
+        charge_for(1e-14)
+
+
+def test_touch_of_a_chip():
+    """A hand's 20 % on an MPR121 is a touch; a slow drift of as much is not."""
+    readout = ReadOut.preset("mpr121", NAMES[:1], expected=LEVEL, noise=False)
+    times = np.arange(0, 20, 0.05)
+    hand = LEVEL * np.where((times > 5) & (times < 10), 1.2, 1.0)
+    touched = readout(times, hand[:, None])
+    during = (touched.time > 5.2) & (touched.time < 10)
+    assert touched.touched is not None
+    assert touched.touched[during].all()
+    assert not touched.touched[touched.time < 5].any()
+    assert not touched.touched[touched.time > 10.3].any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("fdc1005", {}), "unknown chip 'fdc1005'; did you mean 'fdc1004'"),
+        (("fdc1004", {"rate": 150.0}), "no rate of 150.0 conversions per second; it has 100"),
+        (("fdc1004", {"rates": 100.0}), "no option 'rates' of a read-out; did you mean 'rate'"),
+        (("mpr121", {"expected": -1.0}), "expected is -1.0"),
+        (("fdc1004", {"mains": -1.0}), "amplitude is -1.0"),
+    ],
+)
+def test_bad_options_are_refused(arguments, words):
+    name, options = arguments
+    with pytest.raises(ReadOutError, match=words):
+        ReadOut.preset(name, NAMES, **options)
+
+
+def test_options_and_presets_are_one():
+    readout = build_chip("FDC1004", NAMES, Options(rate=400))
+    assert readout.schedule.conversion == near(2.5e-3, rel=1e-12)

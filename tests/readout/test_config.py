@@ -1,0 +1,142 @@
+"""Read-outs from TOML: what a file can say, and what is refused."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+from relative import near
+
+from capsense.errors import ReadOutError
+from capsense.readout.config import load_readout, parse_readout
+from capsense.readout.detector import ExponentialTracker, SteppingTracker
+from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
+
+NAMES = ("E1", "E2", "E3")
+FULL = """
+chip = "fdc1004"
+rate = 400
+seed = 7
+
+[[channel]]
+sense = "E1"
+rest = "guard"
+
+[[channel]]
+name = "difference"
+sense = "E3"
+drive = { E1 = 1.0, E2 = -1.0 }
+
+[wiring]
+trace = [1e-12, 2e-12]
+cable = 50e-12
+shield_gain = 0.99
+crosstalk = 0.001
+
+[noise]
+flicker = 2e-16
+walk = 1e-18
+mains = 1e-15
+mains_frequency = 60
+
+[climate]
+temperature = [[0, 22.0], [600, 30.0]]
+humidity = 40
+offset_per_kelvin = 1e-16
+
+[detector]
+touch = 5000
+release = 3000
+debounce = 2
+samples = 500
+"""
+
+
+def parse(text):
+    return parse_readout(tomllib.loads(text), NAMES, source="my.toml")
+
+
+def test_everything_is_taken_over():
+    readout = parse(FULL)
+    assert readout.channel_names == ("E1", "difference")
+    assert readout.schedule.conversion == near(2.5e-3, rel=1e-12)
+    assert readout.wiring.trace == [1e-12, 2e-12]
+    climate, walk, flicker, mains, white = readout.stages
+    assert isinstance(climate, ClimateDrift)
+    assert climate.temperature.at(np.array([300.0]))[0] == near(26.0, rel=1e-12)
+    assert climate.offset_per_kelvin == 1e-16
+    assert walk == RandomWalk(1e-18)
+    assert flicker == Flicker(2e-16)
+    assert mains == Mains(1e-15, 60.0)
+    assert white == White(1e-15)
+    assert readout.detector is not None
+    assert readout.detector.tracker == ExponentialTracker(500)
+    patterns = readout.bank.patterns
+    assert (patterns[0].rest, patterns[0].shield, patterns[1].shield) == ("guard", 1.0, 0.0)
+    assert dict(patterns[1].drive) == {"E1": 1.0, "E2": -1.0}
+
+
+def test_the_least_a_file_can_say(tmp_path):
+    path = tmp_path / "chip.toml"
+    path.write_text('chip = "ad7746"\n', encoding="utf-8")
+    readout = load_readout(path, NAMES)
+    assert readout.channel_names == ("E1-E2", "E1-E3", "E2-E3")
+    path.write_text('chip = "ad7746"\nmode = "self"\nrandom = false\n', encoding="utf-8")
+    readout = load_readout(path, NAMES)
+    assert readout.channel_names == NAMES
+    assert readout.stages == ()
+
+
+def test_pairs_and_stepping_baseline():
+    readout = parse(
+        'chip = "sdr"\npairs = [["E3", "E1"], ["E3", "E2"]]\nrest = "floating"\n'
+        '[detector]\ntouch = 10\ntracker = "stepping"\n'
+    )
+    assert readout.channel_names == ("E3-E1", "E3-E2")
+    assert readout.schedule.slots == ((0, 1),)
+    assert readout.detector is not None
+    assert (readout.detector.release, readout.detector.tracker) == (5.0, SteppingTracker())
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "my.toml: read-out: missing key 'chip'"),
+        ('chip = "fdc1005"', "chip = 'fdc1005' is not known; did you mean 'fdc1004'"),
+        ('chip = "fdc1004"\nratee = 1', "unknown key 'ratee'; did you mean 'rate'"),
+        ('chip = "fdc1004"\nrate = "fast"', "rate = 'fast' must be a number"),
+        ('chip = "fdc1004"\nrate = 150', "fdc1004 has no rate of 150"),
+        ('chip = "fdc1004"\nseed = -1', "seed = -1 must be an integer"),
+        ('chip = "fdc1004"\nmode = "both"', "mode = 'both' is not known"),
+        ('chip = "fdc1004"\npairs = [["E1", "E2"]]', 'pairs is for mode = "mutual"'),
+        ('chip = "ad7746"\npairs = [["E1"]]', r"pairs\[0\] = \['E1'\] must be"),
+        ('chip = "ad7746"\npairs = []', "pairs = .. must be"),
+        ('chip = "ad7746"\npairs = [["E1", "E9"]]', "names no electrode 'E9'"),
+        ('chip = "ad7746"\npairs = [["E1", "E1"]]', "names one electrode twice"),
+        ('chip = "fdc1004"\nmode = "self"\n[[channel]]\nsense = "E1"', "both choose the channels"),
+        ('chip = "fdc1004"\n[[channel]]\nsens = "E1"', "channel 1: unknown key 'sens'"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E9"', "channel 1: sense names no electrode"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\nfloating = "E2"', "floating = 'E2' must be"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\nfloating = ["E1"]', "is floating, and"),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\ndrive = { E2 = true }', "E2 = True must be"),
+        ('chip = "fdc1004"\n[wiring]\ntrace = -1', "wiring: trace = -1 must be from 0"),
+        ('chip = "fdc1004"\n[wiring]\ntrace = [1e-12]', "trace is .*one per channel"),
+        ('chip = "fdc1004"\n[noise]\nwhite = 1', "noise: unknown key 'white'"),
+        ('chip = "fdc1004"\n[climate]\ntemperature = [[1, 2], [1, 3]]', "times must rise"),
+        ('chip = "fdc1004"\n[detector]\ntouch = 5\nrelease = 9', "release = 9 must be from"),
+        ('chip = "fdc1004"\n[detector]\nrelease = 9', "detector: missing key 'touch'"),
+        (
+            'chip = "fdc1004"\n[detector]\ntouch = 9\ntracker = "stepping"\nsamples = 5',
+            "samples is",
+        ),
+    ],
+)
+def test_wrong_files_are_refused(text, words):
+    with pytest.raises(ReadOutError, match=words):
+        parse(text)
+
+
+def test_missing_files_are_refused(tmp_path):
+    with pytest.raises(ReadOutError, match="there is no read-out file"):
+        load_readout(tmp_path / "none.toml", NAMES)

@@ -1,0 +1,154 @@
+"""Converters: laws, rounding, saturation, offset DAC."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from relative import near
+
+from capsense.errors import ReadOutError
+from capsense.readout.converter import (
+    CapDac,
+    Conversion,
+    LinearLaw,
+    Range,
+    ReciprocalLaw,
+    ResonanceLaw,
+    ShuntLaw,
+    quantise,
+)
+from capsense.readout.front_end import ShuntFrontEnd
+
+LINEAR = LinearLaw(1e-15, -8000, 7999)
+RECIPROCAL = ReciprocalLaw(16e-6, 0.5e-6, 3.3)
+RESONANCE = ResonanceLaw(18e-6, 33e-12, 40e6)
+SHUNT = ShuntLaw(ShuntFrontEnd(1e6, 1e3, 20.0, 1.0), 1.0)
+# Each law with a range of capacitances it converts, and one below and one above that.
+LAWS = [
+    (LINEAR, (-7.9e-12, 7.9e-12), -9e-12, 9e-12),
+    (RECIPROCAL, (3.1e-12, 11e-12), 3e-12, 12e-12),
+    (RESONANCE, (0.0, 500e-12), -32e-12, math.inf),
+    (SHUNT, (0.0, 7.5e-12), -9e-12, 9e-12),
+]
+
+
+@pytest.mark.parametrize(("law", "span", "below", "above"), LAWS, ids=lambda v: type(v).__name__)
+def test_round_trips(law, span, below, above):
+    """Invariant: each code means a capacitance that converts to that code, without exception."""
+    codes, flags = quantise(law, np.linspace(*span, 1000))
+    assert codes.dtype == np.int64
+    assert not flags.any()
+    again = law.capacitance(codes)
+    if law is SHUNT:  # the recovery formula from magnitudes is not the inverse, see its docstring
+        again = again / (1 + law.front_end.omega * law.front_end.shunt * again)
+        assert np.abs(quantise(law, again)[0] - codes).max() <= 0.002 * codes.max()
+    else:
+        assert (quantise(law, again)[0] == codes).all()
+
+
+@pytest.mark.parametrize(("law", "span", "below", "above"), LAWS, ids=lambda v: type(v).__name__)
+def test_saturation(law, span, below, above):
+    """Codes stay within their limits, and flags tell the side by capacitance, not by code."""
+    code, flags = quantise(law, np.array([below, *span]))
+    assert flags.tolist() == [Range.BELOW, Range.INSIDE, Range.INSIDE]
+    assert code[0] == (law.low if law.rising else law.high)
+    if math.isfinite(above):
+        code, flags = quantise(law, np.array([above]))
+        assert flags.tolist() == [Range.ABOVE]
+        assert code[0] == (law.high if law.rising else law.low)
+
+
+def test_quantisation_error_is_uniform():
+    """Statistical: within half a code, mean zero, variance lsb²/12."""
+    c = np.random.default_rng(0).uniform(-5e-12, 5e-12, 200_000)
+    error = LINEAR.capacitance(quantise(LINEAR, c)[0]) - c
+    assert np.abs(error).max() <= 0.5e-15 * (1 + 1e-9)
+    assert error.var() == near(1e-30 / 12, rel=0.02)
+    assert abs(error.mean()) < 5 * 1e-15 / math.sqrt(12 * len(c))
+
+
+def test_reciprocal_law():
+    """Analytic: 1024 I T/(C V_dd); the resolution of a code is C/code."""
+    c = 5e-12
+    code = 16e-6 * 0.5e-6 / (c * 3.3) * 1024
+    assert quantise(RECIPROCAL, c)[0] == round(code)
+    step = RECIPROCAL.capacitance(np.array(500)) - RECIPROCAL.capacitance(np.array(501))
+    assert step == near(RECIPROCAL.capacitance(np.array(500)) / 501, rel=1e-9)
+    assert quantise(RECIPROCAL, np.array([0.0, -1e-12]))[1].tolist() == [Range.BELOW] * 2
+    # The maker states 0.45 to 2880 pF at 1.8 V: 1 µA, 0.5 µs at the upper rail; 63 µA, 32 µs.
+    small, large = ReciprocalLaw(1e-6, 0.5e-6, 1.8), ReciprocalLaw(63e-6, 32e-6, 1.8)
+    assert small.capacitance(np.array(small.high)) == near(0.45e-12, rel=0.02)
+    assert large.capacitance(np.array(large.low)) == near(2880e-12, rel=0.01)
+
+
+def test_resonance_law():
+    """Analytic: the tank's frequency, and its slope −C/2."""
+    code = int(quantise(RESONANCE, 2e-12)[0])
+    frequency = code / 2**28 * 40e6
+    assert frequency == near(1 / (2 * math.pi * math.sqrt(18e-6 * 35e-12)), rel=1e-7)
+    change = (quantise(RESONANCE, 2.01e-12)[0] - code) / code
+    assert change == near(-0.5 * 0.01 / 35, rel=1e-3)
+
+
+def test_dac_moves_the_range():
+    """Analytic: a capacitance far out of the law's range is converted, to half a code."""
+    dac = CapDac(3e-12, 32)
+    c = np.array([2e-12, 40e-12, 92e-12])
+    code, reported, flags = Conversion(LINEAR, dac, 3)(np.arange(3), c)
+    assert not flags.any()
+    assert np.abs(reported - c).max() <= 0.5e-15 * (1 + 1e-9)
+    assert np.abs(code).max() <= 1500
+    assert (Conversion(LINEAR, None, 3)(np.arange(3), c)[2] == [0, Range.ABOVE, Range.ABOVE]).all()
+
+
+def test_dac_steps():
+    """Analytic: where a bit's capacitor is off, the reported value jumps between codes."""
+    errors = (0.0, 0.0, -0.1e-12, 1.3e-12)
+    c = np.array([20e-12])
+    reported = {}
+    for start in range(4, 9):
+        dac = CapDac(3.125e-12, 32, errors, start=start, follow=False)
+        value, flags = Conversion(LinearLaw(1e-15, -16000, 15999), dac, 1)(np.zeros(1, int), c)[1:]
+        assert not flags.any()
+        reported[start] = value[0]
+    assert reported[7] - reported[4] == pytest.approx(0.0, abs=1e-15)
+    assert reported[8] - reported[7] == pytest.approx(-1.4e-12, abs=2e-15)
+    expected = np.array([1.1, 2.0, 3.1, 4.0, 5.1, 6.0, 7.1]) * 1e-12
+    assert CapDac(1e-12, 8, (0.1e-12,)).actual()[1:] == near(expected, rel=1e-12)
+
+
+def test_dac_follows_only_if_it_may():
+    """A saturated channel gets a new code for its next sample; the others keep theirs."""
+    for follow in (True, False):
+        conversion = Conversion(LINEAR, CapDac(3e-12, 32, follow=follow), 2)
+        channel = np.arange(2)
+        conversion(channel, np.array([2e-12, 2e-12]))
+        far = np.array([2e-12, 14e-12])
+        assert conversion(channel, far)[2].tolist() == [Range.INSIDE, Range.ABOVE]
+        after = conversion(channel, far)
+        assert after[2].tolist() == [0, 0 if follow else Range.ABOVE]
+        assert after[1][0] == pytest.approx(2e-12, abs=1e-15)
+        if follow:
+            assert after[1][1] == pytest.approx(14e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: LinearLaw(0.0, 0, 1), "lsb is 0.0"),
+        (lambda: LinearLaw(1e-15, 5, 5), "codes run from 5 to 5"),
+        (lambda: ReciprocalLaw(-1e-6, 1e-6, 3.3), "current is -1e-06"),
+        (lambda: ReciprocalLaw(1e-6, 1e-6, 1.2), "codes run from 598 to 426"),
+        (lambda: ResonanceLaw(0.0, 1e-12, 4e7), "inductance is 0.0"),
+        (lambda: ShuntLaw(ShuntFrontEnd(), math.nan), "full_scale is nan"),
+        (lambda: CapDac(0.0, 32), "step is 0.0"),
+        (lambda: CapDac(1e-12, 0), "codes is 0"),
+        (lambda: CapDac(1e-12, 8, start=8), "start is 8"),
+        (lambda: CapDac(1e-12, 8, (math.nan,)), "bit_errors is nan"),
+    ],
+)
+def test_bad_converters_are_refused(make, words):
+    with pytest.raises(ReadOutError, match=words):
+        make()

@@ -1,0 +1,116 @@
+"""Front end: closed forms against circuit analysis and against sampled waveforms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from relative import near
+
+from capsense.errors import ReadOutError
+from capsense.readout.front_end import ShuntFrontEnd, demodulate, demodulated
+
+PAPER = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0)
+
+
+def random_front_end(rng):
+    return ShuntFrontEnd(
+        10 ** rng.uniform(4, 7), 10 ** rng.uniform(1, 5), 10 ** rng.uniform(0, 3),
+        rng.uniform(0.1, 10), 10 ** rng.uniform(5, 9), rng.uniform(0, 100e-12),
+    )  # fmt: skip
+
+
+def test_output_solves_the_circuit():
+    """Differential: nodal analysis of transmitter, capacitor, shunt and parasitic."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        fe = random_front_end(rng)
+        c = 10 ** rng.uniform(-15, -10)
+        # Unknowns: the source's current and the receiving node's potential.
+        j = 1j * fe.omega
+        nodes = np.array([[1, j * c], [0, j * c + j * fe.parasitic + 1 / fe.shunt]])
+        sources = np.array([j * c * fe.amplitude, j * c * fe.amplitude])
+        _, receiver = np.linalg.solve(nodes, sources)
+        amplifier = fe.gain * fe.bandwidth / (fe.bandwidth + 1j * fe.frequency)
+        found = fe.output(c)
+        assert abs(found - amplifier * receiver) <= 1e-12 * abs(found)
+
+
+def test_recovery_is_exact_for_phasors():
+    """Round trip over eight decades, far beyond where the shunt's voltage is small."""
+    c = np.geomspace(1e-18, 1e-10, 60)
+    assert PAPER.recover(PAPER.output(c)) == near(c, rel=1e-9)
+    assert PAPER.recover(0j) == 0.0
+    assert PAPER.recover(0.0) == 0.0
+
+
+def test_recovery_from_magnitudes_is_too_large():
+    """Analytic: by the factor 1 + ω R_S C, to first order."""
+    c = np.array([1e-15, 1e-13, 1e-12])
+    excess = PAPER.recover(np.abs(PAPER.output(c))) / c - 1
+    assert excess == near(PAPER.omega * PAPER.shunt * c, rel=0.01)
+
+
+def test_parasitics_and_bandwidth_are_gain_errors():
+    """Analytic: for small signals |V_o| falls by |1 + jωR_S C_p| and by the amplifier's pole."""
+    c = 1e-15
+    loaded = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0, parasitic=50e-12)
+    turn = loaded.omega * loaded.shunt * loaded.parasitic
+    assert loaded.recover(loaded.output(c)) / c == near(1 / math.hypot(1, turn), rel=1e-4)
+    slow = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0, bandwidth=3e6)
+    assert slow.recover(slow.output(c)) / c == near(1 / math.hypot(1, 1 / 3), rel=1e-4)
+
+
+def test_demodulation_equals_its_closed_form():
+    """Differential: sampled waveforms, any window, at and beside the transmitter's frequency."""
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        rate, count = 10 ** rng.uniform(5, 8), int(rng.integers(3, 3000))
+        carrier = rng.uniform(0.01, 0.49) * rate
+        signal = carrier if rng.random() < 0.5 else rng.uniform(0, 0.49) * rate
+        phasor = rng.normal() + 1j * rng.normal()
+        phase = 2 * math.pi * signal * np.arange(count) / rate
+        samples = np.real(phasor * np.exp(1j * phase))
+        expected = demodulate(samples, carrier, rate)
+        found = demodulated(phasor, signal, carrier, rate, count)
+        assert abs(found - expected) < 1e-9
+
+
+def test_whole_periods_give_the_phasor():
+    """Analytic: sampled front end, demodulated and recovered, is the capacitance."""
+    rng = np.random.default_rng(2)
+    for c in (1e-15, 3e-13, 2e-12, 4e-11):
+        samples = PAPER.waveform(c, 25e6, 2500)
+        phasor = demodulate(samples, PAPER.frequency, 25e6)
+        assert abs(phasor - PAPER.output(c)) < 1e-9 * abs(phasor)
+        assert PAPER.recover(phasor) == near(c, rel=1e-7)
+        assert demodulated(PAPER.output(c), 1e6, 1e6, 25e6, 2500) == pytest.approx(phasor)
+    batch = rng.standard_normal((4, 5, 100))
+    assert demodulate(batch, 1e6, 25e6).shape == (4, 5)
+
+
+def test_noise_of_demodulation():
+    """Statistical: white noise of variance σ² leaves 2σ²/N on I and on Q, uncorrelated."""
+    noise = 0.3 * np.random.default_rng(3).standard_normal((20_000, 200))
+    phasor = demodulate(noise, 1e6, 25e6)
+    expected = 2 * 0.3**2 / 200
+    for part in (phasor.real, phasor.imag):
+        assert part.var() == near(expected, rel=5 * math.sqrt(2 / 20_000))
+    assert abs(np.corrcoef(phasor.real, phasor.imag)[0, 1]) < 5 / math.sqrt(20_000)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"frequency": 0.0}, "frequency is 0.0"),
+        ({"shunt": -1.0}, "shunt is -1.0"),
+        ({"gain": math.nan}, "gain is nan"),
+        ({"amplitude": math.inf}, "amplitude is inf"),
+        ({"bandwidth": 0.0}, "bandwidth is 0.0"),
+        ({"parasitic": -1e-12}, "parasitic is -1e-12"),
+    ],
+)
+def test_bad_front_ends_are_refused(settings, words):
+    with pytest.raises(ReadOutError, match=words):
+        ShuntFrontEnd(**settings)

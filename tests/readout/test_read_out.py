@@ -1,0 +1,245 @@
+"""The read-out as a whole: instants, time stamps, interpolation, determinism."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from maxwell import random_maxwell
+from relative import near
+
+from capsense.errors import ReadOutError
+from capsense.readout.channels import Pattern, self_patterns
+from capsense.readout.chips import CHIPS
+from capsense.readout.converter import CapDac, LinearLaw
+from capsense.readout.counts import join
+from capsense.readout.detector import Detector, ExponentialTracker
+from capsense.readout.noise import Flicker, Mains, White
+from capsense.readout.read_out import ReadOut
+from capsense.readout.schedule import Schedule
+from capsense.readout.wiring import Wiring
+
+NAMES = ("A", "B", "C")
+FINE = LinearLaw(1e-21, -(10**12), 10**12)
+
+
+def plain(schedule=None, **options):
+    """Three self channels through a converter of very fine codes."""
+    plan = schedule or Schedule.sequential(3, 2e-3, gap=1e-4)
+    return ReadOut(self_patterns(NAMES, shield=0.0), NAMES, plan, FINE, **options)
+
+
+def full(seed=0):
+    """Everything that has a state."""
+    return plain(
+        dac=CapDac(1e-12, 8, follow=True),
+        wiring=Wiring(trace=[1e-13, 2e-13, 0.0], cable=1e-12, shield_gain=0.9, crosstalk=0.01),
+        stages=(Flicker(1e-15), Mains(1e-15), White(1e-15, 1e-3)),
+        detector=Detector(1e5, 1e4, ExponentialTracker(50)), seed=seed,
+    )  # fmt: skip
+
+
+def moving(times, rng):
+    """Matrices along a smooth way between two random ones, shape (n, 3, 3)."""
+    one, two = random_maxwell(rng, 3), random_maxwell(rng, 3)
+    share = 0.5 + 0.5 * np.sin(7 * np.asarray(times))[:, None, None]
+    return one + share * (two - one)
+
+
+def same(one, other):
+    """Equal to the last bit."""
+    columns = ("time", "channel", "code", "capacitance", "flags", "baseline", "touched")
+    pairs = [(getattr(one, c), getattr(other, c)) for c in columns]
+    return all((a is None and b is None) or np.array_equal(a, b) for a, b in pairs)
+
+
+def test_channels_are_read_at_their_own_instants():
+    """Analytic: asked at the instants that are due, each value is that of its instant."""
+    readout = plain()
+    rng = np.random.default_rng(0)
+    one, two = random_maxwell(rng, 3), random_maxwell(rng, 3)
+
+    def world(t):
+        return one + np.sin(40 * t) * (two - one)
+
+    parts = [readout.sample(t, world(t)) for t in readout.due(0.2)]
+    counts = join([*parts, readout.sample(0.2, world(0.2))])
+    assert len(counts) == readout.schedule.samples_until(0.2 - 1e-3)
+    instants = counts.time - 1e-3
+    assert instants[:4] == near([1.1e-3, 3.2e-3, 5.3e-3, 7.4e-3], rel=1e-12)
+    assert counts.channel[:4].tolist() == [0, 1, 2, 0]
+    expected = [world(t)[c, c] for t, c in zip(instants, counts.channel, strict=True)]
+    assert np.abs(counts.capacitance - expected).max() < 1e-20
+
+
+def test_linear_motion_needs_no_more():
+    """Analytic: between steps, values are interpolated linearly in time."""
+    readout = plain()
+    rng = np.random.default_rng(1)
+    one, two = random_maxwell(rng, 3), random_maxwell(rng, 3)
+    times = np.sort(np.concatenate([[0.0, 1.0], rng.uniform(0, 1, 30)]))
+    counts = readout(times, one + times[:, None, None] * two)
+    instants = counts.time - 1e-3
+    expected = [(one + t * two)[c, c] for t, c in zip(instants, counts.channel, strict=True)]
+    assert np.abs(counts.capacitance - expected).max() < 2e-21
+
+
+def test_interpolation_error_is_second_order():
+    """Rate: halving the steps quarters the error of a curved motion."""
+    errors = []
+    for count in (41, 81, 161):
+        times = np.linspace(0, 1, count)
+        matrices = moving(times, np.random.default_rng(2))
+        counts = plain()(times, matrices)
+        exact = moving(counts.time - 1e-3, np.random.default_rng(2))
+        truth = exact[np.arange(len(counts)), counts.channel, counts.channel]
+        errors.append(np.abs(counts.capacitance - truth).max())
+    assert np.array(errors[:-1]) / errors[1:] == near(4.0, rel=0.15)
+
+
+def test_results_are_late():
+    """Invariant: nothing is reported before its conversion is finished, and nothing is lost."""
+    readout = plain()
+    matrix = random_maxwell(np.random.default_rng(3), 3)
+    total = 0
+    for step in range(1000):
+        now = 0.0007 * step
+        counts = readout.sample(now, matrix)
+        assert (counts.time <= now + 1e-9).all()
+        assert (counts.time > now - 0.0007 - 1e-9).all()
+        total += len(counts)
+    assert total == readout.schedule.samples_until(0.0007 * 999 - 1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_step_by_step_is_the_whole_recording(seed):
+    """Differential: random steps, tiny and long ones, against one call; to the last bit."""
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(10 ** rng.uniform(-5, -1, 300))
+    matrices = moving(times, rng)
+    whole = full(seed)(times, matrices)
+    readout = full(seed)
+    readout.reset(start=float(times[0]))
+    parts = join([readout.sample(t, c) for t, c in zip(times, matrices, strict=True)])
+    assert len(whole) > 300
+    assert same(whole, parts)
+
+
+@pytest.mark.parametrize("chip", CHIPS)
+def test_every_chip_step_by_step(chip):
+    """Differential and deterministic: presets too, and the seed decides everything."""
+    rng = np.random.default_rng(0)
+    times = np.arange(100) * 0.01
+    matrices = moving(times, rng)
+    readout = ReadOut.preset(
+        chip, NAMES, seed=5, expected=4e-12, mains=1e-15, temperature=[(0, 25), (1, 30)],
+        wiring=Wiring(crosstalk=0.02),
+    )  # fmt: skip
+    whole = readout(times, matrices)
+    assert same(readout(times, matrices), whole)
+    readout.reset(seed=6)
+    other = join([readout.sample(t, c) for t, c in zip(times, matrices, strict=True)])
+    assert not same(other, whole)
+    readout.reset(seed=5)
+    again = join([readout.sample(t, c) for t, c in zip(times, matrices, strict=True)])
+    assert same(again, whole)
+    assert len(whole) > 3
+
+
+def test_start_shifts_everything():
+    """Invariant: the same recording an hour later gives the same numbers an hour later."""
+    times = np.arange(50) * 0.01
+    matrices = moving(times, np.random.default_rng(1))
+    now, later = plain()(times, matrices), plain()(times + 3600.0, matrices)
+    assert later.time - 3600.0 == pytest.approx(now.time, abs=1e-9)
+    # Instants relative to the start are rounded differently, by 1e-13 s or so.
+    assert np.abs(later.capacitance - now.capacitance).max() < 1e-20
+
+
+def test_wiring():
+    """Analytic: crosstalk mixes channels at the same instant; parasitics add."""
+    wiring = Wiring([1e-13, 2e-13, 3e-13], cable=1e-11, shield_gain=0.98, crosstalk=0.1)
+    matrix = random_maxwell(np.random.default_rng(2), 3)
+    counts = plain(Schedule.simultaneous(3, 1e-3), wiring=wiring)([0.0, 0.01], [matrix, matrix])
+    c = np.diag(matrix)
+    expected = c + 0.1 * (c.sum() - c) + np.array([1, 2, 3]) * 1e-13 + 0.02 * 1e-11
+    assert counts.capacitance[:3] == near(expected, rel=1e-9)
+    moved = plain(Schedule.sequential(3, 1e-3), wiring=Wiring(crosstalk=[[0, 1, 0]] * 3))
+    ramp = np.array([matrix, 2 * matrix])
+    mixed = moved([0.0, 0.01], ramp)
+    at = (1 + (mixed.time - 0.5e-3) / 0.01)[:3]
+    assert mixed.capacitance[:3] == near(at * (c + np.array([c[1], c[1], c[1]])), rel=1e-6)
+
+
+@dataclass
+class Reading:
+    """As a simulator gives it."""
+
+    capacitance: np.ndarray
+    self_capacitance: np.ndarray
+    electrode_names: tuple[str, ...] = NAMES
+
+
+def test_readings_of_a_simulator():
+    """A reading's shields are driven along with a self channel, and grounded for a mutual one."""
+    matrix = random_maxwell(np.random.default_rng(3), 3)
+    coupling = np.array([-0.1, -0.2, -0.3]) * 1e-12
+    reading = Reading(matrix, np.diag(matrix) + coupling)
+    patterns = [Pattern("A", shield=1.0), Pattern("B", shield=0.0), Pattern("C", {"A": 1.0})]
+    readout = ReadOut(patterns, NAMES, Schedule.simultaneous(3, 1e-3), FINE)
+    expected = [matrix[0, 0] + coupling[0], matrix[1, 1], -matrix[2, 0]]
+    assert readout.channel_values(reading) == near(expected, rel=1e-12)
+    assert readout.channel_values(np.array(expected)).tolist() == expected
+    readout.sample(0.0, reading)
+    assert readout.sample(1.0, reading).capacitance[:3] == near(expected, rel=1e-8)
+    other = Reading(matrix, np.diag(matrix), ("A", "C", "B"))
+    with pytest.raises(ReadOutError, match="make it with the simulator's electrode_names"):
+        readout.sample(2.0, other)
+
+
+def test_counts_by_channel_and_in_rows():
+    times = np.arange(50) * 0.01
+    counts = plain()(times, moving(times, np.random.default_rng(1)))
+    assert counts.of("B").channel.tolist() == [1] * len(counts.of("B"))
+    stamps, rows = counts.table()
+    assert rows.shape == (len(counts) // 3, 3)
+    for k, name in enumerate(NAMES):
+        assert (rows[:, k] == counts.of(name).capacitance[: len(rows)]).all()
+        assert (stamps[:, k] == counts.of(name).time[: len(rows)]).all()
+    assert set(counts.latest()) == set(NAMES)
+    assert counts.latest()["C"] == counts.of("C").capacitance[-1]
+    with pytest.raises(ReadOutError, match="no channel 'D'"):
+        counts.of("D")
+    with pytest.raises(ReadOutError, match="not whole cycles"):
+        counts[counts.channel != 1].table()
+
+
+def test_misuse_is_refused():
+    readout = plain()
+    matrix = random_maxwell(np.random.default_rng(0), 3)
+    readout.sample(1.0, matrix)
+    with pytest.raises(ReadOutError, match=r"sample at 0.5 s, after one at 1 s; time must not go"):
+        readout.sample(0.5, matrix)
+    with pytest.raises(ReadOutError, match="sample at nan s; give a finite time"):
+        readout.sample(float("nan"), matrix)
+    with pytest.raises(ReadOutError, match=r"shape \(2, 2\)"):
+        readout.sample(2.0, np.eye(2))
+    with pytest.raises(ReadOutError, match="not finite"):
+        readout.sample(2.0, np.array([1e-12, np.nan, 1e-12]))
+    with pytest.raises(ReadOutError, match="2 times for 3"):
+        readout([0.0, 1.0], np.ones((3, 3)))
+    with pytest.raises(ReadOutError, match="times must be finite numbers that rise"):
+        readout([0.0, 0.0], np.ones((2, 3)))
+    with pytest.raises(ReadOutError, match="samples 4 channels and there are 3"):
+        plain(Schedule.sequential(4, 1e-3))
+    with pytest.raises(ReadOutError, match="seed is -1"):
+        plain(seed=-1)
+    with pytest.raises(ReadOutError, match="start is nan"):
+        readout.reset(start=float("nan"))
+    with pytest.raises(ReadOutError, match=r"shield_gain is 1\.5"):
+        plain(wiring=Wiring(shield_gain=1.5))
+    with pytest.raises(ReadOutError, match="trace is"):
+        plain(wiring=Wiring(trace=[1.0, 2.0]))
+    with pytest.raises(ReadOutError, match="crosstalk is"):
+        plain(wiring=Wiring(crosstalk=[1.0, 2.0]))

@@ -1,0 +1,81 @@
+"""Schedules: when each channel is sampled, against a list written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from relative import near
+
+from capsense.errors import ReadOutError
+from capsense.readout.schedule import Schedule
+
+
+def written_out(plan, cycles):
+    """Slow reference: (instant, channel) of every sample, one after another."""
+    out, now = [], 0.0
+    for cycle in range(cycles):
+        now = cycle * (len(plan.slots) * (plan.conversion + plan.gap) + plan.idle)
+        for slot in plan.slots:
+            now += plan.gap
+            out += [(now + plan.conversion / 2, c) for c in slot]
+            now += plan.conversion
+    return out
+
+
+PLANS = [
+    Schedule.sequential(5, 2e-3),
+    Schedule.sequential(6, 2.5e-3, inputs=4, gap=1e-4),
+    Schedule.sequential(3, 1e-3, period=0.016),
+    Schedule.simultaneous(4, 0.01),
+    Schedule.simultaneous(4, 0.01, period=0.03),
+    Schedule(((2, 0), (1,), (3, 4)), 1e-3, 2e-4, 3e-4),
+]
+
+
+@pytest.mark.parametrize("plan", PLANS)
+def test_instants_follow_the_slots(plan):
+    """Differential: instants and channels of many cycles."""
+    expected = written_out(plan, 50)
+    number = np.arange(len(expected))
+    assert plan.instant(number) == near([t for t, _ in expected], rel=1e-12)
+    assert (plan.order[number % plan.count] == [c for _, c in expected]).all()
+    assert plan.period == near(expected[plan.count][0] - expected[0][0], rel=1e-12)
+
+
+@pytest.mark.parametrize("plan", PLANS)
+def test_counting_up_to_a_time(plan):
+    """Differential: at random times, and at the instants themselves despite rounding."""
+    instants = plan.instant(np.arange(60 * plan.count))
+    rng = np.random.default_rng(0)
+    for time in rng.uniform(-plan.period, 50 * plan.period, 300):
+        assert plan.samples_until(time) == np.count_nonzero(instants <= time)
+    for time in instants[: 40 * plan.count]:
+        assert plan.samples_until(time) == np.count_nonzero(instants <= time + plan.slack)
+        shaken = (time + 1234.5) - 1234.5
+        assert plan.samples_until(shaken) == plan.samples_until(time)
+
+
+def test_inputs_of_several_chips_run_side_by_side():
+    assert Schedule.sequential(6, 1.0, inputs=4).slots == ((0, 4), (1, 5), (2,), (3,))
+    assert Schedule.sequential(2, 1.0, inputs=4).slots == ((0,), (1,))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Schedule(((0,),), 0.0), "conversion is 0.0 s"),
+        (lambda: Schedule(((0,),), float("nan")), "conversion is nan"),
+        (lambda: Schedule(((0,),), 1.0, -1.0), "gap is -1.0"),
+        (lambda: Schedule(((0,),), 1.0, 0.0, float("inf")), "idle is inf"),
+        (lambda: Schedule((), 1.0), "list each of 0, 1, 2"),
+        (lambda: Schedule(((0, 0),), 1.0), "list each of 0, 1, 2"),
+        (lambda: Schedule(((0, 2),), 1.0), "list each of 0, 1, 2"),
+        (lambda: Schedule.sequential(0, 1.0), "0 channels"),
+        (lambda: Schedule.sequential(3, 1.0, inputs=0), "0 inputs"),
+        (lambda: Schedule.sequential(3, 1.0, period=2.0), "too short for 3 conversions"),
+        (lambda: Schedule.simultaneous(3, 1.0, period=0.5), "too short for a conversion"),
+    ],
+)
+def test_bad_schedules_are_refused(make, words):
+    with pytest.raises(ReadOutError, match=words):
+        make()

@@ -1,0 +1,58 @@
+"""The examples with simulators, run for real; pages about simulators, their snippets run."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import capsense as cs
+
+ROOT = Path(__file__).parents[1]
+
+
+def example(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """An example as a module, with fewer readings."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    module = importlib.import_module(name)
+    monkeypatch.setattr(module, "RATE", 20.0)
+    return module
+
+
+@pytest.mark.parametrize("simulator", ["mujoco", "pybullet"])
+def test_forearm(
+    simulator: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Runs without a display, checks itself, writes a plot and an animation, prints a table."""
+    pytest.importorskip(simulator, reason=f"{simulator} is not installed")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    record = example(f"{simulator}_forearm", monkeypatch).main(tmp_path)
+    assert (tmp_path / "forearm.png").stat().st_size > 10_000
+    from PIL import Image
+
+    with Image.open(tmp_path / "forearm.gif") as animation:
+        assert getattr(animation, "n_frames", 1) > 20
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[2:8] == list(record.names)
+    assert len(lines) == 1 + -(-len(record.time) // 10)
+
+
+@pytest.mark.parametrize("page", ["mujoco", "pybullet", "humans"])
+def test_pages_run(page: str) -> None:
+    """The first snippet of a page runs as it stands and feels an arm."""
+    if page != "humans":
+        pytest.importorskip(page, reason=f"{page} is not installed")
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    codes = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    for code in codes:
+        compile(code, page, "exec")
+    scope: dict[str, Any] = {}
+    exec(codes[0], scope)
+    reading = scope["reading"]
+    assert isinstance(reading, cs.Reading)
+    assert np.diag(reading.delta).min() > 5e-15
