@@ -275,7 +275,7 @@ def test_an_interrupted_build_goes_on(
     field = load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path, progress=second)
     assert digest(field) == reference
     assert second.count(DENSE) == dense
-    parts = -(-int((field.lattice.owner == -1).sum()) // PART)
+    parts = -(-int(field.lattice.unknown.sum()) // PART)
     done = max(0, first.count(NODES) - (stage == NODES))
     assert second.count(NODES) == parts - done
     assert files(tmp_path) == [f"{KEY}.npz"]
@@ -389,7 +389,7 @@ def test_ctrl_c_ends_a_build_at_once_and_the_next_goes_on(tmp_path: Path, refere
     field = load_or_build(tiny_design(), SETTINGS, cache_dir=folder, progress=stages)
     assert digest(field) == reference
     assert stages.count(DENSE) == 0
-    assert stages.count(NODES) == -(-int((field.lattice.owner == -1).sum()) // PART) - kept
+    assert stages.count(NODES) == -(-int(field.lattice.unknown.sum()) // PART) - kept
     assert files(folder) == [f"{KEY}.npz"]
 
 

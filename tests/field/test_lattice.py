@@ -9,6 +9,7 @@ import pytest
 from field_cases import patches, rectangle
 
 from capsense.constants import EPS0
+from capsense.errors import FieldError
 from capsense.field.lattice import FREE, WALL, Lattice, LatticeSettings, build_lattice
 from capsense.field.planes import _pair_up, plan_axes, plan_storeys
 
@@ -121,3 +122,22 @@ def test_merged_lines_keep_to_their_bounds():
         for axis in range(2):
             for g, width in zip(plan.groups[axis], np.diff(plan.faces[axis]), strict=True):
                 assert len(g) == 1 or width <= limit * (1 + 1e-12)
+
+
+def test_values_on_another_grid(lattice):
+    """Analytic: a cubic in each coordinate comes through the splines unchanged, across storeys."""
+
+    def smooth(p: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis(p, -1, 0) * 10
+        return np.stack([1 + x - y * z + x**3, z**3 + y**2 - x * y], axis=-1)
+
+    grid = (np.linspace(-0.2, 0.2, 7), np.linspace(-0.25, 0.1, 5), np.linspace(0.0, 0.24, 9))
+    got = lattice.on_grid(smooth(lattice.points), grid)
+    wanted = smooth(np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1))
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-9)
+
+
+def test_a_grid_beyond_the_domain_is_refused(lattice):
+    grid = (np.linspace(-0.2, 0.3, 4), np.zeros(1), np.zeros(1))
+    with pytest.raises(FieldError, match="axis x"):
+        lattice.on_grid(lattice.points, grid)

@@ -49,7 +49,7 @@ def arrays(field: BackgroundField) -> dict[str, np.ndarray]:
     """All arrays of a field."""
     la = field.lattice
     out = {
-        **{f"{n}{k}": a for k, s in enumerate(la.storeys) for n, a in zip("xyz", s.axes)},
+        **{f"axis {k} {n}": a for k, s in enumerate(la.storeys) for n, a in enumerate(s.axes)},
         "weights": la.weights, "eps_r": la.eps_r, "owner": la.owner, "kink": la.kink,
         "half_weights": field.half_weights, "potentials": field.potentials,
         "capacitance": field.capacitance,

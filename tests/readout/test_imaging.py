@@ -16,7 +16,6 @@ from capsense.readout.imaging import (
     electrode_pairs,
     grounded_sensitivity,
     landweber,
-    resample,
     sensitivity,
     tikhonov,
     voxel_centres,
@@ -120,19 +119,6 @@ def test_grounded_matter(field):
     corners = potentials[2:4, 1:3, 4:6].reshape(8, 3)
     expected = [(corners[:, a] * corners[:, b]).mean() for a, b in PAIRS]
     assert j[:, 2, 1, 4] == near(expected, rel=1e-12)
-
-
-def test_resampling():
-    """Analytic: cubics are met exactly; the grid's own nodes too; nothing is extrapolated."""
-    points = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1) / 0.05
-    phi = (points[..., 0] ** 3 - points[..., 1] ** 2 * points[..., 2])[..., None] + [0.0, 1.0]
-    finer = tuple(np.linspace(a[0], a[-1], 9) for a in AXES)
-    at = np.stack(np.meshgrid(*finer, indexing="ij"), axis=-1) / 0.05
-    expected = (at[..., 0] ** 3 - at[..., 1] ** 2 * at[..., 2])[..., None] + [0.0, 1.0]
-    assert resample(phi, AXES, finer) == pytest.approx(expected, abs=1e-12)
-    assert resample(phi, AXES, AXES) == pytest.approx(phi, abs=1e-12)
-    with pytest.raises(ReadOutError, match=r"axis y runs from 0 to 1 m, beyond"):
-        resample(phi, AXES, (AXES[0], [0.0, 1.0], AXES[2]))
 
 
 def test_uniform_field_is_exact():

@@ -9,7 +9,6 @@ import capsense as cs
 from capsense.readout.imaging import (
     electrode_pairs,
     grounded_sensitivity,
-    resample,
     sensitivity,
     tikhonov,
     voxel_centres,
@@ -20,10 +19,10 @@ PAIRS = electrode_pairs(6, diagonal=True)
 
 @pytest.fixture(scope="module")
 def sensor(simulators):
-    """A simulator, its potentials at lattice nodes, and the lattice's axes."""
+    """A simulator, and its potentials on a grid."""
     sim = simulators("six_patch")
-    lattice = sim.background.lattice
-    return sim, sim.background.potentials[:, :6].reshape(*lattice.shape, 6), lattice.axes
+    field = sim.background
+    return sim, lambda grid: field.lattice.on_grid(field.potentials[:, :6], grid)
 
 
 def change(sim, body):
@@ -38,9 +37,9 @@ def test_weak_ball(sensor, place):
 
     Its field inside is 3/(ε + 2) of that outside. The simulator's own error is some per cent.
     """
-    sim, nodes, axes = sensor
+    sim, potentials = sensor
     grid = tuple(np.linspace(x - 0.025, x + 0.025, 27) for x in place)
-    j = sensitivity(resample(nodes, axes, grid), grid, PAIRS)
+    j = sensitivity(potentials(grid), grid, PAIRS)
     inside = np.linalg.norm(voxel_centres(grid) - place, axis=1) < 0.025
     expected = j[:, inside].sum(axis=1) * 3 * 0.05 / 3.05
     weak = cs.Body(cs.Sphere(0.025), cs.Pose(place), cs.Material("weak", 1.05))
@@ -51,14 +50,14 @@ def test_weak_ball(sensor, place):
 @pytest.mark.parametrize("grounding", ["grounded", "floating"])
 def test_images_show_where_something_is(sensor, place, grounding):
     """A ball's image is brightest above the place where it is, within one and a half voxels."""
-    sim, nodes, axes = sensor
+    sim, potentials = sensor
     grid = (
         np.linspace(-0.08, 0.08, 17),
         np.linspace(-0.07, 0.07, 15),
         np.linspace(0.005, 0.105, 11),
     )
     kind = grounded_sensitivity if grounding == "grounded" else sensitivity
-    j = kind(resample(nodes, axes, grid), grid, PAIRS)
+    j = kind(potentials(grid), grid, PAIRS)
     ball = cs.Body(cs.Sphere(0.015), cs.Pose(place), "steel", grounding)
     image = tikhonov(j, 1e-3) @ change(sim, ball)
     brightest = voxel_centres(grid)[np.argmax(image)]

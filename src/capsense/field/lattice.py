@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from capsense.constants import EPS0
 from capsense.design.model import Design
+from capsense.errors import FieldError
 from capsense.field.boundary import eps_at
 from capsense.field.held_nodes import FREE, WALL, Cuts, hold_nodes
 from capsense.field.planes import LatticeSettings, StoreyPlan, plan_storeys
@@ -133,6 +134,54 @@ class Lattice:
         out = self.owner == FREE
         out[self.joints.ceiling] = False
         return out
+
+    @property
+    def levels(self) -> Array:
+        """Heights of all planes of nodes [m], increasing."""
+        return np.concatenate([s.axes[2][self._own_planes(s)] for s in self.storeys])
+
+    def _own_planes(self, storey: Storey) -> slice:
+        return slice(
+            1 if storey.first else 0, None if storey.stop == self.n_nodes else storey.shape[2] - 1
+        )
+
+    def on_grid(self, values: Array, axes: tuple[Array, Array, Array]) -> Array:
+        """Carry values at the nodes to another rectilinear grid, by cubic splines.
+
+        Across planes where the values have kinks, those of electrodes and layers, they are rounded.
+
+        Args:
+            values: One or more values at each node, shape (n, m).
+            axes: Coordinates x, y, z of the grid's nodes [m], in the domain.
+
+        Returns:
+            Shape (len(x), len(y), len(z), m).
+
+        Raises:
+            FieldError: An axis leaves the domain.
+        """
+        from scipy.interpolate import make_interp_spline
+
+        wanted = [np.asarray(a, dtype=float) for a in axes]
+        for name, new, (low, high) in zip("xyz", wanted, self.bounds, strict=True):
+            if not (new.ndim == 1 and new.size and low <= new.min() and new.max() <= high):
+                raise FieldError(
+                    f"axis {name} of the grid is {new!r}; give coordinates from {low:g} to "
+                    f"{high:g} m"
+                )
+        planes = []
+        for s in self.storeys:
+            part = values[s.first : s.stop].reshape(*s.shape, -1)[:, :, self._own_planes(s)]
+            for axis in range(2):
+                part = make_interp_spline(s.axes[axis], part, k=3, axis=axis)(wanted[axis])
+            planes.append(part)
+        return make_interp_spline(self.levels, np.concatenate(planes, axis=2), axis=2)(wanted[2])
+
+    @property
+    def bounds(self) -> list[tuple[float, float]]:
+        """Lower and upper end of the domain along x, y and z [m]."""
+        x, y, _ = self.storeys[0].axes
+        return [(float(c[0]), float(c[-1])) for c in (x, y, self.levels)]
 
     def beyond(self, axis: Index | int, node: Index) -> Index:
         """Flat indices of the far ends of links, given by axis and lower node (not taken home)."""

@@ -19,9 +19,9 @@ from capsense.design.model import Design
 Array = NDArray[np.float64]
 Groups = list[list[int]]
 
-_LEAN = 2.5
+_LEAN = 2.0
 """Width of merged lines, at most, over the height of the joint: it may lean so far that the links
-beside it keep a fifth of their weight (see ``lattice._join_storeys``)."""
+beside it keep half of their weight (see ``lattice._join_storeys``)."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class LatticeSettings:
     """Edges closer to each other than this share one lattice plane."""
     storey: float = 0.022
     """Height of the first storey above the design's highest part; each one doubles it."""
-    thinning: float = 0.32
+    thinning: float = 0.35
     """In-plane spacing of a storey, at most, over its height above the design; 0: one storey."""
 
     def refined(self, factor: float) -> LatticeSettings:

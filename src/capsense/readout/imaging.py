@@ -90,41 +90,6 @@ def grounded_sensitivity(
     return np.array(out).reshape(len(pairs), -1)
 
 
-def resample(potentials: ArrayLike, axes: Axes, voxel_axes: Axes) -> Array:
-    """Potentials at the nodes of another rectilinear grid, by cubic interpolation.
-
-    Between the nodes of a solver's lattice, whose cells grow with the distance from the sensor,
-    this is several times closer than differences over its cells. Keep clear of the electrodes'
-    plane, where potentials have kinks.
-
-    Args:
-        potentials: Potentials at the given nodes, shape (nx, ny, nz, M).
-        axes: Their coordinates along x, y and z [m], rising, at least four each.
-        voxel_axes: Coordinates of the nodes wanted [m], rising.
-
-    Returns:
-        Shape (len(x), len(y), len(z), M) of ``voxel_axes``.
-
-    Raises:
-        ReadOutError: A node wanted lies outside of the given ones.
-    """
-    from scipy.interpolate import make_interp_spline
-
-    given = [np.asarray(a, dtype=float) for a in axes]
-    wanted = [np.asarray(a, dtype=float) for a in voxel_axes]
-    for name, old, new in zip("xyz", given, wanted, strict=True):
-        _axis(name, new)
-        if new[0] < old[0] or new[-1] > old[-1]:
-            raise ReadOutError(
-                f"axis {name} runs from {new[0]:g} to {new[-1]:g} m, beyond the potentials' "
-                f"{old[0]:g} to {old[-1]:g} m; make it smaller"
-            )
-    out = np.asarray(potentials, dtype=float)
-    for axis, (old, new) in enumerate(zip(given, wanted, strict=True)):
-        out = make_interp_spline(old, out, k=3, axis=axis)(new)
-    return out
-
-
 def voxel_centres(axes: Axes) -> Array:
     """Middles of the grid's cells [m], shape (voxels, 3), in the order of J's columns."""
     middle = [0.5 * (np.asarray(a)[1:] + np.asarray(a)[:-1]) for a in axes]
