@@ -42,6 +42,15 @@ def test_forearm(
     assert len(lines) == 1 + -(-len(record.time) // 10)
 
 
+def test_sleeve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm is felt through cotton that moves; the example checks itself and draws a plot."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    module = importlib.import_module("sleeve")
+    monkeypatch.setattr(module, "STEPS", 21)
+    module.main(tmp_path)
+    assert (tmp_path / "sleeve.png").stat().st_size > 10_000
+
+
 @pytest.mark.parametrize("page", ["mujoco", "pybullet", "humans"])
 def test_pages_run(page: str) -> None:
     """The first snippet of a page runs as it stands and feels an arm."""
