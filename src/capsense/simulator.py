@@ -17,6 +17,7 @@ from capsense.errors import SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.cache import default_settings, load_or_build
 from capsense.scene import Scene
+from capsense.scene.depth import DepthFrame
 
 Array = NDArray[np.float64]
 Method = Literal["perturbation", "masked"]
@@ -148,18 +149,23 @@ class Simulator:
         """Electrode names in matrix order."""
         return self.design.electrode_names
 
-    def step(self, scene: Scene) -> Reading:
-        """Return the reading of a scene, given in the sensor frame.
+    def step(self, scene: Scene | DepthFrame) -> Reading:
+        """Return the reading of a scene or of a depth camera's view, given in the sensor frame.
 
         The solution of the previous step is the starting point.
 
         Raises:
-            SceneError: ``scene`` is not a scene.
+            SceneError: ``scene`` is neither a scene nor a depth frame.
             SolveError: The solver did not reach its tolerance.
         """
-        if not isinstance(scene, Scene):
-            raise SceneError(f"step takes a Scene, not {type(scene).__name__}; write Scene([...])")
         start = time.perf_counter()
+        if isinstance(scene, DepthFrame):
+            scene = scene.scene()
+        if not isinstance(scene, Scene):
+            raise SceneError(
+                f"step takes a Scene or a DepthFrame, not {type(scene).__name__}; "
+                "write Scene([...])"
+            )
         change, iterations, error, goal = self._solver.solve(scene)
         if len(self._floating):
             change = self._without_floating(self.background.capacitance + change) - self._empty

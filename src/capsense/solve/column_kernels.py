@@ -13,13 +13,15 @@ from numba import njit
 
 from capsense.scene.approach_kernels import approach, slenderness
 from capsense.scene.kernels import body_line_interval, mesh_line_intervals
+from capsense.scene.layer_kernels import layer_line_intervals
 from capsense.scene.shape import ShapeKind
 
 _MESH = int(ShapeKind.MESH)
+_LAYERS = int(ShapeKind.LAYERS)
 MAX_STRETCHES = 64
 """Stretches of one line inside bodies, over all bodies."""
 MESH_STRETCHES = 4
-"""Stretches of one line inside one mesh body."""
+"""Stretches of one line inside one body given by a grid."""
 
 RAMP = 4.0
 """Steepness with which a body's share of a line's column turns into its weight.
@@ -47,7 +49,7 @@ BODY = np.dtype(
     ]
 )
 """A body of a scene as the scan sees it: shape and pose, the index of a conductor (−1: dielectric),
-and where a mesh's distances begin among those of all meshes."""
+and where the grid of a mesh or of layers begins among those of all."""
 
 
 @njit(cache=True)
@@ -61,18 +63,21 @@ def pierce(axis, op, oq, body, grids, out):
     else:
         ox, oy, dz = op, oq, 1.0
     r, c = body.rotation, body.position
-    if body.kind == _MESH:
+    if body.kind == _MESH or body.kind == _LAYERS:
         ax, ay, az = ox - c[0], oy - c[1], oz - c[2]
-        s = body.grid_shape
-        first = body.grid_first
+        lx = r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az
+        ly = r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az
+        lz = r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az
+        dx, dy, dz = r[axis, 0], r[axis, 1], r[axis, 2]
+        s, first = body.grid_shape, body.grid_first
+        if body.kind == _LAYERS:
+            return layer_line_intervals(
+                grids[first:], s, body.grid_origin, body.grid_inv, lx, ly, lz, dx, dy, dz, out
+            )
         values = grids[first : first + s[0] * s[1] * s[2]].reshape((s[0], s[1], s[2]))
         return mesh_line_intervals(
-            values, body.grid_origin, body.grid_inv,
-            r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az,
-            r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az,
-            r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az,
-            r[axis, 0], r[axis, 1], r[axis, 2], out,
-        )  # fmt: skip
+            values, body.grid_origin, body.grid_inv, lx, ly, lz, dx, dy, dz, out
+        )
     out[0, 0], out[0, 1] = body_line_interval(body.kind, body.params, r, c, ox, oy, oz, dx, dy, dz)
     return 1 if out[0, 1] > out[0, 0] else 0
 
@@ -152,7 +157,7 @@ def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, o
 @njit(cache=True)
 def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
     """Look for a body in a column whose line it misses: a place (sp, sq), and stretches there."""
-    if body.kind == _MESH:
+    if body.kind == _MESH or body.kind == _LAYERS:
         for trial in range(8):
             sp = pl if trial in (0, 4, 5) else (ph if trial in (1, 6, 7) else op)
             sq = ql if trial in (2, 4, 6) else (qh if trial in (3, 5, 7) else oq)

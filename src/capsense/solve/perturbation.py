@@ -14,7 +14,7 @@ from capsense.constants import EPS0
 from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
 from capsense.scene import Scene, TriMesh
-from capsense.scene.shape import ShapeKind
+from capsense.scene.layers import Layers
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
 from capsense.solve.column_kernels import BODY, MAX_STRETCHES
@@ -383,7 +383,7 @@ class _Mesh:
 
 
 def _pack_bodies(scene: Scene, conductors: _Conductors) -> tuple[NDArray[np.void], Array32]:
-    """Bodies as the scan takes them, and the distance grids of meshes, one after the other."""
+    """Bodies as the scan takes them, and the grids of meshes and layers, one after the other."""
     packed = scene.pack()
     bodies = np.zeros(len(packed), BODY)
     for name, values in (
@@ -394,12 +394,15 @@ def _pack_bodies(scene: Scene, conductors: _Conductors) -> tuple[NDArray[np.void
         bodies[name] = values
     parts: list[Array32] = []
     offset = 0
-    for i in np.flatnonzero(packed.kinds == ShapeKind.MESH):
-        shape = packed.shapes[i]
-        assert isinstance(shape, TriMesh)
-        grid = shape.grid
-        bodies["grid_shape"][i], bodies["grid_first"][i] = grid.values.shape, offset
-        bodies["grid_origin"][i], bodies["grid_inv"][i] = grid.origin, 1.0 / grid.cell
-        parts.append(grid.values.ravel())
+    for i, shape in enumerate(packed.shapes):
+        if not isinstance(shape, TriMesh | Layers):
+            continue
+        if isinstance(shape, TriMesh):
+            size, inverse = shape.grid.values.shape, 1.0 / shape.grid.cell
+        else:
+            size, inverse = tuple(shape.grid.shape.tolist()), shape.grid.inverse
+        bodies["grid_shape"][i], bodies["grid_first"][i] = size, offset
+        bodies["grid_origin"][i], bodies["grid_inv"][i] = shape.grid.origin, inverse
+        parts.append(shape.grid.values.ravel())
         offset += parts[-1].size
     return bodies, np.concatenate(parts) if parts else _NO_GRIDS

@@ -531,13 +531,13 @@ class _Column:
     def trials(self, packed: PackedScene, number: int) -> list[tuple[float, float]]:
         """Where to look for a body that the middle misses.
 
-        Where it comes closest to the column's line, drawn into the column. For a mesh, the middles
-        of the column's sides, then its corners.
+        Where it comes closest to the column's line, drawn into the column. For meshes and
+        layers, the middles of the column's sides, then its corners.
         """
         (u, v), (p, q) = self.middle, self.across
         (pl, ph), (ql, qh) = self.bounds[p], self.bounds[q]
         kind = packed.kinds[number]
-        if kind != ShapeKind.MESH:
+        if kind not in (ShapeKind.MESH, ShapeKind.LAYERS):
             x, y, z = self.at(u, v).tolist()
             near = approach(
                 kind, packed.params[number], packed.rotation[number], packed.position[number],
