@@ -46,9 +46,7 @@ def test_bar_rising_is_monotonic(rising):
     assert (np.diff(rising) < 0).all()
 
 
-@pytest.mark.parametrize(
-    ("gap", "start"), [(0.005, 0.0), (0.01, 0.0), (0.03, 0.0), (0.01, 0.055)]
-)
+@pytest.mark.parametrize(("gap", "start"), [(0.005, 0.0), (0.01, 0.0), (0.03, 0.0), (0.01, 0.055)])
 def test_bar_passing(simulators, gap, start):
     """Measured: no jump over 20 mm in x, over the middle and where the bar's edge passes E1."""
     sim = simulators("six_patch_bare")

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.cache import default_settings, load_or_build
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
+
+if TYPE_CHECKING:
+    from capsense.readout.counts import Counts
 
 Array = NDArray[np.float64]
 Method = Literal["perturbation", "masked"]
@@ -48,6 +51,8 @@ class Reading:
     stats: StepStats
     electrode_names: tuple[str, ...]
     _shield_coupling: Array = field(repr=False)
+    counts: Counts | None = None
+    """What the chip has reported since the reading before, where a read-out is configured."""
 
     @property
     def self_capacitance(self) -> Array:

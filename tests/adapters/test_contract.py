@@ -229,3 +229,25 @@ def test_an_open_mesh_is_refused_by_name(adapter: str, sensor_in: SensorIn) -> N
         sensor_in(things, cs.Pose(), **own_surface)
     (body,) = sensor_in(things, cs.Pose(), hull=["wedge"], **own_surface).scene()
     assert body.shape.volume == pytest.approx(WEDGE.volume, rel=1e-5)
+
+
+def test_a_reading_holds_the_counts_of_its_chip(sensor_in, adapter):
+    """Differential: the same conversions as of a read-out fed by hand; none without one."""
+    sensor = sensor_in([], cs.Pose())
+    assert sensor.read().counts is None
+    sensor.use_readout("fdc1004")
+    by_hand = cs.ReadOut.preset("fdc1004", sensor.electrode_names)
+    total = 0
+    for k in range(1, 6):
+        reading = sensor.read(time=0.01 * k)
+        expected = by_hand.sample(0.01 * k, reading)
+        np.testing.assert_array_equal(reading.counts.time, expected.time)
+        np.testing.assert_array_equal(reading.counts.code, expected.code)
+        total += len(expected.time)
+    assert total > 0
+    if adapter == "pybullet":
+        with pytest.raises(cs.SceneError, match=r"read\(time="):
+            sensor.read()
+    else:
+        sensor.reset()
+        sensor.read()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from capsense._validate import suggest
 from capsense.adapters.world import Frames, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
+from capsense.readout.read_out import ReadOut
 from capsense.scene import Pose, Scene
 from capsense.simulator import Reading, Simulator
 
@@ -28,15 +30,50 @@ class AttachedSensor(ABC):
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         """The sensor itself."""
+        self.readout: ReadOut | None = None
+        """The chip that turns capacitances into counts, if any."""
 
-    def read(self) -> Reading:
+    def read(self, time: float | None = None) -> Reading:
         """The reading of the simulator's present state.
 
+        With a :attr:`readout`, the reading holds the conversions that have finished since the last
+        call, with their time stamps, as ``reading.counts``.
+
+        Args:
+            time: Time of the state [s], for the read-out; by default the simulator's own, where it
+                tells it (MuJoCo does, PyBullet does not).
+
         Raises:
-            SceneError: The simulator has not been stepped yet, or has diverged.
+            SceneError: The simulator has not been stepped yet, or has diverged, or a read-out
+                needs a time.
             SolveError: The solver did not reach its tolerance.
+            ReadOutError: Time went back; call :meth:`reset` when the simulator is set back.
         """
-        return self.simulator.step(self.scene())
+        if self.readout is None:
+            return self.simulator.step(self.scene())
+        now = self._time() if time is None else float(time)
+        reading = self.simulator.step(self.scene())
+        return replace(reading, counts=self.readout.sample(now, reading))
+
+    def use_readout(self, readout: ReadOut | str | None) -> None:
+        """Read through a chip from now on.
+
+        Args:
+            readout: A read-out, the name of a chip with its usual settings, or None.
+
+        Raises:
+            ReadOutError: There is no such chip.
+        """
+        if isinstance(readout, str):
+            readout = ReadOut.preset(readout, self.electrode_names)
+        self.readout = readout
+
+    def _time(self) -> float:
+        """The simulator's time [s]."""
+        raise SceneError(
+            "this simulator does not tell its time, which the read-out needs; "
+            "write read(time=…), in seconds"
+        )
 
     @abstractmethod
     def scene(self) -> Scene:
@@ -66,8 +103,10 @@ class AttachedSensor(ABC):
         return self.simulator.electrode_names
 
     def reset(self) -> None:
-        """Forget the previous step, as after the simulator was set back."""
+        """Forget the previous step, as after the simulator was set back; restart the read-out."""
         self.simulator.reset()
+        if self.readout is not None:
+            self.readout.reset()
 
 
 class GeometrySensor(AttachedSensor):

@@ -16,6 +16,7 @@ from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, World
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
+from capsense.readout.read_out import ReadOut
 from capsense.scene import Material
 from capsense.scene.body import Grounding, checked_grounding
 from capsense.simulator import Simulator
@@ -47,6 +48,7 @@ def attach(
     groups: Collection[int] | None = None,
     camera: str | None = None,
     back: str | float = "fill",
+    readout: ReadOut | str | None = None,
 ) -> MujocoSensor | MujocoDepthSensor:
     """Attach a sensor to a site of a model; call ``read()`` after every ``mj_step``.
 
@@ -89,6 +91,8 @@ def attach(
         camera: Name of the camera; by default that of the site. Depth only.
         back: Where what the camera sees ends: ``"fill"``, at the end of the domain, or after an
             assumed thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
+        readout: A chip, or its name, whose counts readings are to hold; see
+            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -96,6 +100,7 @@ def attach(
             supported, the camera is not orthographic or nothing reads it, the data belong to
             another model, or an option belongs to the other kind of world.
         DesignError: The design is wrong.
+        ReadOutError: There is no such chip.
     """
     _require()
     _check_pair(model, data)
@@ -107,16 +112,20 @@ def attach(
     number = find_site(model, site)
     if world == "depth":
         eye = find_camera(model, site if camera is None else camera)
-        return MujocoDepthSensor(
+        sensor: MujocoSensor | MujocoDepthSensor = MujocoDepthSensor(
             model, data, number, eye, make_simulator(design), default_material,
             checked_grounding(default_grounding), back,
         )  # fmt: skip
+        sensor.use_readout(readout)
+        return sensor
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
     )
-    return MujocoSensor(
+    sensor = MujocoSensor(
         model, data, number, make_simulator(design), rules, exclude_own=exclude_own, groups=groups
     )
+    sensor.use_readout(readout)
+    return sensor
 
 
 class MujocoSensor(GeometrySensor):
@@ -144,6 +153,9 @@ class MujocoSensor(GeometrySensor):
         self._own = self._body if exclude_own and self._body else None
         self._turn = np.empty(4)
         super().__init__(simulator)
+
+    def _time(self) -> float:
+        return float(self.data.time)
 
     def _world(self) -> World:
         reader = ModelReader(self.model, self._rules)

@@ -78,6 +78,9 @@ class MujocoDepthSensor(AttachedSensor):
             grounding=self._grounding, back=self._back,
         )  # fmt: skip
 
+    def _time(self) -> float:
+        return float(self.data.time)
+
     def scene(self) -> Scene:
         return self.frame().scene()
 

@@ -22,6 +22,7 @@ from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
+from capsense.readout.read_out import ReadOut
 from capsense.scene import Material, Pose
 from capsense.scene.body import Grounding
 from capsense.simulator import Simulator
@@ -54,6 +55,7 @@ def attach(
     size: float | None = None,
     resolution: int = 64,
     back: str | float = "fill",
+    readout: ReadOut | str | None = None,
 ) -> PybulletSensor | PybulletDepthSensor:
     """Attach a sensor to a link; call ``read()`` after every ``stepSimulation``.
 
@@ -95,12 +97,15 @@ def attach(
         resolution: Pixels along each side of the image.
         back: Where what is drawn ends: ``"fill"``, at the end of the domain, or after an assumed
             thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
+        readout: A chip, or its name, whose counts readings are to hold; see
+            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
         SceneError: There is no such client, body or link, a pattern fits nothing, a shape is
             not supported, or an option is out of range or belongs to the other kind of world.
         DesignError: The design is wrong.
+        ReadOutError: There is no such chip.
     """
     _require()
     if shapes not in ("collision", "visual"):
@@ -119,14 +124,18 @@ def attach(
     simulator = make_simulator(design)
     if world == "depth":
         size, resolution = check_image(size, resolution, max(simulator.design.domain.size[:2]))
-        return PybulletDepthSensor(
+        sensor: PybulletSensor | PybulletDepthSensor = PybulletDepthSensor(
             number, body, index, pose_in_link, simulator, rules,
             exclude_own=exclude_own, size=size, resolution=resolution, back=back,
         )  # fmt: skip
-    return PybulletSensor(
+        sensor.use_readout(readout)
+        return sensor
+    sensor = PybulletSensor(
         number, body, index, pose_in_link, simulator, rules,
         shapes=shapes, exclude_own=exclude_own, sheet_thickness=sheet_thickness,
     )  # fmt: skip
+    sensor.use_readout(readout)
+    return sensor
 
 
 class PybulletSensor(GeometrySensor):

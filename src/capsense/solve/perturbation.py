@@ -291,7 +291,7 @@ class _Conductors:
                 ties.append(known[body.grounding] if isinstance(body.grounding, str)
                             else float(body.grounding))  # fmt: skip
             else:
-                self.eps_r[i] = body.material.eps_r
+                self.eps_r[i] = body.material.at(frequency).eps_r
         self._ties = np.array(ties)
         self.parent = np.arange(max(1, len(ties)))
 

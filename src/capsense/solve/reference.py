@@ -389,7 +389,7 @@ class _Problem:
         for s in on:
             part = min(s.end, b) - max(s.start, a)
             if part > 0.0 and s.body not in self.same:
-                total += part * (empty / self.scene[s.body].material.eps_r - 1.0)
+                total += part * (empty / self.scene[s.body].material.at(self.frequency).eps_r - 1.0)
         return total / (link.ends - link.starts)
 
     def _end_value(self, link: _Link, side: int) -> Array:

@@ -77,7 +77,7 @@ class MaskedScenes:
                 eps[i] = GROUNDED if body.grounding == "grounded" else self.FLOATING_EPS_R
                 inside[within] = i
             else:
-                eps[i] = body.material.eps_r
+                eps[i] = body.material.at(self._frequency).eps_r
                 taken = inside >= 0
                 conductor = np.array([b.material.is_conductor(self._frequency) for b in scene])
                 inside[within & ~(taken & conductor[inside])] = i
