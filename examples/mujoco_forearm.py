@@ -6,7 +6,7 @@ and an animation go to the folder (``out`` by default).
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import mujoco
@@ -130,4 +130,6 @@ def _text(values: object) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "out"))
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", nargs="?", default="out", type=Path, help="of the pictures")
+    main(parser.parse_args().folder)

@@ -7,7 +7,7 @@ the folder (``out`` by default).
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -130,4 +130,6 @@ def draw(curves: dict[str, np.ndarray], folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "out"))
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", nargs="?", default="out", type=Path, help="of the pictures")
+    main(parser.parse_args().folder)
