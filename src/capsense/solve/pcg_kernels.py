@@ -290,7 +290,7 @@ def solve(
             if decrement <= 0.0:
                 left[k] = 0.0
             else:
-                ratio = decrement / previous[k] if previous[k] < np.inf else 0.5
+                ratio = decrement / previous[k] if 0.0 < previous[k] < np.inf else 0.5
                 ratio = min(max(ratio, 0.1), 0.9)
                 left[k] = decrement * ratio / (1.0 - ratio)
             previous[k] = decrement
