@@ -101,33 +101,31 @@ def _thick(f: Array, b: Array, count: Ints, k: int, j: int, i: int) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _spread(margin: Array, state: NDArray[np.int8], j: int, i: int, dj: int, di: int,
-            distance: float, step: float, far: float) -> None:  # fmt: skip
+            distance: float) -> None:  # fmt: skip
     """Lower the margins of like pixels from (j, i) on in one direction to their distances."""
     rows, columns = state.shape
     kind = state[j, i]
-    while 0 <= j < rows and 0 <= i < columns and state[j, i] == kind and distance < far:
+    while 0 <= j < rows and 0 <= i < columns and state[j, i] == kind and distance < FAR:
         margin[j, i] = min(margin[j, i], distance)
-        distance += step
+        distance += 1.0
         j += dj
         i += di
 
 
 @njit(cache=True, error_model="numpy")
-def _margins(f: Array, b: Array, count: Ints, k: int, j0: int, i0: int, dx: float, dy: float,
-             cut_x: Array32, cut_y: Array32, state: NDArray[np.int8],
-             margin: Array) -> None:  # fmt: skip
+def _margins(f: Array, b: Array, count: Ints, k: int, j0: int, i0: int, cut_x: Array32,
+             cut_y: Array32, state: NDArray[np.int8], margin: Array) -> None:  # fmt: skip
     """Distance to the silhouette along rows or columns, whichever is shorter.
 
     Args:
         state: 1 where hit, else 0, on the cropped grid, shape (rows, columns).
-        margin: Receives the distances [m], no sign, at most ``FAR`` pixels, same shape.
+        margin: Receives the distances in pixels, no sign, at most ``FAR``, same shape.
     """
     ny, nx = count.shape
     rows, columns = state.shape
-    far = FAR * max(dx, dy)
-    margin[:] = far
+    margin[:] = FAR
     for way in range(2):
-        dj, di, step = (0, 1, dx) if way == 0 else (1, 0, dy)
+        dj, di = (0, 1) if way == 0 else (1, 0)
         cuts = cut_x if way == 0 else cut_y
         for row in range(rows - dj):
             for column in range(columns - di):
@@ -144,16 +142,20 @@ def _margins(f: Array, b: Array, count: Ints, k: int, j0: int, i0: int, dx: floa
                     known = 1.0 - cuts[j, i, 0] if measured else -1.0
                     s = 1.0 - _edge(known, p < 0 or q < 0, _thick(f, b, count, k, j, i),
                                     _thick(f, b, count, k, j + dj, i + di))  # fmt: skip
-                _spread(margin, state, row, column, -dj, -di, s * step, step, far)
-                _spread(margin, state, row + dj, column + di, dj, di, (1.0 - s) * step, step, far)
+                _spread(margin, state, row, column, -dj, -di, s)
+                _spread(margin, state, row + dj, column + di, dj, di, 1.0 - s)
+
+
+@njit(cache=True, error_model="numpy")
+def _smooth(jump: float, limit: float) -> float:
+    """How much of a surface's slope and curvature to believe: all up to half a step, then less."""
+    return min(1.0, max(0.0, 2.0 - 2.0 * abs(jump) / limit))
 
 
 @njit(cache=True, error_model="numpy")
 def _beyond(a: float, b: float, known: bool, limit: float) -> float:
-    """Value one pixel beyond ``a``, straight on from ``b`` if that is known and close by."""
-    if known and abs(a - b) <= limit:
-        return a + (a - b)
-    return a
+    """Value one pixel beyond ``a``, straight on from ``b`` if that is known and no step away."""
+    return a + (a - b) * _smooth(a - b, limit) if known else a
 
 
 @njit(cache=True, error_model="numpy")
@@ -163,7 +165,7 @@ def _ghosts(field: Array32, state: NDArray[np.int8], limit: float) -> None:
     Args:
         field: Front, back and margin, shape (rows, columns, 3).
         state: 1 where hit; becomes 2 where carried on to, shape (rows, columns).
-        limit: Jump above which a slope is not carried on [m].
+        limit: Jump that is a step [m].
     """
     rows, columns = state.shape
     for way in range(2):
@@ -220,13 +222,46 @@ def _blocks(field: Array32, state: NDArray[np.int8], out: Array32) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def build_values(f: Array, b: Array, count: Ints, found: Ints, dx: float, dy: float,
-                 limit: float, cut_x: Array32, cut_y: Array32) -> Array32:  # fmt: skip
+def _second(a: float, middle: float, b: float, limit: float) -> float:
+    """Second difference of a surface, zero at a step."""
+    a -= middle
+    b -= middle
+    return (a + b) * _smooth(max(abs(a), abs(b)), limit)
+
+
+@njit(cache=True, error_model="numpy")
+def _surface(a: Array, state: NDArray[np.int8], j0: int, i0: int, limit: float, part: int,
+             field: Array32) -> None:  # fmt: skip
+    """Copy a front (part 0) or back (part 1), bent as its curvature asks for.
+
+    Straight lines between the pixels of a curved surface are too large, on average, by a twelfth
+    of its second differences along rows and columns; so much is taken off.
+    """
+    rows, columns = state.shape
+    for row in range(1, rows - 1):
+        j = row + j0 - 1
+        middle = a[j]
+        above, below = a[max(j - 1, 0)], a[min(j + 1, a.shape[0] - 1)]
+        for column in range(1, columns - 1):
+            if state[row, column] == 0:
+                continue
+            i = column + i0 - 1
+            value, bend = middle[i], 0.0
+            if state[row, column - 1] == 1 and state[row, column + 1] == 1:
+                bend += _second(middle[i - 1], value, middle[i + 1], limit)
+            if state[row - 1, column] == 1 and state[row + 1, column] == 1:
+                bend += _second(above[i], value, below[i], limit)
+            field[row, column, part] = value - bend / 12.0
+
+
+@njit(cache=True, error_model="numpy")
+def build_values(f: Array, b: Array, count: Ints, found: Ints, dy: float, limit: float,
+                 cut_x: Array32, cut_y: Array32) -> Array32:  # fmt: skip
     """Values of a :class:`~capsense.scene.layers.LayerGrid`, cropped to what is hit and one more.
 
     Args:
         f, b, count, found: As :func:`sort_slots` leaves them.
-        dx, dy: Size of a pixel [m].
+        dy: Height of a pixel [m].
         limit: Jump from pixel to pixel above which a surface is a step [m].
         cut_x: First and last place where outlines cross the links of every row, shape
             (rows, columns + 1, 2), out of [0, 1] where none does; link i leads to pixel i. Shape
@@ -249,15 +284,15 @@ def build_values(f: Array, b: Array, count: Ints, found: Ints, dx: float, dy: fl
     for k in range(slots):
         state[:] = 0
         state[1:-1, 1:-1] = count[j0 : found[2] + 1, i0 : found[4] + 1] > k
-        _margins(f, b, count, k, j0, i0, dx, dy, cut_x, cut_y, state, margin)
+        _margins(f, b, count, k, j0, i0, cut_x, cut_y, state, margin)
         base = start + 3 * k * rows * columns
         field = values[base : base + 3 * rows * columns].reshape((rows, columns, 3))
+        _surface(f[k], state, j0, i0, limit, 0, field)
+        _surface(b[k], state, j0, i0, limit, 1, field)
         left, right, low, high = columns, -1, rows, -1
         for row in range(rows):
             for column in range(columns):
                 if state[row, column] == 1:
-                    field[row, column, 0] = f[k, row + j0 - 1, column + i0 - 1]
-                    field[row, column, 1] = b[k, row + j0 - 1, column + i0 - 1]
                     field[row, column, 2] = margin[row, column]
                     left, right = min(left, column), max(right, column)
                     low, high = min(low, row), max(high, row)

@@ -1,7 +1,7 @@
 """Compiled line intersections of layered depth images, called from the solver's kernels.
 
 A slot of a layered image holds three numbers at every pixel centre: front and back [m] along z, and
-the margin [m], which is the distance to the silhouette, positive on pixels that are hit. The solid
+the margin, which is the distance to the silhouette in pixels, positive where hit. The solid
 is where the margin is not negative and z lies between front and back. Numbers are interpolated
 linearly from pixel to pixel; where front or back jumps by more than the limit, the ramp between the
 two pixels narrows around their middle, so that a step stays a step, and does so continuously. The
@@ -256,9 +256,12 @@ def _cross_slot(
     j0, j1 = values[table + 2], values[table + 3]
     t0, last = _clip(px, ux, i0, i1, -math.inf, math.inf)
     t0, last = _clip(py, uy, j0, j1, t0, last)
-    t0, last = _clip(oz, dz, values[table + 4], values[table + 5], t0, last)
-    if not t0 < last:
+    a, b = _clip(oz, dz, values[table + 4], values[table + 5], t0, last)
+    if not a < b:
         return n
+    # where the depths in question begin and end, out to the grid lines around
+    t0 = max(t0, -_ahead(px, -ux, -a, 1.0)[1], -_ahead(py, -uy, -a, 1.0)[1])
+    last = min(last, _ahead(px, ux, b, 1.0)[1], _ahead(py, uy, b, 1.0)[1])
     grid_u, next_u, step_u = _ahead(px, ux, t0, float(BLOCK))
     grid_v, next_v, step_v = _ahead(py, uy, t0, float(BLOCK))
     per_row = (nx + BLOCK - 2) // BLOCK
@@ -357,11 +360,11 @@ def layer_level(
     out_u, out_v = max(-u, u - (nx - 1.0), 0.0), max(-v, v - (ny - 1.0), 0.0)
     beside = math.hypot(out_u / inv_x, out_v / inv_y)
     u, v = min(max(u, 0.0), nx - 1.0), min(max(v, 0.0), ny - 1.0)
-    best = math.inf
+    best, pixel = math.inf, 1.0 / max(inv_x, inv_y)
     for k in range(shape[0]):
         base = HEADER + TABLE * shape[0] + 3 * k * ny * nx
         f, b, m = _at(values, base, nx, u, v, limit)
-        best = min(best, max(f - z, z - b, -m) + beside)
+        best = min(best, max(f - z, z - b, -m * pixel) + beside)
     return best
 
 

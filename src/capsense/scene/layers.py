@@ -31,8 +31,9 @@ class LayerGrid:
 
     values: Array32
     """Flat: a header (reciprocal of the pixel's height [1/m], step limit [m]), six numbers for each
-    slot (first and last column and row, nearest front, farthest back [m]), then front, back and
-    margin [m] of every pixel, shape (slots, rows, columns, 3), and bounds of blocks of pixels."""
+    slot (first and last column and row, nearest front, farthest back [m]), then front and back
+    [m] and margin [pixels] of every pixel, shape (slots, rows, columns, 3), then bounds of blocks
+    of pixels."""
     shape: Ints
     """Slots, rows and columns, shape (3,)."""
     origin: Array
@@ -125,7 +126,7 @@ class Layers(Shape):
         if slots == 0:
             raise SceneError("Layers: no pixel holds an interval; front must be less than back")
         limit = STEP_SLOPE * max(dx, dy)
-        values = build_values(low, high, count, found, dx, dy, limit, rows, columns)
+        values = build_values(low, high, count, found, dy, limit, rows, columns)
         origin = np.array([(i0 - 0.5) * dx - 0.5 * size[0], (j0 - 0.5) * dy - 0.5 * size[1], 0.0])
         shape = np.array([slots, j1 - j0 + 3, i1 - i0 + 3])
         fields = self.__dict__
@@ -134,7 +135,7 @@ class Layers(Shape):
 
     @property
     def fields(self) -> Array32:
-        """Front, back and margin [m] at the pixels of the grid, shape (slots, rows, columns, 3)."""
+        """Front and back [m] and margin [pixels] on the grid, shape (slots, rows, columns, 3)."""
         slots, rows, columns = self.grid.shape.tolist()
         start, size = 2 + 6 * slots, 3 * slots * rows * columns
         return self.grid.values[start : start + size].reshape(slots, rows, columns, 3)
