@@ -11,7 +11,7 @@ import argparse
 from importlib import import_module
 from typing import Protocol, cast
 
-COMMANDS = ("capsense.cli.run", "capsense.cli.design", "capsense.cli.readout")
+COMMANDS = ("capsense.cli.run", "capsense.cli.design", "capsense.cli.readout", "capsense.cli.bench")
 """Modules of the subcommands, in the order of ``--help``."""
 
 
