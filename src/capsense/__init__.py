@@ -30,9 +30,14 @@ if TYPE_CHECKING:
     from capsense.readout.read_out import ReadOut
     from capsense.scenario import Scenario, load_scenario
     from capsense.scene.body import Body
+    from capsense.scene.camera import OrthographicCamera
+    from capsense.scene.deformable import DeformableSurface
+    from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
+    from capsense.scene.layers import Layers
     from capsense.scene.materials import MATERIALS, Material
     from capsense.scene.mesh_shape import TriMesh
     from capsense.scene.pose import Pose
+    from capsense.scene.raster import rasterise
     from capsense.scene.scene import Scene
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
     from capsense.simulator import Reading, Simulator
@@ -47,13 +52,17 @@ __all__ = [
     "Capsule",
     "Counts",
     "Cylinder",
+    "DeformableSurface",
+    "DepthFrame",
     "Design",
     "DesignError",
     "Ellipsoid",
     "FieldError",
+    "Layers",
     "Material",
     "MeshError",
     "MissingDependencyError",
+    "OrthographicCamera",
     "Pose",
     "ReadOut",
     "ReadOutError",
@@ -68,12 +77,15 @@ __all__ = [
     "TriMesh",
     "__version__",
     "available_designs",
+    "decode_permittivity",
+    "encode_permittivity",
     "humans",
     "load_design",
     "load_readout",
     "load_scenario",
     "mujoco",
     "pybullet",
+    "rasterise",
 ]
 
 _HOMES = {
@@ -95,9 +107,14 @@ _HOMES = {
     "capsense.readout.read_out": ("ReadOut",),
     "capsense.scenario": ("Scenario", "load_scenario"),
     "capsense.scene.body": ("Body",),
+    "capsense.scene.camera": ("OrthographicCamera",),
+    "capsense.scene.deformable": ("DeformableSurface",),
+    "capsense.scene.depth": ("DepthFrame", "decode_permittivity", "encode_permittivity"),
+    "capsense.scene.layers": ("Layers",),
     "capsense.scene.materials": ("MATERIALS", "Material"),
     "capsense.scene.mesh_shape": ("TriMesh",),
     "capsense.scene.pose": ("Pose",),
+    "capsense.scene.raster": ("rasterise",),
     "capsense.scene.scene": ("Scene",),
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Reading", "Simulator"),

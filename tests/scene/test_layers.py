@@ -10,7 +10,8 @@ from capsense.errors import SceneError
 from capsense.scene import Box, Capsule, Layers, Pose, Scene, ShapeKind, Sphere
 from capsense.scene.body import Body
 from capsense.scene.layer_build import build_values, sort_slots
-from capsense.scene.layer_kernels import add_stretch, layer_inside
+from capsense.scene.layer_kernels import layer_inside
+from capsense.scene.layer_parts import add_stretch
 from capsense.scene.layer_reference import ReferenceLayers, unite
 
 SOLIDS = {

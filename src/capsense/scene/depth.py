@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,7 +134,7 @@ class DepthFrame:
         shape = d.shape
         if d.ndim == 2:
             d = d[None]
-        known: Array | list[Material] = np.empty(MAX_GROUPS)
+        known = np.empty(MAX_GROUPS)
         one = _one_material(eps_r)
         e = np.full((1, 1, 1), np.inf) if one else _checked_eps(eps_r, shape)
         if conducting is not None:
@@ -207,7 +208,7 @@ class DepthFrame:
 
 def _checked_depth(depth: ArrayLike) -> Array:
     try:
-        d = np.ascontiguousarray(depth, dtype=float)
+        d = np.array(depth, dtype=float, order="C")
     except (TypeError, ValueError):
         raise SceneError("DepthFrame: depth is not made of numbers; give metres") from None
     if d.ndim not in (2, 3) or not d.size:
@@ -225,7 +226,7 @@ def _one_material(eps_r: object) -> Material | None:
     return material(eps_r) if isinstance(eps_r, str) else None
 
 
-def _checked_eps(eps_r: object, shape: tuple[int, ...]) -> Array:
+def _checked_eps(eps_r: Any, shape: tuple[int, ...]) -> Array:
     """Permittivities, shape (layers, rows, columns), every axis of full length or of one."""
     e = np.asarray(eps_r)
     if e.dtype == np.uint8:
@@ -249,7 +250,7 @@ def _checked_eps(eps_r: object, shape: tuple[int, ...]) -> Array:
 
 def _backs(back: Back, depth: Array) -> Array:
     """Depths at which bodies end [m], of the shape of ``depth``."""
-    if isinstance(back, list | tuple) and all(np.ndim(b) == 0 for b in back):  # type: ignore[arg-type]
+    if isinstance(back, list | tuple) and all(np.ndim(b) == 0 for b in back):
         if len(back) != len(depth):
             raise SceneError(
                 f"DepthFrame: back lists {len(back)} backs, but there are {len(depth)} layers"
@@ -268,7 +269,7 @@ def _backs(back: Back, depth: Array) -> Array:
             raise SceneError(f"DepthFrame: back is {float(b)!r} m; give a thickness above zero")
         return depth + b
     if b.shape == depth.shape or (len(depth) == 1 and b.shape == depth.shape[1:]):
-        return np.ascontiguousarray(b).reshape(depth.shape)
+        return np.array(b, order="C").reshape(depth.shape)
     raise SceneError(f"DepthFrame: back has shape {b.shape}, but depth has {depth.shape}")
 
 

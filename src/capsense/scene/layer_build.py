@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from capsense.scene.layer_kernels import BLOCK, HEADER, TABLE
+from capsense.scene.layers import BLOCK, HEADER, TABLE
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -20,6 +20,8 @@ Ints = NDArray[np.int64]
 
 FAR = 2.0
 """Margins are not followed farther than this, in pixels."""
+_ROUNDING = 1e-4
+"""Added to how far a silhouette reaches, in pixels, for the rounding of single precision."""
 LEAST = 1e-3
 """A silhouette keeps this far from pixel centres, in parts of a link."""
 
@@ -255,6 +257,24 @@ def _surface(a: Array, state: NDArray[np.int8], j0: int, i0: int, limit: float, 
 
 
 @njit(cache=True, error_model="numpy")
+def _reach(field: Array32, out: Array32) -> None:
+    """How far the silhouette reaches: least and largest column, least and largest row."""
+    rows, columns = field.shape[0], field.shape[1]
+    out[0], out[1], out[2], out[3] = columns, -1.0, rows, -1.0
+    for way in range(2):
+        dj, di = (0, 1) if way == 0 else (1, 0)
+        for j in range(rows - dj):
+            for i in range(columns - di):
+                a, b = field[j, i, 2], field[j + dj, i + di, 2]
+                if (a > 0.0) != (b > 0.0):
+                    place = (i if way == 0 else j) + a / (a - b)
+                    if a > 0.0:
+                        out[2 * way + 1] = max(out[2 * way + 1], place + _ROUNDING)
+                    else:
+                        out[2 * way] = min(out[2 * way], place - _ROUNDING)
+
+
+@njit(cache=True, error_model="numpy")
 def build_values(f: Array, b: Array, count: Ints, found: Ints, dy: float, limit: float,
                  cut_x: Array32, cut_y: Array32) -> Array32:  # fmt: skip
     """Values of a :class:`~capsense.scene.layers.LayerGrid`, cropped to what is hit and one more.
@@ -305,5 +325,6 @@ def build_values(f: Array, b: Array, count: Ints, found: Ints, dy: float, limit:
         table = HEADER + TABLE * k
         values[table], values[table + 1] = left - 1, right + 1
         values[table + 2], values[table + 3] = low - 1, high + 1
+        _reach(field, values[table + 6 : table + 10])
         values[table + 4], values[table + 5] = bounds[0::4].min(), bounds[3::4].max()
     return values

@@ -21,6 +21,14 @@ Ints = NDArray[np.int64]
 
 STEP_SLOPE = 3.0
 """Slope of a surface, depth over width, from which a jump between two pixels narrows to a step."""
+HEADER = 2
+"""Numbers in front of a grid's table: reciprocal of a pixel's height [1/m], limit of a step [m]."""
+TABLE = 10
+"""Numbers a slot: first and last column, first and last row, nearest front, farthest back [m],
+and how far its silhouette reaches, in pixels: least and largest column, least and largest row."""
+BLOCK = 4
+"""Pixels along the side of a block; it shares its outer ones with its neighbours. Of each block
+are kept the nearest front, the farthest front, the nearest back and the farthest back [m]."""
 _NO_OUTLINES: Array32 = np.empty((0, 0, 2), np.float32)
 _MAX_PIXELS = 4_000_000
 
@@ -30,10 +38,8 @@ class LayerGrid:
     """A layered depth image as the compiled kernels read it, in the body's frame."""
 
     values: Array32
-    """Flat: a header (reciprocal of the pixel's height [1/m], step limit [m]), six numbers for each
-    slot (first and last column and row, nearest front, farthest back [m]), then front and back
-    [m] and margin [pixels] of every pixel, shape (slots, rows, columns, 3), then bounds of blocks
-    of pixels."""
+    """Flat: ``HEADER`` numbers, ``TABLE`` numbers for each slot, front and back [m] and margin
+    [pixels] of every pixel, shape (slots, rows, columns, 3), and bounds of blocks of pixels."""
     shape: Ints
     """Slots, rows and columns, shape (3,)."""
     origin: Array
@@ -137,7 +143,7 @@ class Layers(Shape):
     def fields(self) -> Array32:
         """Front and back [m] and margin [pixels] on the grid, shape (slots, rows, columns, 3)."""
         slots, rows, columns = self.grid.shape.tolist()
-        start, size = 2 + 6 * slots, 3 * slots * rows * columns
+        start, size = HEADER + TABLE * slots, 3 * slots * rows * columns
         return self.grid.values[start : start + size].reshape(slots, rows, columns, 3)
 
     @property
@@ -163,12 +169,11 @@ class Layers(Shape):
         return float((f[:, 1] - f[:, 0]).sum(dtype=float)) * self.pixel[0] * self.pixel[1]
 
     def bounds(self) -> Array:
-        slots, rows, columns = self.grid.shape.tolist()
-        table = self.grid.values[2 : 2 + 6 * slots].reshape(slots, 6)
-        dx, dy = self.pixel
-        x, y, _ = self.grid.origin.tolist()
-        near, deep = float(table[:, 4].min()), float(table[:, 5].max())
-        return np.array([[x, y, near], [x + (columns - 1) * dx, y + (rows - 1) * dy, deep]])
+        slots = int(self.grid.shape[0])
+        table = self.grid.values[HEADER : HEADER + TABLE * slots].reshape(slots, TABLE)
+        low, high = table[:, [6, 8, 4]].min(axis=0), table[:, [7, 9, 5]].max(axis=0)
+        scale = (*self.pixel, 1.0)
+        return self.grid.origin + np.array([low, high]) * scale
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """How far points are outside [m], negative inside.
