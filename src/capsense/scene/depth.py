@@ -76,7 +76,7 @@ _DECODED[1] = 0.0
 _DECODED[CONDUCTOR_CODE] = np.inf
 
 
-@dataclass(frozen=True, init=False, eq=False)
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class DepthFrame:
     """An orthographic depth image with permittivities: a world for ``Simulator.step``.
 
@@ -161,6 +161,10 @@ class DepthFrame:
             one or (_CONDUCTOR if k == np.inf else Material(f"eps_r {k:g}", k))
             for k in known[:n].tolist()
         )
+
+    def __repr__(self) -> str:
+        seen = ", ".join(m.name for m in self._materials) or "nothing"
+        return f"DepthFrame(shape {self.depth.shape}, {seen}, {self.camera})"
 
     @property
     def resolution(self) -> tuple[int, int]:

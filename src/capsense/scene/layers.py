@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -71,7 +71,7 @@ class Layers(Shape):
     """Width and height of the image [m]."""
     resolution: tuple[int, int]
     """Rows and columns of the image."""
-    grid: LayerGrid
+    grid: LayerGrid = field(repr=False)
     """The image for the kernels, cropped to the pixels that are hit and one more around them."""
 
     kind = ShapeKind.LAYERS
