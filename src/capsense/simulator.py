@@ -104,7 +104,7 @@ class Simulator:
         *,
         method: Method = "perturbation",
         tolerance: float = 1e-18,
-        relative_tolerance: float = 1e-4,
+        relative_tolerance: float = 1e-5,
         frequency: float = 250e3,
         settings: BuildSettings | None = None,
         cache_dir: Path | None = None,

@@ -60,7 +60,7 @@ class PerturbationSolver:
         background: BackgroundField,
         *,
         tolerance: float = 1e-18,
-        relative_tolerance: float = 1e-4,
+        relative_tolerance: float = 1e-5,
         frequency: float = 250e3,
         max_iterations: int = 500,
     ) -> None:
