@@ -20,7 +20,7 @@ _ELLIPSOID = int(ShapeKind.ELLIPSOID)
 _INF = math.inf
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def place_bodies(
     kinds: NDArray[np.int64],
     params: Array,
@@ -76,7 +76,7 @@ def place_bodies(
             bounds[i, 1, k] = middle + half
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def mesh_intervals_of_lines(
     grid: NDArray[np.float32], origin: Array, inv_h: float, o: Array, d: Array, out: Array
 ) -> None:
@@ -99,7 +99,7 @@ def mesh_intervals_of_lines(
         )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def grid_distances(
     grid: NDArray[np.float32], origin: Array, inv_h: float, points: Array, out: Array
 ) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def segment_distance2(px: float, py: float, pz: float, ex: float, ey: float, ez: float) -> float:
     """Squared distance from p to the segment from the origin to e."""
     length2 = ex * ex + ey * ey + ez * ez
@@ -22,7 +22,7 @@ def segment_distance2(px: float, py: float, pz: float, ex: float, ey: float, ez:
     return qx * qx + qy * qy + qz * qz
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
     """Squared distance from a point to a triangle, shape (3, 3); slivers are fine."""
     px, py, pz = x - tri[0, 0], y - tri[0, 1], z - tri[0, 2]
@@ -48,7 +48,7 @@ def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def fill_band(
     triangles: Array,
     origin: Array,
@@ -99,7 +99,7 @@ def fill_band(
                         nearest[i, j, k] = m
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def fill_far(
     triangles: Array,
     origin: Array,
@@ -128,7 +128,7 @@ def fill_far(
                     distance[i, j, k] = math.sqrt(triangle_distance2(triangles[m], x, y, z))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def set_signs(
     triangles: Array,
     origin: Array,

@@ -26,7 +26,7 @@ LEAST = 1e-3
 """A silhouette keeps this far from pixel centres, in parts of a link."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def sort_slots(front: Array, back: Array, f: Array, b: Array, count: Ints) -> Ints:
     """Sort the intervals of every pixel, drop what is none, unite what overlaps.
 
@@ -69,7 +69,7 @@ def sort_slots(front: Array, back: Array, f: Array, b: Array, count: Ints) -> In
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _edge(known: float, edge: bool, t1: float, t2: float) -> float:
     """Where a silhouette lies between a pixel that is hit and one that is not, from the first.
 
@@ -93,7 +93,7 @@ def _edge(known: float, edge: bool, t1: float, t2: float) -> float:
     return max(s, LEAST) if s <= 0.9 else 0.9 - (s - 0.9) * 0.4 / 1.1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _thick(f: Array, b: Array, count: Ints, k: int, j: int, i: int) -> float:
     """Thickness of an interval [m]; zero where there is none."""
     if j < 0 or i < 0 or j >= count.shape[0] or i >= count.shape[1] or count[j, i] <= k:
@@ -101,7 +101,7 @@ def _thick(f: Array, b: Array, count: Ints, k: int, j: int, i: int) -> float:
     return b[k, j, i] - f[k, j, i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _spread(margin: Array, state: NDArray[np.int8], j: int, i: int, dj: int, di: int,
             distance: float) -> None:  # fmt: skip
     """Lower the margins of like pixels from (j, i) on in one direction to their distances."""
@@ -114,7 +114,7 @@ def _spread(margin: Array, state: NDArray[np.int8], j: int, i: int, dj: int, di:
         i += di
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _margins(f: Array, b: Array, count: Ints, k: int, j0: int, i0: int, cut_x: Array32,
              cut_y: Array32, state: NDArray[np.int8], margin: Array) -> None:  # fmt: skip
     """Distance to the silhouette along rows or columns, whichever is shorter.
@@ -148,19 +148,19 @@ def _margins(f: Array, b: Array, count: Ints, k: int, j0: int, i0: int, cut_x: A
                 _spread(margin, state, row + dj, column + di, dj, di, 1.0 - s)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _smooth(jump: float, limit: float) -> float:
     """How much of a surface's slope and curvature to believe: all up to half a step, then less."""
     return min(1.0, max(0.0, 2.0 - 2.0 * abs(jump) / limit))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _beyond(a: float, b: float, known: bool, limit: float) -> float:
     """Value one pixel beyond ``a``, straight on from ``b`` if that is known and no step away."""
     return a + (a - b) * _smooth(a - b, limit) if known else a
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _ghosts(field: Array32, state: NDArray[np.int8], limit: float) -> None:
     """Carry front and back on to pixels around those hit, along rows, then along columns.
 
@@ -200,7 +200,7 @@ def _ghosts(field: Array32, state: NDArray[np.int8], limit: float) -> None:
                     state[j, i] = 2 + way
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _blocks(field: Array32, state: NDArray[np.int8], out: Array32) -> None:
     """Bounds of fronts and backs over blocks of pixels; ``out`` is flat, four numbers a block."""
     rows, columns = state.shape
@@ -223,7 +223,7 @@ def _blocks(field: Array32, state: NDArray[np.int8], out: Array32) -> None:
             at += 4
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _second(a: float, middle: float, b: float, limit: float) -> float:
     """Second difference of a surface, zero at a step."""
     a -= middle
@@ -231,7 +231,7 @@ def _second(a: float, middle: float, b: float, limit: float) -> float:
     return (a + b) * _smooth(max(abs(a), abs(b)), limit)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _surface(a: Array, state: NDArray[np.int8], j0: int, i0: int, limit: float, part: int,
              field: Array32) -> None:  # fmt: skip
     """Copy a front (part 0) or back (part 1), bent as its curvature asks for.
@@ -256,7 +256,7 @@ def _surface(a: Array, state: NDArray[np.int8], j0: int, i0: int, limit: float, 
             field[row, column, part] = value - bend / 12.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _reach(field: Array32, out: Array32) -> None:
     """How far the silhouette reaches: least and largest column, least and largest row."""
     rows, columns = field.shape[0], field.shape[1]
@@ -274,7 +274,7 @@ def _reach(field: Array32, out: Array32) -> None:
                         out[2 * way] = min(out[2 * way], place - _ROUNDING)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def build_values(f: Array, b: Array, count: Ints, found: Ints, dy: float, limit: float,
                  cut_x: Array32, cut_y: Array32) -> Array32:  # fmt: skip
     """Values of a :class:`~capsense.scene.layers.LayerGrid`, cropped to what is hit and one more.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def blend(a: float, b: float, s: float, limit: float) -> float:
     """Value at fraction ``s`` between two pixels; a ramp above ``limit`` narrows about 1/2."""
     jump = abs(b - a)
@@ -21,7 +21,7 @@ def blend(a: float, b: float, s: float, limit: float) -> float:
     return a + (b - a) * s
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_stretch(a: float, b: float, out: Array, n: int) -> int:
     """Unite [a, b] with the first ``n`` ascending, disjoint rows of ``out``; return their number.
 
@@ -58,7 +58,7 @@ def add_stretch(a: float, b: float, out: Array, n: int) -> int:
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def positive(c0: float, c1: float, low: float, high: float) -> tuple[float, float]:
     """Part of [low, high] in which the line from (0, c0) to (1, c1) is not negative."""
     if c0 >= 0.0:
@@ -71,13 +71,13 @@ def positive(c0: float, c1: float, low: float, high: float) -> tuple[float, floa
     return low, high
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _width(jump: float, limit: float) -> float:
     """Half the width of a ramp, in parts of a link."""
     return 0.5 if jump <= limit else 0.5 * limit / jump
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def steps_between(
     t0: float, z0: float, f0: float, b0: float, m0: float,
     t1: float, z1: float, f1: float, b1: float, m1: float,

@@ -52,7 +52,7 @@ BODY = np.dtype(
 and where the grid of a mesh or of layers begins among those of all."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def pierce(axis, op, oq, body, grids, out):
     """Stretches of a line along ``axis`` inside one body, at (op, oq) across; return how many."""
     ox, oy, oz, dx, dy, dz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -82,7 +82,7 @@ def pierce(axis, op, oq, body, grids, out):
     return 1 if out[0, 1] > out[0, 0] else 0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _chord(axis, along, t, u, v, low, high, body, grids, out):
     """Part of [low, high] that a body covers around a point on a line along ``along``.
 
@@ -99,7 +99,7 @@ def _chord(axis, along, t, u, v, low, high, body, grids, out):
     return u, u, 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def thin_factor(wide_p, wide_q, across_p, across_q):
     """How much less than a wall a thin conductor inside a column takes from the column's field.
 
@@ -116,7 +116,7 @@ def thin_factor(wide_p, wide_q, across_p, across_q):
     return 1.0 / (1.0 + 2.0 * (wide / (math.pi * max(thin, 1e-9)) - 1.0))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def part_covered(low, node, high, a, b, extent):
     """Part of a column's side [low, high] that [a, b] covers; an edge at the node covers half.
 
@@ -129,7 +129,7 @@ def part_covered(low, node, high, a, b, extent):
     return at_b - at_a
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, out):
     """Weight of a body in a column at t around (sp, sq), and the middle of what it covers.
 
@@ -154,7 +154,7 @@ def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, o
     return share, sp, sq, math.hypot(aside_p, aside_q)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
     """Look for a body in a column whose line it misses: a place (sp, sq), and stretches there."""
     if body.kind == _MESH or body.kind == _LAYERS:
@@ -175,7 +175,7 @@ def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
     return sp, sq, pierce(axis, sp, sq, body, grids, out)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, grids, t0, t1,
                       who, cover, aside, out):  # fmt: skip
     """Stretches of a lattice line's column inside bodies, and the weight of each.

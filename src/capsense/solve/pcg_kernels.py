@@ -22,7 +22,7 @@ _RELAX = np.float32(0.97)
 """Share of the dropped fill-in that is moved to the diagonal."""
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def factorise(weight, extra, owner, storeys, ceiling, parent, share, diagonal, active, inverse,
               woken):  # fmt: skip
     """Set up the operator and its incomplete factors, storey by storey.
@@ -82,7 +82,7 @@ def factorise(weight, extra, owner, storeys, ceiling, parent, share, diagonal, a
     return n_woken
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def lift(ceiling, parent, share, begin, end, v):
     """Set floor nodes to the weighted mean of the columns below, for joints [begin, end)."""
     zero = splat(np.float32(0.0))
@@ -93,14 +93,14 @@ def lift(ceiling, parent, share, begin, end, v):
         store(v, floor, madd(share[j], load(v, ceiling[j] - 1), load(v, floor)))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def lower(ceiling, parent, begin, end, v):
     """Set ceiling nodes to the nodes they stand for, for joints [begin, end)."""
     for j in range(begin, end):
         store(v, ceiling[j], load(v, parent[j]))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def joints_of(storeys, ceiling):
     """First joint of each storey, and the number of joints behind; shape (storeys + 1,)."""
     out = np.zeros(storeys.shape[0] + 1, np.int64)
@@ -113,7 +113,7 @@ def joints_of(storeys, ceiling):
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _flush(part, row, total):
     """Add a row of single-precision partial sums to double-precision totals, and clear it."""
     for k in range(LANES):
@@ -121,7 +121,7 @@ def _flush(part, row, total):
         part[row, k] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _advance(u, r, p, ap, alpha):
     """u ← u + alpha p and r ← r − alpha A p, with ``alpha`` of shape (2, 8): alpha and −alpha."""
     on, back = load(alpha, 0), load(alpha, 1)
@@ -130,7 +130,7 @@ def _advance(u, r, p, ap, alpha):
         store(r, a, vmadd(back, load(ap, a), load(r, a)))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def forward(weight, inverse, storeys, ceiling, parent, share, u, r, p, ap, alpha, y, rz):
     """Advance as :func:`_advance` does, then solve the lower incomplete factor for y.
 
@@ -166,7 +166,7 @@ def forward(weight, inverse, storeys, ceiling, parent, share, u, r, p, ap, alpha
             _flush(part, 0, rz)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def backward(weight, inverse, storeys, ceiling, parent, share, y, p, beta):
     """Solve the upper factor in place, y → z, and set p ← z + beta p, with beta of shape (1, 8)."""
     wx, wy, wz = weight[0], weight[1], weight[2]
@@ -192,7 +192,7 @@ def backward(weight, inverse, storeys, ceiling, parent, share, y, p, beta):
     lower(ceiling, parent, 0, ceiling.shape[0], p)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def apply_operator(weight, diagonal, active, storeys, p, ap, pap):
     """Write the operator times p, zero at nodes that are off, and p · A p per lane.
 
@@ -227,7 +227,7 @@ def apply_operator(weight, diagonal, active, storeys, p, ap, pap):
             _flush(part, 0, pap)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r, p, ap, pap):
     """Clear the solution where nodes are off, and set r ← rhs − A u and p ← 0."""
     zero = splat(np.float32(0.0))
@@ -245,7 +245,7 @@ def start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r, 
         store(r, ceiling[j], zero)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def solve(
     weight,
     diagonal,
@@ -304,7 +304,7 @@ def solve(
     return iteration
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def load_scene(phi, floating_lane, held, ties, energies, rhs, value, drop):
     """Fill one block's right-hand sides, and each tie's and energy term's value per lane.
 
@@ -341,7 +341,7 @@ def load_scene(phi, floating_lane, held, ties, energies, rhs, value, drop):
                     rhs[term.b, k] += term.weight * drop[i, k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def gram(terms, left, right, out):
     """Add Σ_i weight_i left_i right_iᵀ over ties or energy terms to ``out`` (8, 8)."""
     for i in range(terms.shape[0]):
@@ -352,7 +352,7 @@ def gram(terms, left, right, out):
                 out[k, m] += v * right[i, m]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def inner(left, right, out):
     """Add leftᵀ right over the nodes to ``out`` (8, 8)."""
     zero = splat(np.float32(0.0))
@@ -381,7 +381,7 @@ def inner(left, right, out):
             _flush(part, k, out[k])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_outer(a, left, right, out):
     for k in range(LANES):
         v = np.float64(left[a, k])
@@ -389,7 +389,7 @@ def _add_outer(a, left, right, out):
             out[k, m] += v * right[a, m]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def sparse_inner(ties, energies, stamp, mark, active, left, right, out):
     """Add leftᵀ right over the nodes that carry a load, each once, to ``out`` (8, 8)."""
     for i in range(ties.shape[0]):

@@ -74,7 +74,7 @@ COUPLE = np.dtype([("a", np.int64), ("b", np.int64), ("weight", np.float64)])
 """Two conductors that face each other on one link."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
     """Turn overlapping stretches into disjoint ones, in order; join conductors that touch."""
     if n == 1:
@@ -116,7 +116,7 @@ def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _join(joined, a, b):
     while joined[a] != a:
         a = joined[a]
@@ -128,7 +128,7 @@ def _join(joined, a, b):
         joined[a] = b
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, inside_nodes, before):
     """Mark free nodes inside conductors with the conductor's index, as seen along z.
 
@@ -173,7 +173,7 @@ def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, in
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, bodies, grids, contact,
           joined, weight, extra, inside, inside_nodes, ties, energies, couples,
           counts):  # fmt: skip
@@ -207,7 +207,7 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, bodie
     return FULL
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
                 weight, extra, inside, ties, energies, couples, counts):  # fmt: skip
     """Scan the lines of a storey along one axis; lines on the walls carry no unknowns."""
@@ -273,7 +273,7 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
     return FULL
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, aside, nodes, links,
               cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
@@ -305,7 +305,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _room(ties, energies, couples, counts):
     """Whether the buffers hold what one link may add."""
     return (
@@ -315,14 +315,14 @@ def _room(ties, energies, couples, counts):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_energy(energies, counts, a, b, end, weight, drives):
     term = energies[counts[1]]
     term.a, term.b, term.end, term.weight, term.drives = a, b, end, weight, drives
     counts[1] += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, aside,
               nodes, cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
@@ -441,7 +441,7 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     _add_energy(energies, counts, na, nb, end, inner, False)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _value_beside_sheet(tie, na, nb, end, s, shift):
     """Background potential at fraction s of a half-link from na or to nb: linear along it."""
     point, coef = tie.point, tie.coef
@@ -453,7 +453,7 @@ def _value_beside_sheet(tie, na, nb, end, s, shift):
     tie.end_coef = at_b if na >= 0 else 1.0 - at_b
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
     """Coefficients of the background potential at t on the link from a to b.
 
@@ -486,7 +486,7 @@ def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
     tie.end, tie.end_coef = -3, 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _close_inside(storeys, nodes, links, weight, extra, inside, inside_nodes, ties, energies,
                   couples, counts):  # fmt: skip
     """Turn what is left of links from a node inside a conductor to one outside into ties.
