@@ -1,4 +1,4 @@
-"""Progress of building a design's field, on a terminal."""
+"""Progress of long work, such as building a design's field, on a terminal."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ class BuildProgress:
     ----------
     shown
         Whether there is a terminal to draw on.
+    prefix
+        What stands before the stage's name.
     """
 
-    def __init__(self, *, shown: bool) -> None:
+    def __init__(self, *, shown: bool, prefix: str = "building the field: ") -> None:
         self._shown = shown
+        self._prefix = prefix
         self._bar: Any = None
 
     def __enter__(self) -> BuildProgress:
@@ -37,6 +40,6 @@ class BuildProgress:
 
             form = "{desc} {percentage:3.0f}%|{bar}| {elapsed}"
             self._bar = tqdm(total=1.0, file=sys.stderr, bar_format=form, leave=False)
-        self._bar.set_description(f"building the field: {stage}", refresh=False)
+        self._bar.set_description(f"{self._prefix}{stage}", refresh=False)
         self._bar.n = min(max(fraction, 0.0), 1.0)
         self._bar.refresh()

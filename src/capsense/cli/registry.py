@@ -11,7 +11,13 @@ import argparse
 from importlib import import_module
 from typing import Protocol, cast
 
-COMMANDS = ("capsense.cli.run", "capsense.cli.design", "capsense.cli.readout", "capsense.cli.bench")
+COMMANDS = (
+    "capsense.cli.run",
+    "capsense.cli.design",
+    "capsense.cli.readout",
+    "capsense.cli.bench",
+    "capsense.cli.reproduce",
+)
 """Modules of the subcommands, in the order of ``--help``."""
 
 

@@ -1,0 +1,86 @@
+"""Writes an outcome: a report to read, and the same as data."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+from capsense.reproduce.study import Cell, Outcome, Row, Table
+
+MAX_ROWS = 40
+"""Longer tables are not shown in the report, only named."""
+
+
+def write_outcome(outcome: Outcome, folder: Path) -> list[str]:
+    """Write ``report.md``, ``rows.json``, a csv per table and a png per plot.
+
+    The report is written last, so that where there is one, the rest is there.
+
+    Args:
+        outcome: What to write.
+        folder: Where; it exists.
+
+    Returns:
+        Names of the files.
+    """
+    names = []
+    for name, table in outcome.tables.items():
+        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(table.columns)
+            writer.writerows([[_exact(cell) for cell in row] for row in table.rows])
+        names.append(f"{name}.csv")
+    for name, figure in outcome.plots.items():
+        figure.savefig(folder / f"{name}.png", dpi=110)
+        names.append(f"{name}.png")
+    rows = {"title": outcome.title, "rows": [asdict(row) for row in outcome.rows]}
+    _write(folder / "rows.json", json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False))
+    _write(folder / "report.md", markdown(outcome))
+    return [*names, "rows.json", "report.md"]
+
+
+def row_cells(row: Row) -> tuple[str, str, str, str, str]:
+    """A row as text: what, value, unit, target, verdict."""
+    return row.what, f"{row.value:.4g}", row.unit, row.target, row.verdict
+
+
+ROW_HEADER = ("what", "value", "unit", "target", "verdict")
+
+
+def markdown(outcome: Outcome) -> str:
+    """The outcome as a page in Markdown; it refers to tables and plots in its own folder."""
+    blocks = [f"# {outcome.title}", _grid(ROW_HEADER, [row_cells(row) for row in outcome.rows])]
+    blocks += [f"![{name.replace('_', ' ')}]({name}.png)" for name in outcome.plots]
+    for name, table in outcome.tables.items():
+        blocks.append(f"## {name.replace('_', ' ')}\n\n{_shown(name, table)}")
+    if outcome.notes:
+        blocks.append("## Notes\n\n" + "\n\n".join(outcome.notes))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _shown(name: str, table: Table) -> str:
+    if len(table.rows) > MAX_ROWS:
+        return f"{len(table.rows)} rows, in [{name}.csv]({name}.csv)."
+    return _grid(table.columns, [tuple(_short(cell) for cell in row) for row in table.rows])
+
+
+def _grid(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [header, ("---",) * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _short(cell: Cell) -> str:
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+
+
+def _exact(cell: Cell) -> str:
+    return f"{cell:.10g}" if isinstance(cell, float) else str(cell)
+
+
+def _write(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text + ("" if text.endswith("\n") else "\n"), encoding="utf-8")
+    os.replace(part, path)
