@@ -35,3 +35,7 @@ class MissingDependencyError(CapSenseError, ImportError):
 
 class ReadOutError(CapSenseError, ValueError):
     """A read-out, its configuration or what is given to it is wrong."""
+
+
+class RecordingError(CapSenseError, ValueError):
+    """A recording cannot be made, or its file is not a recording or is damaged."""

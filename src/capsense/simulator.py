@@ -120,14 +120,20 @@ class Simulator:
                 raise ValueError(f"{name} is {value!r}; give a positive number")
         self.design = design if isinstance(design, Design) else load_design(design)
         self.method: Method = method
+        self.tolerance, self.relative_tolerance = tolerance, relative_tolerance
+        self.frequency = frequency
+        self.settings = settings or default_settings(self.design)
+        """Numerical settings of the background field."""
+        self.steps = 0
+        """Steps since the last reset, one that failed included."""
         self.background: BackgroundField = load_or_build(
-            self.design, settings, cache_dir=cache_dir, progress=progress
+            self.design, self.settings, cache_dir=cache_dir, progress=progress
         )
         if method == "masked":
             from capsense.solve.scene_masks import MaskedScenes
 
             self._solver: _Method = MaskedScenes(
-                self.design, self.background, settings or default_settings(self.design), frequency
+                self.design, self.background, self.settings, frequency
             )
         else:
             from capsense.solve.perturbation import PerturbationSolver
@@ -171,6 +177,7 @@ class Simulator:
                 f"step takes a Scene or a DepthFrame, not {type(scene).__name__}; "
                 "write Scene([...])"
             )
+        self.steps += 1
         change, iterations, error, goal = self._solver.solve(scene)
         if len(self._floating):
             change = self._without_floating(self.background.capacitance + change) - self._empty
@@ -186,6 +193,7 @@ class Simulator:
     def reset(self) -> None:
         """Forget the previous step."""
         self._solver.reset()
+        self.steps = 0
 
     def describe(self) -> dict[str, float | int | str]:
         """Return the figures of the design's mesh and field."""

@@ -15,7 +15,7 @@ from capsense.adapters.world import Frames, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.readout.read_out import ReadOut
-from capsense.scene import Pose, Scene
+from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Reading, Simulator
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ class AttachedSensor(ABC):
         self.readout: ReadOut | None = None
         """The chip that turns capacitances into counts, if any."""
 
-    def read(self, time: float | None = None) -> Reading:
+    def read(self, time: float | None = None, view: Scene | DepthFrame | None = None) -> Reading:
         """The reading of the simulator's present state.
 
         With a :attr:`readout`, the reading holds the conversions that have finished since the last
@@ -42,6 +42,7 @@ class AttachedSensor(ABC):
         Args:
             time: Time of the state [s], for the read-out; by default the simulator's own, where it
                 tells it (MuJoCo does, PyBullet does not).
+            view: What :meth:`view` has just given, if that was asked already.
 
         Raises:
             SceneError: The simulator has not been stepped yet, or has diverged, or a read-out
@@ -49,10 +50,11 @@ class AttachedSensor(ABC):
             SolveError: The solver did not reach its tolerance.
             ReadOutError: Time went back; call :meth:`reset` when the simulator is set back.
         """
+        world = self.view() if view is None else view
         if self.readout is None:
-            return self.simulator.step(self.scene())
+            return self.simulator.step(world)
         now = self._time() if time is None else float(time)
-        reading = self.simulator.step(self.scene())
+        reading = self.simulator.step(world)
         return replace(reading, counts=self.readout.sample(now, reading))
 
     def use_readout(self, readout: ReadOut | str | None) -> None:
@@ -68,12 +70,29 @@ class AttachedSensor(ABC):
             readout = ReadOut.preset(readout, self.electrode_names)
         self.readout = readout
 
+    @property
+    def time(self) -> float:
+        """The simulator's time [s].
+
+        Raises:
+            SceneError: This simulator does not tell it.
+        """
+        return self._time()
+
     def _time(self) -> float:
         """The simulator's time [s]."""
         raise SceneError(
             "this simulator does not tell its time, which the read-out needs; "
             "write read(time=…), in seconds"
         )
+
+    def view(self) -> Scene | DepthFrame:
+        """What a reading is taken of: :meth:`scene`, or the depth image that it is made from.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+        """
+        return self.scene()
 
     @abstractmethod
     def scene(self) -> Scene:

@@ -81,6 +81,9 @@ class MujocoDepthSensor(AttachedSensor):
     def _time(self) -> float:
         return float(self.data.time)
 
+    def view(self) -> DepthFrame:
+        return self.frame()
+
     def scene(self) -> Scene:
         return self.frame().scene()
 

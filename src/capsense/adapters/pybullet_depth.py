@@ -86,6 +86,9 @@ class PybulletDepthSensor(AttachedSensor):
             depth, eps_r, self._camera, grounding=self._rules.default_grounding, back=self._back
         )
 
+    def view(self) -> DepthFrame:
+        return self.frame()
+
     def scene(self) -> Scene:
         return self.frame().scene()
 

@@ -176,6 +176,15 @@ class DepthFrame:
         """Pixels that show something other than air, shape (layers, rows, columns)."""
         return self._group >= 0
 
+    @property
+    def permittivity(self) -> Array:
+        """Relative permittivity at every pixel, shape (layers, rows, columns).
+
+        0 for air, infinity for conductors.
+        """
+        known = [np.inf if m.is_conductor() else m.eps_r for m in self._materials]
+        return np.array([*known, 0.0])[self._group]
+
     def points(self) -> Array:
         """The surface seen, as a point cloud [m] in the sensor frame.
 

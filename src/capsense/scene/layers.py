@@ -118,6 +118,33 @@ class Layers(Shape):
         out._build(front, back, size, rows, columns)
         return out
 
+    @classmethod
+    def from_grid(
+        cls, grid: LayerGrid, size: tuple[float, float], resolution: tuple[int, int]
+    ) -> Layers:
+        """Put a layered image together from its parts, such as those written to a file.
+
+        Args:
+            grid, size, resolution: What the attributes of these names held.
+
+        Raises:
+            SceneError: The parts do not fit together.
+        """
+        slots, rows, columns = grid.shape.tolist()
+        blocks = ((columns + BLOCK - 2) // BLOCK) * ((rows + BLOCK - 2) // BLOCK)
+        numbers = HEADER + slots * (TABLE + 3 * rows * columns + 4 * blocks)
+        good = min(slots, rows - 2, columns - 2) >= 1 and grid.values.shape == (numbers,)
+        if good:
+            table = grid.values[HEADER : HEADER + TABLE * slots].reshape(slots, TABLE)
+            top = np.array([columns, columns, rows, rows]) - 1
+            places = table[:, [0, 1, 2, 3, 6, 7, 8, 9]]  # the kernels take them for indices
+            good = bool(np.all((places > -0.5) & (places < np.tile(top + 0.5, 2))))
+        if not good or grid.values.dtype != np.float32 or grid.origin.shape != (3,):
+            raise SceneError("Layers: the parts of the image do not fit together")
+        out = object.__new__(cls)
+        out.__dict__.update(size=size, resolution=resolution, grid=grid)
+        return out
+
     def _build(
         self, f: Array, b: Array, size: tuple[float, ...], rows: Array32, columns: Array32
     ) -> None:

@@ -75,6 +75,22 @@ class Pose:
         fields["quaternion"] = (x / norm, y / norm, z / norm, w / norm)
 
     @classmethod
+    def from_unit(cls, position: Sequence[float], quaternion: Sequence[float]) -> Pose:
+        """Make a pose with exactly the unit quaternion given, such as one written to a file.
+
+        ``Pose(…)`` divides by the length, which may change the last digit of its own result.
+
+        Raises:
+            SceneError: As for the class, or the length differs from 1 by more than 1e-12.
+        """
+        pose = cls(position, quaternion)
+        given = tuple([float(q) for q in quaternion])
+        if abs(math.hypot(*given) - 1.0) > 1e-12:
+            raise SceneError(f"quaternion is {given}, whose length is not 1; write Pose(…)")
+        pose.__dict__["quaternion"] = given
+        return pose
+
+    @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Pose:
         """Make a pose from a homogeneous transform.
 
