@@ -39,3 +39,16 @@ class ReadOutError(CapSenseError, ValueError):
 
 class RecordingError(CapSenseError, ValueError):
     """A recording cannot be made, or its file is not a recording or is damaged."""
+
+
+class ServerError(CapSenseError, ValueError):
+    """An option of the server is wrong."""
+
+
+class ProtocolError(CapSenseError, ValueError):
+    """A message breaks the server's protocol, or the server refused what was asked."""
+
+    def __init__(self, message: str, code: str = "malformed") -> None:
+        super().__init__(message)
+        self.code = code
+        """What is wrong, one of :data:`capsense.server.messages.CODES`."""

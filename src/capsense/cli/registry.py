@@ -17,6 +17,7 @@ COMMANDS = (
     "capsense.cli.readout",
     "capsense.cli.bench",
     "capsense.cli.reproduce",
+    "capsense.cli.serve",
 )
 """Modules of the subcommands, in the order of ``--help``."""
 

@@ -57,8 +57,8 @@ def read_body(table: Table, name: str, folder: Path) -> MovingBody:
     shape_name = table.choice("shape", list(SHAPE_KEYS))
     table.only((*BODY_KEYS, *SHAPE_KEYS[shape_name]))
     shape = _read_shape(table, shape_name, folder)
-    material = _read_material(table)
-    grounding = _read_grounding(table)
+    material = read_material(table)
+    grounding = read_grounding(table)
     if ("pose" in table) == ("trajectory" in table):
         if "pose" in table:
             raise table.error("pose and trajectory both say where it is; keep one of them")
@@ -71,7 +71,7 @@ def read_body(table: Table, name: str, folder: Path) -> MovingBody:
         trajectory = _read_trajectory(sub)
         pose = trajectory.pose_at(0.0)
     else:
-        pose = _read_pose(Table(table.data["pose"], table.source, f"{table.item}: pose"))
+        pose = read_pose(Table(table.data["pose"], table.source, f"{table.item}: pose"))
     return MovingBody(Body(shape, pose, material, grounding, name), trajectory)
 
 
@@ -125,7 +125,8 @@ def _triangles(table: Table, path: Path) -> tuple[Any, Any]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def _read_material(table: Table) -> Material | str:
+def read_material(table: Table) -> Material | str:
+    """The material that ``material`` names or describes."""
     value = table.raw("material", '"steel", or { eps_r = number, sigma = S/m }')
     if isinstance(value, dict):
         sub = Table(value, table.source, f"{table.item}: material")
@@ -138,7 +139,8 @@ def _read_material(table: Table) -> Material | str:
     return table.string("material")
 
 
-def _read_grounding(table: Table) -> Grounding:
+def read_grounding(table: Table) -> Grounding:
+    """What ``grounding`` says; grounded by default."""
     value = table.data.get("grounding", "grounded")
     if isinstance(value, str):
         choice = table.choice("grounding", ("grounded", "floating"), "grounded")
@@ -179,7 +181,8 @@ def _rotations(table: Table) -> list[Pose]:
     return []
 
 
-def _read_pose(table: Table) -> Pose:
+def read_pose(table: Table) -> Pose:
+    """The pose that a table describes by ``position`` and ``euler`` or ``quaternion``."""
     table.only(("position", "euler", "quaternion"))
     position = table.coordinates("position", (3,))
     rotations = _rotations(table) or [Pose()]

@@ -70,7 +70,7 @@ def parse_scenario(
     excitation = Excitation(top.choice("excitation", list(Excitation), Excitation.MATRIX.value))
     pairs = _read_pairs(top, excitation, design)
     tolerance = top.number("tolerance", 1e-24, 1e-12, unit="F") if "tolerance" in top else None
-    bodies = _read_bodies(top, where)
+    bodies = read_bodies(top, where)
     if not bodies and "duration" not in top:
         raise top.error("has no body and no duration; add a [[body]], or duration = seconds")
     ends = [b.trajectory.duration for b in bodies if b.trajectory is not None]
@@ -143,7 +143,16 @@ def _read_pairs(top: Table, excitation: Excitation, design: Design) -> tuple[tup
     return tuple(out)
 
 
-def _read_bodies(top: Table, folder: Path) -> tuple[MovingBody, ...]:
+def read_bodies(top: Table, folder: Path) -> tuple[MovingBody, ...]:
+    """Read the array of tables ``body``.
+
+    Args:
+        top: The table that holds it.
+        folder: Folder that mesh files are relative to.
+
+    Raises:
+        ScenarioError: Anything is wrong, or two bodies share a name.
+    """
     out: list[MovingBody] = []
     names: set[str] = set()
     for number, raw in enumerate(top.tables("body"), start=1):

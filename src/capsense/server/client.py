@@ -1,0 +1,252 @@
+"""A client of the server, for programs and tests: :class:`Client`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import MissingDependencyError, ProtocolError
+from capsense.server.frames import PROTOCOL, ReadingMessage, pack_depth, unpack_reading
+
+Array = NDArray[np.float64]
+
+
+class Client:
+    """A connection to a server; use it in a ``with`` block.
+
+    Args:
+        url: The server's address, such as ``ws://127.0.0.1:8765``.
+        token: What the server was told to ask for.
+        timeout: Longest wait for an answer [s].
+        name: Told to the server, for its log.
+
+    Raises:
+        ProtocolError: The server refused the connection; ``code`` says why.
+        OSError: There is no server.
+    """
+
+    def __init__(
+        self, url: str = "ws://127.0.0.1:8765", *, token: str = "", timeout: float = 10.0,
+        name: str = "python",
+    ) -> None:  # fmt: skip
+        try:
+            from websockets.sync.client import connect
+        except ImportError as error:
+            raise MissingDependencyError(
+                'the client needs websockets; install it with: pip install "capsense[serve]"'
+            ) from error
+
+        self.timeout = timeout
+        self.sensors: dict[int, RemoteSensor] = {}
+        """Open sensors, by number."""
+        self._connection = connect(
+            url, compression=None, open_timeout=timeout, close_timeout=1.0, max_size=None
+        )
+        try:
+            self.welcome = self.ask("welcome", type="hello", protocol=PROTOCOL, token=token,
+                                    client=name)  # fmt: skip
+            """The server's answer to the hello: its version, designs and limits."""
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+    def open(self, sensor: int | None = None, **options: Any) -> RemoteSensor:
+        """Open a sensor.
+
+        Args:
+            sensor: Its number; by default the first that is free.
+            options: ``design``, ``camera``, ``material``, ``grounding`` and ``back``, as in the
+                protocol's ``open``.
+
+        Raises:
+            ProtocolError: The server refused.
+        """
+        if sensor is None:
+            sensor = next(k for k in range(len(self.sensors) + 1) if k not in self.sensors)
+        answer = self.ask("opened", type="open", sensor=sensor, **options)
+        self.sensors[sensor] = RemoteSensor(self, answer)
+        return self.sensors[sensor]
+
+    def send(self, message: str | bytes) -> None:
+        """Send a message as it is.
+
+        Raises:
+            ProtocolError: The connection is closed.
+        """
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            self._connection.send(message)
+        except ConnectionClosed as error:
+            raise _closed(error) from None
+
+    def ask(self, answer: str, **message: Any) -> dict[str, Any]:
+        """Send a control message, and wait for its answer.
+
+        Args:
+            answer: The answer's type.
+            message: The content.
+
+        Raises:
+            ProtocolError: The server answered an error, or nothing in time.
+        """
+        self.send(json.dumps(message))
+        limit = time.monotonic() + self.timeout
+        while True:
+            found = self.receive(limit - time.monotonic())
+            if isinstance(found, ReadingMessage):
+                self._keep(found)
+            elif found["type"] == "error":
+                raise ProtocolError(found["message"], found["code"])
+            elif found["type"] == answer:
+                return found
+
+    def receive(self, timeout: float | None = None) -> ReadingMessage | dict[str, Any]:
+        """The next message: a reading, or a control message.
+
+        Raises:
+            ProtocolError: Nothing came in time, or the connection is closed.
+        """
+        from websockets.exceptions import ConnectionClosed
+
+        wait = max(self.timeout if timeout is None else timeout, 0.0)
+        try:
+            message = self._connection.recv(wait)
+        except TimeoutError:
+            raise ProtocolError(f"no answer within {self.timeout:g} s", "timeout") from None
+        except ConnectionClosed as error:
+            raise _closed(error) from None
+        return unpack_reading(message) if isinstance(message, bytes) else json.loads(message)
+
+    def reading(self, sensor: int, sequence: int) -> ReadingMessage:
+        """Wait for the reading of a frame; readings of other sensors are kept for their turn.
+
+        Raises:
+            ProtocolError: The server answered that frame with an error, or not in time.
+        """
+        kept = self.sensors[sensor].kept
+        limit = time.monotonic() + self.timeout
+        while True:
+            while kept:
+                reading = kept.popleft()
+                if reading.sequence == sequence:
+                    return reading
+            found = self.receive(limit - time.monotonic())
+            if isinstance(found, ReadingMessage):
+                self._keep(found)
+            elif found["type"] == "error" and found.get("sensor", sensor) == sensor:
+                raise ProtocolError(found["message"], found["code"])
+
+    def _keep(self, reading: ReadingMessage) -> None:
+        if reading.sensor in self.sensors:
+            self.sensors[reading.sensor].kept.append(reading)
+
+
+class RemoteSensor:
+    """A sensor that a server simulates; made by :meth:`Client.open`."""
+
+    def __init__(self, client: Client, opened: Mapping[str, Any]) -> None:
+        self.client = client
+        self.number: int = opened["sensor"]
+        self.design: str = opened["design"]
+        self.electrode_names: tuple[str, ...] = tuple(opened["electrodes"])
+        """In matrix order."""
+        self.channel_names: tuple[str, ...] = tuple(opened["channels"])
+        """Of the read-out; empty without one."""
+        self.baseline: Array = np.array(opened["baseline"])
+        """Maxwell matrix of the empty scene [F], shape (M, M)."""
+        self.domain: Array = np.array(opened["domain"])
+        """Lower and upper corner of what the sensor sees [m], shape (2, 3)."""
+        self.sequence = 0
+        """Number of the next frame."""
+        self.kept: deque[ReadingMessage] = deque(maxlen=64)
+        """Readings that came while something else was waited for."""
+
+    def step(
+        self, depth: ArrayLike, eps_r: ArrayLike | None = None, time: float = 0.0
+    ) -> ReadingMessage:
+        """Send a depth image and wait for its reading.
+
+        Args:
+            depth: [m], shape (rows, columns).
+            eps_r: Permittivity codes, type uint8, or relative permittivities; same shape.
+            time: Of the image [s].
+
+        Raises:
+            ProtocolError: The image is malformed, or the server answered an error.
+        """
+        return self.client.reading(self.number, self.send(depth, eps_r, time))
+
+    def step_scene(self, body: Sequence[Mapping[str, Any]], time: float = 0.0) -> ReadingMessage:
+        """Send bodies and wait for the reading.
+
+        Args:
+            body: Tables as in a scenario file: ``{"name": "ball", "shape": "sphere", …}``.
+            time: [s].
+
+        Raises:
+            ProtocolError: The server answered an error.
+        """
+        return self._control("scene", time, body=list(body))
+
+    def step_poses(self, poses: Mapping[str, Any], time: float = 0.0) -> ReadingMessage:
+        """Move bodies of the last scene and wait for the reading.
+
+        Args:
+            poses: Name of a body to ``{"position": [x, y, z], "quaternion": [x, y, z, w]}``.
+            time: [s].
+
+        Raises:
+            ProtocolError: The server answered an error.
+        """
+        return self._control("poses", time, poses=dict(poses))
+
+    def send(self, depth: ArrayLike, eps_r: ArrayLike | None = None, time: float = 0.0) -> int:
+        """Send a depth image, as :meth:`step` does, but do not wait; returns its number."""
+        self.client.send(pack_depth(self.number, self.sequence, time, depth, eps_r))
+        self.sequence += 1
+        return self.sequence - 1
+
+    def reset(self) -> None:
+        """Forget the step before; the read-out and the numbers of frames begin anew."""
+        self.client.ask("reset", type="reset", sensor=self.number)
+        self.sequence = 0
+        self.kept.clear()
+
+    def close(self) -> dict[str, int]:
+        """Close the sensor; returns how many frames were taken, solved and dropped."""
+        told = self.client.ask("closed", type="close", sensor=self.number)
+        del self.client.sensors[self.number]
+        return {key: told[key] for key in ("frames", "readings", "dropped")}
+
+    def _control(self, kind: str, time: float, **content: Any) -> ReadingMessage:
+        sequence = self.sequence
+        self.sequence += 1
+        message = {"type": kind, "sensor": self.number, "sequence": sequence, "time": time}
+        self.client.send(json.dumps({**message, **content}))
+        return self.client.reading(self.number, sequence)
+
+
+def _closed(error: Any) -> ProtocolError:
+    """What a closed connection means; its reason is the code of the error that closed it."""
+    close = error.rcvd
+    reason = close.reason if close is not None else ""
+    code = close.code if close is not None else 1006
+    return ProtocolError(f"the server closed the connection ({code} {reason})".strip(), reason
+                         or "closed")  # fmt: skip

@@ -1,0 +1,272 @@
+"""Control messages of the protocol: JSON objects with a ``type``, checked as they are read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NoReturn, cast
+
+from capsense import _validate
+from capsense.errors import (
+    CapSenseError,
+    DesignError,
+    MeshError,
+    ProtocolError,
+    ReadOutError,
+    ScenarioError,
+    SceneError,
+    SolveError,
+)
+from capsense.scenario.bodies import read_grounding, read_material, read_pose
+from capsense.scenario.loader import read_bodies
+from capsense.scenario.schema import Table as ScenarioTable
+from capsense.scene import Body, Material, Pose
+from capsense.scene.body import Grounding
+from capsense.scene.camera import OrthographicCamera
+from capsense.server.frames import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL
+
+MAX_TEXT = 65536
+"""Largest control message [bytes]."""
+CODES = {
+    "version": "the client speaks another version of the protocol; closes the connection",
+    "token": "the token is missing or wrong; closes the connection",
+    "timeout": "no hello in time, or the client does not take its readings; closes the connection",
+    "full": "the server takes no more connections; closes the connection",
+    "malformed": "a message is cut, padded, of an unknown kind, or a key or number in it is wrong",
+    "limit": "an image, message or count is larger than the server allows",
+    "sensor": "no sensor of that number is open, or one is already",
+    "sequence": "a sequence number does not exceed the one before",
+    "scene": "a depth frame, body, material or design is wrong",
+    "readout": "the read-out cannot go from the last time to this one",
+    "solve": "the solver did not reach its tolerance",
+    "internal": "a fault of the server; its log says more",
+}
+"""Error codes."""
+_CODE_OF: tuple[tuple[type[CapSenseError], str], ...] = (
+    (ReadOutError, "readout"), (SolveError, "solve"), (SceneError, "scene"),
+    (ScenarioError, "scene"), (MeshError, "scene"), (DesignError, "scene"),
+)  # fmt: skip
+
+
+class Table(_validate.Table):
+    """One object of a control message; whatever is wrong raises :class:`ProtocolError`."""
+
+    error_type = ProtocolError
+
+
+@dataclass(frozen=True)
+class Hello:
+    """The first message."""
+
+    token: str
+    client: str
+    """What the client calls itself."""
+
+
+@dataclass(frozen=True)
+class Open:
+    """A sensor is wanted."""
+
+    sensor: int
+    design: str
+    """Empty for the server's first."""
+    camera: OrthographicCamera
+    material: Material | str
+    """Of frames without permittivities."""
+    grounding: Grounding
+    back: Literal["fill"] | float
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """A scene made of shapes."""
+
+    sensor: int
+    sequence: int
+    time: float
+    bodies: tuple[Body, ...]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Bodies of the last scene have moved."""
+
+    sensor: int
+    sequence: int
+    time: float
+    poses: Mapping[str, Pose]
+
+
+def parse(text: str) -> Table:
+    """The object in a control message.
+
+    Raises:
+        ProtocolError: It is too long, no JSON object, or has no ``type``.
+    """
+    if len(text) > MAX_TEXT:
+        raise ProtocolError(
+            f"a control message has {len(text)} characters; up to {MAX_TEXT} are taken", "limit"
+        )
+    try:
+        data = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"a control message is not JSON: {str(error)[:80]}") from None
+    if not isinstance(data, dict):
+        raise ProtocolError('a control message must be a JSON object, like {"type": "hello"}')
+    kind = Table(data, "message", "control message").string("type")
+    return Table(data, "message", _validate.shorten(kind))
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def read_hello(table: Table) -> Hello:
+    """Read the first message.
+
+    Raises:
+        ProtocolError: It is no ``hello``, of another version, or a key is wrong.
+    """
+    if table.data["type"] != "hello":
+        raise table.error('comes before {"type": "hello"}; say hello first')
+    table.only(("type", "protocol", "token", "client"))
+    version = table.integer("protocol", 0, 2**31 - 1)
+    if version != PROTOCOL:
+        raise ProtocolError(
+            f"the client speaks version {version} of the protocol; this server speaks {PROTOCOL}",
+            "version",
+        )
+    return Hello(table.text("token"), table.text("client")[:80])
+
+
+def read_open(table: Table) -> Open:
+    """Read an ``open``.
+
+    Raises:
+        ProtocolError: A key, type or number is wrong.
+        CapSenseError: A camera, material or grounding is wrong.
+    """
+    table.only(("type", "sensor", "design", "camera", "material", "grounding", "back"))
+    options = ScenarioTable({"material": "steel", **table.data}, "message", "open")
+    back: Literal["fill"] | float = "fill"
+    if table.data.get("back", "fill") != "fill":
+        back = table.length("back")
+    return Open(
+        _sensor(table),
+        table.text("design"),
+        _read_camera(Table(table.data.get("camera", {}), "message", "camera")),
+        read_material(options),
+        read_grounding(options),
+        back,
+    )
+
+
+def _read_camera(table: Table) -> OrthographicCamera:
+    table.only(("width", "height", "near", "far", "rows", "columns", "pose"))
+    pose = Pose()
+    if "pose" in table:
+        pose = read_pose(ScenarioTable(table.data["pose"], "message", "camera: pose"))
+    return OrthographicCamera(
+        table.length("width", 0.5),
+        table.length("height", 0.5),
+        pose,
+        table.length("near", 0.0, zero=True),
+        table.length("far", 0.5),
+        cast("Literal['+y', '-y']", table.choice("rows", ("+y", "-y"), "+y")),
+        cast("Literal['+x', '-x']", table.choice("columns", ("+x", "-x"), "+x")),
+    )
+
+
+def read_scene(table: Table, max_bodies: int) -> Bodies:
+    """Read a ``scene``: bodies as in a scenario file, at rest and without files.
+
+    Raises:
+        ProtocolError: A key, type or number is wrong, or there are too many bodies.
+        ScenarioError: A body is wrong.
+    """
+    table.only(("type", "sensor", "sequence", "time", "body"))
+    raw = table.tables("body")
+    if len(raw) > max_bodies:
+        raise ProtocolError(
+            f"the scene has {len(raw)} bodies; this server takes {max_bodies}", "limit"
+        )
+    for body in raw:
+        if isinstance(body, Mapping) and (body.get("shape") == "mesh" or "trajectory" in body):
+            raise table.error("meshes and trajectories are not taken here; send depth frames, or "
+                              "a new pose for every step")  # fmt: skip
+    bodies = read_bodies(ScenarioTable({"body": raw}, "message", "scene"), Path())
+    return Bodies(*read_address(table), tuple(b.body for b in bodies))
+
+
+def read_poses(table: Table, max_bodies: int) -> Poses:
+    """Read a ``poses``.
+
+    Raises:
+        ProtocolError: A key, type or number is wrong, or there are too many bodies.
+        ScenarioError: A pose is wrong.
+    """
+    table.only(("type", "sensor", "sequence", "time", "poses"))
+    raw = Table(table.raw("poses", '{"name": {"position": [x, y, z]}}'), "message", "poses").data
+    if len(raw) > max_bodies:
+        raise ProtocolError(f"{len(raw)} poses; this server takes {max_bodies}", "limit")
+    poses = {
+        name: read_pose(ScenarioTable(pose, "message", f"pose of {name!r}"))
+        for name, pose in raw.items()
+    }
+    return Poses(*read_address(table), poses)
+
+
+def read_sensor(table: Table) -> int:
+    """Read a ``reset`` or ``close``: nothing but the sensor's number.
+
+    Raises:
+        ProtocolError: A key, type or number is wrong.
+    """
+    table.only(("type", "sensor"))
+    return _sensor(table)
+
+
+def read_address(table: Table) -> tuple[int, int, float]:
+    """Sensor, sequence number and time [s] of a scene.
+
+    Raises:
+        ProtocolError: One is missing or out of range.
+    """
+    return (
+        _sensor(table),
+        table.integer("sequence", 0, MAX_SEQUENCE),
+        table.number("time", -1e300, 1e300, 0.0, unit="s"),
+    )
+
+
+def _sensor(table: Table) -> int:
+    return table.integer("sensor", 0, MAX_SENSOR)
+
+
+def address_of(message: str | bytes) -> dict[str, int]:
+    """Sensor and sequence number of a message, as far as they can be told, for an error."""
+    if isinstance(message, bytes):
+        if len(message) < HEADER.size:
+            return {}
+        fields = HEADER.unpack_from(message)
+        return {"sensor": fields[4], "sequence": fields[8]}
+    try:
+        data = parse(message).data
+    except ProtocolError:
+        return {}
+    keys = ("sensor", "sequence")
+    return {k: data[k] for k in keys if isinstance(data.get(k), int)}
+
+
+def code_of(error: CapSenseError) -> str:
+    """The code of an error."""
+    if isinstance(error, ProtocolError):
+        return error.code
+    return next((code for kind, code in _CODE_OF if isinstance(error, kind)), "internal")
+
+
+def error_message(code: str, text: str, **address: int) -> dict[str, Any]:
+    """The control message of an error."""
+    return {"type": "error", "code": code, "message": text[:500], **address}

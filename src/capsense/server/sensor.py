@@ -1,0 +1,185 @@
+"""One sensor of one client: takes frames, keeps the newest, answers with readings."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import ProtocolError, ReadOutError
+from capsense.readout.config import load_readout
+from capsense.readout.counts import Counts
+from capsense.readout.read_out import ReadOut
+from capsense.scene import Body, Scene
+from capsense.scene.depth import DepthFrame
+from capsense.server.frames import (
+    CONVERSION,
+    NO_DETECTOR,
+    DepthMessage,
+    ReadingMessage,
+    pack_reading,
+)
+from capsense.server.messages import Bodies, Open, Poses
+from capsense.simulator import Reading, Simulator
+
+MAX_CONVERSIONS = 10_000
+"""A step in time that spans more conversions of the read-out than this is refused."""
+Frame = DepthMessage | Bodies
+
+
+class ServedSensor:
+    """A simulator, its read-out, and the newest frame that waits for it.
+
+    :meth:`offer`, :meth:`take`, :meth:`move` and :meth:`restart` belong to the event loop;
+    :meth:`solve` may run in any thread, one call at a time, with :attr:`lock` held.
+
+    Args:
+        options: What the client asked for.
+        simulator: Of its own.
+        readout: Of its own, or None.
+    """
+
+    def __init__(self, options: Open, simulator: Simulator, readout: ReadOut | None) -> None:
+        self.options = options
+        self.simulator = simulator
+        self.readout = readout
+        self.lock = asyncio.Lock()
+        """Held while a frame is solved and its reading sent."""
+        self.frames = 0
+        """Frames taken in."""
+        self.readings = 0
+        """Frames solved."""
+        self.dropped = 0
+        """Frames that newer ones replaced."""
+        self._waiting: Frame | None = None
+        self._last = -1
+        self._bodies: dict[str, Body] = {}
+        self._time: float | None = None
+
+    def offer(self, frame: Frame | Poses) -> None:
+        """Take a frame in; one that still waits is dropped for it.
+
+        Raises:
+            ProtocolError: Its number does not exceed the one before, or it moves an unknown body.
+        """
+        if frame.sequence <= self._last:
+            raise ProtocolError(
+                f"frame {frame.sequence} comes after frame {self._last}; numbers must rise, "
+                "until a reset",
+                "sequence",
+            )
+        self._last = frame.sequence
+        if isinstance(frame, Poses):
+            frame = self._moved(frame)
+        if isinstance(frame, Bodies):
+            self._bodies = {str(b.name): b for b in frame.bodies}
+        self.frames += 1
+        self.dropped += self._waiting is not None
+        self._waiting = frame
+
+    def take(self) -> Frame | None:
+        """The frame that waits, if any; it waits no longer."""
+        frame, self._waiting = self._waiting, None
+        return frame
+
+    def restart(self) -> None:
+        """Forget everything but the bodies; the lock must be held."""
+        self._waiting, self._last, self._time = None, -1, None
+        self.simulator.reset()
+
+    def solve(self, frame: Frame) -> bytes:
+        """The message that answers a frame.
+
+        Raises:
+            SceneError: The frame is wrong.
+            SolveError: The solver did not reach its tolerance.
+            ReadOutError: Time goes back, or leaps ahead.
+        """
+        self._check_time(frame.time)
+        try:
+            reading = self.simulator.step(self._world(frame))
+        except Exception:
+            self.simulator.reset()  # a step that failed is no starting point for the next one
+            raise
+        if self.readout is not None:
+            reading = replace(reading, counts=self._read_out(frame.time, reading))
+        self.readings += 1
+        return pack_reading(
+            ReadingMessage(
+                frame.sensor, frame.sequence, frame.time, reading.capacitance, reading.delta,
+                reading.self_capacitance, reading.stats.iterations, self.dropped,
+                reading.stats.error_estimate, reading.stats.wall_time,
+                _conversions(reading.counts),
+            )
+        )  # fmt: skip
+
+    def _moved(self, message: Poses) -> Bodies:
+        for name in message.poses:
+            if name not in self._bodies:
+                known = ", ".join(self._bodies) or "none"
+                raise ProtocolError(f"the last scene has no body {name!r}; it has {known}", "scene")
+        moved = {name: self._bodies[name].moved(pose) for name, pose in message.poses.items()}
+        bodies = tuple({**self._bodies, **moved}.values())
+        return Bodies(message.sensor, message.sequence, message.time, bodies)
+
+    def _world(self, frame: Frame) -> Scene | DepthFrame:
+        if isinstance(frame, Bodies):
+            return Scene(frame.bodies)
+        wanted = self.options
+        eps_r = wanted.material if frame.eps_r is None else frame.eps_r
+        return DepthFrame(
+            frame.depth, eps_r, wanted.camera, grounding=wanted.grounding, back=wanted.back
+        )
+
+    def _check_time(self, time: float) -> None:
+        """Refuse a time that the read-out cannot go to."""
+        if self.readout is None or self._time is None:
+            return
+        period = self.readout.schedule.period / len(self.readout.channel_names)
+        if (time - self._time) / period > MAX_CONVERSIONS:
+            raise ReadOutError(
+                f"time leaps from {self._time:g} to {time:g} s, over more than {MAX_CONVERSIONS} "
+                "conversions; send a reset first"
+            )
+
+    def _read_out(self, time: float, reading: Reading) -> Counts:
+        assert self.readout is not None
+        if self._time is None:
+            self.readout.reset(start=time)
+        counts = self.readout.sample(time, reading)
+        self._time = time
+        return counts
+
+
+def make_readout(name: str | Path, simulator: Simulator) -> ReadOut:
+    """A read-out for a simulator's electrodes.
+
+    Args:
+        name: A chip's name, or the path of a read-out file, ``.toml``.
+        simulator: The sensor; chips that adapt to their electrodes are set up for its baseline.
+
+    Raises:
+        ReadOutError: There is no such chip, or the file is wrong.
+    """
+    names = simulator.electrode_names
+    if str(name).endswith(".toml"):
+        return load_readout(name, names)
+    first = ReadOut.preset(str(name), names)
+    level = float(first.channel_values(simulator.step(Scene())).max())
+    return ReadOut.preset(str(name), names, expected=max(level, 1e-12))
+
+
+def _conversions(counts: Counts | None) -> NDArray[np.void]:
+    """Counts as the records of a message, shape (n,)."""
+    out = np.zeros(0 if counts is None else len(counts), CONVERSION)
+    if counts is None or not len(counts):
+        return out
+    for key in ("time", "code", "capacitance", "channel", "flags"):
+        out[key] = getattr(counts, key)
+    out["state"] = NO_DETECTOR
+    if counts.baseline is not None and counts.touched is not None:
+        out["baseline"], out["state"] = counts.baseline, counts.touched
+    return out

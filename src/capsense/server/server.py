@@ -1,0 +1,240 @@
+"""The WebSocket server: many clients, each with sensors of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import socket
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from http import HTTPStatus
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+import numpy as np
+
+from capsense._validate import suggest
+from capsense.errors import MissingDependencyError, ProtocolError, ServerError
+from capsense.scene.depth import DepthFrame
+from capsense.server.frames import PROTOCOL
+from capsense.server.messages import Open
+from capsense.server.options import Options
+from capsense.server.sensor import ServedSensor, make_readout
+from capsense.simulator import Simulator
+
+try:
+    from websockets.asyncio.server import ServerConnection, serve
+    from websockets.datastructures import Headers
+    from websockets.http11 import Request, Response
+except ImportError as error:
+    raise MissingDependencyError(
+        'the server needs websockets; install it with: pip install "capsense[serve]"'
+    ) from error
+
+from capsense.server.session import TRY_LATER, Session
+
+if TYPE_CHECKING:
+    from websockets.typing import Origin
+
+T = TypeVar("T")
+SEND_BUFFER = 262144
+"""What the system may hold for a client that does not receive [bytes]."""
+Progress = Callable[[str, float], None]
+
+
+class Server:
+    """Serves sensors of some designs until it is told to stop.
+
+    Making it builds, or loads from the cache, the field of every design, and takes one step of
+    each, so that no client waits for that.
+
+    Args:
+        options: What is served, and to whom.
+        progress: Called with a stage's name and the fraction done while fields are built.
+        logger: Gets one record an event: its name as the message, its fields as ``record.fields``.
+
+    Raises:
+        DesignError: A design is wrong.
+        FieldError: A field could not be built.
+        ReadOutError: There is no such read-out.
+        ServerError: Two designs have one name.
+    """
+
+    def __init__(
+        self, options: Options, *, progress: Progress | None = None,
+        logger: logging.Logger | None = None,
+    ) -> None:  # fmt: skip
+        self.options = options
+        self.version = version("capsense")
+        self.url = ""
+        """Where it listens; empty before."""
+        self._logger = logger or logging.getLogger("capsense.server")
+        self._templates: dict[str, Simulator] = {}
+        for name in options.designs:
+            simulator = Simulator(name, progress=progress)
+            if simulator.design.name in self._templates:
+                raise ServerError(f"two designs are named {simulator.design.name!r}")
+            self._templates[simulator.design.name] = simulator
+            simulator.step(DepthFrame(np.full((8, 8), 0.1)))
+            self._make_readout(simulator)
+        self._sessions: dict[int, Session] = {}
+        self._counter = 0
+        self._readings = 0
+        self._started = time.monotonic()
+        self._stopping = False
+        # Every client has at most one solve and one message in work.
+        self._pool = ThreadPoolExecutor(2 * options.limits.connections, "capsense")
+
+    @property
+    def design_names(self) -> tuple[str, ...]:
+        """Names of the designs, the default first."""
+        return tuple(self._templates)
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Listen and serve until ``stop`` is set; then finish what is in work, and close.
+
+        Raises:
+            OSError: The address is taken or not this machine's.
+        """
+        options, limits = self.options, self.options.limits
+        listener = serve(
+            self._serve, options.host, options.port,
+            process_request=self._process_request,
+            origins=cast("list[Origin | None]", [None, *options.origins]),
+            compression=None, server_header=None,
+            open_timeout=limits.hello_timeout, close_timeout=2.0,
+            max_size=limits.message, max_queue=4,
+            logger=_quiet(self._logger),
+            create_connection=_gate(2 * limits.connections + 16),
+        )  # fmt: skip
+        try:
+            async with listener as server:
+                host, port = next(iter(server.sockets)).getsockname()[:2]
+                self.url = f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
+                self.log("listening", url=self.url, designs=self.design_names)
+                await stop.wait()
+                self._stopping = True
+                self.log("stopping", clients=len(self._sessions))
+        finally:
+            self._pool.shutdown()
+        self.log("stopped", readings=self.health()["readings"])
+
+    def health(self) -> dict[str, Any]:
+        """What ``GET /health`` answers."""
+        sessions = tuple(self._sessions.values())
+        return {
+            "status": "stopping" if self._stopping else "ok",
+            "version": self.version,
+            "protocol": PROTOCOL,
+            "designs": self.design_names,
+            "clients": len(sessions),
+            "sensors": sum(len(s.sensors) for s in sessions),
+            "readings": self._readings + sum(s.readings for s in sessions),
+            "uptime_s": round(time.monotonic() - self._started, 3),
+        }
+
+    # -- what sessions need -----------------------------------------------------------------------
+
+    def make_sensor(self, wanted: Open) -> ServedSensor:
+        """A sensor for a client; runs in a worker thread.
+
+        Raises:
+            ProtocolError: The design is not served.
+        """
+        name = wanted.design or self.design_names[0]
+        if name not in self._templates:
+            raise ProtocolError(
+                f"design {name!r} is not served; {suggest(name, self.design_names)}", "scene"
+            )
+        simulator = Simulator(self._templates[name].design)
+        return ServedSensor(wanted, simulator, self._make_readout(simulator))
+
+    async def work(self, job: Callable[[], T]) -> T:
+        """Do a job in a worker thread."""
+        return await asyncio.get_running_loop().run_in_executor(self._pool, job)
+
+    def log(self, event: str, **fields: Any) -> None:
+        """Log an event."""
+        self._logger.info(event, extra={"fields": fields})
+
+    def fault(self, event: str, **fields: Any) -> None:
+        """Log the exception at hand."""
+        self._logger.exception(event, extra={"fields": fields})
+
+    # -- connections ------------------------------------------------------------------------------
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        """Serve one client, from its handshake to its end."""
+        self._counter += 1
+        session = Session(self._counter, connection, self)
+        peer = connection.remote_address
+        if len(self._sessions) >= self.options.limits.connections:
+            await session.dismiss(
+                "full",
+                f"{len(self._sessions)} clients are connected, as many as allowed",
+                TRY_LATER,
+            )
+            return
+        self._sessions[session.number] = session
+        self.log("connected", client=session.number, peer=f"{peer[0]}:{peer[1]}")
+        try:
+            await session.run()
+        finally:
+            del self._sessions[session.number]
+            self._readings += session.readings
+            self.log("disconnected", client=session.number, readings=session.readings)
+
+    def _process_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer plain HTTP; let the handshake of a WebSocket go on."""
+        path = request.path.partition("?")[0]
+        if path == "/health":
+            status = HTTPStatus.SERVICE_UNAVAILABLE if self._stopping else HTTPStatus.OK
+            return _json(status, self.health())
+        if path != "/":
+            return _json(HTTPStatus.NOT_FOUND, {"error": "there are / (WebSocket) and /health"})
+        return None
+
+    def _make_readout(self, simulator: Simulator) -> Any:
+        readout = self.options.readout
+        return None if readout is None else make_readout(readout, simulator)
+
+
+def _json(status: HTTPStatus, content: dict[str, Any]) -> Response:
+    body = json.dumps(content).encode() + b"\n"
+    headers = Headers(
+        {"Content-Type": "application/json", "Content-Length": str(len(body)),
+         "Cache-Control": "no-store", "Connection": "close"}
+    )  # fmt: skip
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _gate(most: int) -> type[ServerConnection]:
+    """Connections of which no more than ``most`` are open, handshakes included."""
+    count = 0
+
+    class Connection(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            nonlocal count
+            count += 1
+            super().connection_made(transport)
+            raw = transport.get_extra_info("socket")
+            if raw is not None:
+                raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if count > most:
+                cast(asyncio.Transport, transport).abort()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            nonlocal count
+            count -= 1
+            super().connection_lost(exc)
+
+    return Connection
+
+
+def _quiet(logger: logging.Logger) -> logging.Logger:
+    """A child for what websockets says of broken handshakes: that is the clients' fault."""
+    child = logger.getChild("websockets")
+    child.setLevel(logging.CRITICAL)
+    return child

@@ -1,0 +1,272 @@
+"""One client of the server: its messages in, its readings out."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from websockets.exceptions import ConnectionClosed
+
+from capsense.errors import CapSenseError, ProtocolError
+from capsense.server import messages
+from capsense.server.frames import PROTOCOL, unpack_depth
+from capsense.server.options import Options
+from capsense.server.sensor import Frame, ServedSensor
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+
+T = TypeVar("T")
+POLICY, TRY_LATER = 1008, 1013
+"""Codes with which connections are closed on errors, and when there are too many."""
+ALLOWANCE = 5000.0
+"""Work that a client may cause a second without being slowed, in units of a small message."""
+OPENING, MISTAKE = 500.0, 100.0
+"""What it takes to open a sensor, and to answer an error."""
+
+
+class Hall(Protocol):
+    """What a session needs of its server."""
+
+    options: Options
+    version: str
+
+    @property
+    def design_names(self) -> tuple[str, ...]: ...
+
+    def make_sensor(self, wanted: messages.Open) -> ServedSensor: ...
+
+    async def work(self, job: Callable[[], T]) -> T: ...
+
+    def log(self, event: str, **fields: Any) -> None: ...
+
+    def fault(self, event: str, **fields: Any) -> None: ...
+
+
+class Session:
+    """Serves one client until it leaves.
+
+    The reader handles messages in their order. The solver takes the newest frames of the sensors
+    in turn, one solve at a time, each in a worker thread: no client gets more of the machine than
+    another, and none is held up by a client whose reader or solver waits.
+
+    Args:
+        number: Of the client, for the log.
+        connection: An open connection.
+        hall: The server.
+    """
+
+    def __init__(self, number: int, connection: ServerConnection, hall: Hall) -> None:
+        self.number = number
+        self.sensors: dict[int, ServedSensor] = {}
+        self.readings = 0
+        self._connection = connection
+        self._hall = hall
+        self._limits = hall.options.limits
+        self._wake = asyncio.Event()
+        self._left = False
+        self._allowance, self._counted = ALLOWANCE, time.monotonic()
+        self._handlers: dict[str, Callable[[messages.Table], Any]] = {
+            "open": self._open, "close": self._close, "reset": self._reset,
+            "scene": self._scene, "poses": self._poses,
+        }  # fmt: skip
+
+    async def run(self) -> None:
+        """Serve the client; returns when the connection is closed."""
+        try:
+            await self._greet()
+        except CapSenseError as error:
+            await self.dismiss(messages.code_of(error), str(error))
+            return
+        except ConnectionClosed:
+            return
+        solver = asyncio.create_task(self._solve_all())
+        try:
+            async for message in self._connection:
+                await self._pace(1 + len(message) / (16384 if isinstance(message, bytes) else 4096))
+                await self._handle(message)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._left = True
+            self._wake.set()
+            await solver
+
+    async def dismiss(self, code: str, text: str, close_code: int = POLICY) -> None:
+        """Say what is wrong, and close the connection."""
+        self._hall.log("dismissed", client=self.number, code=code, message=text[:200])
+        try:
+            await self._send(json.dumps(messages.error_message(code, text)))
+            await self._connection.close(close_code, code)
+        except ConnectionClosed:
+            pass
+
+    # -- the reader -----------------------------------------------------------------------------
+
+    async def _greet(self) -> None:
+        """Wait for the hello, and answer it.
+
+        Raises:
+            ProtocolError: It did not come, is malformed, of another version, or lacks the token.
+        """
+        try:
+            async with asyncio.timeout(self._limits.hello_timeout):
+                message = await self._connection.recv()
+        except TimeoutError:
+            raise ProtocolError(
+                f"no hello within {self._limits.hello_timeout:g} s", "timeout"
+            ) from None
+        if isinstance(message, bytes):
+            raise ProtocolError("a binary message comes before the hello; say hello first")
+        hello = messages.read_hello(messages.parse(message))
+        if not self._hall.options.admits(hello.token):
+            raise ProtocolError("the token is missing or wrong", "token")
+        self._hall.log("hello", client=self.number, name=hello.client)
+        limits = self._limits
+        await self._tell(
+            "welcome", protocol=PROTOCOL, server=f"capsense {self._hall.version}",
+            designs=self._hall.design_names,
+            limits={"sensors": limits.sensors, "pixels": limits.pixels, "bodies": limits.bodies,
+                    "message": limits.message},
+        )  # fmt: skip
+
+    async def _pace(self, cost: float) -> None:
+        """Charge some work; wait while the client has caused more than its allowance."""
+        now = time.monotonic()
+        regained = (now - self._counted) * ALLOWANCE
+        self._allowance = min(ALLOWANCE, self._allowance + regained) - cost
+        self._counted = now
+        if self._allowance < 0:
+            await asyncio.sleep(-self._allowance / ALLOWANCE)
+
+    async def _handle(self, message: str | bytes) -> None:
+        """Act on one message; whatever is wrong with it is answered."""
+        try:
+            if isinstance(message, bytes):
+                frame = unpack_depth(message, self._limits.pixels)
+                self._sensor(frame.sensor).offer(frame)
+                self._wake.set()
+                return
+            table = messages.parse(message)
+            kind = table.choice("type", tuple(self._handlers))
+            await self._handlers[kind](table)
+        except ConnectionClosed:
+            raise
+        except Exception as error:
+            await self._refuse(error, **messages.address_of(message))
+
+    async def _open(self, table: messages.Table) -> None:
+        wanted = messages.read_open(table)
+        if wanted.sensor in self.sensors:
+            raise ProtocolError(f"sensor {wanted.sensor} is open already; close it first", "sensor")
+        if len(self.sensors) >= self._limits.sensors:
+            raise ProtocolError(
+                f"{len(self.sensors)} sensors are open, as many as allowed", "limit"
+            )
+        await self._pace(OPENING)
+        sensor = await self._hall.work(lambda: self._hall.make_sensor(wanted))
+        self.sensors[wanted.sensor] = sensor
+        simulator, readout = sensor.simulator, sensor.readout
+        self._hall.log(
+            "opened", client=self.number, sensor=wanted.sensor, design=simulator.design.name
+        )
+        domain = simulator.design.domain
+        await self._tell(
+            "opened", sensor=wanted.sensor, design=simulator.design.name,
+            electrodes=simulator.electrode_names, baseline=simulator.baseline.tolist(),
+            domain=[domain.lower.tolist(), domain.upper.tolist()],
+            channels=() if readout is None else readout.channel_names,
+        )  # fmt: skip
+
+    async def _close(self, table: messages.Table) -> None:
+        sensor = self._sensor(messages.read_sensor(table))
+        number = sensor.options.sensor
+        async with sensor.lock:
+            del self.sensors[number]
+        self._hall.log("closed", client=self.number, sensor=number)
+        await self._tell(
+            "closed", sensor=number, frames=sensor.frames, readings=sensor.readings,
+            dropped=sensor.dropped,
+        )  # fmt: skip
+
+    async def _reset(self, table: messages.Table) -> None:
+        sensor = self._sensor(messages.read_sensor(table))
+        async with sensor.lock:
+            sensor.restart()
+        await self._tell("reset", sensor=sensor.options.sensor)
+
+    async def _scene(self, table: messages.Table) -> None:
+        scene = await self._hall.work(lambda: messages.read_scene(table, self._limits.bodies))
+        self._sensor(scene.sensor).offer(scene)
+        self._wake.set()
+
+    async def _poses(self, table: messages.Table) -> None:
+        poses = await self._hall.work(lambda: messages.read_poses(table, self._limits.bodies))
+        self._sensor(poses.sensor).offer(poses)
+        self._wake.set()
+
+    def _sensor(self, number: int) -> ServedSensor:
+        if number not in self.sensors:
+            known = ", ".join(map(str, self.sensors)) or "none"
+            raise ProtocolError(f"there is no sensor {number}; open are {known}", "sensor")
+        return self.sensors[number]
+
+    # -- the solver -----------------------------------------------------------------------------
+
+    async def _solve_all(self) -> None:
+        """Solve the newest frames of all sensors in turn until the client leaves."""
+        while not self._left:
+            await self._wake.wait()
+            self._wake.clear()
+            for sensor in tuple(self.sensors.values()):
+                async with sensor.lock:
+                    frame = sensor.take()
+                    if frame is not None:
+                        self._wake.set()  # another may have come meanwhile
+                        await self._solve(sensor, frame)
+                if self._left:
+                    return
+
+    async def _solve(self, sensor: ServedSensor, frame: Frame) -> None:
+        try:
+            await self._send(await self._hall.work(lambda: sensor.solve(frame)))
+            self.readings += 1
+        except ConnectionClosed:
+            self._left = True
+        except Exception as error:
+            try:
+                await self._refuse(error, sensor=frame.sensor, sequence=frame.sequence)
+            except ConnectionClosed:
+                self._left = True
+
+    # -- answers --------------------------------------------------------------------------------
+
+    async def _refuse(self, error: Exception, **address: int) -> None:
+        """Answer an error; one that nobody foresaw is logged in full."""
+        if isinstance(error, CapSenseError):
+            code, text = messages.code_of(error), str(error)
+            self._hall.log("refused", client=self.number, code=code, message=text[:200], **address)
+        else:
+            code, text = "internal", "a fault of the server; its log says more"
+            self._hall.fault("internal error", client=self.number, **address)
+        await self._send(json.dumps(messages.error_message(code, text, **address)))
+        await self._pace(MISTAKE)
+
+    async def _tell(self, kind: str, **content: Any) -> None:
+        await self._send(json.dumps({"type": kind, **content}))
+
+    async def _send(self, message: str | bytes) -> None:
+        """Send, and cut off a client that does not receive.
+
+        Raises:
+            ConnectionClosed: The connection is closed.
+        """
+        try:
+            async with asyncio.timeout(self._limits.send_timeout):
+                await self._connection.send(message)
+        except TimeoutError:
+            self._hall.log("too slow", client=self.number)
+            self._connection.transport.abort()
