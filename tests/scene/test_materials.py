@@ -11,9 +11,9 @@ from capsense.scene.materials import water
 
 # Gabriel 1996, four-term Cole-Cole: eps_inf, sigma_ion [S/m], then step, tau [s], alpha per term.
 GABRIEL = {
-    "skin": (4, 0, 32, 7.234e-12, 0, 1100, 32.481e-9, 0.2),
+    "skin": (4, 2e-4, 32, 7.234e-12, 0, 1100, 32.481e-9, 0.2),
     "wet skin": (
-        *(4, 0, 39, 7.958e-12, 0.1, 280, 79.577e-9, 0),
+        *(4, 4e-4, 39, 7.958e-12, 0.1, 280, 79.577e-9, 0),
         *(3e4, 1.592e-6, 0.16, 3e4, 1.592e-3, 0.2),
     ),
     "muscle": (

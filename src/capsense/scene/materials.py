@@ -131,7 +131,7 @@ _TABLE = (
     Material("water", 78.5, 0.05, "eps_r at 25 °C; sigma of tap water, common 0.005-0.08 S/m"),
     Material("deionised water", 78.5, 5.5e-6, "eps_r and sigma of pure water at 25 °C"),
     # Tissues, at 250 kHz. All count as conductors there; fat and cortical bone not at 1 MHz.
-    Material("skin", 1098.0, 1.26e-3, _GABRIEL + "dry skin", GABRIEL["skin dry"]),
+    Material("skin", 1098.0, 1.46e-3, _GABRIEL + "dry skin", GABRIEL["skin dry"]),
     Material("wet skin", 7180.0, 0.131, _GABRIEL + "wet skin", GABRIEL["skin wet"]),
     Material("muscle", 5763.0, 0.396, _GABRIEL + "muscle", GABRIEL["muscle"]),
     Material("fat", 67.79, 0.0436, _GABRIEL + "infiltrated fat", GABRIEL["fat"]),
