@@ -29,7 +29,7 @@ def draw_design(design: Design, ax: Axes | None = None) -> Axes:
     """Draw a design seen from the world (along −z), in millimetres.
 
     Without ``ax`` a figure is made with a side view under the top view, its heights stretched
-    and not to scale; with ``ax`` only the top view is drawn into it.
+    and not to scale unless electrodes are curved; with ``ax`` only the top view is drawn into it.
 
     Parameters
     ----------
@@ -47,8 +47,9 @@ def draw_design(design: Design, ax: Axes | None = None) -> Axes:
     if ax is None:
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(7.0, 7.2), layout="constrained")
-        top_axes, side = figure.subplots(2, 1, height_ratios=[4.2, 1.0])
+        ratios, tall = ([1.0, 1.0], 9.0) if _is_curved(design) else ([4.2, 1.0], 7.2)
+        figure = Figure(figsize=(7.0, tall), layout="constrained")
+        top_axes, side = figure.subplots(2, 1, height_ratios=ratios)
         ax = top_axes
     _top_view(design, ax)
     if side is not None:
@@ -57,13 +58,15 @@ def draw_design(design: Design, ax: Axes | None = None) -> Axes:
 
 
 def outlines(surface: Surface) -> list[Polygon]:
-    """Shadows [mm] of a surface's facets on the xy plane; facets on edge leave none."""
-    out = []
+    """Shadows [mm] of a surface on the xy plane; facets on edge leave none."""
+    shadows = []
     for facet in surface.facets:
         rings = [r[:, :2] * 1e3 for r in ring_vertices(facet)]
-        shadow = Polygon(rings[0], rings[1:]).buffer(0)
-        out += [p for p in shapely.get_parts(shadow) if isinstance(p, Polygon) and p.area > 1e-9]
-    return out
+        shadows.append(Polygon(rings[0], rings[1:]).buffer(0))
+    if len(shadows) > 1:  # without the seams between the strips of a bent sheet
+        shadows = [s.buffer(1e-6, join_style="mitre") for s in shadows]
+    parts = shapely.get_parts(shapely.union_all(shadows))
+    return [p for p in parts if isinstance(p, Polygon) and p.area > 1e-4]
 
 
 def outline_patch(polygon: Polygon, **style: Any) -> PathPatch:
@@ -154,8 +157,30 @@ def _label_place(surface: Surface, parts: list[Polygon]) -> tuple[float, float, 
     return float(spot.x), float(spot.y), 0.75
 
 
+def _is_curved(design: Design) -> bool:
+    """Whether some electrode is not flat and level."""
+    return any(np.ptp(e.surface.bounds[:, 2]) > 1e-6 for e in design.electrodes)
+
+
+def _profile(design: Design, ax: Axes) -> None:
+    """What is curved, seen along +y, to scale."""
+    for conductor in design.conductors:
+        _edge_on(ax, conductor.surface, lambda z: z * 1e3, ROLE_COLOURS[conductor.role], 0.8)
+    for number, electrode in enumerate(design.electrodes):
+        _edge_on(ax, electrode.surface, lambda z: z * 1e3, ELECTRODES[number % 2], 2.0, 2.0)
+    ax.set_aspect("equal")
+    ax.set_xlim(ax.figure.axes[0].get_xlim())
+    ax.tick_params(labelsize=8)
+    ax.set(xlabel="x [mm]", ylabel="z [mm]")
+    ax.set_title("side view", fontsize=9)
+    ax.spines[["top", "right"]].set_visible(False)
+
+
 def _side_view(design: Design, ax: Axes) -> None:
     """The stack seen along +y: every level of the design at equal steps, with its z in mm."""
+    if _is_curved(design):
+        _profile(design, ax)
+        return
     backplane = -design.domain.backplane
     values = [backplane]
     for layer in design.layers:
@@ -203,16 +228,20 @@ def _side_view(design: Design, ax: Axes) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _edge_on(ax: Axes, surface: Surface, height: Any, colour: str) -> None:
-    """Draw each facet's extent in x and z."""
+def _edge_on(
+    ax: Axes, surface: Surface, height: Any, colour: str, width: float = 4.0, upright: float = 0.8
+) -> None:
+    """Draw each facet's extent in x and z, with one line width for level facets, one for others."""
     for facet in surface.facets:
         points = ring_vertices(facet)[0]
         x, z = points[:, 0] * 1e3, points[:, 2]
         if np.ptp(z) < 1e-6:
             for low, high in _runs(facet, float(points[:, 1].mean())):
-                ax.plot([low, high], [height(z[0])] * 2, color=colour, lw=4, solid_capstyle="butt")
+                ax.plot(
+                    [low, high], [height(z[0])] * 2, color=colour, lw=width, solid_capstyle="butt"
+                )
         else:
-            ax.fill(x, [height(v) for v in z], color=colour, alpha=0.5, lw=0.8)
+            ax.fill(x, [height(v) for v in z], color=colour, alpha=0.5, lw=upright)
 
 
 def _runs(facet: Any, y: float) -> list[tuple[float, float]]:

@@ -12,6 +12,7 @@ import numpy as np
 from capsense._validate import nearest, read_toml, suggest
 from capsense.design.checks import check_design, snap_to_layers
 from capsense.design.clearance import cut_clearance
+from capsense.design.curved import bend_sheet, cylinder_surface, is_level, read_bend
 from capsense.design.geometry import Surface
 from capsense.design.materials import LAYER_EPS_R
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
@@ -29,6 +30,7 @@ TOP_KEYS = (
     "electrodes_from_stl",
     "layer",
     "conductor",
+    "bend",
     "build",
 )
 
@@ -125,6 +127,15 @@ def parse_design(
     electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack)) for e in electrodes]
     conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
     conductors = [Conductor(c.name, c.role, snap_to_layers(c.surface, stack)) for c in conductors]
+    if "bend" in data:
+        radius = read_bend(Table(data["bend"], source, "bend", limit))
+        if layers:
+            raise DesignError(
+                f'{source}: layer "{layers[0].name}": layers are flat boxes and cannot be bent; '
+                "remove the layers or [bend]"
+            )
+        electrodes = [Electrode(e.name, _bent(e, radius, source)) for e in electrodes]
+        conductors = [Conductor(c.name, c.role, _bent(c, radius, source)) for c in conductors]
     build = _read_build(Table(data.get("build", {}), source, "build"))
     design = Design(
         name=name,
@@ -158,7 +169,7 @@ def _read_build(table: Table) -> dict[str, float]:
 
 def _read_surface(table: Table, folder: Path, domain: Domain, extra: tuple[str, ...]) -> Surface:
     """Read ``shape``, where it sits, and its own keys; ``extra`` are keys of the item itself."""
-    names = [*SHAPES, "box", "stl"]
+    names = [*SHAPES, "box", "cylinder", "stl"]
     shape = table.choice("shape", names)
     common = ("name", "shape", *extra, *PLACEMENT_KEYS)
     if shape == "stl":
@@ -169,8 +180,19 @@ def _read_surface(table: Table, folder: Path, domain: Domain, extra: tuple[str, 
     if shape == "box":
         table.only((*common, "size"))
         return box_surface(table, read_placement(table))
+    if shape == "cylinder":
+        table.only((*common, "radius", "length"))
+        return cylinder_surface(table, read_placement(table))
     table.only((*common, *SHAPES[shape].keys, "leads"))
     return planar_surface(table, shape, read_placement(table))
+
+
+def _bent(sheet: Electrode | Conductor, radius: float, source: str) -> Surface:
+    """A sheet as ``[bend]`` leaves it; what is not flat and level keeps its place."""
+    if not is_level(sheet.surface):
+        return sheet.surface
+    item = f'{source}: {type(sheet).__name__.lower()} "{sheet.name}"'
+    return bend_sheet(item, sheet.surface, radius)
 
 
 def _read_electrode(table: Table, folder: Path, domain: Domain) -> Electrode:

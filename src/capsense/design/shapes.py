@@ -30,11 +30,14 @@ MAX_SEGMENTS = 64
 """... or by this many chords to the circle, whichever is coarser."""
 
 
-def circle_segments(radius: float) -> int:
-    """Chords to the full circle of a radius [m]: a multiple of 4 from 8 to 64."""
-    if radius <= 2 * CHORD_ERROR:
+def circle_segments(radius: float, error: float = CHORD_ERROR) -> int:
+    """Chords to the full circle of a radius [m]: a multiple of 4 from 8 to 64.
+
+    ``error`` is how far they may leave the circle [m].
+    """
+    if radius <= 2 * error:
         return 8
-    exact = math.pi / math.acos(1.0 - CHORD_ERROR / radius)
+    exact = math.pi / math.acos(1.0 - error / radius)
     return max(8, min(MAX_SEGMENTS, 4 * math.ceil(exact / 4)))
 
 
