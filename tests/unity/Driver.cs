@@ -1,0 +1,190 @@
+// Runs one task of the package against a server, and prints what came of it as lines of JSON.
+using System;
+using System.Collections.Generic;
+using System.Diagnostics;
+using System.Linq;
+using System.Threading;
+using CapSense;
+using UnityEngine;
+
+public static class Driver
+{
+    public static int Main(string[] words)
+    {
+        string url = words.Length > 1 ? words[1] : "", last = words.Length > 2 ? words[2] : "";
+        switch (words[0])
+        {
+            case "json": Echo(); break;
+            case "steps": Steps(url, int.Parse(last)); break;
+            case "codes": Codes(url); break;
+            case "mistakes": Mistakes(url); break;
+            case "hello": Hello(url, last, words.Length > 3 ? int.Parse(words[3]) : 1); break;
+            case "stay": Stay(url); break;
+            case "component": Component(url, last == "reversed"); break;
+            default: return 2;
+        }
+        return 0;
+    }
+
+    private static void Print(params object[] pairs)
+    {
+        var line = new Dictionary<string, object>();
+        for (int k = 0; k < pairs.Length; k += 2) line[(string)pairs[k]] = pairs[k + 1];
+        Console.WriteLine(Json.Write(line));
+        Console.Out.Flush();
+    }
+
+    /// <summary>Read lines of JSON, and write each again; "error" for what is none.</summary>
+    private static void Echo()
+    {
+        for (string line = Console.ReadLine(); line != null; line = Console.ReadLine())
+        {
+            try { Console.WriteLine(Json.Write(Json.Parse(line))); }
+            catch (FormatException) { Console.WriteLine("error"); }
+        }
+    }
+
+    /// <summary>A dome that moves across the view.</summary>
+    private static DepthFrame Dome(int k, byte[] codes = null)
+    {
+        var depth = new float[64 * 64];
+        for (int row = 0; row < 64; row++)
+            for (int column = 0; column < 64; column++)
+            {
+                double u = -1 + 2 * column / 63.0 - 0.4 * Math.Sin(0.02 * k), v = -1 + 2 * row / 63.0;
+                double squared = u * u + v * v;
+                depth[64 * row + column] = squared < 0.25 ? (float)(0.05 + 0.1 * squared) : 0;
+            }
+        return new DepthFrame(64, 64, depth, codes, 0.01 * k);
+    }
+
+    private static void Steps(string url, int count)
+    {
+        var frames = Enumerable.Range(0, Math.Min(count, 500)).Select(k => Dome(k)).ToArray();
+        using (var client = new CapSenseClient(url))
+        {
+            RemoteSensor sensor = client.Add(new SensorOptions { Material = "steel" });
+            client.Start();
+            var times = new List<double>();
+            var solve = new List<double>();
+            Reading reading = null;
+            for (int k = 0; k < count; k++)
+            {
+                var clock = Stopwatch.StartNew();
+                reading = sensor.StepAsync(frames[k % frames.Length]).Result;
+                times.Add(clock.Elapsed.TotalSeconds);
+                solve.Add(reading.WallTime);
+                if (k < 3 || k == count - 1)
+                    Print("sequence", reading.Sequence, "time", reading.Time, "delta",
+                        reading.Delta.Cast<double>().ToArray(), "self", reading.SelfCapacitance,
+                        "baseline", sensor.Baseline.Cast<double>().ToArray(), "electrodes",
+                        sensor.Electrodes, "channels", sensor.Channels, "codes",
+                        reading.Conversions.Select(c => c.Code).ToArray(), "dropped", reading.Dropped);
+            }
+            Print("round_trip_s", times.Skip(count / 10).ToArray(), "solve_s", solve.Skip(count / 10).ToArray());
+        }
+    }
+
+    /// <summary>The same dome with permittivity codes: half plastic, half a conductor.</summary>
+    private static void Codes(string url)
+    {
+        using (var client = new CapSenseClient(url))
+        {
+            RemoteSensor sensor = client.Add(new SensorOptions { Thickness = 0.05 });
+            client.Start();
+            byte[] codes = Enumerable.Range(0, 64 * 64).Select(k => (byte)(k < 2048 ? 4 : 255)).ToArray();
+            Print("delta", sensor.StepAsync(Dome(0, codes)).Result.Delta.Cast<double>().ToArray());
+        }
+    }
+
+    /// <summary>A frame that the server refuses, a design it does not have; then a good frame.</summary>
+    private static void Mistakes(string url)
+    {
+        using (var client = new CapSenseClient(url))
+        {
+            RemoteSensor sensor = client.Add(new SensorOptions());
+            RemoteSensor unknown = client.Add(new SensorOptions { Design = "unknown" });
+            client.Start();
+            Print("code", Code(() => sensor.StepAsync(new DepthFrame(300, 300, new float[90000])).Wait()));
+            Print("code", Code(() => unknown.StepAsync(Dome(0)).Wait()));
+            Print("sequence", sensor.StepAsync(Dome(0)).Result.Sequence, "state", client.State.ToString());
+        }
+    }
+
+    private static string Code(Action action)
+    {
+        try { action(); }
+        catch (AggregateException error)
+        {
+            var known = error.GetBaseException() as CapSenseException;
+            return known == null ? error.GetBaseException().ToString() : known.Code;
+        }
+        return "none";
+    }
+
+    /// <summary>Say hello with some token and version; what a frame comes to, and the state then.</summary>
+    private static void Hello(string url, string token, int protocol)
+    {
+        using (var client = new CapSenseClient(url, token, protocol))
+        {
+            RemoteSensor sensor = client.Add(new SensorOptions());
+            client.Start();
+            string code = Code(() => sensor.StepAsync(Dome(0)).Wait());
+            SpinWait.SpinUntil(() => client.State == ClientState.Refused, code == "none" ? 0 : 2000);
+            Print("code", code, "state", client.State.ToString());
+        }
+    }
+
+    /// <summary>Send frames until the connection was lost, made anew, and gave readings again.</summary>
+    private static void Stay(string url)
+    {
+        using (var client = new CapSenseClient(url) { Pause = TimeSpan.FromSeconds(0.1) })
+        {
+            RemoteSensor sensor = client.Add(new SensorOptions());
+            client.Start();
+            int readings = 0, frame = 0;
+            bool lost = false;
+            var limit = Stopwatch.StartNew();
+            while (limit.Elapsed.TotalSeconds < 30)
+            {
+                sensor.Submit(Dome(frame++));
+                Thread.Sleep(5);
+                if (client.State == ClientState.Waiting && !lost)
+                {
+                    lost = true;
+                    readings = 0;
+                    Print("event", "lost");
+                }
+                Reading reading;
+                if (!sensor.TryTake(out reading) || ++readings != 5) continue;
+                Print("event", "readings", "electrodes", sensor.Electrodes);
+                if (lost) return;
+            }
+        }
+    }
+
+    /// <summary>The component, with an object above, to the right, 60 mm away; as Unity would call it.</summary>
+    private static void Component(string url, bool reversed)
+    {
+        SystemInfo.usesReversedZBuffer = reversed;
+        World.Depth = (x, y) => Math.Abs(x - 0.06f) < 0.03f && Math.Abs(y - 0.05f) < 0.03f ? 0.06f : 1;
+        World.Code = (x, y) => 255;
+        var sensor = new GameObject("sensor").AddComponent<CapacitiveSensor>();
+        sensor.url = url;
+        sensor.permittivityCodes = true;
+        int received = 0;
+        sensor.Received += reading => received++;
+        sensor.Tell("OnEnable");
+        var limit = Stopwatch.StartNew();
+        while (received < 3 && limit.Elapsed.TotalSeconds < 10)
+        {
+            UnityEngine.Time.time += 0.02f;
+            sensor.Tell("LateUpdate");
+            Thread.Sleep(5);
+        }
+        Print("delta", sensor.Reading.Delta.Cast<double>().ToArray(), "time", sensor.Reading.Time,
+            "received", received);
+        sensor.Tell("OnDisable");
+        Print("state", sensor.State.ToString());
+    }
+}
