@@ -7,7 +7,9 @@ from typing import cast
 
 from capsense.reproduce.study import Study
 
-STUDIES: dict[str, str] = {}
+STUDIES: dict[str, str] = {
+    "limb-approach": "capsense.reproduce.limb_approach:run",
+}
 """``"module:function"`` of each study, in the order of ``capsense reproduce all``."""
 
 
