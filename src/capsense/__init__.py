@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         MeshError,
         MissingDependencyError,
         ReadOutError,
+        RecordingError,
         ScenarioError,
         SceneError,
         SolveError,
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from capsense.readout.config import load_readout
     from capsense.readout.counts import Counts
     from capsense.readout.read_out import ReadOut
+    from capsense.recording.reader import open_recording
+    from capsense.recording.recorder import Recorder, record
+    from capsense.recording.replay import replay
     from capsense.scenario import Scenario, load_scenario
     from capsense.scene.body import Body
     from capsense.scene.camera import OrthographicCamera
@@ -67,6 +71,8 @@ __all__ = [
     "ReadOut",
     "ReadOutError",
     "Reading",
+    "Recorder",
+    "RecordingError",
     "Scenario",
     "ScenarioError",
     "Scene",
@@ -84,8 +90,11 @@ __all__ = [
     "load_readout",
     "load_scenario",
     "mujoco",
+    "open_recording",
     "pybullet",
     "rasterise",
+    "record",
+    "replay",
 ]
 
 _HOMES = {
@@ -98,6 +107,7 @@ _HOMES = {
         "MeshError",
         "MissingDependencyError",
         "ReadOutError",
+        "RecordingError",
         "ScenarioError",
         "SceneError",
         "SolveError",
@@ -105,6 +115,9 @@ _HOMES = {
     "capsense.readout.config": ("load_readout",),
     "capsense.readout.counts": ("Counts",),
     "capsense.readout.read_out": ("ReadOut",),
+    "capsense.recording.reader": ("open_recording",),
+    "capsense.recording.recorder": ("Recorder", "record"),
+    "capsense.recording.replay": ("replay",),
     "capsense.scenario": ("Scenario", "load_scenario"),
     "capsense.scene.body": ("Body",),
     "capsense.scene.camera": ("OrthographicCamera",),

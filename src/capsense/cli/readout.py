@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,6 +72,7 @@ def execute(args: argparse.Namespace) -> int:
         return OK
     _check(args)
     from capsense.readout.recording import load_recording
+    from capsense.recording.tables import write_counts
 
     recording = load_recording(args.recording)
     readouts = _build(args, recording)
@@ -87,7 +87,7 @@ def execute(args: argparse.Namespace) -> int:
     _prepare(folder, targets.values(), args.force)
     for key, readout in readouts.items():
         counts = readout(recording.time, recording.channels(readout.bank))
-        _write(targets[key], counts)
+        write_counts(targets[key], counts)
         print(report(readout, counts, targets[key]) + "\n")
     return OK
 
@@ -141,26 +141,6 @@ def _prepare(folder: Path, targets: object, force: bool) -> None:
     for target in targets:  # type: ignore[attr-defined]
         if target.exists() and not force:
             raise ReadOutError(f"{target} is there already; give -o DIR, or --force to replace it")
-
-
-def _write(path: Path, counts: Counts) -> None:
-    """One row per conversion."""
-    header = ["time_s", "channel", "code", "capacitance_F", "flags"]
-    names = counts.channel_names
-    columns = [
-        [f"{t:.9f}" for t in counts.time],
-        [names[c] for c in counts.channel],
-        counts.code.tolist(),
-        [f"{c:.10g}" for c in counts.capacitance],
-        counts.flags.tolist(),
-    ]
-    if counts.baseline is not None and counts.touched is not None:
-        header += ["baseline", "touched"]
-        columns += [[f"{b:.10g}" for b in counts.baseline], counts.touched.astype(int).tolist()]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(header)
-        rows.writerows(zip(*columns, strict=True))
 
 
 def report(readout: ReadOut, counts: Counts, path: Path) -> str:

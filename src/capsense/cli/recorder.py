@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import platform
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ScenarioError
+from capsense.recording.tables import column_meanings, csv_row, reading_arrays, replacing
+from capsense.recording.versions import versions
 from capsense.scenario import Channel, Sample, Scenario
 
 Array = NDArray[np.float64]
@@ -109,9 +109,7 @@ class Recorder:
             stats.wall_time,
             stats.tolerance,
         )
-        changes = self._values[k] - self.levels
-        numbers = [*self._values[k], *changes]
-        self._rows.writerow([f"{sample.time:.12g}", *(f"{v:.10g}" for v in numbers)])
+        self._rows.writerow(csv_row(sample.time, self._values[k], self.levels))
         self._file.flush()
         self.count = k + 1
 
@@ -142,23 +140,16 @@ class Recorder:
     def write_arrays(self) -> None:
         """Write ``readings.npz``."""
         n = self.count
-        arrays = {
-            "time": self.times,
-            "capacitance": self._capacitance[:n],
-            "delta": self._delta[:n],
-            "baseline": self.baseline,
-            "electrode_names": np.array(self.scenario.design.electrode_names),
-            "channels": self._values[:n],
-            "channel_baseline": self.levels,
-            "channel_names": np.array([c.column_name for c in self.scenario.channels]),
-            "body_names": np.array([b.body.name for b in self.scenario.bodies], dtype=str),
-            "body_positions": self._positions[:n],
-            "body_quaternions": self._quaternions[:n],
-            "iterations": self._stats[:n, 0].astype(np.int64),
-            "error_estimate": self._stats[:n, 1],
-            "step_time": self._stats[:n, 2],
-        }
-        with _replacing(self.folder / FILES[1]) as path, path.open("wb") as file:
+        arrays = reading_arrays(
+            time=self.times, capacitance=self._capacitance[:n], delta=self._delta[:n],
+            baseline=self.baseline, electrodes=self.scenario.design.electrode_names,
+            channels=self.scenario.channels, values=self._values[:n], levels=self.levels,
+            bodies=[str(b.body.name) for b in self.scenario.bodies],
+            positions=self._positions[:n], quaternions=self._quaternions[:n],
+            iterations=self._stats[:n, 0], error_estimate=self._stats[:n, 1],
+            step_time=self._stats[:n, 2],
+        )  # fmt: skip
+        with replacing(self.folder / FILES[1]) as path, path.open("wb") as file:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
     def summary(
@@ -204,47 +195,9 @@ class Recorder:
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write ``summary.json``."""
-        with _replacing(self.folder / FILES[2]) as path:
+        with replacing(self.folder / FILES[2]) as path:
             text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
             path.write_text(text + "\n", encoding="utf-8")
-
-
-class _replacing:
-    """A temporary path that takes the place of a file once its block ends without error."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.part = path.with_name(f".{path.name}.part")
-
-    def __enter__(self) -> Path:
-        return self.part
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            os.replace(self.part, self.path)
-        else:
-            self.part.unlink(missing_ok=True)
-
-
-def column_meanings(channels: tuple[Channel, ...]) -> list[tuple[str, str]]:
-    """Columns of ``readings.csv``, each with what it is."""
-    out = [("time_s", "time since the start, s")]
-    out += [(f"{c.column_name}_F", f"{c.meaning}, F") for c in channels]
-    out += [
-        (f"d{c.column_name}_F", f"{c.meaning}, change from the empty scene, F") for c in channels
-    ]
-    return out
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
-    out = {"python": platform.python_version(), "platform": platform.platform()}
-    for package in ("capsense", "numpy", "scipy", "numba"):
-        try:
-            out[package] = version(package)
-        except PackageNotFoundError:
-            out[package] = "not installed"
-    return out
 
 
 def _quantiles(values: Array) -> dict[str, float] | None:

@@ -13,6 +13,9 @@ from typing import Protocol, cast
 
 COMMANDS = (
     "capsense.cli.run",
+    "capsense.cli.record",
+    "capsense.cli.replay",
+    "capsense.cli.export",
     "capsense.cli.design",
     "capsense.cli.readout",
     "capsense.cli.bench",

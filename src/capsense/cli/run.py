@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from capsense.cli.interrupt import Interrupt
     from capsense.cli.recorder import Recorder
-    from capsense.scenario import Scenario
+    from capsense.scenario import Sample, Scenario
     from capsense.simulator import Simulator
 
 NAME = "run"
@@ -45,14 +46,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--force", action="store_true", help="replace the results in a folder that is not empty"
     )
     parser.add_argument(
-        "--rate", metavar="HZ", type=_rate, help="sample rate, instead of the scenario's"
+        "--rate", metavar="HZ", type=sample_rate, help="sample rate, instead of the scenario's"
     )
     parser.add_argument(
         "-q", "--quiet", action="store_true", help="no progress bar, no summary; errors only"
     )
 
 
-def _rate(text: str) -> float:
+def sample_rate(text: str) -> float:
+    """A sample rate [Hz] from the command line."""
     value = float(text)
     if not 1e-3 <= value <= 1e6:
         raise argparse.ArgumentTypeError(f"{text} Hz; give a number from 0.001 to 1e6")
@@ -71,13 +73,13 @@ def execute(args: argparse.Namespace) -> int:
     scenario = load_scenario(args.scenario)
     if args.rate is not None:
         scenario = scenario.resampled(args.rate)
-    for name in _absent(scenario):
+    for name in absent_bodies(scenario):
         say(f'warning: body "{name}" never enters the domain; it has no effect')
     made = not args.output.exists()
     prepare_folder(args.output, force=args.force)
     with Interrupt() as interrupt:
         try:
-            simulator = _build(scenario, quiet=args.quiet)
+            simulator = build_simulator(scenario, quiet=args.quiet)
             levels = baseline_of(scenario, simulator)
             recorder = Recorder(args.output, scenario, simulator.baseline, levels)
         except BaseException:
@@ -88,7 +90,7 @@ def execute(args: argparse.Namespace) -> int:
         interrupt.deferring = True
         failure: Exception | None = None
         try:
-            _step(scenario, simulator, recorder, interrupt, quiet=args.quiet)
+            play_samples(scenario, simulator, recorder.add, interrupt, quiet=args.quiet)
         except Exception as error:
             failure = error
         summary = recorder.summary(
@@ -118,7 +120,7 @@ def execute(args: argparse.Namespace) -> int:
     return OK
 
 
-def _absent(scenario: Scenario) -> list[str]:
+def absent_bodies(scenario: Scenario) -> list[str]:
     """Names of the bodies that never enter the domain, looked for at up to 500 samples."""
     import numpy as np
 
@@ -134,41 +136,43 @@ def _absent(scenario: Scenario) -> list[str]:
     return [str(b.body.name) for b, ever in zip(scenario.bodies, seen, strict=True) if not ever]
 
 
-def _progress_shown(quiet: bool) -> bool:
+def progress_shown(quiet: bool) -> bool:
+    """Whether there is somebody to watch a bar."""
     return not quiet and sys.stderr.isatty()
 
 
-def _build(scenario: Scenario, *, quiet: bool) -> Simulator:
+def build_simulator(scenario: Scenario, *, quiet: bool) -> Simulator:
+    """The simulator that a scenario asks for, with a bar while its field is built."""
     import capsense
     from capsense.cli.progress import BuildProgress
 
     settings: dict[str, Any] = {}
     if scenario.tolerance is not None:
         settings["tolerance"] = scenario.tolerance
-    with BuildProgress(shown=_progress_shown(quiet)) as progress:
+    with BuildProgress(shown=progress_shown(quiet)) as progress:
         return capsense.Simulator(
             scenario.design, method=scenario.method, progress=progress, **settings
         )
 
 
-def _step(
+def play_samples(
     scenario: Scenario,
     simulator: Simulator,
-    recorder: Recorder,
+    take: Callable[[Sample], object],
     interrupt: Interrupt,
     *,
     quiet: bool,
 ) -> None:
-    """Play the scenario into the recorder until its end, or until interrupted."""
+    """Play the scenario to its end, or until interrupted, and hand out every sample."""
     from tqdm import tqdm
 
     from capsense.scenario import play
 
     with tqdm(
-        total=scenario.count, unit=" samples", file=sys.stderr, disable=not _progress_shown(quiet)
+        total=scenario.count, unit=" samples", file=sys.stderr, disable=not progress_shown(quiet)
     ) as bar:
         for sample in play(scenario, simulator):
-            recorder.add(sample)
+            take(sample)
             bar.update()
             if interrupt.requested:
                 break

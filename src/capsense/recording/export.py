@@ -1,0 +1,227 @@
+"""Recordings as tables, arrays, and files made whole."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import MissingDependencyError, RecordingError
+from capsense.readout.counts import Counts, join
+from capsense.recording.reader import Recording, Step
+from capsense.recording.session import Session
+from capsense.recording.tables import (
+    column_meanings,
+    csv_row,
+    reading_arrays,
+    replacing,
+    write_counts,
+)
+
+Array = NDArray[np.float64]
+
+ENDINGS = (".csv", ".npz", ".parquet", ".mcap")
+"""What a recording is exported to, by the ending of the file."""
+_BATCH = 4096
+"""Steps that go into a Parquet file at once."""
+
+
+def export(recording: Recording, path: Path, *, counts: bool = False) -> int:
+    """Write a recording as another file, which appears once it is complete.
+
+    ``.csv`` and ``.parquet`` have the columns of ``readings.csv`` and the episode; ``.npz`` has the
+    arrays of ``readings.npz``, the episode, and the counts; ``.mcap`` is the recording again, made
+    whole if it was cut short.
+
+    Args:
+        recording: What to export.
+        path: The file; one that is there is replaced.
+        counts: Write the read-out's conversions in place of the readings; ``.csv``, ``.parquet``.
+
+    Returns:
+        Rows, samples or messages written.
+
+    Raises:
+        RecordingError: The ending is not known, the recording is damaged, or holds no steps or no
+            counts.
+        MissingDependencyError: Parquet needs pyarrow.
+        OSError: The file could not be written.
+    """
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise RecordingError(f"{path} must end in {', '.join(ENDINGS)}; that chooses the format")
+    if counts and ending not in (".csv", ".parquet"):
+        raise RecordingError("counts alone go to .csv or .parquet; .npz has them beside the rest")
+    if ending == ".parquet":
+        _require_pyarrow()
+    writers: dict[str, Callable[[Recording, Path], int]] = {
+        ".csv": _counts_csv if counts else _csv,
+        ".parquet": _counts_parquet if counts else _parquet,
+        ".npz": _npz,
+        ".mcap": _mcap,
+    }
+    with replacing(path) as part:
+        return writers[ending](recording, part)
+
+
+def _levels(session: Session) -> Array:
+    return np.array([c.read(session.empty) for c in session.channels])
+
+
+def _values(session: Session, step: Step) -> Array:
+    return np.array([c.read(step.reading) for c in session.channels])
+
+
+def _csv(recording: Recording, path: Path) -> int:
+    session, levels, n = recording.session, _levels(recording.session), 0
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow([*(name for name, _ in column_meanings(session.channels)), "episode"])
+        for step in recording.steps():
+            rows.writerow([*csv_row(step.clock, _values(session, step), levels), step.episode])
+            n += 1
+    return n
+
+
+def _parquet(recording: Recording, path: Path) -> int:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    session, levels = recording.session, _levels(recording.session)
+    meanings = column_meanings(session.channels)
+    fields = [pa.field(name, pa.float64(), metadata={"meaning": text}) for name, text in meanings]
+    schema = pa.schema([*fields, pa.field("episode", pa.int64())])
+    n, steps = 0, recording.steps()
+    with pq.ParquetWriter(path, schema) as writer:
+        while batch := list(islice(steps, _BATCH)):
+            values = np.array([_values(session, s) for s in batch])
+            columns = [np.array([s.clock for s in batch]), *values.T, *(values - levels).T]
+            arrays = [pa.array(c) for c in columns]
+            arrays.append(pa.array([s.episode for s in batch], pa.int64()))
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+            n += len(batch)
+    return n
+
+
+def _npz(recording: Recording, path: Path) -> int:
+    session = recording.session
+    steps = list(recording.steps())
+    if not steps:
+        raise RecordingError(f"{recording.path} holds no steps; there is nothing to export")
+    names = _body_names(steps)
+    positions = np.full((len(steps), len(names), 3), np.nan)
+    quaternions = np.full((len(steps), len(names), 4), np.nan)
+    for k, step in enumerate(steps):
+        for i, body in enumerate(step.scene):
+            b = names[body.name or f"body{i}"]
+            positions[k, b], quaternions[k, b] = body.pose.position, body.pose.quaternion
+    stats = [s.reading.stats for s in steps]
+    arrays = reading_arrays(
+        time=np.array([s.clock for s in steps]),
+        capacitance=np.array([s.reading.capacitance for s in steps]),
+        delta=np.array([s.reading.delta for s in steps]),
+        baseline=session.empty.capacitance, electrodes=session.design.electrode_names,
+        channels=session.channels, values=np.array([_values(session, s) for s in steps]),
+        levels=_levels(session), bodies=list(names), positions=positions, quaternions=quaternions,
+        iterations=[s.iterations for s in stats],
+        error_estimate=[s.error_estimate for s in stats], step_time=[s.wall_time for s in stats],
+    )  # fmt: skip
+    arrays["episode"] = np.array([s.episode for s in steps])
+    counts = [c for c in (s.reading.counts for s in steps) if c is not None]
+    if counts:
+        arrays.update({f"counts_{k}": v for k, v in _columns(join(counts)).items()})
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    return len(steps)
+
+
+def _body_names(steps: list[Step]) -> dict[str, int]:
+    """Names of all bodies in the order of their appearance, numbered."""
+    found = dict.fromkeys(
+        body.name or f"body{i}" for step in steps for i, body in enumerate(step.scene)
+    )
+    return {name: k for k, name in enumerate(found)}
+
+
+def _all_counts(recording: Recording) -> Counts:
+    parts = [s.reading.counts for s in recording.steps()]
+    found = [c for c in parts if c is not None]
+    if not found:
+        raise RecordingError(f"{recording.path} holds no counts; record with a read-out")
+    return join(found)
+
+
+def _counts_csv(recording: Recording, path: Path) -> int:
+    counts = _all_counts(recording)
+    write_counts(path, counts)
+    return len(counts)
+
+
+def _counts_parquet(recording: Recording, path: Path) -> int:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    counts = _all_counts(recording)
+    pq.write_table(pa.table(_columns(counts)), path)
+    return len(counts)
+
+
+def _columns(counts: Counts) -> dict[str, NDArray[Any]]:
+    """Columns of a table of counts."""
+    out: dict[str, NDArray[Any]] = {
+        "time_s": counts.time,
+        "channel": np.array(counts.channel_names)[counts.channel],
+        "code": counts.code,
+        "capacitance_F": counts.capacitance,
+        "flags": counts.flags,
+    }
+    if counts.baseline is not None and counts.touched is not None:
+        out.update(baseline=counts.baseline, touched=counts.touched)
+    return out
+
+
+def _mcap(recording: Recording, path: Path) -> int:
+    """Copy every record that is whole into a file with an index."""
+    from mcap.records import Attachment, Channel, Message, Metadata, Schema
+    from mcap.writer import Writer
+
+    from capsense.recording.records import read_records
+
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    n = 0
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="capsense")
+        for r in read_records(recording.path):
+            match r:
+                case Schema() if r.id not in schemas:
+                    schemas[r.id] = writer.register_schema(r.name, r.encoding, r.data)
+                case Channel() if r.id not in channels:
+                    channels[r.id] = writer.register_channel(
+                        r.topic, r.message_encoding, schemas[r.schema_id], r.metadata
+                    )
+                case Message():
+                    channel = channels[r.channel_id]
+                    writer.add_message(channel, r.log_time, r.data, r.publish_time, r.sequence)
+                    n += 1
+                case Attachment():
+                    writer.add_attachment(r.create_time, r.log_time, r.name, r.media_type, r.data)
+                case Metadata():
+                    writer.add_metadata(r.name, r.metadata)
+        writer.finish()
+    return n
+
+
+def _require_pyarrow() -> None:
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        raise MissingDependencyError(
+            "Parquet needs pyarrow; pip install 'capsense[record]', or export to .csv or .npz"
+        ) from None

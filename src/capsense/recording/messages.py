@@ -1,0 +1,73 @@
+"""ROS 2 messages: their definitions, and their CDR form.
+
+Standard messages come with ``rosbags``; those of ``capsense_msgs`` lie in ``msg/`` beside this
+module. Stored schemas hold the definition and those of all messages in it, as ROS 2 wants.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+from capsense.errors import MissingDependencyError, RecordingError
+
+PACKAGE = "capsense_msgs/msg"
+OWN = ("Shape", "Body", "Step", "Counts")
+"""Messages of ``capsense_msgs``."""
+
+
+def require() -> None:
+    """Refuse to go on without the optional packages.
+
+    Raises:
+        MissingDependencyError: One of them is not installed.
+    """
+    try:
+        import mcap.writer  # noqa: F401
+        import rosbags.typesys  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"recordings need {error.name}; pip install 'capsense[record]'"
+        ) from None
+
+
+class Messages:
+    """Makes, encodes and decodes messages by the names of their types."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        for name in OWN:
+            text = (resources.files("capsense.recording") / "msg" / f"{name}.msg").read_text()
+            self._store.register(get_types_from_msg(text, f"{PACKAGE}/{name}"))
+        self._types: dict[str, Any] = self._store.types
+
+    def make(self, type_name: str, **fields: Any) -> Any:
+        """A message; every field must be given."""
+        return self._types[type_name](**fields)
+
+    def encode(self, message: Any) -> bytes:
+        """The CDR form of a message, little-endian."""
+        return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
+
+    def decode(self, data: bytes, type_name: str) -> Any:
+        """The message of a CDR form.
+
+        Raises:
+            RecordingError: It is none of that type.
+        """
+        from rosbags.serde import SerdeError
+
+        try:
+            return self._store.deserialize_cdr(data, type_name)
+        except (SerdeError, KeyError, AssertionError, IndexError) as error:
+            raise RecordingError(f"a message is no {type_name}: {error}") from None
+
+    def definition(self, type_name: str) -> str:
+        """Definition of a type and of all types in it, encoding ``ros2msg``."""
+        return self._store.generate_msgdef(type_name, ros_version=2)[0]
+
+    def type_hash(self, type_name: str) -> str:
+        """The hash by which ROS 2 tells types apart (REP 2011)."""
+        return self._store.hash_rihs01(type_name)

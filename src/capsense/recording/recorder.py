@@ -1,0 +1,272 @@
+"""Recording: every step of a simulator, as it is taken, into an MCAP file."""
+
+from __future__ import annotations
+
+import atexit
+import errno
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from capsense._validate import read_toml
+from capsense.adapters.attached import AttachedSensor
+from capsense.errors import ReadOutError, RecordingError
+from capsense.readout.config import parse_readout
+from capsense.readout.read_out import ReadOut
+from capsense.recording.design_json import design_to_json
+from capsense.recording.mcap_file import McapFile
+from capsense.recording.messages import require
+from capsense.recording.session import DESIGN, NAME, SESSION, Session, describe
+from capsense.recording.steps import Moment, StepMessages
+from capsense.scenario.channels import Excitation
+from capsense.scenario.model import Scenario
+from capsense.scene import DepthFrame, Scene
+from capsense.simulator import Reading, Simulator
+
+_SECOND = 10**9
+
+
+class Recorder:
+    """Steps a simulator, or reads an attached sensor, and records what it saw and read.
+
+    The simulator is reset first, since a reading depends, in its last digits, on the steps before
+    it. Everything is on disk up to half a second ago, so a process that is killed loses that much.
+    Close it, or use it in a ``with`` block; that also writes the index that makes the file quick
+    to open.
+
+    Args:
+        path: The file, by custom one that ends in ``.mcap``.
+        source: A simulator, or a sensor attached to one.
+        name: Of the sensor; its frame and the beginning of its topics.
+        readout: A read-out whose counts are recorded too: a chip's name, the path of a read-out
+            file, or a read-out. An attached sensor brings its own.
+        scenario: What is played, if it is one; tables made from the file take its channels.
+        overwrite: Whether a file that is there may be replaced.
+
+    Raises:
+        RecordingError: The file is there already or cannot be made, or ``name`` is no name.
+        ReadOutError: The read-out is wrong, or there are two.
+        MissingDependencyError: The optional packages are not installed.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        source: Simulator | AttachedSensor,
+        *,
+        name: str = "sensor",
+        readout: ReadOut | str | Path | None = None,
+        scenario: Scenario | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        require()
+        self.path = Path(path)
+        self.count = 0
+        """Steps recorded so far."""
+        self._sensor = source if isinstance(source, AttachedSensor) else None
+        self._simulator = source if isinstance(source, Simulator) else source.simulator
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+            raise RecordingError(f"name is {name!r}; give letters, digits and underscores")
+        self._readout, config = self._choose(readout)
+        empty = self._simulator.step(Scene())
+        self.reset()
+        self._file = McapFile(self.path, overwrite=overwrite)
+        self._messages = StepMessages(self._file.messages, name, self._simulator.design)
+        self._steps = self._episode = self._base = 0
+        self._time, self._stamp = -math.inf, -1
+        self.session = describe(
+            self._simulator, name, scenario.name if scenario else "", readout=config,
+            excitation=scenario.excitation if scenario else Excitation.MATRIX,
+            pairs=scenario.pairs if scenario else (), empty=empty,
+        )  # fmt: skip
+        """What the file says once, at its start."""
+        self._begin(self.session)
+        atexit.register(self._file.close)
+
+    def step(self, world: Scene | DepthFrame, time: float) -> Reading:
+        """Step the simulator, record, and return the reading.
+
+        Args:
+            world: As for :meth:`capsense.Simulator.step`.
+            time: Its time [s], zero or more, not before that of the last step since a reset.
+
+        Raises:
+            RecordingError: Time is wrong, or the simulator was stepped behind the recorder's back.
+            OSError: The file could not be written; what was recorded before is in it, and the
+                last half second is kept until :meth:`close` tries again.
+            SceneError, SolveError: As for the simulator.
+        """
+        self._check(time)
+        scene = _scene(world)
+        return self._write(time, world, scene, self._simulator.step(scene))
+
+    def read(self, time: float | None = None) -> Reading:
+        """Read the attached sensor, record, and return the reading.
+
+        Args:
+            time: Time of the state [s]; by default the robot simulator's, where it tells it.
+
+        Raises:
+            RecordingError: No sensor is recorded; otherwise as for :meth:`step`.
+            OSError: As for :meth:`step`.
+            SceneError, SolveError, ReadOutError: As for the sensor.
+        """
+        if self._sensor is None:
+            raise RecordingError("a simulator is recorded, not a sensor; write step(world, time)")
+        now = self._sensor.time if time is None else float(time)
+        self._check(now)
+        view = self._sensor.view()
+        scene = _scene(view)
+        return self._write(now, view, scene, self._sensor.read(now, scene))
+
+    def reset(self) -> None:
+        """Reset the simulator, or the sensor and its read-out. Time may start anew."""
+        (self._sensor or self._simulator).reset()
+        if self._readout is not None:
+            self._readout.reset()
+
+    def write(self, time: float, world: Scene | DepthFrame, reading: Reading) -> Reading:
+        """Record the step that the simulator has just taken; for loops that step it themselves.
+
+        Args:
+            time: Its time [s].
+            world: What was given to the simulator.
+            reading: What it returned.
+
+        Returns:
+            The reading, with the counts of a read-out that was given to the recorder.
+
+        Raises:
+            RecordingError: Time is wrong, or other steps went before that were not recorded.
+            OSError: The file could not be written, as for :meth:`step`.
+        """
+        self._check_file()
+        return self._write(time, world, _scene(world), reading)
+
+    def _write(
+        self, time: float, world: Scene | DepthFrame, scene: Scene, reading: Reading
+    ) -> Reading:
+        steps = self._simulator.steps
+        if steps != self._steps + 1:
+            if steps != 1:
+                raise _stepped_elsewhere(self.count)
+            self._episode += 1
+            self._time = -math.inf
+            if self._readout is not None:
+                self._readout.reset()
+        stamp = self._stamp_of(time)
+        if self._readout is not None:
+            reading = replace(reading, counts=self._readout.sample(time, reading))
+        moment = Moment(stamp, self._episode, time)
+        frame = world if isinstance(world, DepthFrame) else None
+        pose = None if self._sensor is None else self._sensor.pose
+        self._file.write(stamp, self._messages.of(moment, scene, reading, frame, pose))
+        self._steps, self._time, self._stamp = steps, time, stamp
+        self.count += 1
+        return reading
+
+    def flush(self) -> None:
+        """Put everything into the file now.
+
+        Raises:
+            OSError: That failed; it can be tried again.
+        """
+        self._file.flush()
+
+    def close(self) -> None:
+        """Put everything and the index into the file, and close it.
+
+        Raises:
+            OSError: That failed. What was written before is in the file; closing can be tried
+                again.
+        """
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._unwritten(error) from None
+        atexit.unregister(self._file.close)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ---- before a step ----
+
+    def _check(self, time: float) -> None:
+        """Refuse a step that could not be recorded, before it is taken."""
+        self._check_file()
+        if self._simulator.steps not in (0, self._steps):
+            raise _stepped_elsewhere(self.count)
+        if self._simulator.steps == self._steps:
+            self._stamp_of(time)
+
+    def _check_file(self) -> None:
+        if self._file.failure is not None:
+            raise self._unwritten(self._file.failure)
+
+    def _stamp_of(self, time: float) -> int:
+        """Time on the recording's clock [ns]; it goes on where time starts anew."""
+        if not (math.isfinite(time) and 0 <= time < 1e9):
+            raise RecordingError(f"time is {time!r} s; give zero or more")
+        if time < self._time:
+            raise RecordingError(
+                f"time is {time:g} s, but the last step was at {self._time:g} s; "
+                "call reset() where time starts anew"
+            )
+        now = round(time * _SECOND)
+        if self._base + now < self._stamp:
+            self._base = (self._stamp // _SECOND + 2) * _SECOND - now
+        return self._base + now
+
+    def _unwritten(self, error: OSError) -> OSError:
+        why = error.strerror or str(error)
+        return OSError(
+            error.errno or errno.EIO,
+            f"{why}; the file holds what was recorded until half a second before",
+            str(self.path),
+        )
+
+    def _choose(
+        self, readout: ReadOut | str | Path | None
+    ) -> tuple[ReadOut | None, Mapping[str, Any] | None]:
+        """The recorder's own read-out, and the content of its file."""
+        if readout is None:
+            return None, None
+        if self._sensor is not None and self._sensor.readout is not None:
+            raise ReadOutError("the sensor has a read-out of its own; leave out readout=")
+        if isinstance(readout, ReadOut):
+            return readout, None
+        config: Mapping[str, Any] = {"chip": str(readout)}
+        if str(readout).endswith(".toml"):
+            config = read_toml(Path(readout), "read-out", ReadOutError)
+        return parse_readout(config, self._simulator.electrode_names), config
+
+    def _begin(self, session: Session) -> None:
+        self._file.metadata(NAME, session.metadata())
+        for name, text in ((DESIGN, design_to_json(session.design)), (SESSION, session.to_json())):
+            self._file.attachment(name, "application/json", text.encode())
+        self._file.flush()
+
+
+def record(path: str | Path, source: Simulator | AttachedSensor, **options: Any) -> Recorder:
+    """Record a simulator or an attached sensor: ``with cs.record("run.mcap", sensor) as run:``.
+
+    The same as :class:`Recorder`.
+    """
+    return Recorder(path, source, **options)
+
+
+def _scene(world: Scene | DepthFrame) -> Scene:
+    return world.scene() if isinstance(world, DepthFrame) else world
+
+
+def _stepped_elsewhere(count: int) -> RecordingError:
+    return RecordingError(
+        f"the simulator took a step after number {count} that was not recorded, so a replay could "
+        "not repeat what follows; step it through the recorder only, or reset it first"
+    )

@@ -1,0 +1,193 @@
+"""What other programs look at: transforms, matrices, images and markers as ROS 2 messages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.design.model import Design
+from capsense.recording.messages import Messages
+from capsense.scene import Box, Capsule, Cylinder, DepthFrame, Ellipsoid, Pose, Shape, Sphere
+from capsense.scene.body import Body
+
+Array = NDArray[np.float64]
+Colour = tuple[float, float, float, float]
+
+WORLD = "world"
+"""Frame in which the sensor moves."""
+COPPER: Colour = (0.85, 0.53, 0.2, 1.0)
+METAL: Colour = (0.72, 0.74, 0.78, 1.0)
+PLASTIC: Colour = (0.35, 0.6, 0.9, 0.6)
+_CUBE, _SPHERE, _CYLINDER, _TRIANGLES, _DELETE_ALL = 1, 2, 3, 11, 3
+
+
+class Composer:
+    """Makes the messages of one sensor.
+
+    Args:
+        messages: Where message types come from.
+        name: The sensor's frame.
+    """
+
+    def __init__(self, messages: Messages, name: str) -> None:
+        self._make = messages.make
+        self.name = name
+
+    def header(self, stamp: int, frame: str | None = None) -> Any:
+        """A header; ``stamp`` in ns, in the sensor's frame by default."""
+        sec, nanosec = divmod(stamp, 10**9)
+        time = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._make(
+            "std_msgs/msg/Header", stamp=time, frame_id=self.name if frame is None else frame
+        )
+
+    def pose(self, pose: Pose) -> Any:
+        """A ``geometry_msgs/Pose``."""
+        return self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._vector("Point", pose.position),
+            orientation=self._quaternion(pose),
+        )
+
+    def matrix(self, values: Array) -> Any:
+        """A square matrix as ``std_msgs/Float64MultiArray``, row by row."""
+        n = len(values)
+        dims = [
+            self._make("std_msgs/msg/MultiArrayDimension", label=label, size=n, stride=stride)
+            for label, stride in (("row", n * n), ("column", n))
+        ]
+        layout = self._make("std_msgs/msg/MultiArrayLayout", dim=dims, data_offset=0)
+        data = np.ascontiguousarray(values).ravel()
+        return self._make("std_msgs/msg/Float64MultiArray", layout=layout, data=data)
+
+    def transforms(self, stamp: int, frames: Sequence[tuple[str, str, Pose]]) -> Any:
+        """Poses of frames: (parent, child, pose)."""
+        return self._make(
+            "tf2_msgs/msg/TFMessage",
+            transforms=[
+                self._make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self.header(stamp, parent),
+                    child_frame_id=child,
+                    transform=self._make(
+                        "geometry_msgs/msg/Transform",
+                        translation=self._vector("Vector3", pose.position),
+                        rotation=self._quaternion(pose),
+                    ),
+                )
+                for parent, child, pose in frames
+            ],
+        )
+
+    def image(self, stamp: int, frame: DepthFrame, values: Array) -> Any:
+        """The first layer of a depth frame's ``values``, as 32-bit floats.
+
+        Rows grow along the camera's y and columns along its x, as in optical frames of ROS.
+        """
+        pixels = np.ascontiguousarray(frame.camera.upright(values[0]), dtype="<f4")
+        rows, columns = pixels.shape
+        return self._make(
+            "sensor_msgs/msg/Image", header=self.header(stamp, self.camera), height=rows,
+            width=columns, encoding="32FC1", is_bigendian=0, step=4 * columns,
+            data=pixels.view(np.uint8).ravel(),
+        )  # fmt: skip
+
+    def camera_info(self, stamp: int, frame: DepthFrame) -> Any:
+        """The camera of a depth frame.
+
+        ``p`` takes points of the camera's frame to pixels by parallel rays, its last row being
+        0, 0, 0, 1. ``k`` is zero, which tells ROS that there is no pinhole.
+        """
+        rows, columns = frame.resolution
+        c = frame.camera
+        p = [columns / c.width, 0, 0, 0.5 * columns - 0.5]
+        p += [0, rows / c.height, 0, 0.5 * rows - 0.5, 0, 0, 0, 1]
+        roi = self._make(
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+        )  # fmt: skip
+        return self._make(
+            "sensor_msgs/msg/CameraInfo", header=self.header(stamp, self.camera), height=rows,
+            width=columns, distortion_model="orthographic", d=np.empty(0), k=np.zeros(9),
+            r=np.eye(3).ravel(), p=np.array(p, dtype=float), binning_x=0, binning_y=0, roi=roi,
+        )  # fmt: skip
+
+    @property
+    def camera(self) -> str:
+        """The camera's frame."""
+        return f"{self.name}/camera"
+
+    def markers(self, stamp: int, design: Design, bodies: Sequence[tuple[str, Body]]) -> Any:
+        """Electrodes and bodies for drawing; each body moves with the frame it is given with."""
+        out = [self._marker(stamp, self.name, "", 0, _CUBE, METAL, action=_DELETE_ALL)]
+        for k, electrode in enumerate(design.electrodes):
+            points = electrode.surface.triangles.reshape(-1, 3)
+            out.append(
+                self._marker(
+                    stamp, self.name, "electrodes", k, _TRIANGLES, COPPER, points=points
+                )
+            )  # fmt: skip
+        for frame, body in bodies:
+            colour = METAL if body.material.is_conductor() else PLASTIC
+            out += [
+                self._marker(stamp, frame, frame, k, kind, colour, **options)
+                for k, (kind, options) in enumerate(_solids(body.shape))
+            ]
+        return self._make("visualization_msgs/msg/MarkerArray", markers=out)
+
+    def _marker(
+        self, stamp: int, frame: str, group: str, number: int, kind: int, colour: Colour, *,
+        action: int = 0, size: Sequence[float] = (1.0, 1.0, 1.0), height: float = 0.0,
+        points: Array | None = None,
+    ) -> Any:  # fmt: skip
+        make, v = self._make, self._vector
+        zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+        texture = make(
+            "sensor_msgs/msg/CompressedImage",
+            header=self.header(0, ""), format="", data=np.empty(0, np.uint8),
+        )  # fmt: skip
+        r, g, b, a = colour
+        return make(
+            "visualization_msgs/msg/Marker", header=self.header(stamp, frame), ns=group, id=number,
+            type=kind, action=action, pose=self.pose(Pose((0.0, 0.0, height))),
+            scale=v("Vector3", size), color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
+            lifetime=zero, frame_locked=True,
+            points=[] if points is None else [v("Point", p) for p in points.tolist()], colors=[],
+            texture_resource="", texture=texture, uv_coordinates=[], text="", mesh_resource="",
+            mesh_file=make(
+                "visualization_msgs/msg/MeshFile", filename="", data=np.empty(0, np.uint8)
+            ),
+            mesh_use_embedded_materials=False,
+        )  # fmt: skip
+
+    def _vector(self, kind: str, values: Sequence[float]) -> Any:
+        x, y, z = values
+        return self._make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+    def _quaternion(self, pose: Pose) -> Any:
+        x, y, z, w = pose.quaternion
+        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _solids(shape: Shape) -> list[tuple[int, dict[str, Any]]]:
+    """Kinds of markers that make up a shape, each with its size and place."""
+    match shape:
+        case Box(size):
+            return [(_CUBE, {"size": size})]
+        case Sphere(radius):
+            return [(_SPHERE, {"size": (2 * radius,) * 3})]
+        case Ellipsoid(radii):
+            return [(_SPHERE, {"size": tuple(2 * r for r in radii)})]
+        case Cylinder(radius, length):
+            return [(_CYLINDER, {"size": (2 * radius, 2 * radius, length)})]
+        case Capsule(radius, length):
+            cap = {"size": (2 * radius,) * 3}
+            middle = {"size": (2 * radius, 2 * radius, length)}
+            ends = [(_SPHERE, {**cap, "height": s * 0.5 * length}) for s in (-1.0, 1.0)]
+            return [(_CYLINDER, middle), *ends]
+        case _:
+            mesh = shape.to_trimesh()
+            return [(_TRIANGLES, {"points": mesh.vertices[mesh.faces].reshape(-1, 3)})]

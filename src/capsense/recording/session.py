@@ -1,0 +1,200 @@
+"""What a recording says once, at its start: the sensor, the simulator's settings, versions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.design.model import Design
+from capsense.errors import RecordingError
+from capsense.field.background import BuildSettings
+from capsense.field.lattice import LatticeSettings
+from capsense.readout.config import parse_readout
+from capsense.readout.read_out import ReadOut
+from capsense.recording.versions import versions
+from capsense.scenario.channels import Channel, Excitation, channels_of
+from capsense.scenario.model import METHODS
+from capsense.simulator import Reading, Simulator, StepStats
+
+Array = NDArray[np.float64]
+
+FORMAT = 1
+"""Version of what recordings hold; a reader refuses others."""
+NAME = "capsense"
+"""Of the metadata record that makes an MCAP file a recording."""
+DESIGN, SESSION = "design.json", "session.json"
+"""The attachments."""
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Everything of a recording that does not change from step to step."""
+
+    name: str
+    """Of the sensor: its frame, and the beginning of its topics."""
+    title: str
+    """What was recorded, in words."""
+    design: Design
+    method: str
+    """The simulator's."""
+    tolerance: float
+    """The simulator's [F]."""
+    relative_tolerance: float
+    """The simulator's."""
+    frequency: float
+    """The simulator's [Hz]."""
+    settings: BuildSettings
+    """Of the background field."""
+    empty: Reading
+    """The reading of the empty domain."""
+    excitation: Excitation
+    """Which numbers of a reading tables hold."""
+    pairs: tuple[tuple[str, str], ...]
+    """For mutual excitation: the pairs; all of them if empty."""
+    readout: Mapping[str, Any] | None
+    """Content of the read-out's file, where replaying can build it again."""
+    versions: Mapping[str, str]
+    """Of what the numbers depend on, see :func:`~capsense.recording.versions.versions`."""
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What tables hold."""
+        return channels_of(self.excitation, self.design.electrode_names, self.pairs)
+
+    def simulator(
+        self, *, cache_dir: Path | None = None, progress: Callable[[str, float], None] | None = None
+    ) -> Simulator:
+        """A simulator with the recorded settings.
+
+        Raises:
+            FieldError: The background field could not be built.
+        """
+        return Simulator(
+            self.design, method="masked" if self.method == "masked" else "perturbation",
+            tolerance=self.tolerance, relative_tolerance=self.relative_tolerance,
+            frequency=self.frequency, settings=self.settings, cache_dir=cache_dir,
+            progress=progress,
+        )  # fmt: skip
+
+    def new_readout(self) -> ReadOut | None:
+        """The read-out, as it was at the start; None where replaying cannot build it.
+
+        Raises:
+            ReadOutError: The chip is not known to this version.
+        """
+        if self.readout is None:
+            return None
+        return parse_readout(self.readout, self.design.electrode_names, source="the recording")
+
+    def metadata(self) -> dict[str, str]:
+        """What readers of MCAP show."""
+        return {
+            "format": str(FORMAT),
+            "name": self.name,
+            "title": self.title,
+            "design": self.design.name,
+            "design_hash": self.design.content_hash(),
+            "method": self.method,
+            **self.versions,
+        }
+
+    def to_json(self) -> str:
+        """Everything but the design."""
+        return json.dumps(
+            {
+                "format": FORMAT,
+                "name": self.name,
+                "title": self.title,
+                "method": self.method,
+                "tolerance_F": self.tolerance,
+                "relative_tolerance": self.relative_tolerance,
+                "frequency_Hz": self.frequency,
+                "settings": asdict(self.settings),
+                "electrodes": list(self.design.electrode_names),
+                "empty_F": self.empty.capacitance.tolist(),
+                "empty_shield_coupling_F": shield_coupling(self.empty).tolist(),
+                "excitation": self.excitation.value,
+                "pairs": [list(p) for p in self.pairs],
+                "readout": self.readout,
+                "versions": dict(self.versions),
+            },
+            indent=1,
+        )
+
+
+def describe(
+    simulator: Simulator,
+    name: str,
+    title: str,
+    *,
+    readout: Mapping[str, Any] | None,
+    excitation: Excitation = Excitation.MATRIX,
+    pairs: tuple[tuple[str, str], ...] = (),
+    empty: Reading,
+) -> Session:
+    """The session of a simulator as it is."""
+    s = simulator
+    return Session(
+        name, title, s.design, s.method, s.tolerance, s.relative_tolerance, s.frequency,
+        s.settings, empty, excitation, pairs, readout, versions(),
+    )  # fmt: skip
+
+
+def read_session(text: bytes, design: Design) -> Session:
+    """The session that was written down.
+
+    Raises:
+        RecordingError: The text is damaged, or of another version.
+    """
+    try:
+        data = json.loads(text)
+        if data["format"] != FORMAT:
+            raise RecordingError(
+                f"the recording has format {data['format']!r}, but this version reads {FORMAT}; "
+                f"it was made by capsense {data['versions']['capsense']}"
+            )
+        given = dict(data["settings"])
+        lattice = LatticeSettings(**given.pop("lattice"))
+        if data["method"] not in METHODS or tuple(data["electrodes"]) != design.electrode_names:
+            raise RecordingError("the recording's settings do not fit its design; it is damaged")
+        capacitance = np.array(data["empty_F"], dtype=float)
+        coupling = np.array(data["empty_shield_coupling_F"], dtype=float)
+        empty = reading_of(design, capacitance, np.zeros_like(capacitance), coupling)
+        return Session(
+            data["name"], data["title"], design, data["method"], data["tolerance_F"],
+            data["relative_tolerance"], data["frequency_Hz"], BuildSettings(lattice, **given),
+            empty, Excitation(data["excitation"]), tuple((a, b) for a, b in data["pairs"]),
+            data["readout"], data["versions"],
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"the recording's settings are damaged: {error!r}") from None
+
+
+def shield_coupling(reading: Reading) -> Array:
+    """Maxwell coupling of each electrode to all shields [F], shape (M,)."""
+    return reading._shield_coupling
+
+
+def reading_of(
+    design: Design, capacitance: Array, delta: Array, coupling: Array,
+    stats: StepStats = StepStats(0, 0.0, 0.0, 0.0),  # noqa: B008, it is immutable
+) -> Reading:  # fmt: skip
+    """A reading from its parts.
+
+    Raises:
+        RecordingError: They do not have the design's size.
+    """
+    n = len(design.electrode_names)
+    if capacitance.size != n * n or delta.size != n * n or coupling.size != n:
+        raise RecordingError(f"a reading is not one of {n} electrodes; the recording is damaged")
+    return Reading(
+        capacitance.reshape(n, n), delta.reshape(n, n), stats, design.electrode_names, coupling
+    )

@@ -1,0 +1,151 @@
+"""The messages of one step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from capsense.design.model import Design
+from capsense.readout.counts import Counts
+from capsense.recording.messages import PACKAGE, Messages
+from capsense.recording.parts import body_fields, shape_fields
+from capsense.recording.ros import WORLD, Composer
+from capsense.recording.session import shield_coupling
+from capsense.scene import Body, DepthFrame, Layers, Pose, Scene, Shape
+from capsense.simulator import Reading
+
+Topics = list[tuple[str, Any]]
+"""Messages in the order in which they are written, each with its topic."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a step was taken."""
+
+    stamp: int
+    """On the recording's clock [ns]."""
+    episode: int
+    """How often the simulator had been reset since the recording began."""
+    time: float
+    """On the clock of the scenario or simulator [s]."""
+
+
+class StepMessages:
+    """Turns steps into messages; shapes and bodies go ahead of the first step that has them.
+
+    Args:
+        messages: Where message types come from.
+        name: The sensor's frame, and the beginning of its topics.
+        design: The sensor.
+    """
+
+    def __init__(self, messages: Messages, name: str, design: Design) -> None:
+        self._make, self._name, self._design = messages.make, name, design
+        self._compose = Composer(messages, name)
+        self._shapes: dict[Shape, int] = {}
+        self._bodies: dict[tuple[Any, ...], int] = {}
+        self._ids = 0
+        self._drawn: list[tuple[str, int]] | None = None
+
+    def of(
+        self, moment: Moment, scene: Scene, reading: Reading, frame: DepthFrame | None,
+        pose: Pose | None,
+    ) -> Topics:  # fmt: skip
+        """Messages of a step; what lacks the last of them, of type ``Step``, is not whole.
+
+        Args:
+            moment: When.
+            scene: What the simulator was given.
+            reading: What it returned.
+            frame: The depth frame that the scene was made from, if it was.
+            pose: Where the sensor stands in the world, if that is known.
+
+        Raises:
+            RecordingError: The scene holds a shape that messages do not have.
+        """
+        stamp = moment.stamp
+        out: Topics = []
+        ids = self._introduce(scene, out)
+        frames = [] if pose is None else [(WORLD, self._name, pose)]
+        solid: list[tuple[str, int, Body]] = []
+        for k, (body, number) in enumerate(zip(scene, ids, strict=True)):
+            if not isinstance(body.shape, Layers):
+                solid.append((f"{self._name}/{body.name or f'body{k}'}", number, body))
+        frames += [(self._name, child, body.pose) for child, _, body in solid]
+        if frame is not None:
+            frames.append((self._name, self._compose.camera, frame.camera.pose))
+            out += self._images(stamp, frame)
+        out.append(("/tf", self._compose.transforms(stamp, frames)))
+        drawn = [(child, number) for child, number, _ in solid]
+        if drawn != self._drawn:
+            self._drawn = drawn
+            bodies = [(child, body) for child, _, body in solid]
+            self._add(out, "markers", self._compose.markers(stamp, self._design, bodies))
+        if reading.counts is not None and len(reading.counts):
+            self._add(out, "counts", self._counts(stamp, reading.counts))
+        self._add(out, "capacitance", self._compose.matrix(reading.capacitance))
+        self._add(out, "delta", self._compose.matrix(reading.delta))
+        self._add(out, "step", self._step(moment, scene, ids, reading))
+        return out
+
+    def _add(self, out: Topics, topic: str, message: Any) -> None:
+        out.append((f"/{self._name}/{topic}", message))
+
+    def _introduce(self, scene: Scene, out: Topics) -> list[int]:
+        """Ids of the bodies; messages of those that are new, and of new shapes, are put out."""
+        shapes, bodies, ids = dict[Shape, int](), dict[tuple[Any, ...], int](), []
+        for body in scene:
+            key = (body.shape, body.material, body.grounding, body.name)
+            number = self._bodies.get(key)
+            if number is None:
+                shape = self._shapes.get(body.shape, shapes.get(body.shape))
+                if shape is None:
+                    shape = shapes[body.shape] = self._new_id()
+                    fields = shape_fields(body.shape)
+                    self._add(out, "shapes", self._make(f"{PACKAGE}/Shape", id=shape, **fields))
+                number = bodies[key] = self._new_id()
+                fields = {"id": number, "shape": shape, **body_fields(body)}
+                self._add(out, "bodies", self._make(f"{PACKAGE}/Body", **fields))
+            ids.append(number)
+        # Layered images are new in every step and large, so they are not kept.
+        self._shapes.update((s, n) for s, n in shapes.items() if not isinstance(s, Layers))
+        self._bodies.update((k, n) for k, n in bodies.items() if not isinstance(k[0], Layers))
+        return ids
+
+    def _new_id(self) -> int:
+        self._ids += 1
+        return self._ids
+
+    def _step(self, moment: Moment, scene: Scene, ids: list[int], reading: Reading) -> Any:
+        stats = reading.stats
+        return self._make(
+            f"{PACKAGE}/Step", header=self._compose.header(moment.stamp), episode=moment.episode,
+            time=moment.time, bodies=np.array(ids, np.uint32),
+            poses=[self._compose.pose(b.pose) for b in scene],
+            capacitance=reading.capacitance.ravel(), delta=reading.delta.ravel(),
+            shield_coupling=shield_coupling(reading), iterations=stats.iterations,
+            error_estimate=stats.error_estimate, tolerance=stats.tolerance,
+            wall_time=stats.wall_time,
+        )  # fmt: skip
+
+    def _counts(self, stamp: int, counts: Counts) -> Any:
+        none = np.empty(0)
+        return self._make(
+            f"{PACKAGE}/Counts", header=self._compose.header(stamp),
+            channel_names=list(counts.channel_names), time=counts.time,
+            channel=counts.channel.astype(np.uint32), code=counts.code.astype(np.int64),
+            capacitance=counts.capacitance, flags=counts.flags.astype(np.uint8),
+            baseline=none if counts.baseline is None else counts.baseline,
+            touched=none.astype(bool) if counts.touched is None else counts.touched,
+        )  # fmt: skip
+
+    def _images(self, stamp: int, frame: DepthFrame) -> Topics:
+        out: Topics = []
+        depth = np.where(frame.valid, frame.depth, np.nan)
+        self._add(out, "depth/image", self._compose.image(stamp, frame, depth))
+        image = self._compose.image(stamp, frame, frame.permittivity)
+        self._add(out, "depth/permittivity", image)
+        self._add(out, "depth/camera_info", self._compose.camera_info(stamp, frame))
+        return out
