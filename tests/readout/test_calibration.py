@@ -9,6 +9,7 @@ from scipy import stats
 
 from capsense.errors import ReadOutError
 from capsense.readout.calibration import (
+    LinearSensor,
     base_capacitance,
     calibrate,
     cross_correlation,
@@ -47,6 +48,15 @@ def test_figures_are_found():
     assert (fit.residual < 1e-24).all()
     assert np.abs(fit.correct(measured, time) - true).max() < 1e-23
     assert np.abs(fit.distort(true, time) - measured).max() < 1e-23
+
+
+def test_small_changes_on_a_large_base():
+    """Analytic: a change of a hundred-thousandth of C still tells the gain, to rounding."""
+    time = np.linspace(0, 100, 200)
+    true = 5e-12 * (1 + 1e-5 * np.random.default_rng(0).uniform(0, 1, (200, 1)))
+    fit = calibrate(true, 1.02 * true + 3e-13, time)
+    assert fit.gain == near([1.02], rel=1e-9)
+    assert fit.drift == pytest.approx([0.0], abs=1e-27)
 
 
 def test_without_drift():
@@ -97,7 +107,7 @@ def test_a_calibrated_model_measures_like_the_sensor():
     drift_between = DRIFT * (again.epoch - sensor.epoch)
     assert again.offset == pytest.approx(OFFSET + drift_between, abs=5e-17)
     assert again.drift == near(DRIFT, rel=0.05)
-    with pytest.raises(ReadOutError, match="2 channels and the read-out 3"):
+    with pytest.raises(ReadOutError, match="list of 3, one per channel"):
         ReadOut(self_patterns(("A", "B", "C")), ("A", "B", "C"), Schedule.simultaneous(3, 0.1),
                 LinearLaw(1e-15, 0, 9), stages=(sensor,))  # fmt: skip
 
@@ -136,7 +146,16 @@ RISING = np.linspace(1, 2, 10)[:, None]
         (lambda: calibrate(RISING[:3], RISING[:3], np.arange(3)), "3 samples for 3 unknowns"),
         (lambda: calibrate(ONES, ONES, drift=False), "channel 0: the recording does not tell"),
         (lambda: calibrate(RISING, RISING, np.arange(10)), "not along with time only"),
+        (lambda: calibrate(ONES[:, :0], ONES[:, :0], np.arange(10)), r"give both as \(n, K\)"),
+        (lambda: LinearSensor([1.0, 0.0], 0.0, 0.0, 0.0), "a gain is 0"),
+        (lambda: LinearSensor(1.0, np.nan, 0.0, 0.0), "offset: a number is not finite"),
         (lambda: base_capacitance([]), "at least one"),
+        (lambda: base_capacitance([np.nan]), "readings: a number is not finite"),
+        (lambda: tare(np.ones((3, 2)), np.ones(3)), "one base a channel"),
+        (lambda: relative_to([1.0], [np.nan]), "base: a number is not finite"),
+        (lambda: unit_range([]), "no readings"),
+        (lambda: unit_range([1.0, np.nan]), "readings: a number is not finite"),
+        (lambda: cross_correlation([1.0, np.nan], [1.0, 2.0]), "signal: a number is not finite"),
         (lambda: relative_to([1.0], [0.0]), "a base is 0"),
         (lambda: unit_range([[1.0], [1.0]]), "constant"),
         (lambda: cross_correlation([1.0, 1.0], [1.0, 2.0]), "constant"),

@@ -122,7 +122,10 @@ def test_families():
         (lambda: Pattern("A", {"B": 1.0}, floating=("B",)), "'B' is floating, and driven"),
         (lambda: Pattern("A", floating=("A",)), "'A' is floating, and driven"),
         (lambda: Pattern("A", {"A": 1.0, "B": 1.0}), "read and driven together"),
+        (lambda: Pattern("A", {"B": "high"}), "the drive of 'B' is 'high'"),
         (lambda: ChannelBank([], NAMES), "at least one channel"),
+        (lambda: ChannelBank(["A"], NAMES), "channel 'A' is no Pattern"),
+        (lambda: ChannelBank([Pattern("A")], "A"), "electrodes are 'A'; give a list"),
         (lambda: ChannelBank([Pattern("A"), Pattern("A")], NAMES), "two channels are named 'A'"),
         (lambda: ChannelBank([Pattern("E6")], NAMES), "no electrode 'E6'"),
     ],
@@ -140,3 +143,7 @@ def test_bad_matrices_are_refused():
     broken[0, 0] = np.nan
     with pytest.raises(ReadOutError, match="not finite"):
         bank.values(broken)
+    with pytest.raises(ReadOutError, match="complex128 values are no real numbers"):
+        bank.values(1j * np.eye(5))
+    with pytest.raises(ReadOutError, match="open electrodes have no capacitance"):
+        ChannelBank([Pattern("A", floating=("B",))], NAMES).values(np.zeros((5, 5)))

@@ -9,6 +9,7 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadOutError
+from capsense.readout.channels import Pattern, mutual_patterns
 from capsense.readout.chip import Status
 from capsense.readout.chips import CHIPS
 from capsense.readout.converter import Range
@@ -16,6 +17,7 @@ from capsense.readout.noise import allan_deviation
 from capsense.readout.presets import Options, charge_for, schedule_of
 from capsense.readout.presets import build as build_chip
 from capsense.readout.read_out import ReadOut
+from capsense.readout.wiring import Wiring
 
 COUNT = 12
 NAMES = tuple(f"E{k}" for k in range(COUNT))
@@ -153,9 +155,38 @@ def test_touch_of_a_chip():
     assert not touched.touched[touched.time > 10.3].any()
 
 
+def test_what_cannot_be_measured_at_once_is_not():
+    """A radio takes the receivers of a transmitter at once, unless one is open while another is."""
+    plan = {
+        "grounded": ((0, 1), (2,)),
+        "floating": ((0,), (1,), (2,)),
+        "guard": ((0,), (1,), (2,)),
+    }
+    for rest, slots in plan.items():
+        patterns = mutual_patterns(NAMES[:3], rest=rest)
+        assert ReadOut.preset("sdr", NAMES[:3], patterns=patterns).schedule.slots == slots
+    open_ = [Pattern("E1", {"E0": 1.0}), Pattern("E2", {"E0": 1.0}, floating=("E1",))]
+    assert ReadOut.preset("sdr", NAMES[:3], patterns=open_).schedule.slots == ((0,), (1,))
+
+
+def test_leads_load_the_shunt():
+    """Analytic: what leads have to ground takes current from the shunt, and the gain falls."""
+    wiring = Wiring(trace=20e-12, cable=100e-12, shield_gain=0.9)
+    readout = ReadOut.preset("sdr", NAMES[:2], noise=False, wiring=wiring)
+    level = 0.1e-12
+    found = readout([0.0, 0.1], np.full((2, 1), level)).capacitance[0]
+    expected = level / math.hypot(1, 2 * math.pi * 1e6 * 1e3 * 30e-12)
+    assert found == near(expected, rel=3e-3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (("fdc1004", {"rate": "400"}), "no rate of '400' conversions per second"),
+        (("fdc1004", {"flicker": "low"}), "floor is 'low'"),
+        (("mpr121", {"expected": "10 pF"}), "expected is '10 pF'"),
+        (("fdc1004", {"offset_per_kelvin": 1e-15}), "does nothing without a temperature"),
+        (("fdc1004", {"offset_per_percent": 1e-15}), "does nothing without a humidity"),
         (("fdc1005", {}), "unknown chip 'fdc1005'; did you mean 'fdc1004'"),
         (("fdc1004", {"rate": 150.0}), "no rate of 150.0 conversions per second; it has 100"),
         (("fdc1004", {"rates": 100.0}), "no option 'rates' of a read-out; did you mean 'rate'"),
@@ -167,6 +198,11 @@ def test_bad_options_are_refused(arguments, words):
     name, options = arguments
     with pytest.raises(ReadOutError, match=words):
         ReadOut.preset(name, NAMES, **options)
+
+
+def test_a_sensor_without_pairs_is_refused():
+    with pytest.raises(ReadOutError, match=r"electrodes \['E1'\] make none"):
+        ReadOut.preset("ad7746", ["E1"])
 
 
 def test_options_and_presets_are_one():

@@ -9,9 +9,11 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadOutError
+from capsense.readout.calibration import LinearSensor, calibrate
 from capsense.readout.config import load_readout, parse_readout
 from capsense.readout.detector import ExponentialTracker, SteppingTracker
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
+from capsense.readout.read_out import ReadOut
 
 NAMES = ("E1", "E2", "E3")
 FULL = """
@@ -32,6 +34,7 @@ drive = { E1 = 1.0, E2 = -1.0 }
 trace = [1e-12, 2e-12]
 cable = 50e-12
 shield_gain = 0.99
+coupling = 3e-14
 crosstalk = 0.001
 
 [noise]
@@ -50,6 +53,10 @@ touch = 5000
 release = 3000
 debounce = 2
 samples = 500
+
+[calibration]
+gain = [1.02, 0.97]
+offset = 2e-13
 """
 
 
@@ -62,7 +69,14 @@ def test_everything_is_taken_over():
     assert readout.channel_names == ("E1", "difference")
     assert readout.schedule.conversion == near(2.5e-3, rel=1e-12)
     assert readout.wiring.trace == [1e-12, 2e-12]
-    climate, walk, flicker, mains, white = readout.stages
+    assert readout.wiring.coupling == 3e-14
+    sensor, climate, walk, flicker, mains, white = readout.stages
+    assert isinstance(sensor, LinearSensor)
+    assert (sensor.gain.tolist(), float(sensor.offset), float(sensor.drift)) == (
+        [1.02, 0.97],
+        2e-13,
+        0,
+    )
     assert isinstance(climate, ClimateDrift)
     assert climate.temperature.at(np.array([300.0]))[0] == near(26.0, rel=1e-12)
     assert climate.offset_per_kelvin == 1e-16
@@ -75,6 +89,18 @@ def test_everything_is_taken_over():
     patterns = readout.bank.patterns
     assert (patterns[0].rest, patterns[0].shield, patterns[1].shield) == ("guard", 1.0, 0.0)
     assert dict(patterns[1].drive) == {"E1": 1.0, "E2": -1.0}
+
+
+def test_a_calibration_goes_through_a_file():
+    """Round trip: what ``toml`` writes makes the same read-out."""
+    rng = np.random.default_rng(0)
+    true, time = rng.uniform(1e-12, 2e-12, (9, 3)), np.arange(9.0)
+    fit = calibrate(true, 1.1 * true + 3e-13 + 1e-16 * time[:, None], time)
+    from_file = parse('chip = "fdc1004"\nrandom = false\n' + fit.toml())
+    from_code = ReadOut.preset("fdc1004", NAMES, noise=False, stages=[fit])
+    codes = [r(time, true).code.tolist() for r in (from_file, from_code)]
+    assert codes[0] == codes[1]
+    assert codes[0] != parse('chip = "fdc1004"\nrandom = false')(time, true).code.tolist()
 
 
 def test_the_least_a_file_can_say(tmp_path):
@@ -94,7 +120,8 @@ def test_pairs_and_stepping_baseline():
         '[detector]\ntouch = 10\ntracker = "stepping"\n'
     )
     assert readout.channel_names == ("E3-E1", "E3-E2")
-    assert readout.schedule.slots == ((0, 1),)
+    # E1 is read while E2 is open, and the other way round: not at once.
+    assert readout.schedule.slots == ((0,), (1,))
     assert readout.detector is not None
     assert (readout.detector.release, readout.detector.tracker) == (5.0, SteppingTracker())
 
@@ -122,6 +149,9 @@ def test_pairs_and_stepping_baseline():
         ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\ndrive = { E2 = true }', "E2 = True must be"),
         ('chip = "fdc1004"\n[wiring]\ntrace = -1', "wiring: trace = -1 must be from 0"),
         ('chip = "fdc1004"\n[wiring]\ntrace = [1e-12]', "trace is .*one per channel"),
+        ('chip = "fdc1004"\n[calibration]\ngain = [1.0]', "gain is .*one per channel"),
+        ('chip = "fdc1004"\n[calibration]\ngain = 0', "a gain is 0"),
+        ('chip = "fdc1004"\n[climate]\noffset_per_kelvin = 1e-16', "without a temperature"),
         ('chip = "fdc1004"\n[noise]\nwhite = 1', "noise: unknown key 'white'"),
         ('chip = "fdc1004"\n[climate]\ntemperature = [[1, 2], [1, 3]]', "times must rise"),
         ('chip = "fdc1004"\n[detector]\ntouch = 5\nrelease = 9', "release = 9 must be from"),

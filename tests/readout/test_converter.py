@@ -143,9 +143,11 @@ def test_dac_follows_only_if_it_may():
         (lambda: ReciprocalLaw(1e-6, 1e-6, 1.2), "codes run from 598 to 426"),
         (lambda: ResonanceLaw(0.0, 1e-12, 4e7), "inductance is 0.0"),
         (lambda: ShuntLaw(ShuntFrontEnd(), math.nan), "full_scale is nan"),
+        (lambda: LinearLaw("fine", 0, 1), "lsb is 'fine'"),
+        (lambda: CapDac(1e-12, 8, start="low"), "is 'low'; give a whole number"),
         (lambda: CapDac(0.0, 32), "step is 0.0"),
         (lambda: CapDac(1e-12, 0), "codes is 0"),
-        (lambda: CapDac(1e-12, 8, start=8), "start is 8"),
+        (lambda: CapDac(1e-12, 8, start=8), "is 8; give a whole number from 0 to 7"),
         (lambda: CapDac(1e-12, 8, (math.nan,)), "bit_errors is nan"),
     ],
 )

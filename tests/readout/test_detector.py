@@ -102,6 +102,8 @@ def test_channels_are_apart():
         (lambda: Detector(10, 0, STILL), "release = 0"),
         (lambda: Detector(math.inf, 1, STILL), "touch = inf"),
         (lambda: Detector(10, 5, STILL, 0), "debounce is 0"),
+        (lambda: Detector(10, 5, STILL, 1.5), "debounce is 1.5"),
+        (lambda: Detector("10", 5, STILL), "touch = '10'"),
         (lambda: ExponentialTracker(0), "samples is 0"),
         (lambda: Filter(max_half_delta=-1), "max_half_delta is -1"),
         (lambda: Filter(delay=256), "delay is 256"),

@@ -114,3 +114,21 @@ def test_noise_of_demodulation():
 def test_bad_front_ends_are_refused(settings, words):
     with pytest.raises(ReadOutError, match=words):
         ShuntFrontEnd(**settings)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ShuntFrontEnd("1 MHz"), "frequency is '1 MHz'"),
+        (lambda: PAPER.recover([1.0, math.nan]), "an output is not a number"),
+        (lambda: PAPER.waveform(1e-12, 0.0, 10), "sample_rate is 0.0"),
+        (lambda: demodulate([], 1e6, 1e7), "number of samples is 0"),
+        (lambda: demodulate([1.0, math.nan], 1e6, 1e7), "samples: a number is not finite"),
+        (lambda: demodulate([1.0, 2.0], 1e6, -1.0), "sample_rate is -1.0"),
+        (lambda: demodulated(1.0, 1e6, 1e6, 1e7, 0), "number of samples is 0"),
+    ],
+)
+def test_bad_signals_are_refused(make, words):
+    """Nothing becomes NaN in silence."""
+    with pytest.raises(ReadOutError, match=words):
+        make()

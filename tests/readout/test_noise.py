@@ -61,7 +61,7 @@ def test_allan_deviation_is_its_definition():
     ramp = 3.0 * np.arange(100)
     assert allan_deviation(ramp, [10])[0] == near(3.0 * 10 / math.sqrt(2), rel=1e-9)
     assert allan_deviation(np.ones((50, 2, 3)), [5]).shape == (1, 2, 3)
-    with pytest.raises(ReadOutError, match="hold 101; 200 samples allow 1 to 100"):
+    with pytest.raises(ReadOutError, match="is 101; give a whole number from 1 to 100"):
         allan_deviation(values, [101])
 
 
@@ -221,8 +221,16 @@ def test_same_seed_same_bits_however_dealt(stage):
         (lambda: Mains(1.0, 50.0, 0), "order is 0"),
         (lambda: ClimateDrift(math.nan), "offset_per_kelvin is nan"),
         (lambda: Profile.of([(0.0, 1.0), (0.0, 2.0)], "temperature"), "times must rise"),
-        (lambda: Profile.of([(0.0, math.nan)], "temperature"), "temperature is"),
+        (
+            lambda: Profile.of([(0.0, math.nan)], "temperature"),
+            "temperature: a number is not finite",
+        ),
         (lambda: Profile.of([(0.0, 1.0, 2.0)], "humidity"), "humidity is"),
+        (lambda: Profile.of([(0.0, 1.0), (2.0,)], "humidity"), "humidity: rows differ in length"),
+        (lambda: Profile.of("hot", "temperature"), "temperature: .*no real numbers"),
+        (lambda: White("loud"), "rms is 'loud'; give a number at least 0 F"),
+        (lambda: allan_deviation([1.0, math.nan, 2.0, 3.0], [1]), "samples: a number is not"),
+        (lambda: allan_deviation(np.ones(10), [1.5]), "is 1.5; give a whole number from 1 to 5"),
     ],
 )
 def test_bad_stages_are_refused(make, words):

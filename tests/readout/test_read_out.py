@@ -172,6 +172,17 @@ def test_wiring():
     assert mixed.capacitance[:3] == near(at * (c + np.array([c[1], c[1], c[1]])), rel=1e-6)
 
 
+def test_wiring_of_mutual_channels():
+    """Analytic: leads to ground charge a self measurement only; between leads, a mutual one."""
+    patterns = [Pattern("A"), Pattern("B", {"A": 1.0})]
+    wiring = Wiring(trace=4e-12, cable=1e-11, shield_gain=0.5, coupling=[1e-13, 2e-13])
+    readout = ReadOut(patterns, NAMES, Schedule.simultaneous(2, 1e-3), FINE, wiring=wiring)
+    matrix = random_maxwell(np.random.default_rng(2), 3)
+    counts = readout([0.0, 0.01], [matrix, matrix])
+    expected = [matrix[0, 0] + 4e-12 + 5e-12, -matrix[1, 0] + 2e-13]
+    assert counts.capacitance[:2] == near(expected, rel=1e-8)
+
+
 @dataclass
 class Reading:
     """As a simulator gives it."""
@@ -215,6 +226,55 @@ def test_counts_by_channel_and_in_rows():
         counts[counts.channel != 1].table()
 
 
+def test_seeds_of_any_kind_of_integer():
+    times, matrices = [0.0, 0.1], random_maxwell(np.random.default_rng(0), 3)[None].repeat(2, 0)
+    assert same(full(np.int64(3))(times, matrices), full(3)(times, matrices))
+
+
+def test_leaps_are_refused():
+    """A clock that does not start at zero, as that of the day, is no reason to run for hours."""
+    readout = plain()
+    matrix = random_maxwell(np.random.default_rng(0), 3)
+    for leap in (lambda: readout.sample(1.7e9, matrix), lambda: readout.due(1.7e9),
+                 lambda: readout([0.0, 1.7e9], [matrix, matrix])):  # fmt: skip
+        with pytest.raises(ReadOutError, match=r"begin there: reset\(start=…\)"):
+            leap()
+    readout.reset(start=1.7e9)
+    readout.sample(1.7e9, matrix)
+    done = len(readout.sample(1.7e9 + 1, matrix))
+    assert done == readout.schedule.samples_until(1 - 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"stages": [3]}, "3 is no Stage"),
+        ({"detector": 3}, "3 is no Detector"),
+        ({"wiring": "cable"}, "'cable' is no Wiring"),
+        ({"wiring": Wiring(trace=-1e-12)}, "trace holds -1e-12 F"),
+        ({"wiring": Wiring(trace="long")}, "trace: .* no real numbers"),
+        ({"wiring": Wiring(shield_gain="good")}, "shield_gain is 'good'"),
+        ({"wiring": Wiring(crosstalk=[[0.0], [0.0, 1.0]])}, "crosstalk: rows differ"),
+        ({"seed": 1.5}, "seed is 1.5"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(options, words):
+    with pytest.raises(ReadOutError, match=words):
+        plain(**options)
+
+
+def test_a_stage_that_fails_is_noticed():
+    """NaN is never turned into a code."""
+
+    class Broken:
+        def start(self, context):
+            return lambda channel, time, value: value * np.nan
+
+    matrix = random_maxwell(np.random.default_rng(0), 3)
+    with pytest.raises(ReadOutError, match="a stage made a number that is not finite"):
+        plain(stages=[Broken()])([0.0, 1.0], [matrix, matrix])
+
+
 def test_misuse_is_refused():
     readout = plain()
     matrix = random_maxwell(np.random.default_rng(0), 3)
@@ -223,11 +283,17 @@ def test_misuse_is_refused():
         readout.sample(0.5, matrix)
     with pytest.raises(ReadOutError, match="sample at nan s; give a finite time"):
         readout.sample(float("nan"), matrix)
+    with pytest.raises(ReadOutError, match="sample at 'now' s; give a finite time"):
+        readout.sample("now", matrix)
+    with pytest.raises(ReadOutError, match="sample takes one instant"):
+        readout.sample(2.0, np.ones((4, 3, 3)))
+    with pytest.raises(ReadOutError, match="until is nan"):
+        readout.due(float("nan"))
     with pytest.raises(ReadOutError, match=r"shape \(2, 2\)"):
         readout.sample(2.0, np.eye(2))
     with pytest.raises(ReadOutError, match="not finite"):
         readout.sample(2.0, np.array([1e-12, np.nan, 1e-12]))
-    with pytest.raises(ReadOutError, match="2 times for 3"):
+    with pytest.raises(ReadOutError, match=r"2 times for capacitances of shape \(3, 3\)"):
         readout([0.0, 1.0], np.ones((3, 3)))
     with pytest.raises(ReadOutError, match="times must be finite numbers that rise"):
         readout([0.0, 0.0], np.ones((2, 3)))

@@ -63,17 +63,23 @@ def test_inputs_of_several_chips_run_side_by_side():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Schedule(((0,),), 0.0), "conversion is 0.0 s"),
+        (lambda: Schedule(((0,),), 0.0), "conversion is 0.0; give"),
         (lambda: Schedule(((0,),), float("nan")), "conversion is nan"),
         (lambda: Schedule(((0,),), 1.0, -1.0), "gap is -1.0"),
         (lambda: Schedule(((0,),), 1.0, 0.0, float("inf")), "idle is inf"),
         (lambda: Schedule((), 1.0), "list each of 0, 1, 2"),
         (lambda: Schedule(((0, 0),), 1.0), "list each of 0, 1, 2"),
         (lambda: Schedule(((0, 2),), 1.0), "list each of 0, 1, 2"),
-        (lambda: Schedule.sequential(0, 1.0), "0 channels"),
-        (lambda: Schedule.sequential(3, 1.0, inputs=0), "0 inputs"),
-        (lambda: Schedule.sequential(3, 1.0, period=2.0), "too short for 3 conversions"),
-        (lambda: Schedule.simultaneous(3, 1.0, period=0.5), "too short for a conversion"),
+        (lambda: Schedule.sequential(0, 1.0), "number of channels is 0"),
+        (lambda: Schedule.sequential(3, 1.0, inputs=0), "number of inputs is 0"),
+        (
+            lambda: Schedule.sequential(3, 1.0, period=2.0),
+            "too short for its conversions, which take 3 s",
+        ),
+        (lambda: Schedule.sequential(3, -1.0), "conversion is -1.0; give"),
+        (lambda: Schedule.sequential(3, 1.0, period=float("nan")), "period is nan; give"),
+        (lambda: Schedule(((0,), ()), 1.0), "a slot holds no channel"),
+        (lambda: Schedule.simultaneous(3, 1.0, period=0.5), "conversions, which take 1 s"),
     ],
 )
 def test_bad_schedules_are_refused(make, words):

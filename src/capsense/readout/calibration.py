@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsense.errors import ReadOutError
-from capsense.readout.stage import Array, Context, Ints, Process
+from capsense.readout.checks import Array, Ints, finite, per_channel, require
+from capsense.readout.stage import Context, Process
 
 
 def base_capacitance(values: ArrayLike) -> Array:
@@ -21,36 +22,60 @@ def base_capacitance(values: ArrayLike) -> Array:
     Raises:
         ReadOutError: There are no readings, or one is not finite.
     """
-    array = np.asarray(values, dtype=float)
-    if array.ndim < 1 or not len(array) or not np.isfinite(array).all():
-        raise ReadOutError("base capacitance needs finite readings, at least one; give some")
+    array = finite("readings", values)
+    if not array.size or array.ndim < 1:
+        raise ReadOutError("base capacitance needs readings, at least one; give some")
     return array.mean(axis=0)
 
 
 def tare(values: ArrayLike, base: ArrayLike) -> Array:
-    """Readings less the base: what remains is what the scene changed."""
-    return np.asarray(values, dtype=float) - np.asarray(base, dtype=float)
+    """Readings less the base: what remains is what the scene changed.
+
+    Args:
+        values: Readings [F or codes], shape (n, ...).
+        base: Of each channel, shape (...).
+
+    Raises:
+        ReadOutError: The shapes do not fit, or a number is not finite.
+    """
+    readings, level = _against(values, base)
+    return readings - level
 
 
 def relative_to(values: ArrayLike, base: ArrayLike) -> Array:
     """Readings as multiples of the base, as Schöffmann et al. 2022 plot them.
 
+    Args:
+        values: Readings [F or codes], shape (n, ...).
+        base: Of each channel, shape (...).
+
     Raises:
-        ReadOutError: A base is zero.
+        ReadOutError: A base is zero, the shapes do not fit, or a number is not finite.
     """
-    level = np.asarray(base, dtype=float)
+    readings, level = _against(values, base)
     if (level == 0).any():
         raise ReadOutError("a base is 0, to which nothing is relative; use tare() instead")
-    return np.asarray(values, dtype=float) / level
+    return readings / level
+
+
+def _against(values: ArrayLike, base: ArrayLike) -> tuple[Array, Array]:
+    readings, level = finite("readings", values), finite("base", base)
+    if level.ndim and readings.shape[readings.ndim - level.ndim :] != level.shape:
+        raise ReadOutError(
+            f"readings have shape {readings.shape}, the base {level.shape}; give one base a channel"
+        )
+    return readings, level
 
 
 def unit_range(values: ArrayLike) -> Array:
     """Each channel stretched to run from 0 to 1 over a recording, shape (n, ...).
 
     Raises:
-        ReadOutError: A channel is constant.
+        ReadOutError: A channel is constant, or a number is not finite.
     """
-    array = np.asarray(values, dtype=float)
+    array = finite("readings", values)
+    if not array.size:
+        raise ReadOutError("there are no readings to stretch; give some")
     low, span = array.min(axis=0), np.ptp(array, axis=0)
     if (span == 0).any():
         raise ReadOutError("a channel is constant and has no range; leave it out")
@@ -63,9 +88,9 @@ def cross_correlation(one: ArrayLike, other: ArrayLike) -> float:
     ``Σ (a − ā)(b − b̄) / √(Σ (a − ā)² Σ (b − b̄)²)``
 
     Raises:
-        ReadOutError: The signals differ in length, or one is constant.
+        ReadOutError: The signals differ in length, one is constant, or a number is not finite.
     """
-    a, b = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
+    a, b = finite("signal", one), finite("signal", other)
     if a.shape != b.shape:
         raise ReadOutError(f"signals have shapes {a.shape} and {b.shape}; make them the same")
     a, b = a - a.mean(), b - b.mean()
@@ -76,20 +101,72 @@ def cross_correlation(one: ArrayLike, other: ArrayLike) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """A linear model of a sensor, ``measured = gain · true + offset + drift · (t − epoch)``.
+class LinearSensor:
+    """How a sensor measures: ``measured = gain · true + offset + drift · (t − epoch)``.
 
     As a stage of a read-out it makes the simulated sensor measure like the real one.
+
+    Raises:
+        ReadOutError: A figure is not finite, or a gain is zero.
     """
 
     gain: Array
-    """Shape (K,)."""
+    """Shape (K,), or a number for all channels, as the others."""
     offset: Array
-    """At the epoch [F], shape (K,)."""
+    """At the epoch [F]."""
     drift: Array
-    """[F/s], shape (K,)."""
+    """[F/s]"""
     epoch: float
-    """Time that drift is counted from: the recording's mean time [s]."""
+    """Time that drift is counted from [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "offset", "drift"):
+            figures = finite(f"calibration: {name}", getattr(self, name))
+            object.__setattr__(self, name, figures)
+        if (self.gain == 0).any():
+            raise ReadOutError("calibration: a gain is 0; leave that channel out")
+        require("calibration", "epoch", self.epoch, -math.inf, "s")
+
+    def correct(self, measured: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """True capacitances [F] from measured ones, shape (n, K); ``time`` [s] of shape (n,)."""
+        return (np.asarray(measured, dtype=float) - self._shift(time)) / self.gain
+
+    def distort(self, true: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """Measured capacitances [F] from true ones, shape (n, K); ``time`` [s] of shape (n,)."""
+        return np.asarray(true, dtype=float) * self.gain + self._shift(time)
+
+    def toml(self) -> str:
+        """The figures as the table ``[calibration]`` of a read-out file."""
+        lines = [f"{key} = {getattr(self, key).tolist()}" for key in ("gain", "offset", "drift")]
+        return "\n".join(["[calibration]", *lines, f"epoch = {float(self.epoch)!r}", ""])
+
+    def _shift(self, time: ArrayLike | None) -> Array:
+        if time is None:
+            return self.offset
+        since = np.asarray(time, dtype=float)[..., None] - self.epoch
+        return self.offset + self.drift * since
+
+    def start(self, context: Context) -> Process:
+        """The process of a read-out's stage.
+
+        Raises:
+            ReadOutError: There are figures for another number of channels.
+        """
+        gain, offset, drift = (
+            per_channel("calibration", name, getattr(self, name), context.channels)
+            for name in ("gain", "offset", "drift")
+        )
+
+        def process(channel: Ints, time: Array, value: Array) -> Array:
+            return value * gain[channel] + offset[channel] + drift[channel] * (time - self.epoch)
+
+        return process
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(LinearSensor):
+    """A sensor's figures as a recording shows them, with their uncertainties."""
+
     covariance: Array
     """Of (gain, offset, drift) of each channel, shape (K, 3, 3); zero where drift is not fitted."""
     residual: Array
@@ -101,34 +178,6 @@ class Calibration:
     def uncertainty(self) -> Array:
         """Standard uncertainties of (gain, offset, drift), shape (K, 3)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-
-    def correct(self, measured: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """True capacitances [F] from measured ones, shape (n, K); ``time`` [s] of shape (n,)."""
-        return (np.asarray(measured, dtype=float) - self._shift(time)) / self.gain
-
-    def distort(self, true: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Measured capacitances [F] from true ones, shape (n, K); ``time`` [s] of shape (n,)."""
-        return np.asarray(true, dtype=float) * self.gain + self._shift(time)
-
-    def _shift(self, time: ArrayLike | None) -> Array:
-        if time is None:
-            return self.offset
-        since = np.asarray(time, dtype=float)[..., None] - self.epoch
-        return self.offset + self.drift * since
-
-    def start(self, context: Context) -> Process:
-        """The process of a read-out's stage."""
-        if len(self.gain) != context.channels:
-            raise ReadOutError(
-                f"the calibration has {len(self.gain)} channels and the read-out "
-                f"{context.channels}; calibrate each of its channels"
-            )
-
-        def process(channel: Ints, time: Array, value: Array) -> Array:
-            shift = self.offset[channel] + self.drift[channel] * (time - self.epoch)
-            return value * self.gain[channel] + shift
-
-        return process
 
 
 def calibrate(
@@ -151,12 +200,9 @@ def calibrate(
         ReadOutError: Shapes do not fit, numbers are not finite, samples are too few, or the
             recording does not tell the figures apart (a channel that never changes).
     """
-    c = np.asarray(true, dtype=float)
-    m = np.asarray(measured, dtype=float)
-    if c.ndim != 2 or c.shape != m.shape:
+    c, m = finite("true", true), finite("measured", measured)
+    if c.ndim != 2 or c.shape != m.shape or not c.shape[1]:
         raise ReadOutError(f"true has shape {c.shape}, measured {m.shape}; give both as (n, K)")
-    if not (np.isfinite(c).all() and np.isfinite(m).all()):
-        raise ReadOutError("a capacitance is not finite; leave such samples out")
     n, k = c.shape
     t = _times(time, n, drift)
     unknowns = 3 if drift else 2
@@ -179,9 +225,9 @@ def _times(time: ArrayLike | None, count: int, drift: bool) -> Array:
         if drift:
             raise ReadOutError("drift needs the times of the samples; give time, or drift=False")
         return np.zeros(count)
-    t = np.asarray(time, dtype=float)
-    if t.shape != (count,) or not np.isfinite(t).all():
-        raise ReadOutError(f"time has shape {t.shape}; give {count} finite numbers")
+    t = finite("time", time)
+    if t.shape != (count,):
+        raise ReadOutError(f"time has shape {t.shape}; give {count} numbers, one a sample")
     return t
 
 
@@ -194,9 +240,11 @@ def _least_squares(design: Array, seen: Array, channel: int) -> tuple[Array, Arr
             f"channel {channel}: the recording does not tell gain, offset and drift apart; move "
             "the body so that the capacitance changes, and not along with time only"
         )
-    unit = design / scale
-    inverse = np.linalg.inv(unit.T @ unit)
-    figures = inverse @ (unit.T @ seen)
+    # By QR: the normal equations would lose the gain where C changes by little of its own size.
+    q, r = np.linalg.qr(design / scale)
+    figures = np.linalg.solve(r, q.T @ seen)
+    root = np.linalg.inv(r)
     n, p = design.shape
-    variance = float(((seen - unit @ figures) ** 2).sum()) / (n - p)
-    return figures / scale, variance * inverse / np.outer(scale, scale), math.sqrt(variance)
+    variance = float(((seen - (design / scale) @ figures) ** 2).sum()) / (n - p)
+    covariance = variance * (root @ root.T) / np.outer(scale, scale)
+    return figures / scale, covariance, math.sqrt(variance)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from capsense._validate import suggest
 from capsense.errors import ReadOutError
+from capsense.readout.checks import Array, real, require
 
-Array = NDArray[np.float64]
 Rest = Literal["grounded", "floating", "guard"]
 RESTS: tuple[Rest, ...] = ("grounded", "floating", "guard")
 
@@ -51,10 +51,7 @@ class Pattern:
         label = self.name or _default_name(self.sense, drive)
         where = f"channel {label!r}"
         for electrode, weight in (*drive.items(), ("shield", self.shield)):
-            if not math.isfinite(weight):
-                raise ReadOutError(
-                    f"{where}: the drive of {electrode!r} is {weight}; give a number"
-                )
+            require(where, f"the drive of {electrode!r}", weight, -math.inf, "")
         if all(weight == 0.0 for weight in drive.values()):
             raise ReadOutError(f"{where}: nothing is driven; give one electrode a weight")
         if self.rest not in RESTS:
@@ -123,8 +120,15 @@ class ChannelBank:
     """
 
     def __init__(self, patterns: Sequence[Pattern], electrodes: Sequence[str]) -> None:
+        if isinstance(electrodes, str):
+            raise ReadOutError(f"electrodes are {electrodes!r}; give a list of names")
         if not patterns:
-            raise ReadOutError("a read-out needs at least one channel; none is given")
+            raise ReadOutError(
+                f"a read-out needs at least one channel; electrodes {list(electrodes)} make none"
+            )
+        for pattern in patterns:
+            if not isinstance(pattern, Pattern):
+                raise ReadOutError(f"channel {pattern!r} is no Pattern; make one, Pattern('E1')")
         self.patterns = tuple(patterns)
         self.electrodes = tuple(electrodes)
         self.names = tuple(p.name for p in patterns)
@@ -167,7 +171,7 @@ class ChannelBank:
         Raises:
             ReadOutError: The shape does not fit the electrodes, or a number is not finite.
         """
-        matrix = np.asarray(capacitance, dtype=float)
+        matrix = real("capacitance", capacitance)
         m = len(self.electrodes)
         if matrix.shape[-2:] != (m, m):
             raise ReadOutError(
@@ -191,7 +195,13 @@ class ChannelBank:
         if coupling is not None:
             charge = charge + np.asarray(coupling)[..., open_] * self._shield[k]
         own = matrix[..., open_[:, None], open_]
-        volts = -np.linalg.solve(own, charge[..., None])[..., 0]
+        try:
+            volts = -np.linalg.solve(own, charge[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            raise ReadOutError(
+                f"channel {self.names[k]!r}: its open electrodes have no capacitance; mend the "
+                "readings"
+            ) from None
         return (matrix[..., self._sense[k], open_] * volts).sum(axis=-1)
 
     def _potentials(self, pattern: Pattern, index: Mapping[str, int]) -> Array:

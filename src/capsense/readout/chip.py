@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from capsense.readout.checks import as_number
 from capsense.readout.converter import CapDac, Law
 from capsense.readout.detector import Detector
 
@@ -78,5 +79,6 @@ class Chip:
         """The setting of an output rate, the default one for None; None if there is no such."""
         if per_second is None:
             return self.rates[0]
-        near = [r for r in self.rates if abs(r.per_second - per_second) <= 0.01 * r.per_second]
+        wanted = as_number(per_second)
+        near = [r for r in self.rates if abs(r.per_second - wanted) <= 0.01 * r.per_second]
         return near[0] if near else None

@@ -9,6 +9,7 @@ from typing import Any, cast
 from capsense import _validate
 from capsense._validate import read_toml, suggest
 from capsense.errors import ReadOutError
+from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
 from capsense.readout.chips import CHIPS
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
@@ -18,7 +19,7 @@ from capsense.readout.wiring import Wiring
 
 TOP_KEYS = (
     "chip", "rate", "seed", "random", "expected", "mode", "pairs", "rest", "channel", "wiring",
-    "noise", "climate", "detector",
+    "noise", "climate", "detector", "calibration",
 )  # fmt: skip
 
 
@@ -63,6 +64,7 @@ def parse_readout(
     options["noise"] = top.boolean("random", True)
     for key, read in (
         ("wiring", _wiring), ("noise", _noise), ("climate", _climate), ("detector", _detector),
+        ("calibration", _calibration),
     ):  # fmt: skip
         if key in top:
             table = Table(top.data[key], source, key)
@@ -140,13 +142,17 @@ def _require_electrode(table: Table, key: str, name: str, electrodes: Sequence[s
 
 
 def _wiring(table: Table) -> dict[str, Any]:
-    table.only(("trace", "cable", "shield_gain", "crosstalk"))
+    table.only(("trace", "cable", "shield_gain", "crosstalk", "coupling"))
+    capacitances = {
+        key: table.series(key, 0.0, 1e-6, "F")
+        for key in ("trace", "cable", "coupling")
+        if key in table
+    }
     return {
         "wiring": Wiring(
-            table.series("trace", 0.0, 1e-6, "F") if "trace" in table else 0.0,
-            table.series("cable", 0.0, 1e-6, "F") if "cable" in table else 0.0,
-            table.number("shield_gain", 0.0, 1.0, 0.0),
-            table.number("crosstalk", -1.0, 1.0, 0.0),
+            shield_gain=table.number("shield_gain", 0.0, 1.0, 0.0),
+            crosstalk=table.number("crosstalk", -1.0, 1.0, 0.0),
+            **capacitances,
         )
     }
 
@@ -195,3 +201,15 @@ def _detector(table: Table) -> dict[str, Any]:
     touch = table.number("touch", 1e-9, 1e12, unit="codes")
     release = table.number("release", 1e-9, touch, 0.5 * touch, unit="codes")
     return {"detector": Detector(touch, release, tracker, table.integer("debounce", 1, 10**6, 1))}
+
+
+def _calibration(table: Table) -> dict[str, Any]:
+    """What ``Calibration.toml`` writes: one number for all channels, or one per channel."""
+    limits = {"gain": (-1e6, 1e6, ""), "offset": (-1e-6, 1e-6, "F"), "drift": (-1e-6, 1e-6, "F/s")}
+    table.only((*limits, "epoch"))
+    figures: dict[str, Any] = {"gain": 1.0, "offset": 0.0, "drift": 0.0}
+    for key, (low, high, unit) in limits.items():
+        if key in table:
+            figures[key] = table.series(key, low, high, unit)
+    epoch = table.number("epoch", -1e12, 1e12, 0.0)
+    return {"stages": (LinearSensor(**figures, epoch=epoch),)}

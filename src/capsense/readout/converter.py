@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadOutError
+from capsense.readout.checks import Array, Ints, require, require_whole
 from capsense.readout.front_end import ShuntFrontEnd
-from capsense.readout.stage import Array, Ints, require, rounds
+from capsense.readout.stage import rounds
 
 Flags = NDArray[np.uint8]
 
@@ -229,12 +230,9 @@ class CapDac:
 
     def __post_init__(self) -> None:
         require("CAPDAC", "step", self.step, 0.0, "F", open_=True)
-        if self.codes < 1:
-            raise ReadOutError(f"CAPDAC: codes is {self.codes}; give one or more")
-        if self.start != "auto" and not 0 <= self.start < self.codes:
-            raise ReadOutError(
-                f'CAPDAC: start is {self.start!r}; give "auto" or a code from 0 to {self.codes - 1}'
-            )
+        require_whole("CAPDAC", "codes", self.codes, 1)
+        if self.start != "auto":
+            require_whole("CAPDAC", 'start (if not "auto")', self.start, 0, self.codes - 1)
         for error in self.bit_errors:
             require("CAPDAC", "bit_errors", error, -math.inf, "F")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capsense._validate import suggest
 from capsense.errors import ReadOutError
-from capsense.readout.stage import Array, Ints
+from capsense.readout.checks import Array, Ints
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ReadOutError
-from capsense.readout.stage import Array, Ints, require, rounds
+from capsense.readout.checks import Array, Ints, as_number, require, require_whole
+from capsense.readout.stage import rounds
 
 Bools = NDArray[np.bool_]
 
@@ -76,13 +77,8 @@ class Filter:
     """The filter runs at every ``delay + 1``-th sample (FDL)."""
 
     def __post_init__(self) -> None:
-        for name, low in (
-            ("max_half_delta", 0), ("noise_half_delta", 0), ("noise_count", 0), ("delay", 0),
-        ):  # fmt: skip
-            if not low <= getattr(self, name) <= 255:
-                raise ReadOutError(
-                    f"baseline filter: {name} is {getattr(self, name)!r}; give {low} to 255"
-                )
+        for name in ("max_half_delta", "noise_half_delta", "noise_count", "delay"):
+            require_whole("baseline filter", name, getattr(self, name), 0, 255)
 
 
 @dataclass(frozen=True)
@@ -142,13 +138,12 @@ class Detector:
     """Samples in a row that a change of state takes."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.release <= self.touch < math.inf:
+        if not 0 < as_number(self.release) <= as_number(self.touch) < math.inf:
             raise ReadOutError(
                 f"detector: touch = {self.touch!r} and release = {self.release!r}; give "
                 "0 < release <= touch, in codes"
             )
-        if self.debounce < 1:
-            raise ReadOutError(f"detector: debounce is {self.debounce!r}; give 1 or more")
+        require_whole("detector", "debounce", self.debounce, 1)
 
     def start(self, channels: int, rising: bool) -> Detection:
         """Return the detector's process; ``rising`` as of the converter's law."""

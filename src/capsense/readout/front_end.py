@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.readout.stage import Array, require
+from capsense.errors import ReadOutError
+from capsense.readout.checks import Array, finite, require, require_whole
 
 Phasors = NDArray[np.complex128]
 
@@ -73,14 +74,24 @@ class ShuntFrontEnd:
 
         The formula knows neither the parasitic capacitance nor the bandwidth; what they change
         is the error that calibration is there to take out. An output of zero gives 0 F.
+
+        Raises:
+            ReadOutError: An output is not a number.
         """
         v_o = np.asarray(output)
+        if np.isnan(v_o).any():
+            raise ReadOutError("front end: an output is not a number; leave it out")
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.abs(self.gain * self.amplitude / v_o - 1.0)
             return 1.0 / (self.omega * self.shunt * distance)
 
     def waveform(self, capacitance: float, sample_rate: float, count: int) -> Array:
-        """Samples of the amplifier's output [V], from phase 0 of the transmitter on, (count,)."""
+        """Samples of the amplifier's output [V], from phase 0 of the transmitter on, (count,).
+
+        Raises:
+            ReadOutError: The rate is not above zero, or the count not a whole number from 1 on.
+        """
+        _require_window(sample_rate, count)
         phase = self.omega * np.arange(count) / sample_rate
         return np.real(self.output(capacitance) * np.exp(1j * phase))
 
@@ -98,8 +109,12 @@ def demodulate(samples: ArrayLike, frequency: float, sample_rate: float) -> Phas
 
     Returns:
         Phasors I + jQ [V], shape (...).
+
+    Raises:
+        ReadOutError: There are no samples, one is not finite, or the rate is not above zero.
     """
-    signal = np.asarray(samples, dtype=float)
+    signal = finite("samples", samples)
+    _require_window(sample_rate, signal.shape[-1] if signal.ndim else 0)
     phase = 2 * math.pi * frequency * np.arange(signal.shape[-1]) / sample_rate
     return 2 * (signal @ np.exp(-1j * phase)) / signal.shape[-1]
 
@@ -125,11 +140,20 @@ def demodulated(
 
     Returns:
         I + jQ [V], of the shape of ``phasor``.
+
+    Raises:
+        ReadOutError: The rate is not above zero, or the count not a whole number from 1 on.
     """
+    _require_window(sample_rate, count)
     p = np.asarray(phasor, dtype=complex)
     near = _window_mean((signal_frequency - frequency) / sample_rate, count)
     image = _window_mean((-signal_frequency - frequency) / sample_rate, count)
     return p * near + np.conj(p) * image
+
+
+def _require_window(sample_rate: float, count: int) -> None:
+    require("demodulation", "sample_rate", sample_rate, 0.0, "Hz", open_=True)
+    require_whole("demodulation", "the number of samples", count, 1)
 
 
 def _window_mean(cycles: float, count: int) -> complex:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from capsense.constants import EPS0
 from capsense.errors import ReadOutError
-from capsense.readout.stage import Array
+from capsense.readout.checks import Array, as_number, finite, require, require_whole
 
 Axes = tuple[ArrayLike, ArrayLike, ArrayLike]
 
@@ -100,26 +100,26 @@ def _field(
     potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, int]]
 ) -> tuple[Array, tuple[Array, ...]]:
     """Checked potentials, and the spacings of the axes."""
-    phi = np.asarray(potentials, dtype=float)
+    phi = finite("potentials", potentials)
+    if len(axes) != 3:
+        raise ReadOutError(f"{len(axes)} axes are given; give node coordinates along x, y and z")
     steps = tuple(_axis(name, a) for name, a in zip("xyz", axes, strict=True))
     if phi.ndim != 4 or phi.shape[:3] != tuple(len(s) + 1 for s in steps):
         raise ReadOutError(
             f"potentials have shape {phi.shape}; these axes need "
             f"{(*(len(s) + 1 for s in steps), 'M')}"
         )
-    if not np.isfinite(phi).all():
-        raise ReadOutError("a potential is not finite; mend the field")
     for pair in pairs:
-        if not all(0 <= k < phi.shape[3] for k in pair):
-            raise ReadOutError(
-                f"pair {pair} names an electrode beyond the {phi.shape[3]} there are"
-            )
+        if len(pair) != 2:
+            raise ReadOutError(f"pair {pair} names {len(pair)} electrodes; give two")
+        for electrode in pair:
+            require_whole(f"pair {pair}", "an electrode", electrode, 0, phi.shape[3] - 1)
     return phi, steps
 
 
 def _axis(name: str, nodes: ArrayLike) -> Array:
     """Spacings of an axis."""
-    array = np.asarray(nodes, dtype=float)
+    array = finite(f"axis {name}", nodes)
     if array.ndim != 1 or len(array) < 2 or not (np.diff(array) > 0).all():
         raise ReadOutError(f"axis {name} must hold at least two rising coordinates in metres")
     return np.diff(array)
@@ -172,9 +172,8 @@ def tikhonov(matrix: ArrayLike, strength: float = 1e-3, *, depth_weight: float =
         ReadOutError: ``strength`` is not above zero, or ``depth_weight`` not from 0 to 1.
     """
     j = _checked(matrix)
-    if not (math.isfinite(strength) and strength > 0):
-        raise ReadOutError(f"strength is {strength!r}; give a number above zero, such as 1e-3")
-    if not 0 <= depth_weight <= 1:
+    require("Tikhonov", "strength", strength, 0.0, "", open_=True)
+    if not 0 <= as_number(depth_weight) <= 1:
         raise ReadOutError(f"depth_weight is {depth_weight!r}; give a number from 0 to 1")
     power = (j**2).sum(axis=0)
     floor = 1e-12 * power.max(initial=0.0)
@@ -210,14 +209,12 @@ def landweber(
         ReadOutError: Shapes do not fit, or bounds or iterations are out of range.
     """
     j = _checked(matrix)
-    d = np.asarray(change, dtype=float)
-    if d.shape[-1:] != (len(j),) or not np.isfinite(d).all():
-        raise ReadOutError(f"change has shape {d.shape}; give {len(j)} finite numbers an image")
-    if iterations < 1 or not low < high:
-        raise ReadOutError(
-            f"iterations = {iterations!r}, low = {low!r}, high = {high!r}; give at least one "
-            "iteration and low < high"
-        )
+    d = finite("change", change)
+    if d.shape[-1:] != (len(j),):
+        raise ReadOutError(f"change has shape {d.shape}; give {len(j)} numbers an image")
+    require_whole("Landweber", "iterations", iterations, 1)
+    if not as_number(low) < as_number(high):
+        raise ReadOutError(f"low = {low!r}, high = {high!r}; give numbers, low below high")
     largest = float(np.linalg.eigvalsh(j @ j.T)[-1])
     if largest <= 0:
         raise ReadOutError("the sensitivity matrix is zero; check the potentials")
@@ -228,7 +225,7 @@ def landweber(
 
 
 def _checked(matrix: ArrayLike) -> Array:
-    j = np.asarray(matrix, dtype=float)
-    if j.ndim != 2 or not j.size or not np.isfinite(j).all():
-        raise ReadOutError(f"J has shape {j.shape}; give finite numbers of shape (pairs, voxels)")
+    j = finite("J", matrix)
+    if j.ndim != 2 or not j.size:
+        raise ReadOutError(f"J has shape {j.shape}; give it as (pairs, voxels)")
     return j

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadOutError
-from capsense.readout.stage import Array, Context, Ints, Process, require, rounds
+from capsense.readout.checks import Array, Ints, finite, require, require_whole
+from capsense.readout.stage import Context, Process, rounds
 
 _POLES_PER_DECADE = 2.0
 
@@ -173,8 +174,8 @@ class Profile:
         Raises:
             ReadOutError: The points are none, not pairs, not finite, or times do not rise.
         """
-        points = np.atleast_2d(np.asarray([(0.0, value)] if np.isscalar(value) else value, float))
-        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+        points = finite(name, [(0.0, value)] if np.isscalar(value) else value)
+        if points.ndim != 2 or points.shape[1] != 2:
             raise ReadOutError(f"{name} is {value!r}; give a number or [[time, value], …]")
         if (np.diff(points[:, 0]) <= 0).any():
             raise ReadOutError(f"{name} is {value!r}; times must rise from point to point")
@@ -238,14 +239,11 @@ def allan_deviation(values: ArrayLike, averages: Sequence[int] | NDArray[np.int6
     Raises:
         ReadOutError: A number m is out of range.
     """
-    samples = np.asarray(values, dtype=float)
+    samples = finite("samples", values)
     total = np.concatenate([np.zeros((1, *samples.shape[1:])), np.cumsum(samples, axis=0)])
     out = []
     for m in averages:
-        if not 1 <= m <= len(samples) // 2:
-            raise ReadOutError(
-                f"averages hold {m}; {len(samples)} samples allow 1 to {len(samples) // 2}"
-            )
+        require_whole(f"averages of {len(samples)} samples", "one", m, 1, len(samples) // 2)
         change = (total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]) / m
         out.append(np.sqrt(0.5 * np.mean(change**2, axis=0)))
     return np.array(out)

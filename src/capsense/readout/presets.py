@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +11,11 @@ import numpy as np
 
 from capsense._validate import suggest
 from capsense.errors import ReadOutError
-from capsense.readout.channels import Pattern, mutual_patterns, self_patterns
+from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
+from capsense.readout.checks import require
 from capsense.readout.chip import Chip
 from capsense.readout.chips import CHIPS, MPR121_CURRENTS, MPR121_SUPPLY, MPR121_TIMES
-from capsense.readout.converter import Law, ReciprocalLaw
+from capsense.readout.converter import Law, ReciprocalLaw, ShuntLaw
 from capsense.readout.detector import Detector
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.read_out import ReadOut
@@ -104,6 +104,7 @@ def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None =
     part = chip if isinstance(chip, Chip) else chip_of(chip)
     chosen = options or Options()
     patterns = tuple(chosen.patterns) or default_patterns(part, electrodes)
+    ChannelBank(patterns, electrodes)  # refuses what is wrong before a schedule is made of it
     rate = part.rate(chosen.rate)
     if rate is None:
         rates = ", ".join(f"{r.per_second:.4g}" for r in part.rates)
@@ -114,7 +115,7 @@ def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None =
         patterns,
         electrodes,
         schedule_of(part, patterns, 1.0 / rate.per_second - part.gap),
-        law_of(part, chosen.expected),
+        law_of(part, chosen, len(patterns)),
         dac=part.dac,
         wiring=chosen.wiring,
         stages=(*chosen.stages, *_stages(part, rate.rms, chosen)),
@@ -135,21 +136,39 @@ def schedule_of(chip: Chip, patterns: Sequence[Pattern], conversion: float) -> S
     if chip.order == "together":
         return Schedule.simultaneous(count, conversion)
     if chip.order == "by transmitter":
-        groups: dict[frozenset[tuple[str, float]], list[int]] = {}
+        groups: dict[Hashable, list[int]] = {}
         for number, pattern in enumerate(patterns):
-            groups.setdefault(frozenset(pattern.drive.items()), []).append(number)
+            groups.setdefault(_excitation(pattern), []).append(number)
         return Schedule(tuple(tuple(g) for g in groups.values()), conversion, chip.gap)
     return Schedule.sequential(count, conversion, inputs=chip.inputs, gap=chip.gap)
 
 
-def law_of(chip: Chip, expected: float | None) -> Law:
-    """The chip's law; one that charges is set up for the capacitance expected [F]."""
-    if not isinstance(chip.law, ReciprocalLaw):
-        return chip.law
-    capacitance = EXPECTED if expected is None else expected
-    if not (math.isfinite(capacitance) and capacitance > 0):
-        raise ReadOutError(f"expected is {capacitance!r} F; give a capacitance above zero")
-    return charge_for(capacitance)
+def _excitation(pattern: Pattern) -> Hashable:
+    """What the electrodes do: patterns of which it is the same can be measured at once.
+
+    Receivers are held at ground, as the rest is. Where the rest floats or is driven, what another
+    pattern reads would have to float or be driven: such a pattern is measured by itself.
+    """
+    alone = "" if pattern.rest == "grounded" else pattern.name
+    driven = frozenset(pattern.drive.items())
+    return driven, frozenset(pattern.floating), pattern.shield, alone
+
+
+def law_of(chip: Chip, options: Options, channels: int) -> Law:
+    """The chip's law, as it is set up and wired.
+
+    One that charges is set up for the capacitance expected. Over a shunt lies what the leads have
+    to ground, their mean: there is one front end for all.
+    """
+    if isinstance(chip.law, ShuntLaw) and options.wiring is not None:
+        load = float(options.wiring.ground(channels).mean())
+        loaded = dataclasses.replace(chip.law.front_end, parasitic=load)
+        return dataclasses.replace(chip.law, front_end=loaded)
+    if isinstance(chip.law, ReciprocalLaw):
+        expected = EXPECTED if options.expected is None else options.expected
+        require("read-out", "expected", expected, 0.0, "F", open_=True)
+        return charge_for(expected)
+    return chip.law
 
 
 def charge_for(capacitance: float) -> ReciprocalLaw:
@@ -177,6 +196,7 @@ def charge_for(capacitance: float) -> ReciprocalLaw:
 def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
     """Climate, random walk, flicker, mains and white noise, those that are not zero."""
     out: list[Stage] = []
+    _require_climate(options)
     if options.temperature is not None or options.humidity is not None:
         temperature = 25.0 if options.temperature is None else options.temperature
         humidity = 50.0 if options.humidity is None else options.humidity
@@ -199,6 +219,17 @@ def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
     if options.noise and (rms or chip.relative_noise):
         out.append(White(rms, chip.relative_noise))
     return out
+
+
+def _require_climate(options: Options) -> None:
+    """Refuse coefficients of a temperature or humidity that is not given."""
+    for quantity, coefficients in (
+        ("temperature", ("offset_per_kelvin", "gain_per_kelvin")),
+        ("humidity", ("offset_per_percent",)),
+    ):
+        for name in coefficients:
+            if getattr(options, name) and getattr(options, quantity) is None:
+                raise ReadOutError(f"{name} does nothing without a {quantity}; give one")
 
 
 def _first(value: float | None, otherwise: float) -> float:

@@ -11,15 +11,18 @@ from numpy.typing import ArrayLike
 
 from capsense.errors import ReadOutError
 from capsense.readout.channels import ChannelBank, Pattern
+from capsense.readout.checks import Array, as_number, real, require, require_whole
 from capsense.readout.converter import CapDac, Conversion, Law
 from capsense.readout.counts import Counts
 from capsense.readout.detector import Detector
 from capsense.readout.schedule import Schedule
-from capsense.readout.stage import Array, Context, Process, Stage
+from capsense.readout.stage import Context, Process, Stage
 from capsense.readout.wiring import Wiring
 
 _BATCH = 4096
 """Samples processed at a time."""
+_AT_ONCE = 20_000_000
+"""Samples that a single step may hold: hours of the fastest chip."""
 
 
 class Reading(Protocol):
@@ -71,6 +74,10 @@ class ReadOut:
         detector: Detector | None = None, seed: int = 0, name: str = "read-out",
     ) -> None:  # fmt: skip
         self.bank = ChannelBank(patterns, electrodes)
+        for kind, parts in ((Wiring, [wiring]), (Detector, [detector]), (Stage, stages)):
+            for part in parts:
+                if part is not None and not isinstance(part, kind):
+                    raise ReadOutError(f"{part!r} is no {kind.__name__}; give one")
         if schedule.count != len(self.bank):
             raise ReadOutError(
                 f"the schedule samples {schedule.count} channels and there are {len(self.bank)}; "
@@ -79,10 +86,9 @@ class ReadOut:
         self.schedule, self.law, self.dac = schedule, law, dac
         self.stages, self.detector, self.name = tuple(stages), detector, name
         self.wiring = wiring or Wiring()
-        mixing, self._offset = self.wiring.start(len(self.bank))
+        mixing, self._offset = self.wiring.start(np.array([p.is_self for p in self.bank.patterns]))
         self._mixing = None if np.array_equal(mixing, np.eye(len(self.bank))) else mixing
-        self._seed = seed
-        self.reset()
+        self.reset(seed=seed)
 
     @classmethod
     def preset(cls, chip: str, electrodes: Sequence[str], **options: Any) -> ReadOut:
@@ -108,13 +114,12 @@ class ReadOut:
             seed: A new seed; by default random numbers repeat.
 
         Raises:
-            ReadOutError: ``start`` is not finite, or the seed no integer from 0 on.
+            ReadOutError: ``start`` is not finite, or the seed no whole number from 0 on.
         """
-        if not math.isfinite(start):
-            raise ReadOutError(f"start is {start!r} s; give a finite number")
-        self._seed = self._seed if seed is None else seed
-        if isinstance(self._seed, bool) or not isinstance(self._seed, int) or self._seed < 0:
-            raise ReadOutError(f"seed is {self._seed!r}; give an integer, zero or more")
+        require("reset", "start", start, -math.inf, "s")
+        if seed is not None:
+            require_whole("read-out", "seed", seed, 0)
+            self._seed = int(seed)
         seeds = np.random.SeedSequence(self._seed).spawn(len(self.stages))
         k = len(self.bank)
         plan = self.schedule
@@ -136,6 +141,8 @@ class ReadOut:
 
     def due(self, until: float) -> Array:
         """Instants at which capacitances are wanted next [s], up to ``until`` [s], rising."""
+        require("due", "until", until, -math.inf, "s")
+        self._require_patience(until - self._start)
         last = self.schedule.samples_until(until - self._start)
         return self._start + np.unique(self.schedule.instant(np.arange(self._seen, last)))
 
@@ -162,7 +169,7 @@ class ReadOut:
                 )
             matrix = reading.capacitance
             return self.bank.values(matrix, reading.self_capacitance - np.diag(matrix))
-        array = np.asarray(cast("ArrayLike", capacitance), dtype=float)
+        array = real("capacitance", capacitance)
         if array.ndim != 1:
             return self.bank.values(array)
         return self._checked(array)
@@ -192,7 +199,9 @@ class ReadOut:
             ReadOutError: Time goes back or is not finite, or the capacitances do not fit.
         """
         values = self._wired(self.channel_values(capacitance))
-        now = float(time) - self._start
+        if values.ndim != 1:
+            raise ReadOutError("sample takes one instant; call the read-out for a recording")
+        now = as_number(time) - self._start
         if not math.isfinite(now):
             raise ReadOutError(f"sample at {time!r} s; give a finite time")
         if self._last is not None and now < self._last[0]:
@@ -200,6 +209,7 @@ class ReadOut:
                 f"sample at {time!r} s, after one at {self._last[0] + self._start:g} s; time must "
                 "not go back: call reset() to begin anew"
             )
+        self._require_patience(now)
         before = self._last or (now, values)
         self._last = (now, values)
         if self._next_instant <= now:
@@ -220,16 +230,19 @@ class ReadOut:
         Raises:
             ReadOutError: Times do not rise, or shapes do not fit.
         """
-        t = np.asarray(times, dtype=float)
+        t = real("times", times)
         if t.ndim != 1 or not len(t) or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
             raise ReadOutError("times must be finite numbers that rise, of shape (n,)")
-        array = np.asarray(capacitance, dtype=float)
-        if len(array) != len(t):
-            raise ReadOutError(f"{len(t)} times for {len(array)} capacitances; make them the same")
+        array = real("capacitance", capacitance)
+        if array.ndim not in (2, 3) or len(array) != len(t):
+            raise ReadOutError(
+                f"{len(t)} times for capacitances of shape {array.shape}; give (n, K) or (n, M, M)"
+            )
         truth = self._checked(array) if array.ndim == 2 else self.bank.values(array)
         values = self._wired(truth)
         self.reset(start=float(t[0]))
         relative = t - t[0]
+        self._require_patience(float(relative[-1]))
         self._seen = self.schedule.samples_until(float(relative[-1]))
         instant, channel = self.schedule.samples(np.arange(self._seen))
         after = np.searchsorted(relative, instant - self.schedule.slack)
@@ -243,6 +256,15 @@ class ReadOut:
         counts = self._report(float(relative[-1]))
         self.reset()
         return counts
+
+    def _require_patience(self, now: float) -> None:
+        """Refuse a leap over more conversions than anybody wants at once."""
+        plan = self.schedule
+        if (now / plan.period) * plan.count - self._seen > _AT_ONCE:
+            raise ReadOutError(
+                f"{now + self._start:g} s is more than {_AT_ONCE:.0e} conversions after the last "
+                "time; take smaller steps, or begin there: reset(start=…)"
+            )
 
     def _take(self, now: float, before: tuple[float, Array], values: Array) -> None:
         """Sample the channels whose instants have come, between two sets of values [F]."""
@@ -308,6 +330,8 @@ class ReadOut:
         """Send one batch through stages, converter and detector, into its place."""
         for process in self._processes:
             value = process(counts.channel, instant, value)
+        if not np.isfinite(value).all():
+            raise ReadOutError("a stage made a number that is not finite; mend its figures")
         counts.code[:], counts.capacitance[:], counts.flags[:] = self._convert(
             counts.channel, value
         )

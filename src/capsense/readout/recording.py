@@ -12,7 +12,7 @@ import numpy as np
 
 from capsense.errors import ReadOutError
 from capsense.readout.channels import ChannelBank, Pattern
-from capsense.readout.stage import Array
+from capsense.readout.checks import Array
 
 
 @dataclass(frozen=True, eq=False)

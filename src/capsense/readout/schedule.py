@@ -9,16 +9,13 @@ T²/24 times the second derivative of the capacitance, T being the conversion ti
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capsense.errors import ReadOutError
-
-Array = NDArray[np.float64]
+from capsense.readout.checks import Array, Ints, require, require_whole
 
 
 @dataclass(frozen=True)
@@ -39,12 +36,11 @@ class Schedule:
     """Pause at the end of a cycle [s]."""
 
     def __post_init__(self) -> None:
-        for name, value, least in (
-            ("conversion", self.conversion, "above zero"), ("gap", self.gap, "zero or more"),
-            ("idle", self.idle, "zero or more"),
-        ):  # fmt: skip
-            if not math.isfinite(value) or value < 0 or (name == "conversion" and value == 0):
-                raise ReadOutError(f"schedule: {name} is {value!r} s; give a time {least}")
+        require("schedule", "conversion", self.conversion, 0.0, "s", open_=True)
+        require("schedule", "gap", self.gap, 0.0, "s")
+        require("schedule", "idle", self.idle, 0.0, "s")
+        if not all(self.slots):
+            raise ReadOutError("schedule: a slot holds no channel; leave it out")
         channels = sorted(c for slot in self.slots for c in slot)
         if not channels or channels != list(range(len(channels))):
             raise ReadOutError(
@@ -70,33 +66,27 @@ class Schedule:
             ReadOutError: A count is below one, a time out of range, or the period too short.
         """
         per_chip = channels if inputs is None else inputs
-        if channels < 1 or per_chip < 1:
-            raise ReadOutError(
-                f"schedule: {channels} channels on {per_chip} inputs; give one or more"
-            )
+        require_whole("schedule", "the number of channels", channels, 1)
+        require_whole("schedule", "the number of inputs", per_chip, 1)
+        require("schedule", "conversion", conversion, 0.0, "s", open_=True)
+        require("schedule", "gap", gap, 0.0, "s")
         slots = tuple(
             tuple(range(first, channels, per_chip)) for first in range(min(per_chip, channels))
         )
-        busy = len(slots) * (conversion + gap)
-        idle = 0.0 if period is None else period - busy
-        if idle < -1e-12 * busy:
-            raise ReadOutError(
-                f"schedule: a period of {period} s is too short for {len(slots)} conversions, "
-                f"which take {busy:g} s"
-            )
-        return cls(slots, conversion, gap, max(idle, 0.0))
+        return cls(slots, conversion, gap, _idle(period, len(slots) * (conversion + gap)))
 
     @classmethod
     def simultaneous(
         cls, channels: int, conversion: float, *, period: float | None = None
     ) -> Schedule:
-        """All channels at once, every ``period`` [s], by default back to back."""
-        idle = 0.0 if period is None else period - conversion
-        if idle < -1e-12 * conversion:
-            raise ReadOutError(
-                f"schedule: a period of {period} s is too short for a conversion of {conversion} s"
-            )
-        return cls((tuple(range(channels)),), conversion, 0.0, max(idle, 0.0))
+        """All channels at once, every ``period`` [s], by default back to back.
+
+        Raises:
+            ReadOutError: As of :meth:`sequential`.
+        """
+        require_whole("schedule", "the number of channels", channels, 1)
+        require("schedule", "conversion", conversion, 0.0, "s", open_=True)
+        return cls((tuple(range(channels)),), conversion, 0.0, _idle(period, conversion))
 
     @cached_property
     def period(self) -> float:
@@ -109,7 +99,7 @@ class Schedule:
         return len(self.order)
 
     @cached_property
-    def order(self) -> NDArray[np.int64]:
+    def order(self) -> Ints:
         """Channels in the order they are sampled in, shape (K,)."""
         return np.array([c for slot in self.slots for c in slot], dtype=np.int64)
 
@@ -120,11 +110,11 @@ class Schedule:
         starts = [k * step + self.gap for k, slot in enumerate(self.slots) for _ in slot]
         return np.array(starts) + 0.5 * self.conversion
 
-    def instant(self, sample: NDArray[np.int64]) -> Array:
+    def instant(self, sample: Ints) -> Array:
         """Instants [s] of samples by their number, from 0, the first cycle starting at 0."""
         return self.samples(sample)[0]
 
-    def samples(self, sample: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    def samples(self, sample: Ints) -> tuple[Array, Ints]:
         """Instants [s] and channels of samples by their number, from 0."""
         cycle, place = np.divmod(sample, self.count)
         return cycle * self.period + self.offsets[place], self.order[place]
@@ -140,3 +130,16 @@ class Schedule:
         # Rounding may put the time a hair into the wrong cycle: look at the neighbours too.
         near = np.arange(cycle * self.count, (cycle + 3) * self.count, dtype=np.int64)
         return int(near[0] + np.count_nonzero(self.instant(near) - self.slack <= time))
+
+
+def _idle(period: float | None, busy: float) -> float:
+    """What is left of a cycle's period [s] after ``busy`` seconds of conversions."""
+    if period is None:
+        return 0.0
+    require("schedule", "period", period, 0.0, "s", open_=True)
+    if period < busy * (1 - 1e-12):
+        raise ReadOutError(
+            f"schedule: a period of {period} s is too short for its conversions, which take "
+            f"{busy:g} s"
+        )
+    return max(period - busy, 0.0)

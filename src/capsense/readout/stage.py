@@ -9,18 +9,13 @@ of the schedule, of any length; a process with a memory for each channel goes th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from capsense.errors import ReadOutError
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from capsense.readout.checks import Array, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +45,7 @@ class Process(Protocol):
         """
 
 
+@runtime_checkable
 class Stage(Protocol):
     """One link of the analogue chain."""
 
@@ -61,31 +57,3 @@ def rounds(samples: int, channels: int) -> Iterator[slice]:
     """Cut a batch into parts that hold each of the channels once at most."""
     for first in range(0, samples, channels):
         yield slice(first, first + channels)
-
-
-def require(
-    owner: str, name: str, value: float, low: float, unit: str, *, open_: bool = False
-) -> None:
-    """Refuse a number that is not finite or below ``low`` (or at it, if ``open_``)."""
-    good = math.isfinite(value) and (value > low if open_ else value >= low)
-    if not good:
-        bound = f"above {low:g}" if open_ else f"at least {low:g}"
-        raise ReadOutError(f"{owner}: {name} is {value!r}; give a number {bound} {unit}".rstrip())
-
-
-def per_channel(owner: str, name: str, value: object, channels: int) -> Array:
-    """One number for all channels, or one per channel, as an array of shape (K,).
-
-    Raises:
-        ReadOutError: The count does not fit, or a number is not finite.
-    """
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        array = np.array(math.nan)
-    if array.shape not in ((), (channels,)) or not np.isfinite(array).all():
-        raise ReadOutError(
-            f"{owner}: {name} is {value!r}; give a finite number, or a list of {channels}, one "
-            "per channel"
-        )
-    return np.broadcast_to(array, (channels,)).copy()

@@ -88,5 +88,5 @@ GABRIEL: Mapping[str, ColeCole] = MappingProxyType(
 """Parameters of S. Gabriel, R. W. Lau and C. Gabriel, "The dielectric properties of biological
 tissues: III", Phys. Med. Biol. 41 (1996) 2271; 10 Hz to 100 GHz. Fat is infiltrated fat.
 
-The ionic conductivity of skin, 0.2 and 0.4 mS/m, is printed as 0.000 in tables of three decimals; it
-is what the published conductivities of skin below 1 MHz need (tests/scene/test_dispersion.py)."""
+The ionic conductivity of skin, 0.2 and 0.4 mS/m, is printed as 0.000 in tables of three decimals;
+it is what the published conductivities of skin need (tests/scene/test_dispersion.py)."""

@@ -1,0 +1,79 @@
+"""Numbers as a read-out takes them: what is none, not finite or of the wrong size is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import ReadOutError
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def require(
+    owner: str, name: str, value: object, low: float, unit: str, *, open_: bool = False
+) -> None:
+    """Refuse what is no finite number, or below ``low`` (or at it, if ``open_``)."""
+    number = as_number(value)
+    if not math.isfinite(number) or number < low or (open_ and number == low):
+        bound = f"above {low:g}" if open_ else f"at least {low:g}"
+        wanted = "a finite number" if low == -math.inf else f"a number {bound} {unit}".rstrip()
+        raise ReadOutError(f"{owner}: {name} is {value!r}; give {wanted}")
+
+
+def require_whole(owner: str, name: str, value: object, low: int, high: float = math.inf) -> None:
+    """Refuse what is no whole number from ``low`` to ``high``."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or not low <= as_number(value) <= high:
+        bound = f"from {low} on" if high == math.inf else f"from {low} to {high}"
+        raise ReadOutError(f"{owner}: {name} is {value!r}; give a whole number {bound}")
+
+
+def as_number(value: object) -> float:
+    """A real number as a float; NaN for anything else."""
+    real = isinstance(value, int | float | np.integer | np.floating)
+    return float(value) if real and not isinstance(value, bool) else math.nan  # type: ignore[arg-type]
+
+
+def real(what: str, values: object) -> Array:
+    """Real numbers as an array of any shape.
+
+    Raises:
+        ReadOutError: They are not; ``what`` names them.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ReadOutError(f"{what}: rows differ in length; make them the same") from None
+    if array.dtype.kind not in "fiu":
+        raise ReadOutError(f"{what}: {array.dtype} values are no real numbers; give such")
+    return np.asarray(array, dtype=float)
+
+
+def finite(what: str, values: object) -> Array:
+    """Finite real numbers as an array of any shape.
+
+    Raises:
+        ReadOutError: They are not; ``what`` names them.
+    """
+    array = real(what, values)
+    if not np.isfinite(array).all():
+        raise ReadOutError(f"{what}: a number is not finite; leave it out, or mend it")
+    return array
+
+
+def per_channel(owner: str, name: str, value: object, channels: int) -> Array:
+    """One number for all channels, or one per channel, as an array of shape (K,).
+
+    Raises:
+        ReadOutError: The count does not fit, or a number is not finite.
+    """
+    array = finite(f"{owner}: {name}", value)
+    if array.shape not in ((), (channels,)):
+        raise ReadOutError(
+            f"{owner}: {name} is {value!r}; give a number, or a list of {channels}, one per channel"
+        )
+    return np.broadcast_to(array, (channels,)).copy()
