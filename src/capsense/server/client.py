@@ -6,6 +6,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -84,17 +85,11 @@ class Client:
         return self.sensors[sensor]
 
     def send(self, message: str | bytes) -> None:
-        """Send a message as it is.
-
-        Raises:
-            ProtocolError: The connection is closed.
-        """
+        """Send a message as it is; a closed connection shows at the next :meth:`receive`."""
         from websockets.exceptions import ConnectionClosed
 
-        try:
+        with suppress(ConnectionClosed):  # what the server said before it closed is yet to be read
             self._connection.send(message)
-        except ConnectionClosed as error:
-            raise _closed(error) from None
 
     def ask(self, answer: str, **message: Any) -> dict[str, Any]:
         """Send a control message, and wait for its answer.

@@ -29,10 +29,12 @@ from capsense.server.frames import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL
 
 MAX_TEXT = 65536
 """Largest control message [bytes]."""
+_DIGITS = 18
+"""No integer has more; what is larger does not fit a float, or the machine."""
 CODES = {
     "version": "the client speaks another version of the protocol; closes the connection",
     "token": "the token is missing or wrong; closes the connection",
-    "timeout": "no hello in time, or the client does not take its readings; closes the connection",
+    "timeout": "no hello in time; closes the connection",
     "full": "the server takes no more connections; closes the connection",
     "malformed": "a message is cut, padded, of an unknown kind, or a key or number in it is wrong",
     "limit": "an image, message or count is larger than the server allows",
@@ -110,13 +112,19 @@ def parse(text: str) -> Table:
             f"a control message has {len(text)} characters; up to {MAX_TEXT} are taken", "limit"
         )
     try:
-        data = json.loads(text, parse_constant=_refuse_constant)
+        data = json.loads(text, parse_constant=_refuse_constant, parse_int=_integer)
     except (ValueError, RecursionError) as error:
         raise ProtocolError(f"a control message is not JSON: {str(error)[:80]}") from None
     if not isinstance(data, dict):
         raise ProtocolError('a control message must be a JSON object, like {"type": "hello"}')
     kind = Table(data, "message", "control message").string("type")
     return Table(data, "message", _validate.shorten(kind))
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > _DIGITS:
+        raise ValueError(f"an integer has more than {_DIGITS} digits")
+    return int(digits)
 
 
 def _refuse_constant(name: str) -> NoReturn:

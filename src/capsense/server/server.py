@@ -148,7 +148,8 @@ class Server:
             raise ProtocolError(
                 f"design {name!r} is not served; {suggest(name, self.design_names)}", "scene"
             )
-        simulator = Simulator(self._templates[name].design)
+        template = self._templates[name]
+        simulator = Simulator(template.design, background=template.background)
         return ServedSensor(wanted, simulator, self._make_readout(simulator))
 
     async def work(self, job: Callable[[], T]) -> T:

@@ -1,0 +1,102 @@
+"""Round trips through the server: ``python benchmarks/server_round_trips.py``.
+
+Sends a moving dome as 64 × 64 depth frames, one after another, over loopback to a server in a
+process of its own, and waits for each reading. Times are of this machine, as found; what the server
+says its step took is taken from each round trip, and the rest is what the protocol costs. With
+``mcs`` and ``mono`` there, the Unity package is measured as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from capsense.bench import moving_depth
+from capsense.server.client import Client
+
+ROOT = Path(__file__).parents[1]
+SKIPPED = 0.1
+"""Part of the round trips that is left out, during which caches fill."""
+
+
+@contextmanager
+def server(design: str) -> Iterator[str]:
+    """A server in a process of its own; gives its address."""
+    command = [sys.executable, "-m", "capsense", "serve", "--design", design, "--port", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            yield json.loads(process.stderr.readline())["url"]
+        finally:
+            process.terminate()
+
+
+def python_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Round trips and steps [s], shape (n,)."""
+    frames = [moving_depth(k).depth[0].astype(np.float32) for k in range(500)]
+    taken, solve = np.empty(count), np.empty(count)
+    with Client(url) as client:
+        sensor = client.open()
+        for k in range(count):
+            start = time.perf_counter()
+            solve[k] = sensor.step(frames[k % len(frames)]).wall_time
+            taken[k] = time.perf_counter() - start
+    first = int(SKIPPED * count)
+    return taken[first:], solve[first:]
+
+
+def unity_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same by the Unity package under mono."""
+    sources = [*(ROOT / "tests/unity").glob("*.cs"), *(ROOT / "unity/Runtime").glob("*.cs")]
+    sources += (ROOT / "unity/Samples~").rglob("*.cs")
+    with tempfile.TemporaryDirectory() as folder:
+        program = f"{folder}/driver.exe"
+        subprocess.run(
+            ["mcs", "-langversion:7.2", f"-out:{program}", *map(str, sources)], check=True
+        )
+        told = subprocess.run(
+            ["mono", program, "steps", url, str(count)], check=True, capture_output=True, text=True
+        )
+    figures = json.loads(told.stdout.splitlines()[-1])
+    return np.array(figures["round_trip_s"]), np.array(figures["solve_s"])
+
+
+def main() -> None:
+    """Print a row for each client."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=2000, help="round trips of each client")
+    parser.add_argument("--design", default="six_patch")
+    args = parser.parse_args()
+    clients = {"Python": python_client}
+    if shutil.which("mcs") and shutil.which("mono"):
+        clients["Unity package, mono"] = unity_client
+    print(
+        f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.2f}, "
+        f"Python {platform.python_version()}, {args.design}, {args.count} round trips"
+    )
+    columns = ("a second", "median", "p95", "p99", "solve", "protocol")
+    print(f"{'client':20}" + "".join(f"{c:>10}" for c in columns))
+    for name, measure in clients.items():
+        with server(args.design) as url:
+            taken, solve = measure(url, args.count)
+        p50, p95, p99 = 1e3 * np.percentile(taken, [50, 95, 99])
+        step, rest = 1e3 * np.median(solve), 1e3 * np.median(taken - solve)
+        figures = "".join(f"{v:10.2f}" for v in (p50, p95, p99, step, rest))
+        print(f"{name:20}{1 / taken.mean():10.0f}{figures}")
+    print("times in ms; solve and protocol are medians")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""``capsense serve``: starts, logs, serves and stops as documented."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("websockets", reason='needs websockets: pip install "capsense[serve]"')
+
+from capsense.cli.main import main
+from capsense.errors import ProtocolError
+from capsense.server.client import Client
+
+SERVE = [sys.executable, "-m", "capsense", "serve", "--design", "patch", "--port", "0"]
+
+
+@contextmanager
+def serving(*more: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A server in a process of its own, and its address."""
+    with subprocess.Popen([*SERVE, *more], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            yield process, json.loads(process.stderr.readline())["url"]
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_serves_until_a_signal(number: signal.Signals, tmp_path: Path) -> None:
+    """A token is asked for; a signal ends connections, the process with 0, the log with a line."""
+    token = tmp_path / "token"
+    token.write_text("correct horse\n")
+    with serving("--token-file", str(token), "--readout", "fdc1004") as (process, url):
+        with pytest.raises(ProtocolError, match="token"):
+            Client(url)
+        with Client(url, token="correct horse") as client:
+            sensor = client.open()
+            assert sensor.channel_names
+            sensor.step(np.full((16, 16), 0.1))
+            with urllib.request.urlopen(f"http{url[2:]}/health", timeout=5) as answer:
+                assert json.loads(answer.read())["readings"] == 1
+            process.send_signal(number)
+            assert process.wait(10) == 0
+            with pytest.raises(ProtocolError, match="1001"):
+                sensor.step(np.full((16, 16), 0.1))
+        assert process.stderr is not None
+        entries = [json.loads(line) for line in process.stderr]
+    assert entries[-1]["event"] == "stopped"
+    assert all({"time", "level", "event"} <= set(entry) for entry in entries)
+
+
+def test_quiet() -> None:
+    """No line for what goes well."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [*SERVE[:-1], str(port), "--quiet"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        for _ in range(200):
+            try:
+                Client(f"ws://127.0.0.1:{port}", timeout=1).close()
+                break
+            except OSError:
+                time.sleep(0.1)
+        process.send_signal(signal.SIGTERM)
+        _, logged = process.communicate(timeout=10)
+    assert (process.returncode, logged) == (0, "")
+
+
+def test_address_in_use(capsys: pytest.CaptureFixture[str]) -> None:
+    """A port that is taken is not the input's fault, and is named."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["serve", "--design", "patch", "--port", str(port), "-q"]) == 1
+    assert str(port) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--design", "pach"], "pach"),
+        (["--design", "patch", "--readout", "fdc1005"], "fdc1005"),
+        (["--design", "patch", "--design", "patch"], "two designs are named 'patch'"),
+        (["--design", "patch", "--host", "0.0.0.0"], "give a token"),
+        (["--design", "patch", "--token-file", "nowhere"], "--token-file nowhere cannot be read"),
+        (["--design", "patch", "--max-pixels", "0"], "pixels is 0"),
+    ],
+)
+def test_bad_input(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line on stderr names what is wrong, and the exit code is 2."""
+    assert main(["serve", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1

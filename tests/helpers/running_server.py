@@ -1,0 +1,96 @@
+"""A server in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import threading
+import urllib.error
+import urllib.request
+from typing import Any
+
+from capsense.server.client import Client
+from capsense.server.options import Options
+from capsense.server.server import Server
+
+WAIT = 20.0
+"""Longest wait for a server to start or stop [s]."""
+
+
+class RunningServer:
+    """Serves within its ``with`` block.
+
+    Args:
+        options: ``port`` is 0, any free one, unless it is given.
+    """
+
+    def __init__(self, *designs: str, port: int = 0, **options: Any) -> None:
+        self.events: list[dict[str, Any]] = []
+        """What was logged."""
+        logger = logging.Logger("test")
+        logger.addHandler(_Collector(self.events))
+        self.server = Server(
+            Options(designs or ("six_patch",), port=port, **options), logger=logger
+        )
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
+
+    def __enter__(self) -> RunningServer:
+        self._thread.start()
+        assert self._ready.wait(WAIT)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def url(self) -> str:
+        """Its address."""
+        return self.server.url
+
+    @property
+    def port(self) -> int:
+        """Its port."""
+        return int(self.url.rpartition(":")[2])
+
+    def client(self, **options: Any) -> Client:
+        """A new client."""
+        return Client(self.url, **options)
+
+    def stop(self) -> None:
+        """Stop serving, and wait for the end."""
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(WAIT)
+        assert not self._thread.is_alive()
+
+    def logged(self, event: str) -> list[dict[str, Any]]:
+        """The fields of all events of a name."""
+        return [e for e in self.events if e["event"] == event]
+
+    def get(self, path: str) -> tuple[int, dict[str, Any]]:
+        """Status and content of a plain HTTP request."""
+        try:
+            with urllib.request.urlopen(f"http{self.url[2:]}{path}", timeout=5) as answer:
+                return answer.status, json.loads(answer.read())
+        except urllib.error.HTTPError as answer:
+            return answer.code, {}
+
+    async def _run(self) -> None:
+        self._stop, self._loop = asyncio.Event(), asyncio.get_running_loop()
+        serving = asyncio.create_task(self.server.run(self._stop))
+        while not self.server.url and not serving.done():
+            await asyncio.sleep(0.005)
+        self._ready.set()
+        await serving
+
+
+class _Collector(logging.Handler):
+    def __init__(self, events: list[dict[str, Any]]) -> None:
+        super().__init__()
+        self._events = events
+
+    def emit(self, record: logging.LogRecord) -> None:
+        fields = getattr(record, "fields", {})
+        self._events.append({"event": record.getMessage(), "level": record.levelname, **fields})
