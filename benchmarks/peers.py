@@ -12,8 +12,8 @@ against boundary elements good to 0.1 %. The peers:
 
     pip install ".[peers]" "scikit-sparse<0.5"
 
-scikit-sparse is built from source and needs a compiler and Debian's libsuitesparse-dev. A peer that is not
-installed is left out, and the table says so.
+scikit-sparse is built from source and needs a compiler and Debian's libsuitesparse-dev. A peer that
+is not installed is left out, and the table says so.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from capsense.reproduce.study import Study
 
 STUDIES: dict[str, str] = {
     "limb-approach": "capsense.reproduce.limb_approach:run",
+    "fig8": "capsense.reproduce.fig8:run",
 }
 """``"module:function"`` of each study, in the order of ``capsense reproduce all``."""
 

@@ -1,0 +1,100 @@
+"""Fig. 8: the paper's curve, the arithmetic, and what must hold of a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capsense.reproduce import fig8
+from capsense.reproduce.study import Outcome
+from capsense.reproduce.write import write_outcome
+
+FIGURES = Path(__file__).parents[1] / "data" / "reference_capacitances.json"
+
+
+def test_the_papers_curve() -> None:
+    """Its text says 107 ms at 30,000 elements; the figure is read to about 2 %."""
+    elements, times = fig8.paper_figure()
+    assert len(elements) == 15
+    assert (np.diff(elements) > 0).all()
+    assert fig8.at_size(elements, times, 30_000) == pytest.approx(107, rel=0.03)
+
+
+@pytest.mark.parametrize("gap", fig8.REFERENCE)
+def test_carried_figures(gap: int) -> None:
+    table = json.loads(FIGURES.read_text())[fig8.DESIGN]
+    change = np.diag(np.array(table[f"bar {gap}"]) - np.array(table["none"]))
+    corner, middle = fig8.REFERENCE[gap]
+    expected = [middle if k in fig8.MIDDLE else corner for k in range(6)]
+    assert change == pytest.approx(expected, abs=2e-6)
+
+
+def test_power_laws_are_met_exactly() -> None:
+    n = np.array([4e4, 1e4, 2e4])
+    t = 3e-5 * n**1.2
+    assert fig8.exponent(n, t) == pytest.approx(1.2)
+    assert fig8.at_size(n, t, 3e4) == pytest.approx(3e-5 * 3e4**1.2)
+    assert fig8.at_size(n, t, 1e4) == pytest.approx(t[1])
+    with pytest.raises(ValueError, match="outside 10000 to 40000"):
+        fig8.at_size(n, t, 5e4)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fig8")
+
+
+@pytest.fixture(scope="module")
+def outcome(folder: Path) -> Outcome:
+    told: list[float] = []
+    found = fig8.run(folder, reduced=True, report=lambda _, fraction: told.append(fraction))
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    return found
+
+
+def test_errors_at_the_default_lattice(outcome: Outcome) -> None:
+    rows = {row.what: row for row in outcome.rows}
+    assert rows["largest error of ΔC, default lattice, gaps 5 to 100 mm"].verdict == "met"
+    assert rows["time of a step at 30,000 tetrahedra, the paper, three electrodes"].value > 100
+
+
+def test_finer_lattices_err_less(outcome: Outcome) -> None:
+    table = outcome.tables["fig8"]
+    first = table.columns.index("error at 5 mm [%]")
+    coarse, fine = (np.array(row[first:], float) for row in table.rows)
+    assert table.rows[0][1] < table.rows[1][1]
+    assert fine.max() < coarse.max()
+
+
+def test_times_are_of_whole_steps(outcome: Outcome) -> None:
+    columns = outcome.tables["fig8"].columns
+    for row in outcome.tables["fig8"].rows:
+        of = dict(zip(columns, row, strict=True))
+        assert 0 < float(of["median [ms]"]) <= float(of["95 % [ms]"]) <= float(of["99 % [ms]"])
+        assert float(of["iterations"]) >= 1
+
+
+def test_a_second_run_measures_nothing(outcome: Outcome, folder: Path) -> None:
+    again = fig8.run(folder, reduced=True, report=lambda *_: None)
+    assert again.rows == outcome.rows
+
+
+def test_it_writes_all(outcome: Outcome, tmp_path: Path) -> None:
+    names = write_outcome(outcome, tmp_path)
+    assert set(names) == {"fig8.csv", "fig8_paper.csv", "fig8.png", "rows.json", "report.md"}
+    assert all((tmp_path / name).stat().st_size > 0 for name in names)
+
+
+def test_the_papers_scheme_runs_too(folder: Path) -> None:
+    """It has more tetrahedra on the same planes, and errs more."""
+    from capsense.reproduce.store import Store
+
+    ours, masked = (
+        fig8.measure(Store(folder), 0.5, method, 2) for method in ("perturbation", "masked")
+    )
+    assert masked.tetrahedra > ours.tetrahedra
+    assert max(masked.errors) > 3 * max(ours.errors)
