@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ball_scenario import ball_scenario
 from maxwell import random_maxwell
 
 from capsense.cli.main import BAD_INPUT, OK, main
@@ -16,21 +17,6 @@ from capsense.readout.channels import ChannelBank, mutual_patterns, self_pattern
 from capsense.readout.chips import CHIPS
 from capsense.readout.read_out import ReadOut
 from capsense.readout.recording import load_recording
-
-SCENARIO = """
-name = "ball over six electrodes"
-design = "six_patch"
-sample_rate = 20.0
-excitation = "{excitation}"
-[[body]]
-name = "ball"
-shape = "sphere"
-radius = 0.02
-material = "steel"
-[body.trajectory]
-waypoints = [[-0.06, 0.0, 0.04], [0.06, 0.0, 0.04]]
-speed = 0.1
-"""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +33,7 @@ def run(fake: object, originals: Path, tmp_path: Path):
         original, folder = originals / excitation, tmp_path / excitation
         if not original.exists():
             scenario = originals / f"{excitation}.toml"
-            scenario.write_text(SCENARIO.format(excitation=excitation), encoding="utf-8")
+            scenario.write_text(ball_scenario(excitation, sample_rate=20.0), encoding="utf-8")
             assert main(["run", str(scenario), "-o", str(original), "-q"]) == OK
         shutil.copytree(original, folder)
         return folder

@@ -13,24 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ball_scenario import ball_scenario
 
 import capsense as cs
 from capsense.cli.main import main
 
-SCENARIO = """
-name = "ball over six electrodes"
-design = "six_patch"
-sample_rate = 10.0
-excitation = "{excitation}"
-[[body]]
-name = "ball"
-shape = "sphere"
-radius = 0.02
-material = "steel"
-[body.trajectory]
-waypoints = [[-0.06, 0.0, 0.04], [0.06, 0.0, 0.04]]
-speed = 0.1
-"""
 COUNT = 13
 FILES = {"readings.csv", "readings.npz", "summary.json", "plot.png"}
 
@@ -38,7 +25,7 @@ FILES = {"readings.csv", "readings.npz", "summary.json", "plot.png"}
 @pytest.fixture
 def scenario(tmp_path: Path) -> Path:
     path = tmp_path / "ball.toml"
-    path.write_text(SCENARIO.format(excitation="matrix"), encoding="utf-8")
+    path.write_text(ball_scenario(), encoding="utf-8")
     return path
 
 
@@ -106,7 +93,7 @@ def test_all_files_agree(
 )
 def test_excitations(scenario: Path, tmp_path: Path, excitation: str, columns: list[str]) -> None:
     """Columns follow the excitation; mutual capacitances are positive."""
-    scenario.write_text(SCENARIO.format(excitation=excitation), encoding="utf-8")
+    scenario.write_text(ball_scenario(excitation), encoding="utf-8")
     assert main(["run", str(scenario), "-o", str(tmp_path / "out"), "-q"]) == 0
     rows = rows_of(tmp_path / "out")
     assert set(columns) <= set(rows[0])
@@ -130,7 +117,7 @@ def test_rate_quiet_and_repeat(
 @pytest.mark.usefixtures("fake")
 def test_still_scene(scenario: Path, tmp_path: Path) -> None:
     """A single sample is a run too."""
-    text = SCENARIO.format(excitation="mutual").replace("[body.trajectory]", "[body.pose]")
+    text = ball_scenario("mutual").replace("[body.trajectory]", "[body.pose]")
     text = text[: text.index("waypoints")] + "position = [0.0, 0.0, 0.05]\n"
     scenario.write_text(text, encoding="utf-8")
     assert main(["run", str(scenario), "-o", str(tmp_path / "out"), "-q"]) == 0

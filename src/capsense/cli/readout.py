@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from capsense.errors import ReadOutError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from capsense.readout.chip import Chip
     from capsense.readout.counts import Counts
     from capsense.readout.read_out import ReadOut
@@ -115,8 +117,9 @@ def _check(args: argparse.Namespace) -> None:
 
 def _build(args: argparse.Namespace, recording: Recording) -> dict[str, ReadOut]:
     """The read-outs asked for, by a name for files."""
+    from capsense.readout.channels import ChannelBank
     from capsense.readout.config import load_readout
-    from capsense.readout.presets import Options, build, chip_of
+    from capsense.readout.presets import Options, build, chip_of, default_patterns
 
     if args.config is not None:
         return {args.config.stem: load_readout(args.config, recording.electrodes)}
@@ -126,19 +129,18 @@ def _build(args: argparse.Namespace, recording: Recording) -> dict[str, ReadOut]
     out = {}
     for name in names:
         chip = chip_of(name)
-        options = Options(rate=args.rate, seed=args.seed, noise=not args.no_noise)
-        readout = build(chip, recording.electrodes, options)
-        level = float(recording.empty_channels(readout.bank).max())
-        adapted = Options(
-            rate=args.rate, seed=args.seed, noise=not args.no_noise, expected=max(level, 1e-12)
+        patterns = default_patterns(chip, recording.electrodes)
+        empty = recording.empty_channels(ChannelBank(patterns, recording.electrodes))
+        options = Options(
+            patterns, args.rate, args.seed, not args.no_noise, expected=max(empty.max(), 1e-12)
         )
-        out[chip.name] = build(chip, recording.electrodes, adapted)
+        out[chip.name] = build(chip, recording.electrodes, options)
     return out
 
 
-def _prepare(folder: Path, targets: object, force: bool) -> None:
+def _prepare(folder: Path, targets: Iterable[Path], force: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for target in targets:  # type: ignore[attr-defined]
+    for target in targets:
         if target.exists() and not force:
             raise ReadOutError(f"{target} is there already; give -o DIR, or --force to replace it")
 
