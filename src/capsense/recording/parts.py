@@ -33,7 +33,7 @@ def shape_fields(shape: Shape) -> Fields:
     Raises:
         RecordingError: A kind of shape that messages do not have.
     """
-    kind = type(shape).__name__.lower()
+    kind = shape.kind.name.lower()
     sizes: tuple[float, ...] = ()
     vertices, faces, values = np.empty(0), np.empty(0, np.uint32), np.empty(0, np.float32)
     match shape:
@@ -46,7 +46,7 @@ def shape_fields(shape: Shape) -> Fields:
         case Ellipsoid(radii):
             sizes = radii
         case TriMesh():
-            kind, sizes = "mesh", (shape.cell,)
+            sizes = (shape.cell,)
             vertices, faces = shape.vertices.ravel(), shape.faces.ravel().astype(np.uint32)
         case Layers():
             g = shape.grid

@@ -93,6 +93,7 @@ def replay(
     recording = path if isinstance(path, Recording) else open_recording(path)
     session = recording.session
     simulator = session.simulator(cache_dir=cache_dir, progress=progress)
+    simulator.reset()  # as the recorder did; the masked method keeps a solution from its making
     readout = session.new_readout()
     compare = _Comparison(session, tolerance)
     compare.baseline(simulator.baseline)

@@ -118,7 +118,7 @@ class Composer:
     @property
     def camera(self) -> str:
         """The camera's frame."""
-        return f"{self.name}/camera"
+        return f"{self.name}/depth_camera"
 
     def markers(self, stamp: int, design: Design, bodies: Sequence[tuple[str, Body]]) -> Any:
         """Electrodes and bodies for drawing; each body moves with the frame it is given with."""

@@ -1,0 +1,235 @@
+"""Decoded by others: the CDR of ROS 2 by mcap_ros2, the bag by rosbags."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import recorded_scenes
+from mcap.reader import make_reader
+
+import capsense as cs
+
+decoder = pytest.importorskip("mcap_ros2.decoder", reason="needs mcap-ros2-support")
+
+Recorded = tuple[Path, list[cs.Reading]]
+MATRIX = "std_msgs/msg/Float64MultiArray"
+TYPES = {
+    "/sensor/bodies": "capsense_msgs/msg/Body",
+    "/sensor/capacitance": MATRIX,
+    "/sensor/counts": "capsense_msgs/msg/Counts",
+    "/sensor/delta": MATRIX,
+    "/sensor/depth/camera_info": "sensor_msgs/msg/CameraInfo",
+    "/sensor/depth/image": "sensor_msgs/msg/Image",
+    "/sensor/depth/permittivity": "sensor_msgs/msg/Image",
+    "/sensor/markers": "visualization_msgs/msg/MarkerArray",
+    "/sensor/shapes": "capsense_msgs/msg/Shape",
+    "/sensor/step": "capsense_msgs/msg/Step",
+    "/tf": "tf2_msgs/msg/TFMessage",
+}
+
+
+@pytest.fixture(scope="module")
+def decoded(recorded: Recorded) -> dict[str, list[tuple[int, Any]]]:
+    """Messages by topic, each with its log time [ns]."""
+    out: dict[str, list[tuple[int, Any]]] = {}
+    with recorded[0].open("rb") as file:
+        reader = make_reader(file, decoder_factories=[decoder.DecoderFactory()])
+        for _, channel, message, content in reader.iter_decoded_messages():
+            out.setdefault(channel.topic, []).append((message.log_time, content))
+    return out
+
+
+def at(stamp: Any) -> int:
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def test_what_rosbag2_wants(recorded: Recorded) -> None:
+    """Profile, encodings and notes of the channels, and an index with statistics."""
+    with recorded[0].open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        header, summary = reader.get_header(), reader.get_summary()
+        attachments = [a.name for a in reader.iter_attachments()]
+        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+    assert header.profile == "ros2"
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) > 0
+    assert {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()} == TYPES
+    assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
+    for channel in summary.channels.values():
+        assert channel.message_encoding == "cdr"
+        assert channel.metadata["offered_qos_profiles"] == ""
+        assert re.fullmatch("RIHS01_[0-9a-f]{64}", channel.metadata["topic_type_hash"])
+    assert attachments == ["design.json", "session.json"]
+    assert metadata["capsense"]["design"] == "six_patch"
+
+
+def test_type_hashes() -> None:
+    """Hashes as ROS 2 itself has them, in its type description of the message."""
+    from capsense.recording.messages import Messages
+
+    known = {
+        "std_msgs/msg/Header": "f49fb3ae2cf070f793645ff749683ac6"
+        "b06203e41c891e17701b1cb597ce6a01",
+    }  # fmt: skip
+    for name, digest in known.items():
+        assert Messages().type_hash(name) == f"RIHS01_{digest}"
+
+
+def test_opens_as_a_bag(recorded: Recorded) -> None:
+    """The other reader of bags sees the same topics, and gives the same numbers."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    path, readings = recorded
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        assert {c.topic: c.msgtype for c in bag.connections} == TYPES
+        only = [c for c in bag.connections if c.topic == "/sensor/delta"]
+        found = [bag.deserialize(raw, c.msgtype) for c, _, raw in bag.messages(only)]
+    for message, reading in zip(found, readings, strict=True):
+        assert message.data.tobytes() == reading.delta.tobytes()
+
+
+def test_matrices(recorded: Recorded, decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    for name in ("capacitance", "delta"):
+        for (_, message), reading in zip(decoded[f"/sensor/{name}"], recorded[1], strict=True):
+            assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
+                ("row", 6, 36),
+                ("column", 6, 6),
+            ]
+            assert list(message.data) == getattr(reading, name).ravel().tolist()
+
+
+def test_steps_and_counts(recorded: Recorded, decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    for (log_time, step), reading in zip(decoded["/sensor/step"], recorded[1], strict=True):
+        assert at(step.header.stamp) == log_time
+        assert step.header.frame_id == "sensor"
+        assert list(step.capacitance) == reading.capacitance.ravel().tolist()
+        assert step.iterations == reading.stats.iterations
+        assert len(step.bodies) == len(step.poses)
+    codes = [c for _, m in decoded["/sensor/counts"] for c in m.code]
+    expected = [c for r in recorded[1] if r.counts is not None for c in r.counts.code.tolist()]
+    assert codes == expected
+    first = [log_time for log_time, _ in decoded["/sensor/step"]]
+    assert first[:3] == [0, 100_000_000, 200_000_000]
+    # the second episode begins on a later second, so that nothing lies on top of the first
+    assert first[8:10] == [2_000_000_000, 2_050_000_000]
+
+
+def test_transforms(decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    """Poses of the bodies in the sensor's frame, under their names."""
+    for k, (log_time, message) in enumerate(decoded["/tf"][:8]):
+        scene = recorded_scenes.scene_at(k)
+        assert len(message.transforms) == len(scene)
+        for i, (t, body) in enumerate(zip(message.transforms, scene, strict=True)):
+            assert at(t.header.stamp) == log_time
+            assert t.header.frame_id == "sensor"
+            assert t.child_frame_id == f"sensor/{body.name or f'body{i}'}"
+            v, q = t.transform.translation, t.transform.rotation
+            assert (v.x, v.y, v.z) == body.pose.position
+            assert (q.x, q.y, q.z, q.w) == body.pose.quaternion
+
+
+def test_depth_images(decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    """Pixels land, through ``p`` and the camera's transform, on the points of the frame."""
+    images, infos = decoded["/sensor/depth/image"], decoded["/sensor/depth/camera_info"]
+    matter = decoded["/sensor/depth/permittivity"]
+    assert len(images) == len(infos) == 4
+    for k in range(4):
+        frame, (_, image), (_, info) = recorded_scenes.frame_at(k), images[k], infos[k]
+        assert (image.height, image.width, image.step, image.encoding) == (24, 32, 128, "32FC1")
+        assert image.header.frame_id == "sensor/depth_camera"
+        assert list(info.k) == [0.0] * 9
+        depth = np.frombuffer(image.data, "<f4").reshape(24, 32)
+        (pose,) = [
+            t.transform
+            for t in decoded["/tf"][8 + k][1].transforms
+            if t.child_frame_id == "sensor/depth_camera"
+        ]
+        v, q = pose.translation, pose.rotation
+        camera = cs.Pose.from_unit((v.x, v.y, v.z), (q.x, q.y, q.z, q.w))
+        points = camera.inverse().apply(frame.points())
+        p = np.array(info.p).reshape(3, 4)
+        u, row, one = p @ np.column_stack([points, np.ones(len(points))]).T
+        assert (one == 1).all()
+        assert np.abs(u - np.rint(u)).max() < 1e-9
+        seen = depth[np.rint(row).astype(int), np.rint(u).astype(int)]
+        np.testing.assert_allclose(seen, points[:, 2], rtol=1e-6)
+        assert np.isfinite(depth).sum() == len(points)
+        eps = np.frombuffer(matter[k][1].data, "<f4").reshape(24, 32)
+        assert set(eps[np.isfinite(depth)].tolist()) == {np.inf, 4.0}
+        assert (eps[~np.isfinite(depth)] == 0).all()
+
+
+def test_markers(decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    """Drawn anew when the bodies change; electrodes in place, bodies in their own frames."""
+    messages = [m for _, m in decoded["/sensor/markers"]]
+    assert 1 < len(messages) < 8
+    first = messages[0].markers
+    assert (first[0].action, first[0].type) == (3, 1)
+    electrodes = [m for m in first if m.ns == "electrodes"]
+    design = cs.load_design("six_patch")
+    assert len(electrodes) == 6
+    for marker, electrode in zip(electrodes, design.electrodes, strict=True):
+        points = np.array([[p.x, p.y, p.z] for p in marker.points])
+        np.testing.assert_array_equal(points, electrode.surface.triangles.reshape(-1, 3))
+    kinds = {m.ns: [] for m in first[7:]}
+    for m in first[7:]:
+        assert m.header.frame_id == m.ns
+        assert m.frame_locked
+        kinds[m.ns].append((m.type, round(m.scale.x, 9), round(m.scale.z, 9)))
+    assert kinds == {
+        "sensor/box": [(1, 0.03, 0.01)],
+        "sensor/ball": [(2, 0.024, 0.024)],
+        "sensor/finger": [(3, 0.02, 0.05), (2, 0.02, 0.02), (2, 0.02, 0.02)],
+        "sensor/rod": [(3, 0.02, 0.02)],
+        "sensor/body4": [(2, 0.04, 0.03)],
+        "sensor/wedge": [(11, 1.0, 1.0)],
+    }
+
+
+def test_attached_sensor(simulators: Callable[..., cs.Simulator], tmp_path: Path) -> None:
+    """A moving sensor: its frame in the world, the robot simulator's time, its chip's counts."""
+    mujoco = pytest.importorskip("mujoco", reason="needs pip install 'capsense[mujoco]'")
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody>
+        <body name="tool" pos="0 0 0.1"><freejoint/><geom type="sphere" size=".03"/></body>
+        <body name="arm"><joint type="slide" axis="1 0 0"/><geom type="box" size=".01 .01 .001"
+          pos="0 0 -.1"/><site name="pad"/>
+          <camera name="pad" projection="orthographic" resolution="24 24" fovy="0.3"
+            euler="180 0 0"/></body>
+        </worldbody><sensor><rangefinder camera="pad" data="depth"/></sensor></mujoco>"""
+    )
+    for world in ("geometry", "depth"):
+        data = mujoco.MjData(model)
+        data.qvel[-1] = 0.5
+        sensor = cs.mujoco.attach(
+            model, data, "pad", simulators("six_patch"), world=world, readout="fdc1004"
+        )
+        path = tmp_path / f"{world}.mcap"
+        places = []
+        with cs.record(path, sensor) as run:
+            for _ in range(2):
+                for _ in range(6):
+                    mujoco.mj_step(model, data)
+                    reading = run.read()
+                    places.append(float(data.site_xpos[0, 0]))
+                mujoco.mj_resetData(model, data)
+                run.reset()
+        assert reading.counts is not None
+        assert cs.replay(path).same
+        steps = list(cs.open_recording(path).steps())
+        assert [s.episode for s in steps] == [0] * 6 + [1] * 6
+        assert steps[5].time == steps[11].time == pytest.approx(6 * model.opt.timestep)
+        with path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[decoder.DecoderFactory()])
+            found = [d for *_, d in reader.iter_decoded_messages(topics=["/tf"])]
+        first = [m.transforms[0] for m in found]
+        assert {(t.header.frame_id, t.child_frame_id) for t in first} == {("world", "sensor")}
+        assert [t.transform.translation.x for t in first] == places
+        assert places[5] > places[0]
