@@ -75,7 +75,7 @@ def test_command(
         ]
     page = (folder / "report.md").read_text()
     assert "![picture](picture.png)" in page
-    assert "| 2 | 0.6667 |" in page
+    assert "| 2 | 0.66667 |" in page
     assert (folder / "picture.png").stat().st_size > 0
     assert len(list((folder / "parts").iterdir())) == 2
 
@@ -108,7 +108,7 @@ def test_long_tables_are_named(tmp_path: Path) -> None:
     """The report stays readable."""
     long = Table(("k",), tuple((k,) for k in range(MAX_ROWS + 1)))
     write_outcome(Outcome("T", (), {"long": long}), tmp_path)
-    assert f"{MAX_ROWS + 1} rows, in [long.csv]" in (tmp_path / "report.md").read_text()
+    assert f"- [long.csv](long.csv), {MAX_ROWS + 1} rows" in (tmp_path / "report.md").read_text()
 
 
 def test_every_registered_study_is_there() -> None:

@@ -8,6 +8,8 @@ from typing import cast
 from capsense.reproduce.study import Study
 
 STUDIES: dict[str, str] = {
+    "scenario1": "capsense.reproduce.scenario1:run",
+    "scenario2": "capsense.reproduce.scenario2:run",
     "limb-approach": "capsense.reproduce.limb_approach:run",
     "fig8": "capsense.reproduce.fig8:run",
 }

@@ -64,7 +64,7 @@ def judged(
     limit, sign = (above, ">") if above is not None else (below, "<")
     assert limit is not None
     met = value > limit if sign == ">" else value < limit
-    target = f"{sign} {limit:g}" + (f" ({source})" if source else "")
+    target = f"{sign} {limit:.5g}" + (f" ({source})" if source else "")
     return Row(what, value, unit, target, "met" if met else "missed")
 
 

@@ -8,7 +8,7 @@ import os
 from dataclasses import asdict
 from pathlib import Path
 
-from capsense.reproduce.study import Cell, Outcome, Row, Table
+from capsense.reproduce.study import Cell, Outcome, Row
 
 MAX_ROWS = 40
 """Longer tables are not shown in the report, only named."""
@@ -44,7 +44,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> list[str]:
 
 def row_cells(row: Row) -> tuple[str, str, str, str, str]:
     """A row as text: what, value, unit, target, verdict."""
-    return row.what, f"{row.value:.4g}", row.unit, row.target, row.verdict
+    return row.what, f"{row.value:.5g}", row.unit, row.target, row.verdict
 
 
 ROW_HEADER = ("what", "value", "unit", "target", "verdict")
@@ -54,17 +54,17 @@ def markdown(outcome: Outcome) -> str:
     """The outcome as a page in Markdown; it refers to tables and plots in its own folder."""
     blocks = [f"# {outcome.title}", _grid(ROW_HEADER, [row_cells(row) for row in outcome.rows])]
     blocks += [f"![{name.replace('_', ' ')}]({name}.png)" for name in outcome.plots]
-    for name, table in outcome.tables.items():
-        blocks.append(f"## {name.replace('_', ' ')}\n\n{_shown(name, table)}")
+    short = {n: t for n, t in outcome.tables.items() if len(t.rows) <= MAX_ROWS}
+    for name, table in short.items():
+        cells = [tuple(_short(cell) for cell in row) for row in table.rows]
+        blocks.append(f"## {name.replace('_', ' ')}\n\n{_grid(table.columns, cells)}")
+    long = [f"- [{n}.csv]({n}.csv), {len(t.rows)} rows" for n, t in outcome.tables.items()
+            if n not in short]  # fmt: skip
+    if long:
+        blocks.append("## Longer tables\n\n" + "\n".join(long))
     if outcome.notes:
         blocks.append("## Notes\n\n" + "\n\n".join(outcome.notes))
     return "\n\n".join(blocks) + "\n"
-
-
-def _shown(name: str, table: Table) -> str:
-    if len(table.rows) > MAX_ROWS:
-        return f"{len(table.rows)} rows, in [{name}.csv]({name}.csv)."
-    return _grid(table.columns, [tuple(_short(cell) for cell in row) for row in table.rows])
 
 
 def _grid(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -73,7 +73,7 @@ def _grid(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def _short(cell: Cell) -> str:
-    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+    return f"{cell:.5g}" if isinstance(cell, float) else str(cell)
 
 
 def _exact(cell: Cell) -> str:

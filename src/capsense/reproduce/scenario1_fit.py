@@ -1,0 +1,152 @@
+"""Fits what the paper leaves out of scenario 1 to the measured curves of its triangular panels.
+
+The change of a pair's capacitance is tabulated over the bar's place once per board, and
+interpolated while fitting; the final curves come from the simulation itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+from scipy.optimize import least_squares
+
+from capsense.reproduce.scenario1_setup import PANEL_SAMPLES, Array, Panel, Setup, load_panel
+from capsense.reproduce.scenario1_signal import matrices, mutual
+from capsense.scene import Pose
+from capsense.simulator import Simulator
+
+STEP, REACH = 0.006, 0.252
+"""The table's spacing and reach along x [m]."""
+NEAREST, FARTHEST, HEIGHTS = 0.005, 0.160, 26
+"""Gaps of the table [m], and their number; they grow by a constant factor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Relative change of a pair's capacitance over the bar's place."""
+
+    empty: float
+    """Mutual capacitance without the bar [F]."""
+    spline: RectBivariateSpline
+    thickness: float
+    """Of the bar [m]."""
+
+    def change(self, x: Array, z: Array) -> Array:
+        """C/C_empty − 1 with the bar's centre at x, z [m], shapes (n,)."""
+        gap = np.maximum(z - 0.5 * self.thickness, NEAREST)
+        return self.spline.ev(np.clip(x, -REACH, REACH), np.log(gap))
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Matrices of a board over the bar's place, from which a pair's table is made."""
+
+    names: tuple[str, ...]
+    """Electrodes in matrix order."""
+    empty: Array
+    """Matrix without the bar [F], shape (M, M)."""
+    x: Array
+    """[m]"""
+    gaps: Array
+    """[m]"""
+    matrices: Array
+    """[F], shape (len(x), len(gaps), M, M)."""
+    thickness: float
+    """Of the bar [m]."""
+
+    def table(self, pair: tuple[str, str]) -> Table:
+        """The table of a pair."""
+        empty = float(mutual(self.empty, self.names, pair))
+        change = mutual(self.matrices, self.names, pair) / empty - 1
+        return Table(empty, RectBivariateSpline(self.x, np.log(self.gaps), change), self.thickness)
+
+
+def tabulate(sim: Simulator, setup: Setup, coarser: float = 1.0) -> Grid:
+    """Step the bar through a grid of places.
+
+    Args:
+        sim: A simulator of the board.
+        setup: The scenario.
+        coarser: Factor between grid points; 1 is 85 x 26 steps.
+    """
+    x = np.linspace(-REACH, REACH, round(2 * REACH / STEP / coarser) + 1)
+    gaps = np.geomspace(NEAREST, FARTHEST, round(HEIGHTS / coarser))
+    values = [
+        matrices(sim, setup, [Pose((a, 0.0, gap + 0.5 * setup.size[2])) for a in x]) for gap in gaps
+    ]
+    stacked = np.swapaxes(np.array(values), 0, 1)
+    return Grid(sim.electrode_names, sim.baseline, x, gaps, stacked, setup.size[2])
+
+
+def predicted(setup: Setup, name: str, table: Table) -> Array:
+    """The panel's curve by the table, without rounding and noise, shape (250,)."""
+    board = setup.boards[name]
+    times = np.arange(PANEL_SAMPLES) / board.sample_rate
+    poses = setup.poses("T2", setup.panel_speed, times)
+    place = np.array([pose.position for pose in poses])
+    share = table.empty / (table.empty + setup.stray)
+    return board.level * (1 + share * table.change(place[:, 0], place[:, 2]))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The outcome of a fit."""
+
+    setup: Setup
+    """The set-up with the fitted figures and their uncertainties."""
+    cost: float
+    """Half the sum of squared differences over both panels."""
+    memory: float
+    """Correlation of successive residuals, the larger of the two panels'."""
+
+
+def fit(
+    setup: Setup,
+    tables: Mapping[str, Table],
+    *,
+    starts: tuple[float, ...] = (0.5, 1.0, 1.6),
+    report: Callable[[str, float], None] = lambda stage, fraction: None,
+) -> Fit:
+    """Least squares over the panels of all tables, in the figures that have an uncertainty.
+
+    Residuals are not white: what is left is mostly the model's, and lasts several samples. So
+    the covariance s²(JᵀJ)⁻¹ is widened by (1 + ρ)/(1 − ρ), where ρ is the correlation of
+    successive residuals, as for a first-order process.
+
+    Args:
+        setup: Where to begin.
+        tables: By board, of :meth:`Grid.table`.
+        starts: Factors on the gap; the fit begins from each, and the best one counts.
+        report: Told of each start.
+    """
+    keys = list(setup.uncertainty)
+    panels: dict[str, Panel] = {name: load_panel(setup.boards[name].panel) for name in tables}
+    start = np.array([setup.value(key) for key in keys])
+    scale = np.where(start == 0, 1.0, np.abs(start))
+
+    def residuals(vector: Array) -> Array:
+        trial = setup.changed(dict(zip(keys, vector * scale, strict=True)))
+        return np.concatenate(
+            [predicted(trial, name, tables[name]) - panels[name].measured for name in tables]
+        )
+
+    best = None
+    for number, factor in enumerate(starts):
+        report(f"start {number + 1} of {len(starts)}", number / len(starts))
+        begin = start / scale
+        begin[keys.index("gap")] *= factor
+        found = least_squares(residuals, begin, x_scale=0.1, max_nfev=60)
+        if best is None or found.cost < best.cost:
+            best = found
+    assert best is not None
+    parts = np.split(best.fun, len(tables))
+    memory = max(float(np.corrcoef(part[1:], part[:-1])[0, 1]) for part in parts)
+    variance = 2 * best.cost / (len(best.fun) - len(keys)) * (1 + memory) / (1 - memory)
+    deviation = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)) * variance) * scale
+    values = dict(zip(keys, best.x * scale, strict=True))
+    uncertainty = dict(zip(keys, deviation.tolist(), strict=True))
+    fitted = replace(setup.changed(values), uncertainty=uncertainty)
+    return Fit(fitted, float(best.cost), memory)

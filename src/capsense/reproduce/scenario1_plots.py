@@ -1,0 +1,80 @@
+"""Scenario 1's pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from capsense.reproduce.scenario1_setup import PANEL_SAMPLES, Array, Panel, Setup
+
+MEASURED, PAPER, OURS, FAINT = "#2b2b2b", "#E69F00", "#0072B2", "#b9bdc1"
+
+
+def plot_panels(panels: Mapping[str, tuple[Array, Panel]]) -> Figure:
+    """Fig. 9's triangular panels with our curves: hardware, the paper's simulation, ours."""
+    figure = Figure(figsize=(8.2, 3.0 * len(panels)), layout="constrained")
+    sample = np.arange(1, PANEL_SAMPLES + 1)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (name, (ours, panel)) in zip(axes, panels.items(), strict=True):
+        ax.plot(sample, panel.simulated, color=PAPER, lw=1.2, label="the paper's simulation")
+        ax.plot(sample, panel.measured, ".", color=MEASURED, ms=3, label="hardware (the paper)")
+        ax.plot(sample, ours, color=OURS, lw=1.6, label="CapSense")
+        ax.set_ylabel(f"{name}: C / C of the empty scene")
+        _bare(ax)
+    axes[0].legend(frameon=False, fontsize=9, loc="lower left", ncols=3, bbox_to_anchor=(0, 1))
+    axes[-1].set_xlabel("sample")
+    return figure
+
+
+def plot_trajectories(
+    setup: Setup, curves: Mapping[tuple[str, str], tuple[Array, Array]]
+) -> Figure:
+    """Ways of the bar in the upper row; below, a row per board with its readings.
+
+    Args:
+        setup: The scenario.
+        curves: Times [s] and normalised readings by board and trajectory.
+    """
+    boards = list(dict.fromkeys(board for board, _ in curves))
+    ways = list(dict.fromkeys(way for _, way in curves))
+    figure = Figure(figsize=(3.0 * len(ways) + 0.6, 1.2 + 2.0 * len(boards)), layout="constrained")
+    axes = figure.subplots(
+        len(boards) + 1, len(ways), squeeze=False, sharey="row",
+        height_ratios=[0.55] + [1.0] * len(boards),
+    )  # fmt: skip
+    for column, way in enumerate(ways):
+        _draw_way(axes[0, column], setup, way)
+        for row, board in enumerate(boards, start=1):
+            ax = axes[row, column]
+            ax.plot(*curves[board, way], color=OURS, lw=1.0)
+            _bare(ax)
+            if column == 0:
+                ax.set_ylabel(f"{board}: C / C empty")
+        axes[-1, column].set_xlabel("time [s]")
+    return figure
+
+
+def _draw_way(ax: Axes, setup: Setup, way: str) -> None:
+    """The middle of the bar's lower face, and the board, to scale."""
+    poses = setup.path(way, 1.0).waypoints
+    points = 1e3 * np.array([pose.position for pose in (*poses, poses[0])])
+    height = points[:, 2] - 5e2 * setup.size[2]
+    ax.plot(points[:, 0], height, color=OURS, lw=1.0, marker="o", ms=2.5)
+    half = 5e2 * setup.size[0]
+    x, z = points[0, 0], height[0]
+    ax.plot([x - half, x + half], [z, z], color=FAINT, lw=3, solid_capstyle="butt")
+    ax.plot([-32.5, 32.5], [0, 0], color=MEASURED, lw=3, solid_capstyle="butt")
+    ax.set_title(f"{way} [mm]", fontsize=10)
+    ax.set_xlim(-265, 265)
+    ax.set_ylim(-8, 125)
+    ax.set_aspect("equal")
+    _bare(ax)
+
+
+def _bare(ax: Axes) -> None:
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.tick_params(labelsize=8)
+    ax.grid(color=FAINT, lw=0.3)
