@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from relative import near
 
 from capsense.errors import ReadOutError
 from capsense.readout.calibration import LinearSensor, calibrate
-from capsense.readout.config import load_readout, parse_readout
+from capsense.readout.config import choose_readout, load_readout, parse_readout
 from capsense.readout.detector import ExponentialTracker, SteppingTracker
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
 from capsense.readout.read_out import ReadOut
@@ -165,6 +166,28 @@ def test_pairs_and_stepping_baseline():
 def test_wrong_files_are_refused(text, words):
     with pytest.raises(ReadOutError, match=words):
         parse(text)
+
+
+@dataclass
+class Reading:
+    """As a simulator gives it."""
+
+    capacitance: np.ndarray
+    self_capacitance: np.ndarray
+    electrode_names: tuple[str, ...] = NAMES
+
+
+def test_choosing_by_name_or_file(tmp_path):
+    """A named chip that adapts to its electrodes is set up for them: nothing is out of range."""
+    matrix = 2.4e-12 * np.eye(3)
+    empty = Reading(matrix, np.diag(matrix))
+    readout = choose_readout("mpr121", NAMES, empty)
+    assert not readout([0.0, 1.0], np.stack([matrix, matrix])).flags.any()
+    path = tmp_path / "mine.toml"
+    path.write_text('chip = "fdc1004"\nrate = 400\n', encoding="utf-8")
+    assert choose_readout(path, NAMES, empty).schedule.conversion == near(2.5e-3, rel=1e-12)
+    with pytest.raises(ReadOutError, match="unknown chip 'mpr122'; did you mean 'mpr121'"):
+        choose_readout("mpr122", NAMES, empty)
 
 
 def test_missing_files_are_refused(tmp_path):

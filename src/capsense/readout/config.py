@@ -13,8 +13,8 @@ from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
 from capsense.readout.chips import CHIPS
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
-from capsense.readout.presets import Options, build, chip_of
-from capsense.readout.read_out import ReadOut
+from capsense.readout.presets import LEAST_EXPECTED, Options, build, chip_of
+from capsense.readout.read_out import Reading, ReadOut
 from capsense.readout.wiring import Wiring
 
 TOP_KEYS = (
@@ -42,6 +42,25 @@ def load_readout(path: str | Path, electrodes: Sequence[str]) -> ReadOut:
     """
     file = Path(path)
     return parse_readout(read_toml(file, "read-out", ReadOutError), electrodes, source=file.name)
+
+
+def choose_readout(choice: str | Path, electrodes: Sequence[str], empty: Reading) -> ReadOut:
+    """A read-out by the name of a chip, or from a file.
+
+    Args:
+        choice: A chip's name, or the path of a read-out file, ``.toml``.
+        electrodes: Electrode names of the sensor, in matrix order.
+        empty: The sensor's reading of an empty scene. A named chip that adapts to its electrodes
+            is set up for it; a file says ``expected`` itself.
+
+    Raises:
+        ReadOutError: There is no such chip or file, or the file is wrong.
+    """
+    if str(choice).endswith(".toml"):
+        return load_readout(choice, electrodes)
+    first = build(str(choice), electrodes)
+    expected = max(float(first.channel_values(empty).max()), LEAST_EXPECTED)
+    return build(str(choice), electrodes, Options(expected=expected))
 
 
 def parse_readout(

@@ -25,6 +25,8 @@ from capsense.readout.wiring import Wiring
 
 EXPECTED = 10e-12
 """Capacitance that chips which adapt to it are set up for by default [F]."""
+LEAST_EXPECTED = 1e-12
+"""Least capacitance that a chip is set up for where it is known [F]: leads add to electrodes."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ProtocolError, ReadOutError
-from capsense.readout.config import load_readout
+from capsense.readout.config import choose_readout
 from capsense.readout.counts import Counts
 from capsense.readout.read_out import ReadOut
 from capsense.scene import Body, Scene
@@ -164,12 +164,7 @@ def make_readout(name: str | Path, simulator: Simulator) -> ReadOut:
     Raises:
         ReadOutError: There is no such chip, or the file is wrong.
     """
-    names = simulator.electrode_names
-    if str(name).endswith(".toml"):
-        return load_readout(name, names)
-    first = ReadOut.preset(str(name), names)
-    level = float(first.channel_values(simulator.step(Scene())).max())
-    return ReadOut.preset(str(name), names, expected=max(level, 1e-12))
+    return choose_readout(name, simulator.electrode_names, simulator.step(Scene()))
 
 
 def _conversions(counts: Counts | None) -> NDArray[np.void]:
