@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import select
 import socket
 import threading
 import time
@@ -213,7 +214,7 @@ def test_connections_are_limited(dome: np.ndarray) -> None:
     """The last one is told so and closed; those before stay, and a place that is left is free."""
     with RunningServer(limits=Limits(connections=2)) as server:
         first, second = server.client(), server.client()
-        with pytest.raises(ProtocolError, match="2 clients are connected") as caught:
+        with pytest.raises(ProtocolError, match=r"2 clients are connected|1013 full") as caught:
             server.client()
         assert caught.value.code == "full"
         assert first.open().step(dome).sequence == 0
@@ -235,6 +236,21 @@ def test_half_open_connections(dome: np.ndarray) -> None:
             one.settimeout(3)
             with suppress(ConnectionResetError):
                 assert one.recv(1) == b""
+            one.close()
+        with server.client() as client:
+            assert client.open().step(dome).sequence == 0
+
+
+def test_too_many_sockets(dome: np.ndarray) -> None:
+    """Beyond twice the connections and 16, sockets are closed at once, before any handshake."""
+    with RunningServer(limits=Limits(connections=2)) as server:
+        sockets = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(30)]
+        readable = time.monotonic() + 3
+        gone = 0
+        while gone < 10 and time.monotonic() < readable:
+            gone = len(select.select(sockets, [], [], 0.05)[0])
+        assert gone == 10
+        for one in sockets:
             one.close()
         with server.client() as client:
             assert client.open().step(dome).sequence == 0

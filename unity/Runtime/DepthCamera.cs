@@ -42,7 +42,7 @@ namespace CapSense
             camera.backgroundColor = Color.clear;
             camera.allowMSAA = false;  // codes and depths must not be blended
             camera.allowHDR = false;
-            color = Target(24, RenderTextureFormat.ARGB32);
+            color = Target(0, RenderTextureFormat.ARGB32);
             depth = Target(32, RenderTextureFormat.Depth);
             copy = Target(0, RenderTextureFormat.RFloat);
             depthPixels = new Texture2D(resolution, resolution, TextureFormat.RFloat, false, true);

@@ -24,6 +24,8 @@ POLICY, TRY_LATER = 1008, 1013
 """Codes with which connections are closed on errors, and when there are too many."""
 ALLOWANCE = 5000.0
 """Work that a client may cause a second without being slowed, in units of a small message."""
+BINARY_UNIT, TEXT_UNIT = 16384, 512
+"""Bytes that count as much as a message: JSON takes longer to read than pixels."""
 OPENING, MISTAKE = 500.0, 100.0
 """What it takes to open a sensor, and to answer an error."""
 
@@ -86,7 +88,8 @@ class Session:
         solver = asyncio.create_task(self._solve_all())
         try:
             async for message in self._connection:
-                await self._pace(1 + len(message) / (16384 if isinstance(message, bytes) else 4096))
+                size = BINARY_UNIT if isinstance(message, bytes) else TEXT_UNIT
+                await self._pace(1 + len(message) / size)
                 await self._handle(message)
         except ConnectionClosed:
             pass
