@@ -130,7 +130,7 @@ def measure(makers: Makers, budget: float) -> list[dict[str, Any]]:
     for label, method, prepared, _, times in methods:
         rows.append({"label": label, "name": method.name, "settings": method.settings,
                      "tetrahedra": method.n_tets, "unknowns": method.unknowns,
-                     "prepare_s": prepared, "steps": len(times),
+                     "prepare_s": prepared, "steps": len(times), "mean_ms": float(np.mean(times)),
                      **{f"{key}_ms": float(np.percentile(times, q))
                         for key, q in (("median", 50), ("p95", 95), ("p99", 99))},
                      **errors(method)})  # fmt: skip
@@ -157,8 +157,8 @@ def errors(method: Any) -> dict[str, Any]:
 def line(row: dict[str, Any]) -> str:
     """A result as a line of text."""
     per_gap = " ".join(f"{100 * e:+7.1f}" for e in row["errors"].values())
-    return (f"  {row['name']:36s} {row['tetrahedra']:9,d} {row['median_ms']:9.2f} "
-            f"{row['p95_ms']:9.2f} {row['p99_ms']:9.2f}   {per_gap}")  # fmt: skip
+    times = " ".join(f"{row[key]:9.2f}" for key in ("median_ms", "mean_ms", "p95_ms", "p99_ms"))
+    return f"  {row['name']:36s} {row['tetrahedra']:9,d} {times}   {per_gap}"
 
 
 def main() -> None:
@@ -180,7 +180,10 @@ def main() -> None:
                 sys.exit(f"there is no group {name!r}; known: {', '.join(known)}")
         results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
         for name in wanted:
-            print(f"{name}: tetrahedra, median, p95, p99 [ms], errors [%] at {GAPS} mm", flush=True)
+            print(
+                f"{name}: tetrahedra, median, mean, p95, p99 [ms], errors [%] at {GAPS} mm",
+                flush=True,
+            )
             load = os.getloadavg()[0]
             rows = measure(known[name](), 1.0 if args.quick else BUDGET)
             results[name] = {**describe_machine(PACKAGES), "load": load, "results": rows}
