@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         RecordingError,
         ScenarioError,
         SceneError,
+        SkinError,
         SolveError,
     )
     from capsense.readout.config import load_readout
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from capsense.scene.scene import Scene
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
     from capsense.simulator import Reading, Simulator
+    from capsense.skin import Skin
 
     __version__: str
 
@@ -78,6 +80,8 @@ __all__ = [
     "Scene",
     "SceneError",
     "Simulator",
+    "Skin",
+    "SkinError",
     "SolveError",
     "Sphere",
     "TriMesh",
@@ -110,6 +114,7 @@ _HOMES = {
         "RecordingError",
         "ScenarioError",
         "SceneError",
+        "SkinError",
         "SolveError",
     ),
     "capsense.readout.config": ("load_readout",),
@@ -131,6 +136,7 @@ _HOMES = {
     "capsense.scene.scene": ("Scene",),
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Reading", "Simulator"),
+    "capsense.skin": ("Skin",),
 }
 _SUBMODULES = {
     "humans": "capsense.humans",

@@ -1,5 +1,9 @@
 """The exceptions CapSense raises on purpose. All derive from :class:`CapSenseError`."""
 
+from __future__ import annotations
+
+from typing import Any
+
 
 class CapSenseError(Exception):
     """Base of every error that CapSense raises on purpose."""
@@ -27,6 +31,19 @@ class FieldError(CapSenseError, RuntimeError):
 
 class SolveError(CapSenseError, RuntimeError):
     """A step did not reach its tolerance."""
+
+
+class SkinError(CapSenseError, RuntimeError):
+    """Some sensors of a skin failed; the readings of the others are kept."""
+
+    def __init__(
+        self, message: str, readings: dict[str, Any], failures: dict[str, CapSenseError]
+    ) -> None:
+        super().__init__(message)
+        self.readings = readings
+        """Name → reading of the sensors that did not fail."""
+        self.failures = failures
+        """Name → error of those that did."""
 
 
 class MissingDependencyError(CapSenseError, ImportError):

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from capsense.design import load_design
 from capsense.design.model import Design, Role
-from capsense.errors import SceneError
+from capsense.errors import FieldError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
@@ -92,10 +93,12 @@ class Simulator:
         settings: Numerical settings of the background field; default from ``design.build``.
         cache_dir: Where built fields are kept; default the user's cache directory.
         progress: Called with a stage's name and the fraction done while a field is built.
+        background: The field of this design with these settings, if it is at hand; it is shared,
+            not copied. :meth:`sibling` passes its own.
 
     Raises:
         DesignError: The design is wrong.
-        FieldError: The background field could not be built.
+        FieldError: The background field could not be built, or ``background`` is of another design.
     """
 
     def __init__(
@@ -109,6 +112,7 @@ class Simulator:
         settings: BuildSettings | None = None,
         cache_dir: Path | None = None,
         progress: Callable[[str, float], None] | None = None,
+        background: BackgroundField | None = None,
     ) -> None:
         if method not in ("perturbation", "masked"):
             raise ValueError(f'method is {method!r}; choose "perturbation" or "masked"')
@@ -126,9 +130,17 @@ class Simulator:
         """Numerical settings of the background field."""
         self.steps = 0
         """Steps since the last reset, one that failed included."""
-        self.background: BackgroundField = load_or_build(
-            self.design, self.settings, cache_dir=cache_dir, progress=progress
-        )
+        if background is None:
+            background = load_or_build(
+                self.design, self.settings, cache_dir=cache_dir, progress=progress
+            )
+        elif background.terminals != tuple(terminals(self.design)):
+            raise FieldError(
+                f"the background field is of terminals {background.terminals}, but design "
+                f"{self.design.name!r} has {tuple(terminals(self.design))}; leave it out"
+            )
+        self.background: BackgroundField = background
+        """Field and online mesh of the empty domain; never changed, so that it can be shared."""
         if method == "masked":
             from capsense.solve.scene_masks import MaskedScenes
 
@@ -188,6 +200,14 @@ class Simulator:
         return Reading(
             self.baseline + delta, delta.copy(), stats, self.electrode_names,
             total[:n, n:].sum(axis=1),
+        )  # fmt: skip
+
+    def sibling(self) -> Simulator:
+        """Another sensor of the same design and settings, at rest; the two share the field."""
+        return Simulator(
+            self.design, method=self.method, tolerance=self.tolerance,
+            relative_tolerance=self.relative_tolerance, frequency=self.frequency,
+            settings=self.settings, background=self.background,
         )  # fmt: skip
 
     def reset(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._validate import suggest
-from capsense.adapters.world import Frames, World
+from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.readout.read_out import ReadOut
@@ -128,6 +128,43 @@ class AttachedSensor(ABC):
             self.readout.reset()
 
 
+class WorldSource(ABC):
+    """The solids of a simulator's model, taken over once for all sensors that ride in it."""
+
+    def __init__(self) -> None:
+        self.version = 0
+        """Goes up whenever the solids are taken over again."""
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take the solids over again, after their shapes, sizes or number changed.
+
+        Raises:
+            SceneError: A name pattern fits nothing.
+        """
+        self.version += 1
+
+    @abstractmethod
+    def solids(self, own: int | None) -> list[Solid]:
+        """All solids but those of the frame ``own``.
+
+        Raises:
+            SceneError: A shape is not supported.
+        """
+
+    @abstractmethod
+    def soft(self, own: int | None) -> list[SoftSolid]:
+        """All deformables but those of the frame ``own``.
+
+        Raises:
+            SceneError: One is not supported.
+        """
+
+    @abstractmethod
+    def links(self) -> tuple[Array, Array]:
+        """Origins [m] (f, 3) and quaternions (f, 4) of the moving frames, as they are now."""
+
+
 class GeometrySensor(AttachedSensor):
     """A sensor that sees the shapes of the simulator's model themselves.
 
@@ -137,22 +174,27 @@ class GeometrySensor(AttachedSensor):
     world: World
     """Everything it may see."""
 
-    def __init__(self, simulator: Simulator) -> None:
+    def __init__(self, simulator: Simulator, source: WorldSource) -> None:
         super().__init__(simulator)
-        self.refresh()
+        self.source = source
+        """Where its world comes from; the sensors of a skin share it."""
+        self._take_over()
 
-    def scene(self) -> Scene:
+    def scene(self, links: tuple[Array, Array] | None = None) -> Scene:
         """The bodies within the sensor's domain, in the sensor frame, at the present state.
+
+        Args:
+            links: What ``source.links()`` has just given, if that was asked already.
 
         Raises:
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
-        frames = self._frames()  # may refresh the world
+        frames = self._now(links)  # may take over another world
         return self.world.scene(frames)
 
     @property
     def pose(self) -> Pose:
-        frames = self._frames()
+        frames = self._now(None)
         return Pose(frames.sensor_position, frames.sensor_quaternion)
 
     def refresh(self) -> None:
@@ -161,15 +203,35 @@ class GeometrySensor(AttachedSensor):
         Raises:
             SceneError: A shape is not supported, or a name pattern fits nothing.
         """
-        self.world = self._world()
+        self.source.refresh()
+        self._take_over()
+
+    def catch_up(self) -> None:
+        """Take over the world again if its source has changed.
+
+        Raises:
+            SceneError: A shape is not supported.
+        """
+        if self._version != self.source.version:
+            self._take_over()
+
+    def _now(self, links: tuple[Array, Array] | None) -> Frames:
+        links = self.source.links() if links is None else links
+        self.catch_up()
+        return self._frames(*links)
+
+    def _take_over(self) -> None:
+        own, domain = self._own_frame(), self.simulator.design.domain
+        self.world = World(self.source.solids(own), domain, self.source.soft(own))
+        self._version = self.source.version
 
     @abstractmethod
-    def _world(self) -> World:
-        """Everything that the sensor may see, what is excluded left out."""
+    def _own_frame(self) -> int | None:
+        """The frame whose solids the sensor does not see; None where it sees them all."""
 
     @abstractmethod
-    def _frames(self) -> Frames:
-        """Where everything is now."""
+    def _frames(self, position: Array, quaternion: Array) -> Frames:
+        """Where everything is now, from the moving frames."""
 
 
 def make_simulator(design: Design | str | Path | Simulator) -> Simulator:

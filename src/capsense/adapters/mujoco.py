@@ -11,22 +11,24 @@ from numpy.typing import NDArray
 
 from capsense.adapters.attached import GeometrySensor, check_world, make_simulator
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
-from capsense.adapters.mujoco_model import ModelReader
+from capsense.adapters.mujoco_model import ModelSource
 from capsense.adapters.rules import Rules
-from capsense.adapters.world import Frames, World
+from capsense.adapters.skin import AttachedSkin, simulators_of
+from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.readout.read_out import ReadOut
 from capsense.scene import Material
 from capsense.scene.body import Grounding, checked_grounding
 from capsense.simulator import Simulator
+from capsense.skin import AnyDesign
 
 if TYPE_CHECKING:
     import mujoco
 
 Array = NDArray[np.float64]
 
-__all__ = ["MujocoDepthSensor", "MujocoSensor", "attach"]
+__all__ = ["AttachedSkin", "MujocoDepthSensor", "MujocoSensor", "attach", "attach_skin"]
 
 _SCALAR_LAST = [1, 2, 3, 0]
 
@@ -121,66 +123,106 @@ def attach(
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
     )
-    sensor = MujocoSensor(
-        model, data, number, make_simulator(design), rules, exclude_own=exclude_own, groups=groups
-    )
+    source = ModelSource(model, data, rules, groups)
+    sensor = MujocoSensor(source, number, make_simulator(design), exclude_own=exclude_own)
     sensor.use_readout(readout)
     return sensor
+
+
+def attach_skin(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    sites: Sequence[str],
+    design: AnyDesign | Mapping[str, AnyDesign] = "arm_segment",
+    *,
+    materials: Mapping[str, Material | str] | None = None,
+    grounding: Mapping[str, Grounding] | None = None,
+    default_material: Material | str = "steel",
+    default_grounding: Grounding = "grounded",
+    exclude: Sequence[str] = (),
+    exclude_own: bool = True,
+    hull: Sequence[str] = (),
+    groups: Collection[int] | None = None,
+    readout: str | None = None,
+    threads: int | None = None,
+) -> AttachedSkin:
+    """Attach a sensor to each of several sites; one ``read()`` reads them all, in parallel.
+
+    The model is taken over once for all of them, and sensors of one design share its field. Each
+    sees the geometry from its own frame, without the geoms of its own body.
+
+    Args:
+        model: The model.
+        data: Its state.
+        sites: Names of the sites, which are also those of the readings.
+        design: What :func:`attach` takes, for all sites, or site → design. A simulator that is
+            given for several sites stands for its own design.
+        materials: As for :func:`attach`, like all that follow up to ``groups``.
+        grounding: Name pattern → grounding.
+        default_material: Material of everything else.
+        default_grounding: Grounding of everything else.
+        exclude: Name patterns of geoms that no sensor sees.
+        exclude_own: Leave out the geoms of the body that carries a sensor, for that sensor.
+        hull: Name patterns of mesh geoms that are taken as their convex hulls.
+        groups: See only geoms of these groups; default all.
+        readout: Name of the chip behind every sensor.
+        threads: How many threads read; by default as many as the process may use processors.
+
+    Raises:
+        MissingDependencyError: MuJoCo is not installed.
+        SceneError: There is no such site, a pattern fits nothing, a shape is not supported, or
+            the data belong to another model.
+        DesignError: A design is wrong.
+        ReadOutError: There is no such chip.
+    """
+    _require()
+    _check_pair(model, data)
+    if isinstance(sites, str):
+        raise SceneError(f"sites is {sites!r}; give a list of names, like [{sites!r}]")
+    numbers = {site: find_site(model, site) for site in sites}
+    rules = Rules(
+        materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
+    )
+    source = ModelSource(model, data, rules, groups)
+    simulators = simulators_of(sites, design)
+    sensors = {
+        site: MujocoSensor(source, number, simulators[site], exclude_own=exclude_own)
+        for site, number in numbers.items()
+    }
+    return AttachedSkin(sensors, readout, threads)
 
 
 class MujocoSensor(GeometrySensor):
     """A sensor on a site of a MuJoCo model; made by :func:`attach`."""
 
+    source: ModelSource
+
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        site: int,
-        simulator: Simulator,
-        rules: Rules,
-        *,
-        exclude_own: bool,
-        groups: Collection[int] | None,
+        self, source: ModelSource, site: int, simulator: Simulator, *, exclude_own: bool
     ) -> None:
-        self.model = model
+        self.model = source.model
         """The model."""
-        self.data = data
+        self.data = source.data
         """The state that readings are taken of."""
-        self._rules = rules
-        self._groups = None if groups is None else frozenset(int(g) for g in groups)
         self._site = site
-        self._body = int(model.site_bodyid[self._site])
-        self._own = self._body if exclude_own and self._body else None
+        self._body = int(self.model.site_bodyid[site])
+        self._exclude_own = exclude_own
         self._turn = np.empty(4)
-        super().__init__(simulator)
+        super().__init__(simulator, source)
 
     def _time(self) -> float:
         return float(self.data.time)
 
-    def _world(self) -> World:
-        reader = ModelReader(self.model, self._rules)
-        solids = []
-        for geom in range(self.model.ngeom):
-            if self._groups is not None and int(self.model.geom_group[geom]) not in self._groups:
-                continue
-            if int(self.model.geom_bodyid[geom]) == self._own:
-                continue
-            solid = reader.solid(geom)
-            if solid is not None:
-                solids.append(solid)
-        soft = [reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
-        return World(solids, self.simulator.design.domain, [s for s in soft if s is not None])
+    def _own_frame(self) -> int | None:
+        return self._body if self._exclude_own and self._body else None
 
-    def _frames(self) -> Frames:
+    def _frames(self, position: Array, quaternion: Array) -> Frames:
         import mujoco
 
         data = self.data
         check_stepped(data, self._site)
         mujoco.mju_mulQuat(self._turn, data.xquat[self._body], self.model.site_quat[self._site])
-        return Frames(
-            data.xpos, data.xquat[:, _SCALAR_LAST], data.site_xpos[self._site],
-            self._turn[_SCALAR_LAST],
-        )  # fmt: skip
+        return Frames(position, quaternion, data.site_xpos[self._site], self._turn[_SCALAR_LAST])
 
 
 def _require() -> None:

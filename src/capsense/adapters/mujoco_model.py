@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.adapters.attached import WorldSource
 from capsense.adapters.meshes import height_field, solid_mesh
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_SCALAR_LAST = [1, 2, 3, 0]
 MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
@@ -194,6 +197,58 @@ class ModelReader:
         heights = top * m.hfield_data[start : start + rows * columns].reshape(rows, columns)
         vertices, faces = height_field(heights, (half_x, half_y), base)
         return solid_mesh(vertices, faces, names[-1])
+
+
+class ModelSource(WorldSource):
+    """The solids of a MuJoCo model; frames are its bodies.
+
+    Args:
+        model: The model.
+        data: The state that readings are taken of.
+        rules: What is seen, and what it is made of.
+        groups: See only geoms of these groups; all where None.
+
+    Raises:
+        SceneError: A pattern fits nothing, or one of the model's own texts is wrong.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        rules: Rules,
+        groups: Collection[int] | None,
+    ) -> None:
+        self.model = model
+        self.data = data
+        self._rules = rules
+        chosen = None if groups is None else {int(g) for g in groups}
+        self._geoms = [
+            i for i in range(model.ngeom) if chosen is None or int(model.geom_group[i]) in chosen
+        ]
+        super().__init__()
+
+    def refresh(self) -> None:
+        super().refresh()
+        self._reader = ModelReader(self.model, self._rules)
+        self._made: dict[int, Solid | None] = {}
+
+    def solids(self, own: int | None) -> list[Solid]:
+        out = []
+        for geom in self._geoms:
+            if int(self.model.geom_bodyid[geom]) == own:
+                continue
+            if geom not in self._made:
+                self._made[geom] = self._reader.solid(geom)
+            out.append(self._made[geom])
+        return [solid for solid in out if solid is not None]
+
+    def soft(self, own: int | None) -> list[SoftSolid]:
+        soft = [self._reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
+        return [s for s in soft if s is not None]
+
+    def links(self) -> tuple[Array, Array]:
+        return self.data.xpos, self.data.xquat[:, _SCALAR_LAST]
 
 
 def _part(array: Any, start: Any, count: int) -> NDArray[np.int32]:

@@ -11,26 +11,22 @@ from numpy.typing import NDArray
 
 from capsense.adapters.attached import GeometrySensor, check_world, make_simulator, refuse_missing
 from capsense.adapters.pybullet_depth import PybulletDepthSensor, check_image
-from capsense.adapters.pybullet_model import (
-    Link,
-    WorldReader,
-    body_numbers,
-    is_soft,
-    links_of,
-)
+from capsense.adapters.pybullet_model import ClientSource, body_numbers, links_of
 from capsense.adapters.rules import Rules
-from capsense.adapters.world import Frames, SoftSolid, Solid, World
+from capsense.adapters.skin import AttachedSkin, simulators_of
+from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.readout.read_out import ReadOut
 from capsense.scene import Material, Pose
 from capsense.scene.body import Grounding
 from capsense.simulator import Simulator
+from capsense.skin import AnyDesign
 
 Array = NDArray[np.float64]
 Shapes = Literal["collision", "visual"]
 
-__all__ = ["PybulletDepthSensor", "PybulletSensor", "attach"]
+__all__ = ["AttachedSkin", "PybulletDepthSensor", "PybulletSensor", "attach", "attach_skin"]
 
 _NO_POSE = Pose()
 
@@ -108,8 +104,7 @@ def attach(
         ReadOutError: There is no such chip.
     """
     _require()
-    if shapes not in ("collision", "visual"):
-        raise SceneError(f'shapes is {shapes!r}; choose "collision" or "visual"')
+    _check_shapes(shapes)
     only_geometry = {
         "grounding": grounding, "hull": hull, 'shapes="visual"': shapes == "visual",
     }  # fmt: skip
@@ -130,88 +125,117 @@ def attach(
         )  # fmt: skip
         sensor.use_readout(readout)
         return sensor
-    sensor = PybulletSensor(
-        number, body, index, pose_in_link, simulator, rules,
-        shapes=shapes, exclude_own=exclude_own, sheet_thickness=sheet_thickness,
-    )  # fmt: skip
+    source = ClientSource(number, rules, shapes, sheet_thickness)
+    sensor = PybulletSensor(source, body, index, pose_in_link, simulator, exclude_own=exclude_own)
     sensor.use_readout(readout)
     return sensor
+
+
+def attach_skin(
+    client: Any,
+    body: int,
+    mounts: Mapping[str, tuple[int | str, Pose]],
+    design: AnyDesign | Mapping[str, AnyDesign] = "arm_segment",
+    *,
+    shapes: Shapes = "collision",
+    materials: Mapping[str, Material | str] | None = None,
+    grounding: Mapping[str, Grounding] | None = None,
+    default_material: Material | str = "steel",
+    default_grounding: Grounding = "grounded",
+    exclude: Sequence[str] = (),
+    exclude_own: bool = True,
+    hull: Sequence[str] = (),
+    sheet_thickness: float = 1e-3,
+    readout: str | None = None,
+    threads: int | None = None,
+) -> AttachedSkin:
+    """Attach several sensors to a robot's links; one ``read()`` reads them all, in parallel.
+
+    The world is taken over once for all of them, and sensors of one design share its field. Each
+    sees the geometry from its own frame, without its own link.
+
+    Args:
+        client: What ``pybullet.connect`` returned, or a ``BulletClient``.
+        body: The body that carries the sensors.
+        mounts: Name → link, by index or name, and the sensor frame in the link's frame.
+        design: What :func:`attach` takes, for all sensors, or name → design. A simulator that is
+            given for several sensors stands for its own design.
+        shapes: As for :func:`attach`, like all that follow up to ``sheet_thickness``.
+        materials: Name pattern → material.
+        grounding: Name pattern → grounding.
+        default_material: Material of everything else.
+        default_grounding: Grounding of everything else.
+        exclude: Name patterns of links that no sensor sees.
+        exclude_own: Leave out the link that carries a sensor, for that sensor.
+        hull: Name patterns of links whose visual meshes are taken as their convex hulls.
+        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
+        readout: Name of the chip behind every sensor.
+        threads: How many threads read; by default as many as the process may use processors.
+
+    Raises:
+        MissingDependencyError: PyBullet is not installed.
+        SceneError: There is no such client, body or link, a pattern fits nothing, or a shape is
+            not supported.
+        DesignError: A design is wrong.
+        ReadOutError: There is no such chip.
+    """
+    _require()
+    _check_shapes(shapes)
+    number = _client_number(client)
+    links: dict[str, tuple[int, Pose]] = {}
+    for name, mount in mounts.items():
+        if not (isinstance(mount, tuple) and len(mount) == 2 and isinstance(mount[1], Pose)):
+            raise SceneError(f"mount {name!r} is {mount!r}; give a pair (link, Pose(…))")
+        links[name] = _find_link(number, body, mount[0]), mount[1]
+    rules = Rules(
+        materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
+    )
+    source = ClientSource(number, rules, shapes, sheet_thickness)
+    simulators = simulators_of(links, design)
+    sensors = {
+        name: PybulletSensor(source, body, *mount, simulators[name], exclude_own=exclude_own)
+        for name, mount in links.items()
+    }
+    return AttachedSkin(sensors, readout, threads)
 
 
 class PybulletSensor(GeometrySensor):
     """A sensor on a link in PyBullet; made by :func:`attach`."""
 
+    source: ClientSource
+
     def __init__(
         self,
-        client: int,
+        source: ClientSource,
         body: int,
         link: int,
         pose_in_link: Pose,
         simulator: Simulator,
-        rules: Rules,
         *,
-        shapes: Shapes,
         exclude_own: bool,
-        sheet_thickness: float,
     ) -> None:
-        self.client = client
+        self.client = source.client
         """Number of the physics client."""
         self.body = body
         """The body that carries the sensor."""
         self.link = link
         """Its link, -1 for the base."""
         self._in_link = pose_in_link
-        self._rules = rules
-        self._shapes: Shapes = shapes
         self._exclude_own = exclude_own
-        self._sheet_thickness = sheet_thickness
-        super().__init__(simulator)
+        super().__init__(simulator, source)
 
-    def _world(self) -> World:
+    def _take_over(self) -> None:
         import pybullet as p
 
-        self._bodies = body_numbers(self.client)
-        self._links: list[Link] = [
-            link for body in self._bodies for link in links_of(self.client, body)
-        ]
-        self._groups = [
-            (body, [k.link for k in self._links if k.body == body and k.link >= 0])
-            for body in self._bodies
-        ]
-        own = (self.body, self.link)
-        self._carrier = [(k.body, k.link) for k in self._links].index(own)
-        inertial = p.getDynamicsInfo(*own, physicsClientId=self.client)[3:5]
-        self._in_frame = Pose(*inertial).inverse() @ self._in_link
-        reader = WorldReader(
-            self.client, self._links, self._rules, self._shapes, self._sheet_thickness
-        )
-        solids: list[Solid] = []
-        soft: list[SoftSolid] = []
-        for i, link in enumerate(self._links):
-            if self._exclude_own and (link.body, link.link) == own:
-                continue
-            if is_soft(self.client, link):
-                soft += reader.soft_solids(i)
-            else:
-                solids += reader.solids(i)
-        return World(solids, self.simulator.design.domain, soft)
+        self._carrier = self.source.index(self.body, self.link)
+        dynamics = p.getDynamicsInfo(self.body, self.link, physicsClientId=self.client)
+        self._in_frame = Pose(*dynamics[3:5]).inverse() @ self._in_link
+        super()._take_over()
 
-    def _frames(self) -> Frames:
-        """Frames of the links' centres of mass, in the order of ``self._links``."""
-        import pybullet as p
+    def _own_frame(self) -> int | None:
+        return self._carrier if self._exclude_own else None
 
-        if body_numbers(self.client) != self._bodies:
-            self.refresh()
-        poses: list[Any] = []
-        for body, links in self._groups:
-            poses.append(p.getBasePositionAndOrientation(body, physicsClientId=self.client))
-            if links:
-                states = p.getLinkStates(
-                    body, links, computeForwardKinematics=1, physicsClientId=self.client
-                )
-                poses += [s[:2] for s in states]
-        position = np.array([pose[0] for pose in poses])
-        quaternion = np.array([pose[1] for pose in poses])
+    def _frames(self, position: Array, quaternion: Array) -> Frames:
         sensor = Pose(position[self._carrier], quaternion[self._carrier]) @ self._in_frame
         return Frames(position, quaternion, np.array(sensor.position), np.array(sensor.quaternion))
 
@@ -223,6 +247,11 @@ def _require() -> None:
         raise MissingDependencyError(
             "PyBullet is not installed; pip install 'capsense[pybullet]'"
         ) from None
+
+
+def _check_shapes(shapes: object) -> None:
+    if shapes not in ("collision", "visual"):
+        raise SceneError(f'shapes is {shapes!r}; choose "collision" or "visual"')
 
 
 def _client_number(client: Any) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.adapters.attached import WorldSource
 from capsense.adapters.meshes import (
     joined_hulls,
     load_triangles,
@@ -269,6 +270,73 @@ class WorldReader:
             raise _refuse(link, "has a concave collision mesh that PyBullet does not give out")
         corners = pose.inverse().apply(vertices)  # given in the frame of the centre of mass
         return round_cylinder(corners) or solid_mesh(corners, (), label, hull=True), pose
+
+
+class ClientSource(WorldSource):
+    """The solids of a PyBullet world; frames are its links' centres of mass.
+
+    They are taken over again when bodies were added or removed.
+
+    Args:
+        client: Number of the physics client.
+        rules: What is seen, and what it is made of.
+        shapes: ``"collision"`` or ``"visual"``.
+        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
+
+    Raises:
+        SceneError: A pattern fits nothing.
+    """
+
+    def __init__(self, client: int, rules: Rules, shapes: str, sheet_thickness: float) -> None:
+        self.client = client
+        self._rules, self._shapes, self._sheet_thickness = rules, shapes, sheet_thickness
+        super().__init__()
+
+    def refresh(self) -> None:
+        super().refresh()
+        self._bodies = body_numbers(self.client)
+        self._links = [link for body in self._bodies for link in links_of(self.client, body)]
+        self._groups = [
+            (body, [k.link for k in self._links if k.body == body and k.link >= 0])
+            for body in self._bodies
+        ]
+        self._reader = WorldReader(
+            self.client, self._links, self._rules, self._shapes, self._sheet_thickness
+        )
+        self._made: dict[int, list[Solid]] = {}
+
+    def index(self, body: int, link: int) -> int:
+        """Number of a link's frame."""
+        return [(k.body, k.link) for k in self._links].index((body, link))
+
+    def solids(self, own: int | None) -> list[Solid]:
+        out = []
+        for i, link in enumerate(self._links):
+            if i == own or is_soft(self.client, link):
+                continue
+            if i not in self._made:
+                self._made[i] = list(self._reader.solids(i))
+            out += self._made[i]
+        return out
+
+    def soft(self, own: int | None) -> list[SoftSolid]:
+        numbers = [i for i, k in enumerate(self._links) if i != own and is_soft(self.client, k)]
+        return [soft for i in numbers for soft in self._reader.soft_solids(i)]
+
+    def links(self) -> tuple[Array, Array]:
+        import pybullet as p
+
+        if body_numbers(self.client) != self._bodies:
+            self.refresh()
+        poses: list[Any] = []
+        for body, links in self._groups:
+            poses.append(p.getBasePositionAndOrientation(body, physicsClientId=self.client))
+            if links:
+                states = p.getLinkStates(
+                    body, links, computeForwardKinematics=1, physicsClientId=self.client
+                )
+                poses += [s[:2] for s in states]
+        return np.array([pose[0] for pose in poses]), np.array([pose[1] for pose in poses])
 
 
 def _primitive(kind: int, sizes: tuple[float, float, float]) -> Shape | None:

@@ -1,0 +1,110 @@
+"""Many sensors on a simulated robot, read in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from capsense._validate import suggest
+from capsense.adapters.attached import GeometrySensor
+from capsense.errors import SceneError
+from capsense.scene import Pose
+from capsense.simulator import Reading, Simulator
+from capsense.skin import AnyDesign, Crew, make_simulators
+
+
+class AttachedSkin:
+    """Reads sensors that ride on links of a simulated robot; made by an adapter's ``attach_skin``.
+
+    Args:
+        sensors: Name → sensor; they share one source of their world.
+        readout: Name of the chip behind every sensor, or None.
+        threads: How many threads read; by default as many as the process may use processors.
+
+    Raises:
+        SceneError: ``threads`` is not a positive whole number.
+        ReadOutError: There is no such chip.
+    """
+
+    def __init__(
+        self, sensors: Mapping[str, GeometrySensor], readout: str | None, threads: int | None
+    ) -> None:
+        self.sensors = dict(sensors)
+        """The sensors, as ``attach`` makes them."""
+        self._source = next(iter(self.sensors.values())).source
+        self._crew = Crew(threads)
+        for sensor in self.sensors.values():
+            sensor.use_readout(readout)
+
+    def read(self, time: float | None = None) -> dict[str, Reading]:
+        """The readings of the simulator's present state, by name.
+
+        They are those that the sensors would give one by one, to the last bit.
+
+        Args:
+            time: Time of the state [s], for read-outs; by default the simulator's own, where it
+                tells it.
+
+        Raises:
+            SkinError: Some sensors failed; it holds the readings of the others.
+            SceneError: A pattern fits nothing any more, after bodies were added or removed.
+        """
+        links = self._source.links()
+        for sensor in self.sensors.values():
+            sensor.catch_up()
+
+        def task(sensor: GeometrySensor) -> Callable[[], Reading]:
+            return lambda: sensor.read(time, sensor.scene(links))
+
+        return self._crew.read({name: task(sensor) for name, sensor in self.sensors.items()})
+
+    @property
+    def poses(self) -> dict[str, Pose]:
+        """Where the sensor frames stand in the simulator's world, by name.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet.
+        """
+        return {name: sensor.pose for name, sensor in self.sensors.items()}
+
+    def refresh(self) -> None:
+        """Take the world's solids over again, after their shapes, sizes or number changed.
+
+        Raises:
+            SceneError: A shape is not supported, or a name pattern fits nothing.
+        """
+        self._source.refresh()
+        for sensor in self.sensors.values():
+            sensor.catch_up()
+
+    def reset(self) -> None:
+        """Forget the previous step, as after the simulator was set back; restart read-outs."""
+        for sensor in self.sensors.values():
+            sensor.reset()
+
+    def __len__(self) -> int:
+        return len(self.sensors)
+
+
+def simulators_of(
+    names: Iterable[str], design: AnyDesign | Mapping[str, AnyDesign]
+) -> dict[str, Simulator]:
+    """Simulators for the sensors of a skin: all of one design, or each of its own.
+
+    Raises:
+        SceneError: Names repeat, or those of ``design`` are others.
+        DesignError: A design is wrong.
+        FieldError: A background field could not be built.
+    """
+    names = list(names)
+    for name in names:
+        if names.count(name) > 1:
+            raise SceneError(f"{name!r} is given {names.count(name)} times; once is enough")
+    if not isinstance(design, Mapping):
+        return make_simulators(dict.fromkeys(names, design))
+    for name in design:
+        if name not in names:
+            raise SceneError(f"design: no sensor is named {name!r}; {suggest(name, names)}")
+    for name in names:
+        if name not in design:
+            raise SceneError(f"design: nothing is given for {name!r}; give a design for each")
+    return make_simulators({name: design[name] for name in names})

@@ -1,0 +1,187 @@
+"""Many sensors in one call: the same readings as one by one, whatever the number of threads."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_field import SETTINGS, tiny_design
+
+import capsense as cs
+from capsense.errors import SceneError, SkinError
+from capsense.skin import Crew, make_simulators
+
+Array = np.ndarray
+
+POSES = {
+    "left": cs.Pose((-0.10, 0.0, 0.0)),
+    "middle": cs.Pose((0.0, 0.01, 0.02), (0.3, -0.1, 0.2, 0.9)),
+    "right": cs.Pose((0.10, 0.0, 0.0), (0.0, 0.0, 0.7071, 0.7071)),
+    "far": cs.Pose((5.0, 0.0, 0.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def tiny(field_cache: Path) -> cs.Simulator:
+    """A square and a disc in a 0.1 m box."""
+    return cs.Simulator(tiny_design(), settings=SETTINGS, cache_dir=field_cache)
+
+
+def skin_of(tiny: cs.Simulator, **options: object) -> cs.Skin:
+    """Four sensors, all fresh."""
+    return cs.Skin({n: (tiny.sibling(), p) for n, p in POSES.items()}, **options)
+
+
+def scenes(count: int = 12) -> list[cs.Scene]:
+    """A ball and a loose box that go by, in the world."""
+    out = []
+    for k in range(count):
+        x = -0.12 + 0.24 * k / count
+        out.append(
+            cs.Scene(
+                [
+                    cs.Body(cs.Sphere(0.02), cs.Pose((x, 0.0, 0.05)), "human", 100e-12, "ball"),
+                    cs.Body(
+                        cs.Box((0.03, 0.02, 0.01)), cs.Pose((-x, 0.02, 0.04), (0.1, 0.2, 0.3, 0.9)),
+                        "steel", "floating", "box",
+                    ),
+                ]
+            )
+        )  # fmt: skip
+    return out
+
+
+def same(a: cs.Reading, b: cs.Reading) -> bool:
+    """Whether two readings agree to the last bit."""
+    return (
+        np.array_equal(a.delta, b.delta)
+        and np.array_equal(a.self_capacitance, b.self_capacitance)
+        and a.stats.iterations == b.stats.iterations
+    )
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_the_same_as_one_by_one_to_the_last_bit(tiny: cs.Simulator, threads: int) -> None:
+    """Differential: a walk of scenes, against single sensors that are given the same views."""
+    skin = skin_of(tiny, threads=threads)
+    alone = {name: tiny.sibling() for name in POSES}
+    for scene in scenes():
+        together = skin.step(scene)
+        assert list(together) == list(POSES)
+        for name, view in skin.views(scene).items():
+            assert same(together[name], alone[name].step(view))
+
+
+def test_every_sensor_sees_the_world_from_its_own_frame(tiny: cs.Simulator) -> None:
+    """Differential: against all bodies moved to the sensor's frame, none left out."""
+    skin = skin_of(tiny)
+    for scene in scenes(5):
+        readings = skin.step(scene)
+        for name, pose in POSES.items():
+            inverse = pose.inverse()
+            whole = cs.Scene([b.moved(inverse @ b.pose) for b in scene])
+            expected = tiny.sibling().step(whole).delta
+            assert readings[name].delta == pytest.approx(expected, rel=1e-4, abs=1e-19)
+        assert not readings["far"].delta.any()
+
+
+def test_only_what_reaches_into_a_domain_is_solved(tiny: cs.Simulator) -> None:
+    """Bodies far away are culled before anything else is done with them."""
+    skin = skin_of(tiny)
+    crowd = [cs.Body(cs.Sphere(0.1), cs.Pose((k, 3.0, 1.0)), name=f"b{k}") for k in range(50)]
+    ball = cs.Body(cs.Sphere(0.02), cs.Pose((-0.1, 0.0, 0.05)), name="ball")
+    views = skin.views(cs.Scene([*crowd, ball]))
+    assert [[b.name for b in views[n]] for n in POSES] == [["ball"], [], [], []]
+    readings = skin.step_views(views)
+    assert [r.stats.iterations > 0 for r in readings.values()] == [True, False, False, False]
+
+
+def test_sensors_move(tiny: cs.Simulator) -> None:
+    """A pose given at a step is remembered; moving the sensor is moving the world."""
+    ball = cs.Body(cs.Sphere(0.02), cs.Pose((0.0, 0.0, 0.05)))
+    pose = cs.Pose((0.01, 0.0, 0.01), (0.0, 0.1, 0.0, 0.99))
+    skin = skin_of(tiny)
+    there = skin.step(cs.Scene([ball]), {"far": pose})["far"].delta
+    assert skin.poses["far"] == pose
+    expected = tiny.sibling().step(cs.Scene([ball.moved(pose.inverse() @ ball.pose)])).delta
+    assert np.array_equal(there, expected)
+    skin.reset()
+    assert np.array_equal(skin.step(cs.Scene([ball]))["far"].delta, expected)
+
+
+def test_sensors_of_one_design_share_its_field(tiny: cs.Simulator) -> None:
+    """A given simulator is used once; siblings have its field and settings, not its state."""
+    made = make_simulators({"a": tiny, "b": tiny, "c": "arm_segment", "d": "arm_segment"})
+    assert made["a"] is tiny
+    assert made["b"] is not tiny
+    assert made["b"].background is tiny.background
+    assert made["c"].background is made["d"].background
+    for name in ("method", "tolerance", "relative_tolerance", "frequency", "settings", "design"):
+        assert getattr(made["b"], name) == getattr(tiny, name)
+    assert made["b"].steps == 0
+
+
+def test_a_failing_sensor_does_not_lose_the_others(tiny: cs.Simulator) -> None:
+    """The error names it and holds the readings of the others."""
+    skin = skin_of(tiny)
+    good = scenes(1)[0]
+    views: dict[str, object] = dict(skin.views(good))
+    views["middle"] = "no scene"
+    with pytest.raises(SkinError, match=r"1 of 4 sensors failed; 'middle': step takes") as caught:
+        skin.step_views(views)  # type: ignore[arg-type]
+    assert list(caught.value.readings) == ["left", "right", "far"]
+    assert list(caught.value.failures) == ["middle"]
+    assert isinstance(caught.value.failures["middle"], SceneError)
+    expected = tiny.sibling().step(skin.views(good)["left"])
+    assert same(caught.value.readings["left"], expected)
+    views["right"] = None
+    with pytest.raises(SkinError, match=r"2 of 4 sensors failed; 'middle': .*so did 'right'"):
+        skin.step_views(views)  # type: ignore[arg-type]
+    assert set(skin.step(good)) == set(POSES), "and the next step is sound"
+
+
+def test_crew_runs_tasks_beside_each_other() -> None:
+    """Two tasks that wait for each other finish with two threads."""
+    meet = threading.Barrier(2, timeout=20)
+
+    def task() -> int:
+        return meet.wait()
+
+    assert set(Crew(2).read({"a": task, "b": task}).values()) == {0, 1}  # type: ignore[dict-item]
+
+
+def test_crew_passes_on_what_it_did_not_foresee() -> None:
+    """A bug in a task is not taken for a failing sensor."""
+
+    def broken() -> int:
+        raise ZeroDivisionError
+
+    for threads in (1, 2):
+        with pytest.raises(ZeroDivisionError):
+            Crew(threads).read({"a": broken, "b": broken})  # type: ignore[dict-item]
+
+
+def test_refused(tiny: cs.Simulator) -> None:
+    """Refused by name, with the mend."""
+    ball = cs.Body(cs.Sphere(0.02))
+    skin = skin_of(tiny)
+    with pytest.raises(SceneError, match="give at least one"):
+        cs.Skin({})
+    with pytest.raises(SceneError, match=r"sensor 'a' is .*give a pair \(design, Pose"):
+        cs.Skin({"a": "six_patch"})  # type: ignore[dict-item]
+    with pytest.raises(SceneError, match="threads is 0"):
+        skin_of(tiny, threads=0)
+    with pytest.raises(SceneError, match=r"poses: no sensor is named 'lefd'.*'left'"):
+        skin.step(cs.Scene([ball]), {"lefd": cs.Pose()})
+    with pytest.raises(SceneError, match="views: no sensor is named"):
+        skin.step_views({"elsewhere": cs.Scene()})
+    with pytest.raises(SceneError, match=r"write Scene\(\[...\]\)"):
+        skin.step([ball])  # type: ignore[arg-type]
+
+
+def test_a_field_of_another_design_is_refused(tiny: cs.Simulator) -> None:
+    """A simulator does not take the field of other terminals."""
+    with pytest.raises(cs.FieldError, match="leave it out"):
+        cs.Simulator("six_patch", background=tiny.background)
