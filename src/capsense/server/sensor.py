@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ProtocolError, ReadOutError
-from capsense.readout.config import choose_readout
 from capsense.readout.counts import Counts
 from capsense.readout.read_out import ReadOut
 from capsense.scene import Body, Scene
@@ -152,19 +150,6 @@ class ServedSensor:
         counts = self.readout.sample(time, reading)
         self._time = time
         return counts
-
-
-def make_readout(name: str | Path, simulator: Simulator) -> ReadOut:
-    """A read-out for a simulator's electrodes.
-
-    Args:
-        name: A chip's name, or the path of a read-out file, ``.toml``.
-        simulator: The sensor; chips that adapt to their electrodes are set up for its baseline.
-
-    Raises:
-        ReadOutError: There is no such chip, or the file is wrong.
-    """
-    return choose_readout(name, simulator.electrode_names, simulator.step(Scene()))
 
 
 def _conversions(counts: Counts | None) -> NDArray[np.void]:

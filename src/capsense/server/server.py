@@ -17,11 +17,14 @@ import numpy as np
 
 from capsense._validate import suggest
 from capsense.errors import MissingDependencyError, ProtocolError, ServerError
+from capsense.readout.config import choose_readout
+from capsense.readout.read_out import ReadOut
+from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
 from capsense.server.frames import PROTOCOL
 from capsense.server.messages import Open
 from capsense.server.options import Options
-from capsense.server.sensor import ServedSensor, make_readout
+from capsense.server.sensor import ServedSensor
 from capsense.simulator import Simulator
 
 try:
@@ -148,8 +151,7 @@ class Server:
             raise ProtocolError(
                 f"design {name!r} is not served; {suggest(name, self.design_names)}", "scene"
             )
-        template = self._templates[name]
-        simulator = Simulator(template.design, background=template.background)
+        simulator = self._templates[name].sibling()
         return ServedSensor(wanted, simulator, self._make_readout(simulator))
 
     async def work(self, job: Callable[[], T]) -> T:
@@ -197,9 +199,11 @@ class Server:
             return _json(HTTPStatus.NOT_FOUND, {"error": "there are / (WebSocket) and /health"})
         return None
 
-    def _make_readout(self, simulator: Simulator) -> Any:
-        readout = self.options.readout
-        return None if readout is None else make_readout(readout, simulator)
+    def _make_readout(self, simulator: Simulator) -> ReadOut | None:
+        choice = self.options.readout
+        if choice is None:
+            return None
+        return choose_readout(choice, simulator.electrode_names, simulator.step(Scene()))
 
 
 def _json(status: HTTPStatus, content: dict[str, Any]) -> Response:
