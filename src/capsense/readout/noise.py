@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadOutError
 from capsense.readout.checks import Array, Ints, finite, require, require_whole
-from capsense.readout.stage import Context, Process, rounds
+from capsense.readout.stage import Context, Process
 
 _POLES_PER_DECADE = 2.0
 
@@ -81,17 +81,14 @@ class Flicker:
     def start(self, context: Context) -> Process:
         """Return the process, in its stationary state."""
         taus, variance = self.poles(context.period)
-        rng, channels = context.rng, context.channels
+        rng = context.rng
         keep = np.exp(-context.period / taus)
         kick = np.sqrt(variance * -np.expm1(-2 * context.period / taus))
-        state = math.sqrt(variance) * rng.standard_normal((channels, len(taus)))
+        state = math.sqrt(variance) * rng.standard_normal((context.channels, len(taus)))
 
         def process(channel: Ints, time: Array, value: Array) -> Array:
             states = kick * rng.standard_normal((len(value), len(taus)))
-            for part in rounds(len(value), channels):
-                of = channel[part]
-                states[part] += keep * state[of]
-                state[of] = states[part]
+            _recur(states, keep, state, channel)
             return value + states.sum(axis=1)
 
         return process
@@ -109,20 +106,30 @@ class RandomWalk:
 
     def start(self, context: Context) -> Process:
         """Return the process."""
-        rng, channels = context.rng, context.channels
+        rng = context.rng
         step = self.rate * math.sqrt(context.period)
-        state = np.zeros(channels)
+        state = np.zeros(context.channels)
 
         def process(channel: Ints, time: Array, value: Array) -> Array:
-            steps = step * rng.standard_normal(len(value))
-            walked = np.empty(len(value))
-            for part in rounds(len(value), channels):
-                of = channel[part]
-                state[of] += steps[part]
-                walked[part] = state[of]
+            walked = step * rng.standard_normal(len(value))
+            _recur(walked, 1.0, state, channel)
             return value + walked
 
         return process
+
+
+def _recur(kicks: Array, keep: Array | float, state: Array, channel: Ints) -> None:
+    """Add ``keep`` times its channel's last state to each kick, in place.
+
+    As any K samples in a row are of different channels, a channel's last state lies K rows back;
+    for the first K it is in ``state``, shape (K, ...), which is brought up to date.
+    """
+    count = len(state)
+    kicks[:count] += keep * state[channel[:count]]
+    for first in range(count, len(kicks), count):
+        part = kicks[first : first + count]
+        part += keep * kicks[first - count : first - count + len(part)]
+    state[channel[-count:]] = kicks[-count:]
 
 
 @dataclass(frozen=True)
