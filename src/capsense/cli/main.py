@@ -13,7 +13,7 @@ from typing import Any
 from capsense.cli.registry import load_commands
 from capsense.errors import CapSenseError, FieldError, SolveError
 
-OK, FAILED, BAD_INPUT, TARGET_MISSED, INTERRUPTED = 0, 1, 2, 3, 130
+OK, FAILED, BAD_INPUT, TARGET_MISSED, DIFFERS, INTERRUPTED = 0, 1, 2, 3, 3, 130
 
 EXIT_CODES = """\
 exit codes:
@@ -21,7 +21,7 @@ exit codes:
   1    failed for a reason that is not your input: a step that was not solved, a full
        disk, a bug (what was computed until then is kept)
   2    bad usage or input; the message names what is wrong and how to mend it
-  3    reproduce only: it ran, and a figure missed its target
+  3    reproduce: it ran, and a figure missed its target; replay: a reading differs
   130  interrupted by Ctrl-C or a request to terminate (what was computed is kept)
 """
 

@@ -12,9 +12,6 @@ from capsense.cli.run import progress_shown
 if TYPE_CHECKING:
     from capsense.recording.replay import Replay
 
-DIFFERS = 3
-"""Exit code of a replay in which a number came out otherwise."""
-
 NAME = "replay"
 HELP = "simulate a recording again and verify that every reading is the same"
 DESCRIPTION = """\
@@ -49,7 +46,7 @@ def execute(args: argparse.Namespace) -> int:
     """Replay the recording and return the exit code."""
     from tqdm import tqdm
 
-    from capsense.cli.main import OK, say
+    from capsense.cli.main import DIFFERS, OK, say
     from capsense.cli.progress import BuildProgress
     from capsense.recording.reader import open_recording
     from capsense.recording.replay import replay
