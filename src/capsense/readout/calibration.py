@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from capsense.errors import ReadOutError
 from capsense.readout.checks import Array, Ints, finite, per_channel, require
+from capsense.readout.noise import Flicker
 from capsense.readout.stage import Context, Process
 
 
@@ -181,13 +182,17 @@ class Calibration(LinearSensor):
 
 
 def calibrate(
-    true: ArrayLike, measured: ArrayLike, time: ArrayLike | None = None, *, drift: bool = True
-) -> Calibration:
+    true: ArrayLike, measured: ArrayLike, time: ArrayLike | None = None, *, drift: bool = True,
+    floor: float = 0.0,
+) -> Calibration:  # fmt: skip
     """Fit gain, offset and drift of each channel to a recording with known poses.
 
-    Ordinary least squares. Uncertainties follow from the residuals, ``s² (XᵀX)⁻¹``, and hold for
-    noise that is white from sample to sample: where an Allan plot shows flicker or a random walk
-    within the recording's length, they are too small.
+    Ordinary least squares. Without a ``floor``, uncertainties follow from the residuals,
+    ``s² (XᵀX)⁻¹``, and hold for noise that is white from sample to sample. A sensor's noise seldom
+    is: with flicker they come out several times too small, that of the drift most. With the floor
+    of the sensor's Allan plot, taken at rest, uncertainties hold for white noise and flicker
+    together, ``A (s² + Σ) Aᵀ`` with A = (XᵀX)⁻¹Xᵀ, Σ being the covariance of
+    :class:`~capsense.readout.noise.Flicker` at the samples' times.
 
     Args:
         true: Capacitances that the simulator gives at the poses and times of the recording [F],
@@ -195,6 +200,7 @@ def calibrate(
         measured: What the sensor reported [F], shape (n, K).
         time: Times of the samples [s], shape (n,); needed for drift.
         drift: Whether to fit a drift that is linear in time.
+        floor: Allan deviation of the flicker floor [F]; needs times that rise.
 
     Raises:
         ReadOutError: Shapes do not fit, numbers are not finite, samples are too few, or the
@@ -204,7 +210,10 @@ def calibrate(
     if c.ndim != 2 or c.shape != m.shape or not c.shape[1]:
         raise ReadOutError(f"true has shape {c.shape}, measured {m.shape}; give both as (n, K)")
     n, k = c.shape
-    t = _times(time, n, drift)
+    require("calibrate", "floor", floor, 0.0, "F")
+    t = _times(time, n, drift or floor > 0)
+    if floor > 0 and (np.diff(t) <= 0).any():
+        raise ReadOutError("with a floor, times must rise; sort the samples")
     unknowns = 3 if drift else 2
     if n <= unknowns:
         raise ReadOutError(f"{n} samples for {unknowns} unknowns a channel; record more")
@@ -214,16 +223,19 @@ def calibrate(
     residual = np.zeros(k)
     for channel in range(k):
         columns = [c[:, channel], np.ones(n), t - epoch][:unknowns]
-        fit = _least_squares(np.stack(columns, axis=1), m[:, channel], channel)
+        fit = _least_squares(np.stack(columns, axis=1), m[:, channel], channel, t, floor)
         figures[channel, :unknowns], covariance[channel, :unknowns, :unknowns] = fit[:2]
         residual[channel] = fit[2]
     return Calibration(figures[:, 0], figures[:, 1], figures[:, 2], epoch, covariance, residual, n)
 
 
-def _times(time: ArrayLike | None, count: int, drift: bool) -> Array:
+def _times(time: ArrayLike | None, count: int, needed: bool) -> Array:
     if time is None:
-        if drift:
-            raise ReadOutError("drift needs the times of the samples; give time, or drift=False")
+        if needed:
+            raise ReadOutError(
+                "drift and floor need the times of the samples; give time, or drift=False and "
+                "no floor"
+            )
         return np.zeros(count)
     t = finite("time", time)
     if t.shape != (count,):
@@ -231,7 +243,9 @@ def _times(time: ArrayLike | None, count: int, drift: bool) -> Array:
     return t
 
 
-def _least_squares(design: Array, seen: Array, channel: int) -> tuple[Array, Array, float]:
+def _least_squares(
+    design: Array, seen: Array, channel: int, time: Array, floor: float
+) -> tuple[Array, Array, float]:
     """Figures, their covariance and the residual's deviation, in columns scaled to one."""
     scale = np.sqrt((design**2).mean(axis=0))
     # A column that is a constant, or a multiple of another one, tells nothing of its own.
@@ -245,6 +259,28 @@ def _least_squares(design: Array, seen: Array, channel: int) -> tuple[Array, Arr
     figures = np.linalg.solve(r, q.T @ seen)
     root = np.linalg.inv(r)
     n, p = design.shape
-    variance = float(((seen - (design / scale) @ figures) ** 2).sum()) / (n - p)
-    covariance = variance * (root @ root.T) / np.outer(scale, scale)
-    return figures / scale, covariance, math.sqrt(variance)
+    squares = float(((seen - (design / scale) @ figures) ** 2).sum())
+    slow, total = np.zeros((p, p)), 0.0
+    if floor > 0:
+        covered, total = _flicker_covariance(q, time, floor)
+        slow = q.T @ covered
+    # The residuals hold the white noise, and what of the flicker the fit did not follow.
+    white = max(0.0, squares - total + float(np.trace(slow))) / (n - p)
+    covariance = root @ (white * np.eye(p) + slow) @ root.T / np.outer(scale, scale)
+    return figures / scale, covariance, math.sqrt(squares / (n - p))
+
+
+def _flicker_covariance(columns: Array, time: Array, floor: float) -> tuple[Array, float]:
+    """Σ times columns, shape (n, p), and the trace of Σ, Σ being flicker's covariance [F²].
+
+    ``Σ_ij = v Σ_k exp(−|t_i − t_j|/τ_k)``; each exponential is carried along, forth and back.
+    """
+    taus, variance = Flicker(floor).poles(float(np.median(np.diff(time))))
+    keep = np.exp(-np.diff(time)[:, None] / taus)[:, :, None]
+    out = len(taus) * columns
+    for sums, rows, kept in ((out, columns, keep), (out[::-1], columns[::-1], keep[::-1])):
+        memory = np.zeros((len(taus), columns.shape[1]))
+        for n in range(1, len(rows)):
+            memory = kept[n - 1] * (memory + rows[n - 1])
+            sums[n] += memory.sum(axis=0)
+    return variance * out, variance * len(taus) * len(time)
