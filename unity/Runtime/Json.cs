@@ -143,8 +143,8 @@ namespace CapSense
             else if (value is string) Quote(text, (string)value);
             else if (value is IDictionary<string, object>) WriteObject(text, (IDictionary<string, object>)value);
             else if (value is IEnumerable) WriteArray(text, (IEnumerable)value);
-            else if (value is float) text.Append(((float)value).ToString("R", CultureInfo.InvariantCulture));
-            else if (value is double) text.Append(((double)value).ToString("R", CultureInfo.InvariantCulture));
+            else if (value is float) text.Append(((float)value).ToString("G9", CultureInfo.InvariantCulture));
+            else if (value is double) text.Append(((double)value).ToString("G17", CultureInfo.InvariantCulture));
             else text.Append(Convert.ToString(value, CultureInfo.InvariantCulture));
         }
 
