@@ -178,8 +178,9 @@ def test_stretches_beyond_four_are_joined_to_the_fourth():
     out = np.full((6, 2), np.nan)
     grid = shape.grid
     n = mesh_line_intervals(
-        grid.values, grid.origin, 1 / grid.cell, -1.0, 0.001, 0.002, 1.0, 0.0, 0.0, out
-    )
+        grid.values, grid.origin, 1 / grid.cell, -1.0, 0.001, 0.002, 1.0, 0.0, 0.0,
+        -np.inf, np.inf, out,
+    )  # fmt: skip
     assert n == 6
     np.testing.assert_allclose(out[:, 1] - out[:, 0], 0.01, atol=1e-6)
 

@@ -95,6 +95,8 @@ def mesh_intervals_of_lines(
             d[i, 0],
             d[i, 1],
             d[i, 2],
+            -np.inf,
+            np.inf,
             out[i],
         )
 

@@ -138,6 +138,22 @@ def line_interval(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def contains(kind: int, params: Array, x: float, y: float, z: float) -> bool:
+    """Whether a point in a convex primitive's frame lies in it; meshes and layers: never."""
+    if kind == _BOX:
+        return abs(x) <= params[0] and abs(y) <= params[1] and abs(z) <= params[2]
+    if kind == _ELLIPSOID:
+        return (x / params[0]) ** 2 + (y / params[1]) ** 2 + (z / params[2]) ** 2 <= 1.0
+    if kind == _CYLINDER:
+        return abs(z) <= params[1] and x * x + y * y <= params[0] * params[0]
+    if kind == _CAPSULE:
+        z -= min(max(z, -params[1]), params[1])
+    elif kind != _SPHERE:
+        return False
+    return x * x + y * y + z * z <= params[0] * params[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def body_line_interval(
     kind: int,
     params: Array,
@@ -255,10 +271,13 @@ def mesh_line_intervals(
     dx: float,
     dy: float,
     dz: float,
+    begin: float,
+    stop: float,
     out: Array,
 ) -> int:
     """Stretches of the line o + t d inside a signed-distance grid, all in the body's frame.
 
+    Only t from ``begin`` to ``stop`` is looked at; a stretch that goes on beyond ends there.
     The line is followed in steps of the distance less half a cell, and of half a cell at least;
     crossings are then found to 1e-7 of a cell on the trilinear interpolant. Where three samples
     show a nearest approach, their parabola's extremum is probed, so that a grazing
@@ -285,15 +304,15 @@ def mesh_line_intervals(
     x0, x1 = slab(px - hx, ux, hx)
     y0, y1 = slab(py - hy, uy, hy)
     z0, z1 = slab(pz - hz, uz, hz)
-    s = max(x0, max(y0, z0))
-    end = min(x1, min(y1, z1))
+    s = max(begin * speed, max(x0, max(y0, z0)))
+    end = min(stop * speed, min(x1, min(y1, z1)))
     n = 0
     if s >= end:
         return n
     v = grid_value(grid, px + s * ux, py + s * uy, pz + s * uz)
     before_s = s
     before_v = v
-    entry = s
+    entry = s / speed
     inside = v <= 0.0
     while s < end:
         step = max(0.5, abs(v) * inv_h - 0.5)

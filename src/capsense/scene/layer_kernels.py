@@ -139,7 +139,8 @@ def _walk(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cross_slot(
     values: Array32, table: int, base: int, blocks: int, nx: int, limit: float,
-    px: float, py: float, oz: float, ux: float, uy: float, dz: float, out: Array, n: int,
+    px: float, py: float, oz: float, ux: float, uy: float, dz: float, begin: float, stop: float,
+    out: Array, n: int,
 ) -> int:  # fmt: skip
     """Add the stretches of a line that runs across the view inside one slot.
 
@@ -149,7 +150,7 @@ def _cross_slot(
     """
     i0, i1 = values[table], values[table + 1]
     j0, j1 = values[table + 2], values[table + 3]
-    t0, last = _clip(px, ux, i0, i1, -math.inf, math.inf)
+    t0, last = _clip(px, ux, i0, i1, begin, stop)
     t0, last = _clip(py, uy, j0, j1, t0, last)
     a, b = _clip(oz, dz, values[table + 4], values[table + 5], t0, last)
     if not a < b:
@@ -255,7 +256,7 @@ def _add_pixels(start: float, end: float, p: float, u: float, out: Array, n: int
 @njit(cache=True, nogil=True, error_model="numpy")
 def _straight_slot(
     values: Array32, table: int, base: int, blocks: int, nx: int, limit: float, axis: int,
-    p: float, u: float, v: float, z: float, out: Array, n: int,
+    p: float, u: float, v: float, z: float, begin: float, stop: float, out: Array, n: int,
 ) -> int:  # fmt: skip
     """Add the stretches of a line at one depth along rows (axis 0) or columns (axis 1).
 
@@ -273,6 +274,9 @@ def _straight_slot(
     blocks += 4 * (j // BLOCK) * (per_row if axis == 0 else 1)
     stride = 4 * (1 if axis == 0 else per_row)
     i, last = int(values[table + 2 * axis]), int(values[table + 2 * axis + 1])
+    if begin > -math.inf:
+        low, high = min(p + begin * u, p + stop * u), max(p + begin * u, p + stop * u)
+        i, last = max(i, int(max(low, 0.0))), min(last, int(max(high, 0.0)) + 1)
     start, end = 0.0, -math.inf
     while i < last:
         at = blocks + stride * (i // BLOCK)
@@ -295,9 +299,12 @@ def _straight_slot(
 @njit(cache=True, nogil=True, error_model="numpy")
 def layer_line_intervals(
     values: Array32, shape: Ints, origin: Array, inv_x: float,
-    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, out: Array,
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, begin: float, stop: float,
+    out: Array,
 ) -> int:  # fmt: skip
     """Stretches of the line o + t d inside a layered depth image, all in the body's frame.
+
+    Only t about from ``begin`` to ``stop`` is looked at; a stretch may end there or go on.
 
     Args:
         values: A :class:`~capsense.scene.layers.LayerGrid`'s values, flat; numbers behind its end
@@ -334,7 +341,7 @@ def layer_line_intervals(
             p, u, v = (px, ux, py + t * uy) if axis == 0 else (py, uy, px + t * ux)
             n = _straight_slot(
                 values, table, base, blocks + k * per_slot, nx, limit, axis, p, u, v,
-                oz + t * dz, out, n,
+                oz + t * dz, begin, stop, out, n,
             )  # fmt: skip
         elif along:
             if not (values[table + 6] <= px <= values[table + 7]
@@ -347,7 +354,7 @@ def layer_line_intervals(
         else:
             n = _cross_slot(
                 values, table, base, blocks + k * per_slot, nx, limit,
-                px, py, oz, ux, uy, dz, out, n,
+                px, py, oz, ux, uy, dz, begin, stop, out, n,
             )  # fmt: skip
     return n
 
@@ -391,7 +398,7 @@ def layer_intervals_of_lines(
     for i in range(o.shape[0]):
         n = layer_line_intervals(
             values, shape, origin, inv_x, o[i, 0], o[i, 1], o[i, 2], d[i, 0], d[i, 1], d[i, 2],
-            out[i],
+            -math.inf, math.inf, out[i],
         )  # fmt: skip
         for row in range(n, out.shape[1]):
             out[i, row, 0] = math.inf

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from capsense.scene.approach_kernels import approach, slenderness
-from capsense.scene.kernels import body_line_interval, mesh_line_intervals
+from capsense.scene.kernels import body_line_interval, contains, mesh_line_intervals
 from capsense.scene.layer_kernels import layer_line_intervals
 from capsense.scene.shape import ShapeKind
 
@@ -52,9 +52,12 @@ BODY = np.dtype(
 and where the grid of a mesh or of layers begins among those of all."""
 
 
-@njit(cache=True, nogil=True)
-def pierce(axis, op, oq, body, grids, out):
-    """Stretches of a line along ``axis`` inside one body, at (op, oq) across; return how many."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def pierce(axis, op, oq, low, high, body, grids, out):
+    """Stretches of a line along ``axis`` inside one body, at (op, oq) across; return how many.
+
+    All that lie in [low, high]; a stretch that goes on beyond may end there.
+    """
     ox, oy, oz, dx, dy, dz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if axis == 0:
         oy, oz, dx = op, oq, 1.0
@@ -72,34 +75,37 @@ def pierce(axis, op, oq, body, grids, out):
         s, first = body.grid_shape, body.grid_first
         if body.kind == _LAYERS:
             return layer_line_intervals(
-                grids[first:], s, body.grid_origin, body.grid_inv, lx, ly, lz, dx, dy, dz, out
-            )
+                grids[first:], s, body.grid_origin, body.grid_inv, lx, ly, lz, dx, dy, dz,
+                low, high, out,
+            )  # fmt: skip
         values = grids[first : first + s[0] * s[1] * s[2]].reshape((s[0], s[1], s[2]))
         return mesh_line_intervals(
-            values, body.grid_origin, body.grid_inv, lx, ly, lz, dx, dy, dz, out
+            values, body.grid_origin, body.grid_inv, lx, ly, lz, dx, dy, dz, low, high, out
         )
     out[0, 0], out[0, 1] = body_line_interval(body.kind, body.params, r, c, ox, oy, oz, dx, dy, dz)
     return 1 if out[0, 1] > out[0, 0] else 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _chord(axis, along, t, u, v, low, high, body, grids, out):
     """Part of [low, high] that a body covers around a point on a line along ``along``.
 
     The point lies at t on ``axis``, u on ``along`` and v on the third axis. Returns both ends of
     the part, and the length of the whole stretch inside the body.
     """
+    # far enough to tell how long a stretch is that is shorter than the part
+    first, last = 2.0 * low - high, 2.0 * high - low
     if axis < 3 - axis - along:
-        n = pierce(along, t, v, body, grids, out)
+        n = pierce(along, t, v, first, last, body, grids, out)
     else:
-        n = pierce(along, v, t, body, grids, out)
+        n = pierce(along, v, t, first, last, body, grids, out)
     for k in range(n):
         if out[k, 0] - 1e-12 <= u and u <= out[k, 1] + 1e-12:
             return max(low, out[k, 0]), min(high, out[k, 1]), out[k, 1] - out[k, 0]
     return u, u, 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def thin_factor(wide_p, wide_q, across_p, across_q):
     """How much less than a wall a thin conductor inside a column takes from the column's field.
 
@@ -116,7 +122,7 @@ def thin_factor(wide_p, wide_q, across_p, across_q):
     return 1.0 / (1.0 + 2.0 * (wide / (math.pi * max(thin, 1e-9)) - 1.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def part_covered(low, node, high, a, b, extent):
     """Part of a column's side [low, high] that [a, b] covers; an edge at the node covers half.
 
@@ -129,7 +135,26 @@ def part_covered(low, node, high, a, b, extent):
     return at_b - at_a
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _holds_cross(axis, p, q, t, pl, ph, ql, qh, sq, body):
+    """Whether a convex body holds [pl, ph] at sq and [ql, qh] at its middle: a short cut."""
+    r, c = body.rotation, body.position
+    at_p, at_q, at_t = 0.5 * (pl + ph) - c[p], sq - c[q], t - c[axis]
+    half, down, up = 0.5 * (ph - pl), ql - sq, qh - sq
+    x = r[p, 0] * at_p + r[q, 0] * at_q + r[axis, 0] * at_t
+    y = r[p, 1] * at_p + r[q, 1] * at_q + r[axis, 1] * at_t
+    z = r[p, 2] * at_p + r[q, 2] * at_q + r[axis, 2] * at_t
+    ux, uy, uz = half * r[p, 0], half * r[p, 1], half * r[p, 2]
+    vx, vy, vz = r[q, 0], r[q, 1], r[q, 2]
+    return (
+        contains(body.kind, body.params, x - ux, y - uy, z - uz)
+        and contains(body.kind, body.params, x + ux, y + uy, z + uz)
+        and contains(body.kind, body.params, x + down * vx, y + down * vy, z + down * vz)
+        and contains(body.kind, body.params, x + up * vx, y + up * vy, z + up * vz)
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, out):
     """Weight of a body in a column at t around (sp, sq), and the middle of what it covers.
 
@@ -138,6 +163,9 @@ def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, o
     part lies aside of the column's line [m].
     """
     least = slenderness(body.kind, body.params)
+    if (least >= ph - pl or least >= qh - ql) and _holds_cross(axis, p, q, t, pl, ph, ql, qh, sq,
+                                                              body):  # fmt: skip
+        return 1.0, 0.5 * (pl + ph), 0.5 * (ql + qh), 0.0
     a, b, across_p = _chord(axis, p, t, sp, sq, pl, ph, body, grids, out)
     sp = 0.5 * (a + b)
     share = part_covered(pl, op, ph, a, b, max(across_p, least))
@@ -154,14 +182,27 @@ def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, o
     return share, sp, sq, math.hypot(aside_p, aside_q)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _barely_covers(pl, op, ph, ql, oq, qh, p, q, body):
+    """Whether a body's bounding box tells that its weight in a column is zero: a short cut."""
+    least, bounds = slenderness(body.kind, body.params), body.bounds
+    if least < ph - pl or least < qh - ql:
+        return False
+    a, b = max(pl, bounds[0, p]), min(ph, bounds[1, p])
+    share = part_covered(pl, op, ph, a, b, math.inf)
+    a, b = max(ql, bounds[0, q]), min(qh, bounds[1, q])
+    share = min(share, part_covered(ql, oq, qh, a, b, math.inf))
+    return 0.5 + RAMP * (share - 0.5) <= 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
     """Look for a body in a column whose line it misses: a place (sp, sq), and stretches there."""
     if body.kind == _MESH or body.kind == _LAYERS:
         for trial in range(8):
             sp = pl if trial in (0, 4, 5) else (ph if trial in (1, 6, 7) else op)
             sq = ql if trial in (2, 4, 6) else (qh if trial in (3, 5, 7) else oq)
-            count = pierce(axis, sp, sq, body, grids, out)
+            count = pierce(axis, sp, sq, -math.inf, math.inf, body, grids, out)
             if count > 0:
                 return sp, sq, count
         return op, oq, 0
@@ -172,10 +213,10 @@ def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
     else:
         sp, sq, _ = approach(body.kind, body.params, body.rotation, body.position, op, oq, 0.0, 2)
     sp, sq = min(max(sp, pl), ph), min(max(sq, ql), qh)
-    return sp, sq, pierce(axis, sp, sq, body, grids, out)
+    return sp, sq, pierce(axis, sp, sq, -math.inf, math.inf, body, grids, out)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, grids, t0, t1,
                       who, cover, aside, out):  # fmt: skip
     """Stretches of a lattice line's column inside bodies, and the weight of each.
@@ -193,12 +234,14 @@ def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, 
         if ph < bounds[0, p] or pl > bounds[1, p] or qh < bounds[0, q] or ql > bounds[1, q]:
             continue
         sp, sq = op, oq
-        count = pierce(axis, sp, sq, body, grids, out)
+        count = pierce(axis, sp, sq, -math.inf, math.inf, body, grids, out)
         share = 1.0
         aside[near[m]] = 0.0
         if body.conductor >= 0:
             centred = count > 0
             if not centred:
+                if _barely_covers(pl, op, ph, ql, oq, qh, p, q, body):
+                    continue
                 sp, sq, count = _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out)
                 if count == 0:
                     continue
@@ -216,7 +259,7 @@ def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, 
             else:
                 if share == 1.0 and centred:
                     sp, sq = op, oq
-                count = pierce(axis, sp, sq, body, grids, out)
+                count = pierce(axis, sp, sq, -math.inf, math.inf, body, grids, out)
         for k in range(count):
             if out[k, 1] > out[k, 0]:
                 if n == MAX_STRETCHES:

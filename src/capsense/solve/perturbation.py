@@ -80,7 +80,7 @@ class PerturbationSolver:
         self._stamp, self._mark = np.zeros(n, np.int64), 0
         self._inside, self._inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
         self._counts = np.zeros(4, np.int64)
-        self._found = _Found(n, max(4096, n // 4))
+        self._found = _Found(self._mesh, max(4096, n // 4))
         self._blocks: list[_Block] = []
         self._lanes: tuple[object, ...] = ()
 
@@ -158,9 +158,9 @@ class PerturbationSolver:
             conductors.parent[:] = np.arange(len(conductors.parent))
             status = tracing.trace(
                 mesh.scan_storeys, mesh.axes, mesh.faces, mesh.nodes, mesh.links, mesh.cuts,
-                mesh.ceiling, mesh.parent, mesh.home, bodies, grids, CONTACT, conductors.parent,
-                found.weight, found.extra, self._inside, self._inside_nodes, found.ties,
-                found.energies, found.couples, self._counts,
+                mesh.ceiling, mesh.parent, mesh.home, mesh.stored, bodies, grids, CONTACT,
+                conductors.parent, found.weight, found.extra, self._inside, self._inside_nodes,
+                found.ties, found.energies, found.couples, found.within, self._counts,
             )  # fmt: skip
             if status == tracing.FULL:
                 ties, energies, couples, _ = self._counts.tolist()
@@ -170,7 +170,7 @@ class PerturbationSolver:
                     f"more than {MAX_STRETCHES} stretches of bodies lie on one line "
                     "through the domain; join small bodies into one mesh"
                 )
-            self._found = _Found(len(found.extra), 2 * len(found.ties))
+            self._found = _Found(mesh, 2 * len(found.ties))
 
     def _prepare(
         self, scene: Scene, conductors: _Conductors, lanes: NDArray[np.int64], n_lanes: int
@@ -232,6 +232,9 @@ class PerturbationSolver:
                 pcg.gram(ties, first.value, second.value, part)
                 pcg.gram(energies, first.drop, second.drop, part)
                 _place(energy, i, j, part)
+        rows, columns = mesh.pairs
+        energy[rows, columns] += self._found.within
+        energy[columns, rows] = energy[rows, columns]
         for i, block in enumerate(self._blocks):
             start = np.abs(np.diag(energy))[i * LANES : (i + 1) * LANES]
             wanted = np.maximum(
@@ -341,10 +344,12 @@ class _Block:
 
 
 class _Found:
-    """Room for what the scan of a scene finds on n nodes."""
+    """Room for what the scan of a scene finds."""
 
-    def __init__(self, n: int, size: int) -> None:
+    def __init__(self, mesh: _Mesh, size: int) -> None:
+        n, pairs = mesh.stored.shape
         self.weight, self.extra = np.empty((3, n), np.float32), np.empty(n, np.float32)
+        self.within = np.zeros(pairs)
         self.ties = np.zeros(size, tracing.TIE)
         self.energies = np.zeros(size, tracing.ENERGY)
         self.couples = np.zeros(size, tracing.COUPLE)
@@ -380,6 +385,24 @@ class _Mesh:
         self.cuts["length"] = np.stack([la.cuts.lower, la.cuts.upper], axis=1)
         self.cuts["owner"] = np.stack([la.cuts.lower_owner, la.cuts.upper_owner], axis=1)
         self.ceiling, self.parent, self.home = la.joints.ceiling, la.joints.parent, la.home
+        self.pairs = np.tril_indices(len(background.terminals))
+        self.stored = self._stored_energies(background)
+
+    def _stored_energies(self, background: BackgroundField) -> Array32:
+        """Energies of each node's links to the next ones, for each pair of terminals, (n, pairs).
+
+        Marks the nodes whose three links are all whole; only these are filled in.
+        """
+        la, phi = background.lattice, background.potentials
+        whole = (self.links["weight"] > 0) & (self.links["cut"] < 0)
+        plain = np.flatnonzero(whole.all(axis=0))
+        self.nodes["plain"][plain] = True
+        out = np.zeros((la.n_nodes, len(self.pairs[0])), np.float32)
+        for axis in range(3):
+            drop = phi[plain] - phi[la.beyond(axis, plain)]
+            weight = self.links["weight"][axis, plain, None]
+            out[plain] += weight * drop[:, self.pairs[0]] * drop[:, self.pairs[1]]
+        return out
 
 
 def _pack_bodies(scene: Scene, conductors: _Conductors) -> tuple[NDArray[np.void], Array32]:

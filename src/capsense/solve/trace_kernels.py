@@ -37,7 +37,9 @@ STOREY = np.dtype(
 last node on a line whose values may be used together (the floor's and ceiling's may not)."""
 LINK = np.dtype([("weight", np.float32), ("eps_r", np.float32), ("cut", np.int64)])
 """Weight and permittivity in the empty domain, and the number of the link's cut; −1: none."""
-NODE = np.dtype([("owner", np.int64), ("kink", np.bool_)])
+NODE = np.dtype([("owner", np.int64), ("kink", np.bool_), ("plain", np.bool_)])
+"""What holds a node, whether the background field has a kink there, and whether its links along x,
+y and z to the next nodes are all whole."""
 CUT = np.dtype(
     [
         ("half", np.float64, (2,)),
@@ -74,7 +76,7 @@ COUPLE = np.dtype([("a", np.int64), ("b", np.int64), ("weight", np.float64)])
 """Two conductors that face each other on one link."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
     """Turn overlapping stretches into disjoint ones, in order; join conductors that touch."""
     if n == 1:
@@ -116,7 +118,7 @@ def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _join(joined, a, b):
     while joined[a] != a:
         a = joined[a]
@@ -128,7 +130,20 @@ def _join(joined, a, b):
         joined[a] = b
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _place(c, t):
+    """How many of the increasing numbers ``c`` lie below t."""
+    low, high = 0, c.shape[0]
+    while low < high:
+        middle = (low + high) >> 1
+        if c[middle] < t:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, inside_nodes, before):
     """Mark free nodes inside conductors with the conductor's index, as seen along z.
 
@@ -155,9 +170,9 @@ def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, in
                 for j in range(1, ny - 1):
                     if y[j] < bounds[0, 1] or y[j] > bounds[1, 1]:
                         continue
-                    count = pierce(2, x[i], y[j], body, grids, out)
+                    count = pierce(2, x[i], y[j], -math.inf, math.inf, body, grids, out)
                     for c in range(count):
-                        k = max(1, np.searchsorted(z, out[c, 0]))
+                        k = max(1, _place(z, out[c, 0]))
                         while k < nz - 1 and z[k] <= out[c, 1]:
                             a = first + (i * ny + j) * nz + k
                             if nodes[a].owner == -1 and inside[a] < 0:
@@ -173,12 +188,14 @@ def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, in
     return n
 
 
-@njit(cache=True, nogil=True)
-def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, bodies, grids, contact,
-          joined, weight, extra, inside, inside_nodes, ties, energies, couples,
+@njit(cache=True, nogil=True, error_model="numpy")
+def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, stored, bodies, grids,
+          contact, joined, weight, extra, inside, inside_nodes, ties, energies, couples, within,
           counts):  # fmt: skip
     """Scan a scene: change ``weight`` (3, n) and ``extra`` (n,), list ties, energies and couples.
 
+    ``stored`` (n, pairs) holds the energies of the links to the next nodes, for each pair of
+    terminals; those that lie inside conductors are summed in ``within`` (pairs,) where whole.
     ``joined[c]`` leads from a conductor to one it touches. ``counts`` holds the numbers of ties,
     energies, couples and nodes inside conductors. Returns ``FULL``, ``CROWDED`` or ``SHORT``.
     """
@@ -193,8 +210,8 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, bodie
             )  # fmt: skip
             if status != FULL:
                 return status
-    if not _close_inside(storeys, nodes, links, weight, extra, inside, inside_nodes, ties,
-                         energies, couples, counts):  # fmt: skip
+    if not _close_inside(storeys, nodes, links, stored, weight, extra, inside, inside_nodes, ties,
+                         energies, couples, within, counts):  # fmt: skip
         return SHORT
     for i in range(counts[0]):
         if ties[i].node >= 0:
@@ -207,7 +224,7 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, bodie
     return FULL
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
                 weight, extra, inside, ties, energies, couples, counts):  # fmt: skip
     """Scan the lines of a storey along one axis; lines on the walls carry no unknowns."""
@@ -273,13 +290,13 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
     return FULL
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, aside, nodes, links,
               cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
     """Lay ``n`` disjoint stretches over the links of a line; False: the findings do not fit."""
     last = c.shape[0] - 1
-    m = max(0, np.searchsorted(c, r0[0]) - 1)
+    m = max(0, _place(c, r0[0]) - 1)
     seg = 0
     while m < last:
         while seg < n and r1[seg] <= c[m]:
@@ -287,7 +304,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
         if seg == n:
             break
         if r0[seg] >= c[m + 1]:
-            m = max(m + 1, np.searchsorted(c, r0[seg]) - 1)
+            m = max(m + 1, _place(c, r0[seg]) - 1)
             continue
         a = line + m * stride
         b = a + stride
@@ -305,7 +322,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _room(ties, energies, couples, counts):
     """Whether the buffers hold what one link may add."""
     return (
@@ -315,14 +332,14 @@ def _room(ties, energies, couples, counts):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_energy(energies, counts, a, b, end, weight, drives):
     term = energies[counts[1]]
     term.a, term.b, term.end, term.weight, term.drives = a, b, end, weight, drives
     counts[1] += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, aside,
               nodes, cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
@@ -441,7 +458,7 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     _add_energy(energies, counts, na, nb, end, inner, False)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _value_beside_sheet(tie, na, nb, end, s, shift):
     """Background potential at fraction s of a half-link from na or to nb: linear along it."""
     point, coef = tie.point, tie.coef
@@ -453,7 +470,7 @@ def _value_beside_sheet(tie, na, nb, end, s, shift):
     tie.end_coef = at_b if na >= 0 else 1.0 - at_b
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
     """Coefficients of the background potential at t on the link from a to b.
 
@@ -486,13 +503,14 @@ def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
     tie.end, tie.end_coef = -3, 0.0
 
 
-@njit(cache=True, nogil=True)
-def _close_inside(storeys, nodes, links, weight, extra, inside, inside_nodes, ties, energies,
-                  couples, counts):  # fmt: skip
+@njit(cache=True, nogil=True, error_model="numpy")
+def _close_inside(storeys, nodes, links, stored, weight, extra, inside, inside_nodes, ties,
+                  energies, couples, within, counts):  # fmt: skip
     """Turn what is left of links from a node inside a conductor to one outside into ties.
 
     Returns False if the findings do not fit.
     """
+    within[:] = 0.0
     s = 0
     for i in range(counts[3]):
         a = inside_nodes[i]
@@ -501,19 +519,28 @@ def _close_inside(storeys, nodes, links, weight, extra, inside, inside_nodes, ti
         while s + 1 < storeys.shape[0] and a >= storeys[s + 1].first:
             s += 1
         strides = (storeys[s].shape[1] * storeys[s].shape[2], storeys[s].shape[2], 1)
+        deep = nodes[a].plain
         for axis in range(3):
-            for way in range(2):
+            deep = deep and inside[a + strides[axis]] >= 0
+        if deep:
+            for axis in range(3):
+                weight[axis, a] = 0.0
+            for k in range(within.shape[0]):
+                within[k] += stored[a, k]
+        for axis in range(3):
+            for way in range(1 if deep else 0, 2):
                 lower = a if way == 0 else a - strides[axis]
                 b = a + strides[axis] if way == 0 else lower
+                if way == 1 and inside[b] >= 0:
+                    continue
                 link = links[axis, lower]
                 if link.cut >= 0 or link.weight == 0.0:
                     continue
                 if not _room(ties, energies, couples, counts):
                     return False
                 if inside[b] >= 0:
-                    if way == 0:
-                        weight[axis, lower] = 0.0
-                        _add_energy(energies, counts, a, b, -3, link.weight, False)
+                    weight[axis, lower] = 0.0
+                    _add_energy(energies, counts, a, b, -3, link.weight, False)
                     continue
                 w = weight[axis, lower]
                 weight[axis, lower] = 0.0
