@@ -25,6 +25,7 @@ import numpy as np
 
 from capsense.bench import moving_depth
 from capsense.server.client import Client
+from capsense.server.frames import ReadingMessage
 
 ROOT = Path(__file__).parents[1]
 SKIPPED = 0.1
@@ -57,6 +58,24 @@ def python_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     return taken[first:], solve[first:]
 
 
+def python_stream(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times between readings, and steps [s], shape (n,); the next frame is sent meanwhile."""
+    frames = [moving_depth(k).depth[0].astype(np.float32) for k in range(500)]
+    came, solve = np.empty(count), np.empty(count)
+    with Client(url) as client:
+        sensor = client.open()
+        answered = 0
+        for k in range(count):
+            while sensor.sequence < answered + 2:
+                sensor.send(frames[sensor.sequence % len(frames)])
+            reading = client.receive()
+            assert isinstance(reading, ReadingMessage)
+            answered, solve[k] = reading.sequence + 1, reading.wall_time
+            came[k] = time.perf_counter()
+    first = int(SKIPPED * count)
+    return np.diff(came[first - 1 :]), solve[first:]
+
+
 def unity_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The same by the Unity package under mono."""
     sources = [*(ROOT / "tests/unity").glob("*.cs"), *(ROOT / "unity/Runtime").glob("*.cs")]
@@ -79,7 +98,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2000, help="round trips of each client")
     parser.add_argument("--design", default="six_patch")
     args = parser.parse_args()
-    clients = {"Python": python_client}
+    clients = {"Python": python_client, "Python, streaming": python_stream}
     if shutil.which("mcs") and shutil.which("mono"):
         clients["Unity package, mono"] = unity_client
     print(
