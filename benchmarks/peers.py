@@ -6,8 +6,9 @@
 
 The task: ``six_patch_bare``, a grounded bar of 150 × 150 × 20 mm that moves at 0.116 m/s, 100 times
 a second; the bar's nodes found, the operator brought up to date, six right-hand sides solved, the
-6 × 6 matrix returned. One core. Methods of a group take turns, so that whatever else the machine
-does meets all of them; a turn's first step is not counted. Errors are those of the diagonal of ΔC
+6 × 6 matrix returned. One core; times are the processor's, see ``machine.Times``. Methods of a
+group take turns, so that whatever else the machine does meets all of them; a turn's first step is
+not counted. Errors are those of the diagonal of ΔC
 against boundary elements good to 0.1 %. The peers:
 
     pip install ".[peers]" "scikit-sparse<0.5"
@@ -24,11 +25,12 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import describe_machine, on_one_core
+from machine import Times, describe_machine, on_one_core
 from peers_capsense import CapSense, PaperOnLattice, PaperScheme
 from peers_direct import Cholmod, Pardiso
 from peers_iterative import AmgCg, AmgRebuiltCg, JacobiCg, ScikitFem
@@ -54,6 +56,7 @@ BUDGET = 12.0
 AWAY = (9.0, 9.0)
 """A place of the bar, outside the domain."""
 SCALES = {"30k": 1.55, "100k": 1.0}
+HEADINGS = "tetrahedra, median, mean, p95, p99 [ms], median by the clock; errors [%] at"
 Makers = dict[str, Callable[[], Any]]
 
 
@@ -118,22 +121,16 @@ def measure(makers: Makers, budget: float) -> list[dict[str, Any]]:
         start = time.perf_counter()
         method.step(*timed_place(1))
         steps = int(np.clip(budget / (time.perf_counter() - start), 1, SAMPLES) / TURNS)
-        methods.append((label, method, prepared, max(2, steps), []))
+        methods.append((label, method, prepared, max(2, steps), Times()))
     for turn in range(TURNS):
         for _, method, _, steps, times in methods:
             for k in range(steps):
                 place = timed_place(turn * SAMPLES // TURNS + k)
-                start = time.perf_counter()
-                method.step(*place)
-                if k:
-                    times.append(1e3 * (time.perf_counter() - start))
+                times.take(partial(method.step, *place), keep=k > 0)
     for label, method, prepared, _, times in methods:
         rows.append({"label": label, "name": method.name, "settings": method.settings,
                      "tetrahedra": method.n_tets, "unknowns": method.unknowns,
-                     "prepare_s": prepared, "steps": len(times), "mean_ms": float(np.mean(times)),
-                     **{f"{key}_ms": float(np.percentile(times, q))
-                        for key, q in (("median", 50), ("p95", 95), ("p99", 99))},
-                     **errors(method)})  # fmt: skip
+                     "prepare_s": prepared, **times.summary(), **errors(method)})  # fmt: skip
         print(line(rows[-1]), flush=True)
         if hasattr(method, "close"):
             method.close()
@@ -157,7 +154,8 @@ def errors(method: Any) -> dict[str, Any]:
 def line(row: dict[str, Any]) -> str:
     """A result as a line of text."""
     per_gap = " ".join(f"{100 * e:+7.1f}" for e in row["errors"].values())
-    times = " ".join(f"{row[key]:9.2f}" for key in ("median_ms", "mean_ms", "p95_ms", "p99_ms"))
+    keys = ("median_ms", "mean_ms", "p95_ms", "p99_ms", "clock_median_ms")
+    times = " ".join(f"{row[key]:8.2f}" for key in keys)
     return f"  {row['name']:36s} {row['tetrahedra']:9,d} {times}   {per_gap}"
 
 
@@ -181,7 +179,7 @@ def main() -> None:
         results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
         for name in wanted:
             print(
-                f"{name}: tetrahedra, median, mean, p95, p99 [ms], errors [%] at {GAPS} mm",
+                f"{name}: {HEADINGS} {GAPS} mm",
                 flush=True,
             )
             load = os.getloadavg()[0]
