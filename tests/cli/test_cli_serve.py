@@ -103,3 +103,14 @@ def test_bad_input(arguments: list[str], words: str, capsys: pytest.CaptureFixtu
     error = capsys.readouterr().err
     assert words in error
     assert error.count("\n") == 1
+
+
+def test_without_websockets() -> None:
+    """The message names the install that mends it."""
+    code = (
+        "import sys; sys.modules['websockets'] = None; from capsense.cli.main import main; "
+        "sys.exit(main(['serve', '--design', 'patch']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert 'pip install "capsense[serve]"' in done.stderr

@@ -31,7 +31,7 @@ Frame = DepthMessage | Bodies
 class ServedSensor:
     """A simulator, its read-out, and the newest frame that waits for it.
 
-    :meth:`offer`, :meth:`take`, :meth:`move` and :meth:`restart` belong to the event loop;
+    :meth:`offer`, :meth:`take` and :meth:`restart` belong to the event loop;
     :meth:`solve` may run in any thread, one call at a time, with :attr:`lock` held.
 
     Args:
