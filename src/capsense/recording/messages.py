@@ -71,3 +71,7 @@ class Messages:
     def type_hash(self, type_name: str) -> str:
         """The hash by which ROS 2 tells types apart (REP 2011)."""
         return self._store.hash_rihs01(type_name)
+
+    def fields(self, type_name: str) -> list[tuple[str, Any]]:
+        """Names of a type's fields, each with its kind as ``rosbags`` describes it."""
+        return list(self._store.fielddefs[type_name][1])

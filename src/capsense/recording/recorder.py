@@ -17,6 +17,7 @@ from capsense.errors import ReadOutError, RecordingError
 from capsense.readout.config import parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.recording.design_json import design_to_json
+from capsense.recording.live import LiveTopics
 from capsense.recording.mcap_file import McapFile
 from capsense.recording.messages import require
 from capsense.recording.session import DESIGN, NAME, SESSION, Session, describe
@@ -45,6 +46,8 @@ class Recorder:
             file, or a read-out. An attached sensor brings its own.
         scenario: What is played, if it is one; tables made from the file take its channels.
         overwrite: Whether a file that is there may be replaced.
+        ros_domain: Experimental: publish the topics of standard types, as they are recorded, to the
+            ROS 2 nodes of this domain (``ROS_DOMAIN_ID``, 0 by default there).
 
     Raises:
         RecordingError: The file is there already or cannot be made, or ``name`` is no name.
@@ -61,6 +64,7 @@ class Recorder:
         readout: ReadOut | str | Path | None = None,
         scenario: Scenario | None = None,
         overwrite: bool = False,
+        ros_domain: int | None = None,
     ) -> None:
         require()
         self.path = Path(path)
@@ -73,6 +77,7 @@ class Recorder:
         self._readout, config = self._choose(readout)
         empty = self._simulator.step(Scene())
         self.reset()
+        self._live = None if ros_domain is None else LiveTopics(ros_domain)
         self._file = McapFile(self.path, overwrite=overwrite)
         self._messages = StepMessages(self._file.messages, name, self._simulator.design)
         self._steps = self._episode = self._base = 0
@@ -163,7 +168,10 @@ class Recorder:
         moment = Moment(stamp, self._episode, time)
         frame = world if isinstance(world, DepthFrame) else None
         pose = None if self._sensor is None else self._sensor.pose
-        self._file.write(stamp, self._messages.of(moment, scene, reading, frame, pose))
+        messages = self._messages.of(moment, scene, reading, frame, pose)
+        self._file.write(stamp, messages)
+        if self._live is not None:
+            self._live.write(stamp, messages)
         self._steps, self._time, self._stamp = steps, time, stamp
         self.count += 1
         return reading
