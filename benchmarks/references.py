@@ -1,6 +1,7 @@
 """Converged reference capacitances of objects in front of a sensor, by boundary elements.
 
-    python benchmarks/references.py            # write the capsule's figures
+    python benchmarks/references.py            # write the figures of a capsule over six_patch_bare
+    python benchmarks/references.py --curved   # write those of balls and a limb over arm_segment
     python benchmarks/references.py --check    # re-derive figures carried over from elsewhere
 
 The object is one more grounded conductor in the design's box. Its effect follows from reciprocity,
@@ -32,7 +33,7 @@ from capsense.constants import EPS0
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
-from capsense.field.boundary import _walls
+from capsense.field.boundary import _walls, terminals
 from capsense.field.panels import Grading, concatenate, cut_facet, make_panels
 
 Array = NDArray[np.float64]
@@ -42,9 +43,11 @@ CARRIED = DATA / "reference_capacitances.json"
 OUTPUT = DATA / "reference_capsule.json"
 
 OBJECT, WALLS = -1, -2
-"""Owners of panels that are not an electrode's."""
+"""Owners of panels that are no terminal's."""
 SCALES = (1.4, 1.0, 0.75)
-"""Panel sizes, as multiples of the ones in this file."""
+"""Panel sizes, as multiples of the ones in this file ..."""
+CURVED_SCALES = (2.0, 1.4, 1.05)
+"""... and for the curved design, which has more surface."""
 GAPS = (5, 10, 20, 50, 100)
 """Gaps [mm] between the capsule's lowest point and the electrode plane."""
 RADIUS, LENGTH = 0.040, 0.200
@@ -53,6 +56,15 @@ AZIMUTH, TILT = math.radians(30.0), math.radians(12.0)
 """Direction of its axis: in the plane from x towards y, and upward."""
 LOWEST = np.array([-0.045, -0.045 * math.tan(AZIMUTH)])
 """Where in the plane [m] the lowest point lies: over E1; the axis passes over the origin."""
+
+CURVED_OUTPUT = DATA / "reference_arm_segment.json"
+BALL_RADIUS, BALL_GAPS = 0.040, (5, 10, 20, 50, 100)
+"""The ball over the curved design [m], and its gaps to the shell [mm]."""
+BALL_ANGLE, BALL_ALONG = math.radians(12.0), 0.005
+"""Where it stands: about the shell's axis, from z towards x, and along the axis [m]."""
+LIMB_GAPS = (10, 50)
+LIMB_AXIS = np.array([math.cos(math.radians(40.0)), math.sin(math.radians(40.0)), 0.0])
+"""Direction of a capsule that crosses the shell above its crest; sizes as over the flat design."""
 
 AXIS = np.array(
     [math.cos(TILT) * math.cos(AZIMUTH), math.cos(TILT) * math.sin(AZIMUTH), math.sin(TILT)]
@@ -182,7 +194,7 @@ def sphere(center: Array, radius: float, scale: float) -> Surface:
 
 
 class Solution:
-    """Charges on electrodes, walls and an object (or none), panels graded to every rim.
+    """Charges on terminals, walls and an object (or none), panels graded to every rim.
 
     Electrodes are cut more finely than the package does it: their own error enters ΔC twice.
     """
@@ -191,8 +203,13 @@ class Solution:
         fine = Grading(3e-5 * scale, smallest=0.0012 * scale, largest=0.003 * scale)
         coarse = Grading(0.01, largest=0.04 * scale)
         parts, owners = [], []
+        shield = Grading(3e-4 * scale, smallest=0.0025 * scale, largest=0.0035 * scale)
+        names = terminals(design)
+        self.electrodes = len(design.electrodes)
         sheets = [(f, e.surface.rims, fine, k) for k, e in enumerate(design.electrodes)
                   for f in e.surface.facets]  # fmt: skip
+        sheets += [(f, c.surface.rims, shield, names.index(c.name)) for c in design.conductors
+                   for f in c.surface.facets]  # fmt: skip
         sheets += [(f, np.zeros((0, 2, 3)), coarse, WALLS) for f in _walls(design)]
         if surface is not None:
             grading = Grading(3e-4 * scale, smallest=0.004 * scale, largest=0.006 * scale)
@@ -206,14 +223,14 @@ class Solution:
         matrix = kernels.system_matrix(
             np.zeros(n, dtype=bool), np.zeros(n), self._floor, *self.panels.kernel_args
         )
-        unit = np.zeros((n, len(design.electrodes)))
+        unit = np.zeros((n, len(names)))
         driven = self.owner >= 0
         unit[driven, self.owner[driven]] = 1.0
         self.scaled = scipy.linalg.solve(matrix, unit, overwrite_a=True)
-        """Charge densities over 4π eps0 [V/m], shape (n, electrodes)."""
+        """Charge densities over 4π eps0 [V/m], shape (n, terminals)."""
 
     def potential(self, points: Array) -> Array:
-        """Potentials [V] at points [m], shape (n, 3) -> (n, electrodes)."""
+        """Potentials [V] at points [m], shape (n, 3) -> (n, terminals)."""
         return np.concatenate(
             [
                 kernels.potential_matrix(part, self._floor, *self.panels.kernel_args) @ self.scaled
@@ -229,14 +246,16 @@ def change(empty: Solution, full: Solution) -> Array:
     panel, _ = np.nonzero(weights)
     phi = empty.potential(full.panels.quad[mine][weights > 0])
     charge = weights[weights > 0][:, None] * 4 * math.pi * EPS0 * full.scaled[mine][panel]
-    delta = -phi.T @ charge
+    delta = (-phi.T @ charge)[: full.electrodes, : full.electrodes]
     return 0.5 * (delta + delta.T)
 
 
-def converged(design: Design, make: Callable[[float], Surface]) -> tuple[Array, Array]:
+def converged(
+    design: Design, make: Callable[[float], Surface], scales: tuple[float, ...] = SCALES
+) -> tuple[Array, Array]:
     """Extrapolated ΔC [F] and its estimated error [F]."""
     results = []
-    for scale in SCALES:
+    for scale in scales:
         started = time.perf_counter()
         full = Solution(design, scale, make(scale))
         results.append(change(_empty(design, scale), full))
@@ -247,7 +266,7 @@ def converged(design: Design, make: Callable[[float], Surface]) -> tuple[Array, 
         )
     *_, before, finest = results
     # first order in the panel size beside rims, second elsewhere: the middle is taken
-    best = finest + (finest - before) / ((SCALES[-2] / SCALES[-1]) ** 1.5 - 1)
+    best = finest + (finest - before) / ((scales[-2] / scales[-1]) ** 1.5 - 1)
     return best, np.abs(best - finest)
 
 
@@ -313,11 +332,59 @@ def write(design: Design) -> None:
     print("wrote", OUTPUT.relative_to(DATA.parents[1]))
 
 
+def write_curved(design: Design) -> None:
+    """Solve a ball and a limb over the curved design and write the file that the tests read."""
+    radius = -float(design.conductors[0].surface.bounds[:, 2].mean())
+    up = np.array([math.sin(BALL_ANGLE), 0.0, math.cos(BALL_ANGLE)])
+    cases = {}
+
+    def keep(name: str, position: Array, make: Callable[[float], Surface]) -> None:
+        best, error = converged(design, make, CURVED_SCALES)
+        report(name, best, error)
+        cases[name] = {
+            "position": position.round(12).tolist(),
+            "delta": np.round(best * 1e12, 8).tolist(),
+            "error": np.round(error * 1e12, 8).tolist(),
+        }
+
+    for gap in BALL_GAPS:
+        center = up * (radius + BALL_RADIUS + gap / 1e3) + [0.0, BALL_ALONG, -radius]
+        keep(f"ball {gap}", center, lambda s, c=center: sphere(c, BALL_RADIUS, s))
+    for gap in LIMB_GAPS:
+        center = np.array([0.0, 0.0, RADIUS + gap / 1e3])
+        lower = center - LIMB_AXIS * LENGTH / 2
+
+        def limb(scale: float, lower: Array = lower) -> Surface:
+            return revolved(
+                lower, LIMB_AXIS, RADIUS, LENGTH,
+                lambda p: scale * np.clip(0.15 * np.linalg.norm(p, axis=-1), 0.002, 0.008),
+            )  # fmt: skip
+
+        keep(f"limb {gap}", center, limb)
+    text = {
+        "about": "Change of the Maxwell matrix by a grounded ball, or limb, over arm_segment; "
+        "written by benchmarks/references.py --curved",
+        "method": __doc__.split("\n\n", 2)[2].strip(),
+        "units": "delta and error (estimated) in pF, lengths in m; cases by gap in mm",
+        "ball_radius": BALL_RADIUS,
+        "limb_radius": RADIUS,
+        "limb_length": LENGTH,
+        "limb_axis": LIMB_AXIS.round(12).tolist(),
+        "cases": cases,
+    }
+    CURVED_OUTPUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n")
+    print("wrote", CURVED_OUTPUT.relative_to(DATA.parents[1]))
+
+
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--check", action="store_true", help="re-derive known figures")
+    parser.add_argument("--curved", action="store_true", help="the curved design instead")
     arguments = parser.parse_args()
+    if arguments.curved:
+        write_curved(cs.load_design("arm_segment"))
+        return
     design = cs.load_design("six_patch_bare")
     if arguments.check:
         check(design)

@@ -1,0 +1,88 @@
+"""The curved design against converged references, and what must hold of any design.
+
+The references' own errors are below 1 %.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from curved_cases import RADIUS, curved_body, curved_figures, curved_reference
+from field_cases import assert_physical
+
+import capsense as cs
+
+MIRRORED = np.array([2, 1, 0, 5, 4, 3])
+"""Electrodes in the order of their mirror images in x."""
+
+
+@pytest.mark.parametrize("case", list(curved_figures()["cases"]))
+def test_accuracy(simulators, case):
+    """Measured against boundary elements: diagonals to 10 %, all to 10 % of the largest."""
+    expected = curved_reference(case)
+    reading = simulators("arm_segment").step(cs.Scene([curved_body(case)]))
+    off = np.diag(reading.delta) / np.diag(expected) - 1
+    assert np.abs(off).max() < 0.10, np.round(100 * off, 1)
+    assert np.abs(reading.delta - expected).max() < 0.10 * np.abs(expected).max()
+    assert_physical(reading.capacitance)
+
+
+def test_references_are_good_enough():
+    """Invariant: their estimated errors are a tenth of the bounds."""
+    for case in curved_figures()["cases"].values():
+        assert (np.diag(case["error"]) < 0.01 * np.abs(np.diag(case["delta"]))).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_scenes_are_physical(simulators, seed):
+    """Invariant: bodies of every grounding around the shell, in one warm-started walk."""
+    rng, sim = np.random.default_rng(seed), simulators("arm_segment")
+    for _ in range(20):
+        bodies = []
+        for _ in range(rng.integers(1, 4)):
+            angle, gap, r = (
+                rng.uniform(-1.5, 1.5),
+                rng.uniform(0.0005, 0.12),
+                rng.uniform(0.01, 0.05),
+            )
+            reach = RADIUS + gap + r
+            at = (reach * np.sin(angle), rng.uniform(-0.08, 0.08), reach * np.cos(angle) - RADIUS)
+            material = "steel" if rng.random() < 0.6 else cs.Material("d", eps_r=rng.uniform(2, 80))
+            grounding = ("grounded", "floating", 100e-12)[rng.integers(3)]
+            bodies.append(cs.Body(cs.Sphere(r), cs.Pose(at), material, grounding))
+        assert_physical(sim.step(cs.Scene(bodies)).capacitance, 1e-3)
+
+
+def test_mirror_images(simulators):
+    """Invariant: a mirrored scene gives the mirrored matrix, within the mesh's own symmetry."""
+    sim = simulators("arm_segment")
+    x, y, z = curved_body("ball 20").pose.position
+    readings = []
+    for sign in (1.0, -1.0):
+        sim.reset()
+        ball = cs.Body(cs.Sphere(0.04), cs.Pose((sign * x, y, z)))
+        readings.append(sim.step(cs.Scene([ball])).delta)
+    mirrored = readings[1][np.ix_(MIRRORED, MIRRORED)]
+    assert np.abs(readings[0] - mirrored).max() < 1e-3 * np.abs(readings[0]).max()
+
+
+def test_approach_is_monotonic(simulators):
+    """Invariant: along a radius, every diagonal falls as the ball goes away."""
+    sim = simulators("arm_segment")
+    for angle in (0.0, 0.3, 0.7):
+        last = np.full(6, np.inf)
+        for gap in np.geomspace(0.002, 0.15, 25):
+            reach = RADIUS + gap + 0.04
+            at = (reach * np.sin(angle), 0.01, reach * np.cos(angle) - RADIUS)
+            now = np.diag(sim.step(cs.Scene([cs.Body(cs.Sphere(0.04), cs.Pose(at))])).delta)
+            assert (now < 1.0001 * last).all(), (angle, gap)
+            last = now
+
+
+def test_the_driven_housing_takes_no_part_in_self_mode(simulators):
+    """Invariant: driven along, the housing's large capacitance leaves the self-mode channels."""
+    sim = simulators("arm_segment")
+    reading = sim.step(cs.Scene([]))
+    assert (np.diag(reading.capacitance) > 3.5e-12).all()
+    assert (reading.self_capacitance < 1.0e-12).all()
+    assert (reading.self_capacitance > 0.3e-12).all()
