@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from sticks import Rod, frame_of, save_animation, silhouettes
 
 import capsense as cs
 from capsense.humans import Build, arm
@@ -59,9 +60,7 @@ def person_angles(t: float) -> dict[str, float]:
     }
 
 
-Stick = tuple[np.ndarray, np.ndarray, float, str]
-"""A capsule to be drawn: its two ends [m] in the world, its radius [m], whose it is."""
-View = tuple[cs.Pose, list[Stick]]
+View = tuple[cs.Pose, list[Rod]]
 """Where the sensor is in the world, and what is drawn around it."""
 
 
@@ -79,7 +78,7 @@ class Record:
     views: list[View] = field(default_factory=list)
     """What there is to be drawn."""
 
-    def add(self, t: float, reading: cs.Reading, pose: cs.Pose, capsules: list[Stick]) -> None:
+    def add(self, t: float, reading: cs.Reading, pose: cs.Pose, capsules: list[Rod]) -> None:
         """Keep one reading, and print every tenth as a line of the table.
 
         ``capsules`` are the robot's and the person's, in the world, to be drawn.
@@ -150,7 +149,7 @@ def draw(record: Record, folder: Path, title: str) -> None:
     _animate(record, folder / "forearm.gif")
 
 
-COLOURS = {"robot": "#8090a0", "person": "#e0a080"}
+COLOURS = {"robot": "#8090a0", "person": "#e0a080", "pad": "C1"}
 RIGHT = np.array((-0.94, -0.34, 0.0))
 UP = np.array((-0.10, 0.28, 0.95))
 """Axes of the picture in the world: seen from the person's left, a little from above."""
@@ -160,7 +159,6 @@ def _animate(record: Record, file: Path) -> None:
     """Robot and person, and the electrodes as bars."""
     from matplotlib import pyplot as plt
     from matplotlib.collections import PolyCollection
-    from PIL import Image
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(8, 4), dpi=70, width_ratios=(3, 2))
     left.set(xlim=(-0.66, 0.20), ylim=(0.28, 1.04), aspect="equal")
@@ -172,38 +170,16 @@ def _animate(record: Record, file: Path) -> None:
     right.set(ylim=(0, record.diagonal.max() * 1.1e15), ylabel="change of capacitance, fF")
     figure.tight_layout()
     frames = []
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    box = 0.5 * corners * PAD_SIZE - (0.0, 0.0, 0.5 * PAD_SIZE[2])
     for k in range(0, len(record.time), max(1, len(record.time) // 50)):
-        polygons = _polygons(record.views[k])
+        pose, capsules = record.views[k]
+        polygons = silhouettes(capsules, RIGHT, UP, [(pose.apply(box), "pad")])
         shapes.set_verts([p for p, _ in polygons])
-        shapes.set_facecolor([c for _, c in polygons])
+        shapes.set_facecolor([COLOURS[what] for _, what in polygons])
         for bar, value in zip(bars, record.diagonal[k], strict=True):
             bar.set_height(value * 1e15)
         left.set_title(f"{record.time[k]:.1f} s")
-        figure.canvas.draw()
-        picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba()))  # type: ignore[attr-defined]
-        frames.append(picture.convert("RGB").quantize(64))
-    frames[0].save(file, save_all=True, append_images=frames[1:], duration=120, loop=0)
+        frames.append(frame_of(figure))
+    save_animation(frames, file, 120)
     plt.close(figure)
-
-
-def _polygons(view: View) -> list[tuple[np.ndarray, str]]:
-    """Outlines in the picture [m] and colours, the farthest first."""
-    from scipy.spatial import ConvexHull
-
-    pose, capsules = view
-    turn = np.linspace(0, 2 * np.pi, 30)
-    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    parts = [
-        (np.concatenate([_flat(a) + r * ring, _flat(b) + r * ring]), 0.5 * (a + b), COLOURS[whose])
-        for a, b, r, whose in capsules
-    ]
-    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    pad = pose.apply(0.5 * corners * PAD_SIZE - (0.0, 0.0, 0.5 * PAD_SIZE[2]))
-    parts.append((_flat(pad), pad.mean(axis=0), "C1"))
-    parts.sort(key=lambda part: float(np.cross(RIGHT, UP) @ part[1]))
-    return [(points[ConvexHull(points).vertices], colour) for points, _, colour in parts]
-
-
-def _flat(points: np.ndarray) -> np.ndarray:
-    """Points of the world in the picture [m], shape (..., 2)."""
-    return points @ np.stack([RIGHT, UP], axis=1)

@@ -23,12 +23,12 @@ from forearm_story import (
     SECONDS,
     SHOULDER,
     Record,
-    Stick,
     check,
     draw,
     person_angles,
     sensor_target,
 )
+from sticks import Rod
 
 import capsense as cs
 from capsense.humans.export import mjcf_body
@@ -79,7 +79,7 @@ def step_towards(
     return data.qpos[joints] + jacobian.T @ np.linalg.solve(gain, error)
 
 
-def capsules(model: mujoco.MjModel, data: mujoco.MjData) -> list[Stick]:
+def capsules(model: mujoco.MjModel, data: mujoco.MjData) -> list[Rod]:
     """All capsules of the world, to be drawn."""
     out = []
     for k in np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)):

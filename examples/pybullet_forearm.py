@@ -24,12 +24,12 @@ from forearm_story import (
     SECONDS,
     SHOULDER,
     Record,
-    Stick,
     check,
     draw,
     person_angles,
     sensor_target,
 )
+from sticks import Rod
 
 import capsense as cs
 from capsense.humans import Part
@@ -73,7 +73,7 @@ def names_of_joints(client: int, body: int) -> list[str]:
     return [p.getJointInfo(body, k, physicsClientId=client)[1].decode() for k in range(count)]
 
 
-def capsules(client: int, robot: int, person: int) -> list[Stick]:
+def capsules(client: int, robot: int, person: int) -> list[Rod]:
     """All capsules of robot and person, to be drawn."""
     out = []
     for body, whose in ((robot, "robot"), (person, "person")):

@@ -50,10 +50,22 @@ def test_sleeve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (tmp_path / "sleeve.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("page", ["mujoco", "pybullet", "humans"])
+def test_skin_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixteen sensors stop a robot before it touches a person; the example checks itself."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    module = example("skin_stops", monkeypatch)
+    monkeypatch.setattr(module, "RATE", 10.0)
+    record = module.main(tmp_path)
+    assert record.signal[0].shape == (16,)
+    for name in ("skin_stops.png", "skin_stops.gif"):
+        assert 10_000 < (tmp_path / name).stat().st_size < 400_000
+
+
+@pytest.mark.parametrize("page", ["mujoco", "pybullet", "humans", "skins"])
 def test_pages_run(page: str) -> None:
     """The first snippet of a page runs as it stands and feels an arm."""
-    if page != "humans":
+    if page in ("mujoco", "pybullet"):
         pytest.importorskip(page, reason=f"{page} is not installed")
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     codes = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)

@@ -1,0 +1,169 @@
+"""Sixteen curved sensors around a robot arm, near a person: ``python benchmarks/skin.py``.
+
+The robot and the person are those of ``examples/skin_stops.py``: the arm turns to and fro beside a
+hand that moves, so that every step is a new scene for every sensor. Times are of this machine as
+found; the load says what else it did. Errors of the design are against boundary elements.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+import tracemalloc
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from machine import describe_machine
+
+import capsense as cs
+
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT / "examples"), str(ROOT / "tests" / "helpers")]
+
+from curved_cases import curved_body, curved_figures, curved_reference  # noqa: E402
+from skin_robot import GROUNDING, JOINTS, MATERIALS, PERSON, SITES, model_text  # noqa: E402
+from skin_stops import POSTURE, SHOULDER  # noqa: E402
+
+PERIOD = 50
+"""Steps in which the person's arm goes up and down once."""
+
+
+class World:
+    """The robot beside the person."""
+
+    def __init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_string(model_text(SHOULDER))
+        self.data = mujoco.MjData(self.model)
+        joints = [f"{j.name}" for j in PERSON.joints]
+        self._flexion = len(JOINTS) + joints.index("shoulder_flexion")
+        self._elbow = len(JOINTS) + joints.index("elbow_flexion")
+        self.move(0)
+
+    def move(self, k: int) -> None:
+        """Take the k-th posture."""
+        phase = 2 * math.pi * k / PERIOD
+        self.data.qpos[: len(JOINTS)] = math.radians(28.0 + 3.0 * math.sin(0.37 * phase)), *POSTURE
+        self.data.qpos[self._flexion] = math.radians(75.0)
+        self.data.qpos[self._elbow] = math.radians(12.0 + 6.0 * math.sin(phase))
+        mujoco.mj_forward(self.model, self.data)
+
+    def skin(self, threads: int) -> object:
+        """The sixteen sensors."""
+        return cs.mujoco.attach_skin(
+            self.model, self.data, SITES, materials=MATERIALS, grounding=GROUNDING, threads=threads
+        )
+
+
+def time_steps(world: World, threads: int, steps: int) -> None:
+    """Print the time of a step of all sensors."""
+    skin = world.skin(threads)
+    times, iterations, largest = [], 0, 0.0
+    busy = time.process_time()
+    for k in range(-20, steps):
+        world.move(k)
+        if k == 0:
+            busy = time.process_time()
+        start = time.perf_counter()
+        readings = skin.read()  # type: ignore[attr-defined]
+        if k >= 0:
+            times.append(time.perf_counter() - start)
+            iterations += sum(r.stats.iterations for r in readings.values())
+            largest = max(largest, *(r.delta.max() for r in readings.values()))
+    busy = (time.process_time() - busy) / steps
+    p50, p95, p99 = 1e3 * np.percentile(times, (50, 95, 99))
+    print(
+        f"  {threads} threads: median {p50:.1f} ms, 95 % below {p95:.1f}, 99 % below {p99:.1f}; "
+        f"processor time {1e3 * busy:.1f} ms; {iterations / steps / len(SITES):.1f} iterations a "
+        f"sensor; largest change {1e15 * largest:.1f} fF"
+    )
+
+
+def parts(world: World, steps: int) -> None:
+    """Print where the time goes, sensor after sensor."""
+    skin = world.skin(1)
+    see, solve, bodies = [], [], 0
+    for k in range(steps):
+        world.move(k)
+        for sensor in skin.sensors.values():  # type: ignore[attr-defined]
+            start = time.perf_counter()
+            view = sensor.scene()
+            middle = time.perf_counter()
+            sensor.simulator.step(view)
+            see.append(middle - start)
+            solve.append(time.perf_counter() - middle)
+            bodies += len(view)
+    print(
+        f"  one sensor: sees {bodies / len(see):.1f} bodies in {1e3 * np.median(see):.2f} ms, "
+        f"solves in {1e3 * np.median(solve):.2f} ms (medians)"
+    )
+
+
+def far_away(world: World) -> None:
+    """Print what sensors cost that see nothing."""
+    poses = {f"s{k}": cs.Pose((0.0, 0.0, 10.0 + k)) for k in range(16)}
+    one = cs.Simulator("arm_segment")
+    skin = cs.Skin({name: (one.sibling(), pose) for name, pose in poses.items()}, threads=1)
+    scene = cs.Scene([cs.Body(cs.Sphere(0.1), cs.Pose((k, 0.0, 0.0))) for k in range(30)])
+    times = []
+    for _ in range(100):
+        start = time.perf_counter()
+        skin.step(scene)
+        times.append(time.perf_counter() - start)
+    print(f"  16 sensors, 30 bodies, all far away: {1e3 * np.median(times):.2f} ms")
+
+
+def memory() -> None:
+    """Print the memory of one more sensor."""
+    first = cs.Simulator("arm_segment")
+    scene = cs.Scene([cs.Body(cs.Sphere(0.04), cs.Pose((0.0, 0.0, 0.06)))])
+    first.step(scene)
+    tracemalloc.start()
+    second = first.sibling()
+    second.step(scene)
+    taken = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    print(
+        f"  one more sensor takes {taken / 1e6:.1f} MB; mesh of {first.describe()['nodes']} nodes"
+    )
+
+
+def accuracy() -> None:
+    """Print the design's errors."""
+    sim, every = cs.Simulator("arm_segment"), []
+    print("errors of the diagonal of arm_segment, %:")
+    for case in curved_figures()["cases"]:
+        sim.reset()
+        got = np.diag(sim.step(cs.Scene([curved_body(case)])).delta)
+        off = 100 * (got / np.diag(curved_reference(case)) - 1)
+        every.append(off)
+        print(f"  {case:>8} mm: {' '.join(f'{v:+5.1f}' for v in off)}   rms {_rms(off):.1f}")
+    print(f"  all: rms {_rms(np.array(every)):.1f}")
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=300)
+    options = parser.parse_args()
+    machine = describe_machine(("numpy", "numba", "mujoco"))
+    print(f"{machine['processor']}, {machine['cores']} cores, load {machine['load']:.1f}")
+    accuracy()
+    print("a step of 16 sensors, 96 electrodes:")
+    world = World()
+    for threads in range(1, (os.cpu_count() or 1) + 1):
+        time_steps(world, threads, options.steps)
+    parts(world, options.steps // 5)
+    far_away(world)
+    memory()
+
+
+if __name__ == "__main__":
+    main()
