@@ -170,6 +170,11 @@ def test_record_refuses_before_computing(
     for output in (tmp_path, tmp_path / "no" / "a.mcap", tmp_path / "file"):
         assert main(["record", str(scenario), "-o", str(output)]) == 2
         assert str(output) in capsys.readouterr().err
+    output = tmp_path / "a.mcap"
+    for option, value in (("--readout", "fdc1005"), ("--readout", "no.toml"), ("--name", "a b")):
+        assert main(["record", str(scenario), "-o", str(output), option, value]) == 2
+        assert value in capsys.readouterr().err
+    assert not output.exists()
 
 
 def test_a_failing_step_keeps_what_was_recorded(

@@ -57,7 +57,7 @@ def execute(args: argparse.Namespace) -> int:
     from capsense.cli.main import INTERRUPTED, OK, say
     from capsense.recording.disk import check_target
     from capsense.recording.messages import require
-    from capsense.recording.recorder import Recorder
+    from capsense.recording.recorder import Recorder, check_name, make_readout
     from capsense.scenario import load_scenario
 
     require()
@@ -67,6 +67,8 @@ def execute(args: argparse.Namespace) -> int:
     for name in absent_bodies(scenario):
         say(f'warning: body "{name}" never enters the domain; it has no effect')
     check_target(args.output, overwrite=args.force)
+    check_name(args.name)
+    make_readout(args.readout, scenario.design.electrode_names)
     with Interrupt() as interrupt:
         simulator = build_simulator(scenario, quiet=args.quiet)
         recorder = Recorder(

@@ -6,7 +6,7 @@ import atexit
 import errno
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,7 @@ class Recorder:
         RecordingError: The file is there already or cannot be made, or ``name`` is no name.
         ReadOutError: The read-out is wrong, or there are two.
         MissingDependencyError: The optional packages are not installed.
+        OSError: The beginning could not be written.
     """
 
     def __init__(
@@ -72,9 +73,10 @@ class Recorder:
         """Steps recorded so far."""
         self._sensor = source if isinstance(source, AttachedSensor) else None
         self._simulator = source if isinstance(source, Simulator) else source.simulator
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-            raise RecordingError(f"name is {name!r}; give letters, digits and underscores")
-        self._readout, config = self._choose(readout)
+        check_name(name)
+        if readout is not None and self._sensor is not None and self._sensor.readout is not None:
+            raise ReadOutError("the sensor has a read-out of its own; leave out readout=")
+        self._readout, config = make_readout(readout, self._simulator.electrode_names)
         empty = self._simulator.step(Scene())
         self.reset()
         self._live = None if ros_domain is None else LiveTopics(ros_domain)
@@ -88,7 +90,10 @@ class Recorder:
             pairs=scenario.pairs if scenario else (), empty=empty,
         )  # fmt: skip
         """What the file says once, at its start."""
-        self._begin(self.session)
+        try:
+            self._begin(self.session)
+        except OSError as error:
+            raise self._unwritten(error) from None
         atexit.register(self._file.close)
 
     def step(self, world: Scene | DepthFrame, time: float) -> Reading:
@@ -239,21 +244,6 @@ class Recorder:
             str(self.path),
         )
 
-    def _choose(
-        self, readout: ReadOut | str | Path | None
-    ) -> tuple[ReadOut | None, Mapping[str, Any] | None]:
-        """The recorder's own read-out, and the content of its file."""
-        if readout is None:
-            return None, None
-        if self._sensor is not None and self._sensor.readout is not None:
-            raise ReadOutError("the sensor has a read-out of its own; leave out readout=")
-        if isinstance(readout, ReadOut):
-            return readout, None
-        config: Mapping[str, Any] = {"chip": str(readout)}
-        if str(readout).endswith(".toml"):
-            config = read_toml(Path(readout), "read-out", ReadOutError)
-        return parse_readout(config, self._simulator.electrode_names), config
-
     def _begin(self, session: Session) -> None:
         self._file.metadata(NAME, session.metadata())
         for name, text in ((DESIGN, design_to_json(session.design)), (SESSION, session.to_json())):
@@ -267,6 +257,36 @@ def record(path: str | Path, source: Simulator | AttachedSensor, **options: Any)
     The same as :class:`Recorder`.
     """
     return Recorder(path, source, **options)
+
+
+def check_name(name: str) -> None:
+    """Refuse what cannot be the name of a sensor.
+
+    Raises:
+        RecordingError: It is none.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise RecordingError(f"name is {name!r}; give letters, digits and underscores")
+
+
+def make_readout(
+    readout: ReadOut | str | Path | None, electrodes: Sequence[str]
+) -> tuple[ReadOut | None, Mapping[str, Any] | None]:
+    """A read-out, and the content of its file where it has one or could have.
+
+    Args:
+        readout: A chip's name, the path of a read-out file, a read-out, or None.
+        electrodes: Electrode names in matrix order.
+
+    Raises:
+        ReadOutError: There is no such chip or file, or anything in it is wrong.
+    """
+    if readout is None or isinstance(readout, ReadOut):
+        return readout, None
+    config: Mapping[str, Any] = {"chip": str(readout)}
+    if str(readout).endswith(".toml"):
+        config = read_toml(Path(readout), "read-out", ReadOutError)
+    return parse_readout(config, electrodes, source=str(readout)), config
 
 
 def _scene(world: Scene | DepthFrame) -> Scene:
