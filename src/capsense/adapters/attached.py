@@ -82,7 +82,7 @@ class AttachedSensor(ABC):
     def _time(self) -> float:
         """The simulator's time [s]."""
         raise SceneError(
-            "this simulator does not tell its time, which the read-out needs; "
+            "this simulator does not tell its time, which read-outs and recordings need; "
             "write read(time=…), in seconds"
         )
 
