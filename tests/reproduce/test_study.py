@@ -29,6 +29,7 @@ def sample_study(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         {"values": Table(("k", "v [F]"), ((1, 1 / 3), (2, 2 / 3)))},
         {"picture": Figure()},
         ("It shows nothing.",),
+        store.told(),
     )
 
 
@@ -63,7 +64,9 @@ def test_command(
     assert main(["reproduce", "all", "-o", str(tmp_path), *options]) == code
     folder = tmp_path / "sample"
     verdict = "missed" if code else "met"
-    assert verdict in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert verdict in printed
+    assert "2 parts computed, 0 reused" in printed
     rows = json.loads((folder / "rows.json").read_text())["rows"]
     assert [r["verdict"] for r in rows] == [verdict, "for information"]
     assert rows[0]["value"] == pytest.approx(0.3, abs=1e-15)
@@ -78,6 +81,8 @@ def test_command(
     assert "| 2 | 0.66667 |" in page
     assert (folder / "picture.png").stat().st_size > 0
     assert len(list((folder / "parts").iterdir())) == 2
+    assert main(["reproduce", "sample", "-o", str(tmp_path), *options]) == code
+    assert "0 parts computed, 2 reused" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("registered")

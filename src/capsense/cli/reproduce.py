@@ -93,5 +93,13 @@ def _carry_out(name: str, study: Study, folder: Path, *, reduced: bool) -> int:
         outcome = study(folder, reduced=reduced, report=progress)
     written = write_outcome(outcome, folder)
     print(f"{outcome.title}\n\n{table(ROW_HEADER, [row_cells(row) for row in outcome.rows])}\n")
-    print(f"wrote {', '.join(written)} to {folder}\n", flush=True)
+    print(f"wrote {_listed(written)} to {folder}", outcome.parts, sep="\n", end="\n\n", flush=True)
     return len(outcome.missed)
+
+
+def _listed(names: list[str]) -> str:
+    """File names; of many, the first ones and how many more there are."""
+    shown = 6
+    if len(names) <= shown:
+        return ", ".join(names)
+    return f"{', '.join(names[:shown])} and {len(names) - shown} more files"

@@ -147,6 +147,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         {"fig8": _table(points), "fig8_paper": _paper_table()},
         {"fig8": _plot(points)},
         NOTES,
+        store.told(),
     )
 
 

@@ -238,6 +238,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         _tables(first, cases, in_boxes),
         {"limb_approach": _plot(cases, in_boxes)},
         NOTES,
+        store.told(),
     )
 
 

@@ -154,7 +154,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         ),
     }
     title = "Scenario 1: a steel bar over stripe, patch and meander electrodes"
-    return Outcome(title, rows, tables, plots, NOTES)
+    return Outcome(title, rows, tables, plots, NOTES, store.told())
 
 
 def _compare(shown: dict[str, Curve], panels: dict[str, Panel]) -> tuple[tuple[Row, ...], Table]:

@@ -105,6 +105,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         _tables(found, codes),
         {"scenario2_ride": _ride_plot(codes, ways), "scenario2_scale": _scale_plot(codes)},
         NOTES,
+        store.told(),
     )
 
 

@@ -41,6 +41,10 @@ class Store:
         self.reused = 0
         """Units found on disk so far."""
 
+    def told(self) -> str:
+        """How much was computed and how much reused, in words."""
+        return f"{self.computed} parts computed, {self.reused} reused from {self.folder}"
+
     def get(
         self, name: str, inputs: Mapping[str, Any], compute: Callable[[], Mapping[str, Any]]
     ) -> Arrays:

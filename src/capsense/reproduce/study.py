@@ -94,6 +94,8 @@ class Outcome:
     """By file name without ending."""
     notes: tuple[str, ...] = ()
     """Paragraphs in Markdown: what it does and does not show."""
+    parts: str = ""
+    """How much was computed and how much reused, of :meth:`capsense.reproduce.store.Store.told`."""
 
     @property
     def missed(self) -> tuple[Row, ...]:
