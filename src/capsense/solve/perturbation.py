@@ -83,11 +83,13 @@ class PerturbationSolver:
         self._found = _Found(self._mesh, max(4096, n // 4))
         self._blocks: list[_Block] = []
         self._lanes: tuple[object, ...] = ()
+        self._rested = True
 
     def reset(self) -> None:
         """Forget the last solution."""
-        self._blocks = []
-        self._lanes = ()
+        for block in self._blocks:
+            block.u[:] = 0.0
+        self._rested = True
         self._active[:] = 0.0
 
     def step(self, scene: Scene) -> Perturbation:
@@ -125,7 +127,7 @@ class PerturbationSolver:
 
     def potentials(self) -> Array:
         """Change of the potentials at the nodes in the last step [V], shape (n, terminals)."""
-        if not self._blocks:
+        if self._rested:
             return np.zeros((self.background.lattice.n_nodes, self._n_terminals))
         stacked = np.concatenate([b.u for b in self._blocks], axis=1)
         out = stacked[:, : self._n_terminals].astype(float)
@@ -182,9 +184,8 @@ class PerturbationSolver:
             found.weight, found.extra, la.owner, mesh.storeys, mesh.ceiling, mesh.parent,
             self._share, self._diagonal, self._active, self._inverse, self._woken,
         )  # fmt: skip
-        fresh = not self._blocks
         signature = (len(scene), *lanes.tolist())
-        if fresh or signature != self._lanes:
+        if signature != self._lanes:
             old = self._blocks
             self._blocks = self._make_blocks(n_lanes)
             for block, last in zip(self._blocks, old, strict=False):
@@ -192,10 +193,11 @@ class PerturbationSolver:
                 if keep > 0:
                     block.u[:, :keep] = last.u[:, :keep]
             self._lanes = signature
-        if not fresh:
+        if not self._rested:
             woken = self._woken[:n_woken]
             for block in self._blocks:
                 block.u[woken] = -block.phi[woken]
+        self._rested = False
 
     def _make_blocks(self, n_lanes: int) -> list[_Block]:
         phi = self.background.potentials
