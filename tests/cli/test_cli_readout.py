@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from ball_scenario import ball_scenario
 from maxwell import random_maxwell
+from relative import near
 
 from capsense.cli.main import BAD_INPUT, OK, main
 from capsense.errors import ReadOutError
@@ -104,6 +106,28 @@ def test_shields_count_as_recorded(run):
     assert recording.channels(bank) == pytest.approx(columns, rel=1e-12, abs=0)
 
 
+def test_driven_shields_are_read_from_a_matrix_recording(run):
+    """Self channels drive the shields along: the arrays say what that gives, a table does not."""
+    folder = run()
+    with np.load(folder / "readings.npz") as data:
+        arrays = dict(data)
+    arrays["self_capacitance"] = 0.2 * np.diagonal(arrays["capacitance"], axis1=1, axis2=2)
+    arrays["self_baseline"] = 0.2 * np.diag(arrays["baseline"])
+    np.savez(folder / "readings.npz", **arrays)
+    recording = load_recording(folder)
+    driven = ChannelBank(self_patterns(recording.electrodes), recording.electrodes)
+    assert recording.channels(driven) == near(arrays["self_capacitance"], rel=1e-12)
+    assert recording.empty_channels(driven) == near(arrays["self_baseline"], rel=1e-12)
+    summary = json.loads((folder / "summary.json").read_text("utf-8"))
+    (folder / "summary.json").write_text(json.dumps({**summary, "shields": 1}), "utf-8")
+    table = load_recording(folder / "readings.csv")
+    with pytest.raises(ReadOutError, match="what the sensor's shields do when they are driven"):
+        table.channels(driven)
+    still = ChannelBank(self_patterns(recording.electrodes, shield=0.0), recording.electrodes)
+    diagonal = np.diagonal(arrays["capacitance"], axis1=1, axis2=2)
+    assert table.channels(still) == near(diagonal, rel=1e-9)
+
+
 def test_all_chips_write_and_draw(run, tmp_path, capsys):
     folder = run()
     assert main(["readout", str(folder), "--chip", "all", "-o", str(tmp_path / "counts")]) == OK
@@ -192,6 +216,10 @@ def test_bad_recordings_are_refused(run, tmp_path):
         (broken / name).write_bytes(content)
         with pytest.raises(ReadOutError, match=words):
             load_recording(broken / name)
+    whole = tmp_path / "whole.mcap"
+    whole.write_bytes(b"")
+    with pytest.raises(ReadOutError, match=r"capsense export .*whole.mcap -o whole.npz"):
+        load_recording(whole)
     odd = tmp_path / "odd.csv"
     odd.write_bytes(b"time_s,C_a_F,C_b_F,C_a_b_F\n0,1,1,1\n")
     with pytest.raises(ReadOutError, match="may mean the pair or the electrode"):

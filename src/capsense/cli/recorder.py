@@ -6,7 +6,7 @@ import csv
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from capsense.errors import ScenarioError
 from capsense.recording.tables import column_meanings, csv_row, reading_arrays, replacing
 from capsense.recording.versions import versions
 from capsense.scenario import Channel, Sample, Scenario
+
+if TYPE_CHECKING:
+    from capsense.simulator import Reading
 
 Array = NDArray[np.float64]
 
@@ -66,24 +69,22 @@ class Recorder:
         An output folder made by :func:`prepare_folder`.
     scenario
         The scenario that is run.
-    baseline
-        Maxwell matrix [F] of the sensor with nothing in front of it, shape (M, M).
-    levels
-        Capacitance [F] of each channel with nothing in front of the sensor.
+    empty
+        The sensor's reading with nothing in front of it.
     """
 
-    def __init__(
-        self, folder: Path, scenario: Scenario, baseline: Array, levels: tuple[float, ...]
-    ) -> None:
+    def __init__(self, folder: Path, scenario: Scenario, empty: Reading) -> None:
         self.folder = folder
         self.scenario = scenario
-        self.baseline = np.asarray(baseline, dtype=float)
-        self.levels = np.array(levels)
+        self.baseline = np.asarray(empty.capacitance, dtype=float)
+        self.self_baseline = np.asarray(empty.self_capacitance, dtype=float)
+        self.levels = np.array([c.read(empty) for c in scenario.channels])
         self.count = 0
         size, electrodes = scenario.count, len(self.baseline)
         bodies = len(scenario.bodies)
         self._capacitance = np.empty((size, electrodes, electrodes))
         self._delta = np.empty((size, electrodes, electrodes))
+        self._self = np.empty((size, electrodes))
         self._values = np.empty((size, len(scenario.channels)))
         self._positions = np.empty((size, bodies, 3))
         self._quaternions = np.empty((size, bodies, 4))
@@ -98,6 +99,7 @@ class Recorder:
         k, reading = sample.index, sample.reading
         self._capacitance[k] = reading.capacitance
         self._delta[k] = reading.delta
+        self._self[k] = reading.self_capacitance
         self._values[k] = sample.values
         for b, body in enumerate(sample.scene):
             self._positions[k, b] = body.pose.position
@@ -142,7 +144,8 @@ class Recorder:
         n = self.count
         arrays = reading_arrays(
             time=self.times, capacitance=self._capacitance[:n], delta=self._delta[:n],
-            baseline=self.baseline, electrodes=self.scenario.design.electrode_names,
+            baseline=self.baseline, self_capacitance=self._self[:n],
+            self_baseline=self.self_baseline, electrodes=self.scenario.design.electrode_names,
             channels=self.scenario.channels, values=self._values[:n], levels=self.levels,
             bodies=[str(b.body.name) for b in self.scenario.bodies],
             positions=self._positions[:n], quaternions=self._quaternions[:n],
@@ -163,6 +166,7 @@ class Recorder:
             "design": scenario.design.name,
             "design_hash": scenario.design.content_hash(),
             "electrodes": list(scenario.design.electrode_names),
+            "shields": sum(c.role == "shield" for c in scenario.design.conductors),
             "bodies": [b.body.name for b in scenario.bodies],
             "mesh": mesh,
             "method": scenario.method,

@@ -68,7 +68,7 @@ def execute(args: argparse.Namespace) -> int:
     from capsense.cli.recorder import Recorder, prepare_folder
     from capsense.cli.tables import field_figures
     from capsense.scenario import load_scenario
-    from capsense.scenario.play import baseline_of
+    from capsense.scene import Scene
 
     scenario = load_scenario(args.scenario)
     if args.rate is not None:
@@ -80,8 +80,7 @@ def execute(args: argparse.Namespace) -> int:
     with Interrupt() as interrupt:
         try:
             simulator = build_simulator(scenario, quiet=args.quiet)
-            levels = baseline_of(scenario, simulator)
-            recorder = Recorder(args.output, scenario, simulator.baseline, levels)
+            recorder = Recorder(args.output, scenario, simulator.step(Scene()))
         except BaseException:
             if made:
                 with contextlib.suppress(OSError):

@@ -30,6 +30,8 @@ class Recording:
     ``C_E1`` a self capacitance, ``Cm_E1_E2`` a mutual one."""
     empty: dict[str, float]
     """The same with an empty scene [F]; holds nothing where the file does not."""
+    shields: bool = False
+    """Whether the sensor is known to have driven shields."""
 
     def channels(self, bank: ChannelBank) -> Array:
         """Channel values of a read-out [F], shape (n, K).
@@ -55,11 +57,16 @@ class Recording:
     def _values(self, columns: dict[str, Array], bank: ChannelBank) -> Array:
         matrix = self._matrix(columns)
         if matrix is not None:
-            shields = [columns.get(f"C_{name}") for name in self.electrodes]
+            alone = [columns.get(f"C_{name}") for name in self.electrodes]
             coupling = None
-            if all(s is not None for s in shields):
-                own = np.concatenate([s for s in shields if s is not None], axis=1)
+            if all(a is not None for a in alone):
+                own = np.concatenate([a for a in alone if a is not None], axis=1)
                 coupling = own - np.diagonal(matrix, axis1=1, axis2=2)
+            elif self.shields and any(p.shield for p in bank.patterns):
+                raise ReadOutError(
+                    f"{self.path} does not hold what the sensor's shields do when they are driven; "
+                    "read its readings.npz, or set shield = 0 for each channel"
+                )
             return bank.values(matrix, coupling)
         return np.concatenate([self._simple(columns, p) for p in bank.patterns], axis=1)
 
@@ -111,6 +118,11 @@ def load_recording(path: str | Path) -> Recording:
         given = present[0]
     if not given.is_file():
         raise ReadOutError(f"there is no recording {given}; check the path")
+    if given.suffix == ".mcap":
+        raise ReadOutError(
+            f"{given} is to be exported first: capsense export {given} -o "
+            f"{given.with_suffix('.npz').name}"
+        )
     if given.suffix not in (".npz", ".csv"):
         raise ReadOutError(f"{given} is no recording; give a .npz, a .csv, or their folder")
     recording = _load_arrays(given) if given.suffix == ".npz" else _load_table(given)
@@ -152,6 +164,9 @@ def _load_arrays(path: Path) -> Recording:
             for i, a in enumerate(names)
             for j, b in enumerate(names)
         }
+        alone = [f"C_{name}" for name in names]
+        columns.update(zip(alone, arrays["self_capacitance"].T, strict=True))
+        empty.update(zip(alone, arrays["self_baseline"].tolist(), strict=True))
         columns.update(zip(channels, arrays["channels"].T, strict=True))
         empty.update(zip(channels, arrays["channel_baseline"].tolist(), strict=True))
         return Recording(path, arrays["time"], names, columns, empty)
@@ -181,17 +196,22 @@ def _load_table(path: Path) -> Recording:
         for name, column in columns.items()
         if len(column) and f"d{name}_F" in table
     }
-    return Recording(path, values[:, 0], _electrodes(path, list(columns)), columns, empty)
+    electrodes, shields = _summary(path)
+    names = electrodes or _electrodes(path, list(columns))
+    return Recording(path, values[:, 0], names, columns, empty, shields)
+
+
+def _summary(path: Path) -> tuple[tuple[str, ...], bool]:
+    """Electrodes, and whether there are shields, as the summary beside a table says, if any."""
+    try:
+        summary = json.loads(path.with_name("summary.json").read_text(encoding="utf-8"))
+        return tuple(str(n) for n in summary["electrodes"]), bool(summary.get("shields"))
+    except (OSError, ValueError, KeyError, TypeError):
+        return (), False
 
 
 def _electrodes(path: Path, columns: list[str]) -> tuple[str, ...]:
-    """Electrode names: from the summary beside the table, or as the columns tell them."""
-    summary = path.with_name("summary.json")
-    try:
-        names = json.loads(summary.read_text(encoding="utf-8"))["electrodes"]
-        return tuple(str(n) for n in names)
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+    """Electrode names as the columns tell them."""
     found: list[str] = []
     for column in columns:
         rest = column.partition("_")[2]

@@ -48,9 +48,3 @@ def play(scenario: Scenario, simulator: Simulator) -> Iterator[Sample]:
         reading = simulator.step(scene)
         values = tuple(c.read(reading) for c in scenario.channels)
         yield Sample(index, time, scene, reading, values)
-
-
-def baseline_of(scenario: Scenario, simulator: Simulator) -> tuple[float, ...]:
-    """Capacitance [F] of each channel with nothing in front of the sensor."""
-    reading = simulator.step(Scene())
-    return tuple(c.read(reading) for c in scenario.channels)
