@@ -120,6 +120,20 @@ def check(record: Record) -> None:
     assert swing.min() > 0.1, swing
 
 
+def save(record: Record, folder: Path) -> None:
+    """Write ``forearm.csv``: times, places, and the change of every entry of the matrix."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names, count = record.names, len(record.names)
+    pairs = [(i, j) for i in range(count) for j in range(i, count)]
+    head = ["time [s]", "along [mm]", *(f"{names[i]} {names[j]} [fF]" for i, j in pairs)]
+    rows = [
+        [f"{t:.3f}", f"{x * 1e3:.2f}", *(f"{d[p] * 1e15:.4f}" for p in pairs)]
+        for t, x, d in zip(record.time, record.along, record.delta, strict=True)
+    ]
+    text = "\n".join(",".join(row) for row in [head, *rows])
+    (folder / "forearm.csv").write_text(text + "\n", encoding="utf-8")
+
+
 # -- pictures ------------------------------------------------------------------------------------
 
 

@@ -1,7 +1,7 @@
 """MuJoCo: a robot arm carries six electrodes along a person's moving forearm.
 
-Run it: ``python examples/mujoco_forearm.py [FOLDER]``. It needs no display and no OpenGL. A plot
-and an animation go to the folder (``out`` by default).
+Run it: ``python examples/mujoco_forearm.py [FOLDER]``. It needs no display and no OpenGL. A
+table, a plot and an animation go to the folder (``out`` by default).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from forearm_story import (
     check,
     draw,
     person_angles,
+    save,
     sensor_target,
 )
 from sticks import Rod
@@ -120,6 +121,7 @@ def main(folder: Path) -> Record:
             for name, angle in person_angles(data.time).items():
                 data.ctrl[person[name]] = angle
         mujoco.mj_step(model, data)
+    save(record, folder)
     draw(record, folder, "six_patch carried along a forearm, in MuJoCo")
     check(record)
     return record

@@ -1,7 +1,7 @@
 """PyBullet: a robot arm carries six electrodes along a person's moving forearm.
 
-Run it: ``python examples/pybullet_forearm.py [FOLDER]``. It needs no display. A plot and an
-animation go to the folder (``out`` by default).
+Run it: ``python examples/pybullet_forearm.py [FOLDER]``. It needs no display. A table, a plot
+and an animation go to the folder (``out`` by default).
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from forearm_story import (
     check,
     draw,
     person_angles,
+    save,
     sensor_target,
 )
 from sticks import Rod
@@ -147,6 +148,7 @@ def main(folder: Path) -> Record:
             drive(step * STEP)
         p.stepSimulation(physicsClientId=client)
     p.disconnect(physicsClientId=client)
+    save(record, folder)
     draw(record, folder, "six_patch carried along a forearm, in PyBullet")
     check(record)
     return record
