@@ -245,6 +245,11 @@ def test_a_reading_holds_the_counts_of_its_chip(sensor_in, adapter):
         np.testing.assert_array_equal(reading.counts.code, expected.code)
         total += len(expected.time)
     assert total > 0
+    sensor.reset()
+    sensor.use_readout("mpr121")  # set up for these electrodes: in range
+    flags = [sensor.read(time=0.1 * k).counts.flags for k in range(3)]
+    assert sum(map(len, flags)) > 0
+    assert not np.concatenate(flags).any()
     if adapter == "pybullet":
         with pytest.raises(cs.SceneError, match=r"read\(time="):
             sensor.read()

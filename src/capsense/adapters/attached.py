@@ -14,6 +14,7 @@ from capsense._validate import suggest
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
+from capsense.readout.config import choose_readout
 from capsense.readout.read_out import ReadOut
 from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Reading, Simulator
@@ -61,13 +62,16 @@ class AttachedSensor(ABC):
         """Read through a chip from now on.
 
         Args:
-            readout: A read-out, the name of a chip with its usual settings, or None.
+            readout: A read-out, the name of a chip with its usual settings, the path of a read-out
+                file (``.toml``), or None.
 
         Raises:
-            ReadOutError: There is no such chip.
+            ReadOutError: There is no such chip or file, or the file is wrong.
         """
         if isinstance(readout, str):
-            readout = ReadOut.preset(readout, self.electrode_names)
+            empty = self.simulator.step(Scene())
+            self.simulator.reset()
+            readout = choose_readout(readout, self.electrode_names, empty)
         self.readout = readout
 
     @property

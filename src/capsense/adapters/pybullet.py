@@ -93,7 +93,7 @@ def attach(
         resolution: Pixels along each side of the image.
         back: Where what is drawn ends: ``"fill"``, at the end of the domain, or after an assumed
             thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
-        readout: A chip, or its name, whose counts readings are to hold; see
+        readout: A read-out whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
 
     Raises:

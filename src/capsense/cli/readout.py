@@ -119,7 +119,7 @@ def _build(args: argparse.Namespace, recording: Recording) -> dict[str, ReadOut]
     """The read-outs asked for, by a name for files."""
     from capsense.readout.channels import ChannelBank
     from capsense.readout.config import load_readout
-    from capsense.readout.presets import LEAST_EXPECTED, Options, build, chip_of, default_patterns
+    from capsense.readout.presets import Options, build, chip_of, default_patterns, expected_of
 
     if args.config is not None:
         return {args.config.stem: load_readout(args.config, recording.electrodes)}
@@ -131,13 +131,8 @@ def _build(args: argparse.Namespace, recording: Recording) -> dict[str, ReadOut]
         chip = chip_of(name)
         patterns = default_patterns(chip, recording.electrodes)
         empty = recording.empty_channels(ChannelBank(patterns, recording.electrodes))
-        options = Options(
-            patterns,
-            args.rate,
-            args.seed,
-            not args.no_noise,
-            expected=max(empty.max(), LEAST_EXPECTED),
-        )
+        expected = expected_of(empty)
+        options = Options(patterns, args.rate, args.seed, not args.no_noise, expected=expected)
         out[chip.name] = build(chip, recording.electrodes, options)
     return out
 

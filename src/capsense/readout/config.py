@@ -13,7 +13,7 @@ from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
 from capsense.readout.chips import CHIPS
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
-from capsense.readout.presets import LEAST_EXPECTED, Options, build, chip_of
+from capsense.readout.presets import Options, build, chip_of, expected_of
 from capsense.readout.read_out import Reading, ReadOut
 from capsense.readout.wiring import Wiring
 
@@ -58,9 +58,8 @@ def choose_readout(choice: str | Path, electrodes: Sequence[str], empty: Reading
     """
     if str(choice).endswith(".toml"):
         return load_readout(choice, electrodes)
-    first = build(str(choice), electrodes)
-    expected = max(float(first.channel_values(empty).max()), LEAST_EXPECTED)
-    return build(str(choice), electrodes, Options(expected=expected))
+    values = build(str(choice), electrodes).channel_values(empty)
+    return build(str(choice), electrodes, Options(expected=expected_of(values)))
 
 
 def parse_readout(

@@ -12,7 +12,7 @@ import numpy as np
 from capsense._validate import suggest
 from capsense.errors import ReadOutError
 from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
-from capsense.readout.checks import require
+from capsense.readout.checks import Array, require
 from capsense.readout.chip import Chip
 from capsense.readout.chips import CHIPS, MPR121_CURRENTS, MPR121_SUPPLY, MPR121_TIMES
 from capsense.readout.converter import Law, ReciprocalLaw, ShuntLaw
@@ -25,8 +25,8 @@ from capsense.readout.wiring import Wiring
 
 EXPECTED = 10e-12
 """Capacitance that chips which adapt to it are set up for by default [F]."""
-LEAST_EXPECTED = 1e-12
-"""Least capacitance that a chip is set up for where it is known [F]: leads add to electrodes."""
+LEAST_EXPECTED = 0.2e-12
+"""Least capacitance that a chip can be set up for [F]."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +171,14 @@ def law_of(chip: Chip, options: Options, channels: int) -> Law:
         require("read-out", "expected", expected, 0.0, "F", open_=True)
         return charge_for(expected)
     return chip.law
+
+
+def expected_of(empty: Array) -> float:
+    """What a chip is to be set up for, given all channels' capacitances with an empty scene [F].
+
+    The least of them: one setting serves all channels, and codes rise as capacitance falls.
+    """
+    return max(float(empty.min()), LEAST_EXPECTED)
 
 
 def charge_for(capacitance: float) -> ReciprocalLaw:

@@ -170,7 +170,11 @@ def _load_arrays(path: Path) -> Recording:
         columns.update(zip(channels, arrays["channels"].T, strict=True))
         empty.update(zip(channels, arrays["channel_baseline"].tolist(), strict=True))
         return Recording(path, arrays["time"], names, columns, empty)
-    except (KeyError, IndexError, ValueError, OSError, BadZipFile, EOFError) as error:
+    except KeyError as error:
+        raise ReadOutError(
+            f"{path} is no readings.npz of this version: it lacks {error}; run it again"
+        ) from None
+    except (IndexError, ValueError, OSError, BadZipFile, EOFError) as error:
         raise ReadOutError(f"{path} is no readings.npz of capsense run: {error}") from None
 
 
