@@ -226,6 +226,14 @@ def test_counts_by_channel_and_in_rows():
         counts[counts.channel != 1].table()
 
 
+def test_representations_are_short():
+    readout = ReadOut.preset("fdc1004", NAMES)
+    assert repr(readout) == "<ReadOut 'Texas Instruments FDC1004': 3 channels, each every 30 ms>"
+    counts = readout([0.0, 0.035], np.full((2, 3), 1e-12))
+    assert repr(counts) == "<Counts: 3 conversions of 3 channels, 0.01 to 0.03 s>"
+    assert repr(counts[:0]) == "<Counts: 0 conversions of 3 channels>"
+
+
 def test_seeds_of_any_kind_of_integer():
     times, matrices = [0.0, 0.1], random_maxwell(np.random.default_rng(0), 3)[None].repeat(2, 0)
     assert same(full(np.int64(3))(times, matrices), full(3)(times, matrices))

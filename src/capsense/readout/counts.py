@@ -34,6 +34,10 @@ class Counts:
     touched: NDArray[np.bool_] | None = None
     """Touch or proximity states, shape (n,); None without a detector."""
 
+    def __repr__(self) -> str:
+        span = f", {self.time[0]:.6g} to {self.time[-1]:.6g} s" if len(self) else ""
+        return f"<Counts: {len(self)} conversions of {len(self.channel_names)} channels{span}>"
+
     def __len__(self) -> int:
         return len(self.time)
 

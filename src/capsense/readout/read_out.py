@@ -101,6 +101,12 @@ class ReadOut:
 
         return build(chip, electrodes, Options.of(options))
 
+    def __repr__(self) -> str:
+        return (
+            f"<ReadOut {self.name!r}: {len(self.bank)} channels, each every "
+            f"{1e3 * self.schedule.period:.4g} ms>"
+        )
+
     @property
     def channel_names(self) -> tuple[str, ...]:
         """Names of the channels."""
