@@ -6,6 +6,7 @@ import difflib
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,6 +18,13 @@ MIN_LENGTH = 1e-6
 """No size in a file may be smaller than this [m]."""
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 """Metres to the unit of a geometry file."""
+
+
+def as_number(value: object) -> float:
+    """A real number as a float; NaN for anything else, booleans too."""
+    if isinstance(value, Real) and not isinstance(value, bool):
+        return float(value)
+    return math.nan
 
 
 def nearest(word: str, options: Iterable[str]) -> str | None:

@@ -35,6 +35,8 @@ def test_every_path_names_its_source():
     [
         ((0.0,), "capacitance is 0.0"),
         ((math.inf,), "capacitance"),
+        (("100 pF",), "capacitance is '100 pF'"),
+        ((1e-10, 0.0, None), "leakage is None"),
         ((1e-10, -1.0), "series is -1"),
         ((1e-10, 0.0, 0.0), "leakage is 0"),
         ((1e-10, 0.0, math.nan), "leakage"),
@@ -45,7 +47,7 @@ def test_bad_paths_are_refused(arguments, words):
         GroundPath(*arguments)
 
 
-@pytest.mark.parametrize("frequency", [0.0, math.nan])
+@pytest.mark.parametrize("frequency", [0.0, math.nan, "1 MHz"])
 def test_bad_frequencies_are_refused(frequency):
     with pytest.raises(SceneError, match="frequency"):
         GroundPath(1e-10).impedance(frequency)

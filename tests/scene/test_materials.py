@@ -107,6 +107,8 @@ def test_water_has_a_range(temperature):
         ((2.0, ((1.0, 0.0, 0.0),)), "term"),
         ((2.0, ((1.0, 1e-9, 1.0),)), "term"),
         ((2.0, (), -1.0), "sigma is -1"),
+        (("two", ()), "eps_inf is 'two'"),
+        ((2.0, ((1.0, "fast", 0.0),)), "term"),
     ],
 )
 def test_bad_dispersions_are_refused(arguments, words):

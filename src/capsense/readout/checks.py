@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._validate import as_number
 from capsense.errors import ReadOutError
 
 Array = NDArray[np.float64]
@@ -30,12 +31,6 @@ def require_whole(owner: str, name: str, value: object, low: int, high: float = 
     if not whole or not low <= as_number(value) <= high:
         bound = f"from {low} on" if high == math.inf else f"from {low} to {high}"
         raise ReadOutError(f"{owner}: {name} is {value!r}; give a whole number {bound}")
-
-
-def as_number(value: object) -> float:
-    """A real number as a float; NaN for anything else."""
-    real = isinstance(value, int | float | np.integer | np.floating)
-    return float(value) if real and not isinstance(value, bool) else math.nan  # type: ignore[arg-type]
 
 
 def real(what: str, values: object) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from capsense.readout.checks import as_number
+from capsense._validate import as_number
 from capsense.readout.converter import CapDac, Law
 from capsense.readout.detector import Detector
 

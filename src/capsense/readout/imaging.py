@@ -18,9 +18,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from capsense._validate import as_number
 from capsense.constants import EPS0
 from capsense.errors import ReadOutError
-from capsense.readout.checks import Array, as_number, finite, require, require_whole
+from capsense.readout.checks import Array, finite, require, require_whole
 
 Axes = tuple[ArrayLike, ArrayLike, ArrayLike]
 

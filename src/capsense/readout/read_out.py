@@ -9,9 +9,10 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from capsense._validate import as_number
 from capsense.errors import ReadOutError
 from capsense.readout.channels import ChannelBank, Pattern
-from capsense.readout.checks import Array, as_number, real, require, require_whole
+from capsense.readout.checks import Array, real, require, require_whole
 from capsense.readout.converter import CapDac, Conversion, Law
 from capsense.readout.counts import Counts
 from capsense.readout.detector import Detector

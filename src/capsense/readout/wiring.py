@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._validate import as_number
 from capsense.errors import ReadOutError
-from capsense.readout.checks import Array, as_number, finite, per_channel
+from capsense.readout.checks import Array, finite, per_channel
 
 
 @dataclass(frozen=True)

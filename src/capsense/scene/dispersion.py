@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from capsense._validate import as_number
 from capsense.constants import EPS0
 from capsense.errors import SceneError
 
@@ -27,15 +28,15 @@ class ColeCole:
     """Ionic conductivity [S/m]."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.eps_inf) and self.eps_inf >= 1):
+        if not 1 <= as_number(self.eps_inf) < math.inf:
             raise SceneError(f"Cole-Cole: eps_inf is {self.eps_inf!r}; give at least 1")
-        if not (math.isfinite(self.sigma) and self.sigma >= 0):
+        if not 0 <= as_number(self.sigma) < math.inf:
             raise SceneError(f"Cole-Cole: sigma is {self.sigma!r}; give at least 0 S/m")
-        for step, tau, alpha in self.terms:
-            good = math.isfinite(step) and math.isfinite(tau) and step >= 0 and tau > 0
-            if not (good and 0 <= alpha < 1):
+        for term in self.terms:
+            step, tau, alpha = (as_number(figure) for figure in term)
+            if not (0 <= step < math.inf and 0 < tau < math.inf and 0 <= alpha < 1):
                 raise SceneError(
-                    f"Cole-Cole: the term {(step, tau, alpha)} must be (step >= 0, tau > 0 in "
+                    f"Cole-Cole: the term {term} must be (step >= 0, tau > 0 in "
                     "seconds, 0 <= alpha < 1)"
                 )
 

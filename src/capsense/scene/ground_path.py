@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from capsense._validate import as_number
 from capsense.errors import SceneError
 
 
@@ -28,14 +29,14 @@ class GroundPath:
     """Where the numbers come from."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.capacitance) and self.capacitance > 0):
+        if not 0 < as_number(self.capacitance) < math.inf:
             raise SceneError(
                 f"ground path: capacitance is {self.capacitance!r} F; give a positive number, "
                 "like 100e-12"
             )
-        if not (math.isfinite(self.series) and self.series >= 0):
+        if not 0 <= as_number(self.series) < math.inf:
             raise SceneError(f"ground path: series is {self.series!r} Ω; give zero or more")
-        if not self.leakage > 0:
+        if not as_number(self.leakage) > 0:
             raise SceneError(f"ground path: leakage is {self.leakage!r} Ω; give a positive number")
 
     def impedance(self, frequency: float) -> complex:
@@ -44,7 +45,7 @@ class GroundPath:
         Raises:
             SceneError: The frequency is not a positive finite number.
         """
-        if not (math.isfinite(frequency) and frequency > 0):
+        if not 0 < as_number(frequency) < math.inf:
             raise SceneError(f"frequency is {frequency!r} Hz; give a positive finite number")
         branch = self.series + 1 / (2j * math.pi * frequency * self.capacitance)
         return 1 / (1 / branch + 1 / self.leakage)
