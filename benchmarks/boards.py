@@ -61,10 +61,11 @@ def main() -> None:
             wanted = wanted[:n, :n]
             off = 100 * np.diag(found / wanted - 1)
             cross = ~np.eye(n, dtype=bool)
+            mutual = 100 * np.abs(found / wanted - 1)[cross]
             print(
                 f"  x {1e3 * x:.0f} mm, gap {gap} mm: ΔC_11 {1e15 * wanted[0, 0]:.3f} fF, diagonal "
-                f"{np.abs(off).max():.1f} %, mutual {100 * np.abs(found / wanted - 1)[cross].max():.1f}"
-                f" % of itself ({time.perf_counter() - start:.0f} s)",
+                f"{np.abs(off).max():.1f} %, mutual {mutual.max():.1f} % of itself "
+                f"({time.perf_counter() - start:.0f} s)",
                 flush=True,
             )
 
