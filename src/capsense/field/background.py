@@ -26,7 +26,7 @@ from capsense.field.lattice import Lattice, LatticeSettings, build_lattice
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 3
+NUMERICS = 4
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 
@@ -110,7 +110,9 @@ def build_background(
     tell("calibration", 0.92)
     weights, half = lattice.weights, half_link_weights(lattice)
     if math.isfinite(settings.calibration):
-        weights, half = calibrate(lattice, potentials, settings.calibration)
+        weights, half = calibrate(
+            lattice, potentials, charges.capacitance, settings.calibration
+        )
     _require_finite(design, potentials, charges.capacitance, weights, half)
     tell("done", 1.0)
     return BackgroundField(
