@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,6 +131,24 @@ class AttachedSensor(ABC):
         self.simulator.reset()
         if self.readout is not None:
             self.readout.reset()
+
+
+class DepthSensor(AttachedSensor):
+    """A sensor that sees a depth image."""
+
+    @abstractmethod
+    def frame(self) -> DepthFrame:
+        """The depth image of the present state.
+
+        Raises:
+            SceneError: The simulator does not give one.
+        """
+
+    def view(self) -> DepthFrame:
+        return self.frame()
+
+    def scene(self) -> Scene:
+        return self.frame().scene()
 
 
 class WorldSource(ABC):
@@ -267,6 +286,25 @@ def check_world(
     for name, value in options.items():
         if value is not None and value is not False and value != () and value != {}:
             raise SceneError(f'{name} goes with world="{other}"; leave it out of world="{world}"')
+
+
+def check_image(size: Any, resolution: Any, domain_width: float) -> tuple[float, int]:
+    """Size [m] and pixels of a square image; the width of the domain by default.
+
+    Raises:
+        SceneError: Not a positive length, or not a number of pixels from 4 to 2000.
+    """
+    if size is None:
+        size = domain_width
+    if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
+        raise SceneError(f"size is {size!r}; give the width of the image in metres")
+    if (
+        isinstance(resolution, bool)
+        or not isinstance(resolution, int)
+        or not 4 <= resolution <= 2000
+    ):
+        raise SceneError(f"resolution is {resolution!r}; give a whole number from 4 to 2000")
+    return float(size), resolution
 
 
 def refuse_missing(what: str, name: str, known: Sequence[str]) -> SceneError:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import AttachedSensor, refuse_missing
+from capsense.adapters.attached import DepthSensor, refuse_missing
 from capsense.errors import SceneError
-from capsense.scene import Material, Pose, Scene
+from capsense.scene import Material, Pose
 from capsense.scene.body import Grounding
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
@@ -36,7 +36,7 @@ class Eye:
     """Height of the image [m]."""
 
 
-class MujocoDepthSensor(AttachedSensor):
+class MujocoDepthSensor(DepthSensor):
     """A sensor that sees a depth image; made by :func:`capsense.adapters.mujoco.attach`."""
 
     def __init__(
@@ -80,12 +80,6 @@ class MujocoDepthSensor(AttachedSensor):
 
     def _time(self) -> float:
         return float(self.data.time)
-
-    def view(self) -> DepthFrame:
-        return self.frame()
-
-    def scene(self) -> Scene:
-        return self.frame().scene()
 
     @property
     def pose(self) -> Pose:

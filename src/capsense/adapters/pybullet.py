@@ -9,8 +9,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import GeometrySensor, check_world, make_simulator, refuse_missing
-from capsense.adapters.pybullet_depth import PybulletDepthSensor, check_image
+from capsense.adapters.attached import (
+    GeometrySensor,
+    check_image,
+    check_world,
+    make_simulator,
+    refuse_missing,
+)
+from capsense.adapters.pybullet_depth import PybulletDepthSensor
 from capsense.adapters.pybullet_model import ClientSource, body_numbers, links_of
 from capsense.adapters.rules import Rules
 from capsense.adapters.skin import AttachedSkin, simulators_of

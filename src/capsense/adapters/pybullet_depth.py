@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import AttachedSensor
+from capsense.adapters.attached import DepthSensor
 from capsense.adapters.pybullet_model import body_numbers, links_of, matter_of
 from capsense.adapters.rules import Rules
 from capsense.errors import SceneError
-from capsense.scene import Pose, Scene
+from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
 from capsense.simulator import Simulator
@@ -27,7 +25,7 @@ _EYE = Pose((0.0, 0.0, -_WITHDRAWN), (1.0, 0.0, 0.0, 0.0))
 """The OpenGL camera, which looks along its −z, in the sensor frame."""
 
 
-class PybulletDepthSensor(AttachedSensor):
+class PybulletDepthSensor(DepthSensor):
     """A sensor that sees a depth image; made by :func:`capsense.adapters.pybullet.attach`."""
 
     def __init__(
@@ -86,12 +84,6 @@ class PybulletDepthSensor(AttachedSensor):
             depth, eps_r, self._camera, grounding=self._rules.default_grounding, back=self._back
         )
 
-    def view(self) -> DepthFrame:
-        return self.frame()
-
-    def scene(self) -> Scene:
-        return self.frame().scene()
-
     @property
     def pose(self) -> Pose:
         import pybullet as p
@@ -133,22 +125,3 @@ def _projection(size: float, near: float, far: float, resolution: int) -> list[f
     m[2, 3] = -2 * far * near / (far - near)
     m[0, 3] = m[1, 3] = -1 / resolution
     return [float(v) for v in m.T.ravel()]
-
-
-def check_image(size: Any, resolution: Any, domain_width: float) -> tuple[float, int]:
-    """Size [m] and pixels of a square image; the width of the domain by default.
-
-    Raises:
-        SceneError: Not a positive length, or not a number of pixels from 4 to 2000.
-    """
-    if size is None:
-        size = domain_width
-    if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
-        raise SceneError(f"size is {size!r}; give the width of the image in metres")
-    if (
-        isinstance(resolution, bool)
-        or not isinstance(resolution, int)
-        or not 4 <= resolution <= 2000
-    ):
-        raise SceneError(f"resolution is {resolution!r}; give a whole number from 4 to 2000")
-    return float(size), resolution
