@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import DepthSensor
 from capsense.adapters.pybullet_model import body_numbers, links_of, matter_of
 from capsense.adapters.rules import Rules
-from capsense.errors import SceneError
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
