@@ -202,6 +202,22 @@ class Simulator:
             total[:n, n:].sum(axis=1),
         )  # fmt: skip
 
+    def potentials(self) -> Array:
+        """Potentials of the last step at the nodes of ``background.lattice`` [V].
+
+        Returns:
+            Shape (n, terminals), in the order of ``background.terminals``: each at 1 V in its own
+            column, all others and all conducting bodies, floating ones included, at 0.
+
+        Raises:
+            ValueError: The method is ``"masked"``, which solves on another mesh.
+        """
+        from capsense.solve.perturbation import PerturbationSolver
+
+        if not isinstance(self._solver, PerturbationSolver):
+            raise ValueError('method "masked" gives no potentials; use "perturbation"')
+        return self.background.potentials + self._solver.potentials()
+
     def sibling(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field."""
         return Simulator(

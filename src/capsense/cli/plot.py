@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from capsense.cli.plot_views import FAINT, INK, LABELS, TIME_COLOURS, bare, draw_views
 from capsense.cli.recorder import Recorder
+from capsense.design.draw import COLOURS
 from capsense.scenario import Channel, Excitation
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#7A5C00", "#333333")
-"""After Okabe and Ito: told apart with any colour vision; yellow darkened for white paper."""
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
 PLAIN_ELECTRODE = "#c08a3e"
 MAX_LINES = 8

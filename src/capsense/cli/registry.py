@@ -21,6 +21,7 @@ COMMANDS = (
     "capsense.cli.bench",
     "capsense.cli.reproduce",
     "capsense.cli.serve",
+    "capsense.cli.view",
 )
 """Modules of the subcommands, in the order of ``--help``."""
 

@@ -76,7 +76,7 @@ def execute(args: argparse.Namespace) -> int:
     from capsense.server.server import Server
 
     options = Options(
-        tuple(args.design), args.readout, args.host, args.port, _token(args.token_file),
+        tuple(args.design), args.readout, args.host, args.port, read_token(args.token_file),
         tuple(args.origin), _limits(args),
     )  # fmt: skip
     logger = _logger(quiet=args.quiet)
@@ -94,7 +94,8 @@ def _limits(args: argparse.Namespace) -> Limits:
     return Limits(**{name: value for name, value in values.items() if value is not None})
 
 
-def _token(path: Path | None) -> str | None:
+def read_token(path: Path | None) -> str | None:
+    """The token in a file; None without a file."""
     from capsense.errors import ServerError
 
     if path is None:

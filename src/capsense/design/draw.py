@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#7A5C00", "#333333")
+"""After Okabe and Ito: told apart with any colour vision; yellow darkened for white paper."""
 ELECTRODES = ("#d9822b", "#eab676")  # neighbours in matrix order differ
 ROLE_COLOURS = {Role.GROUND: "#8fa3ad", Role.SHIELD: "#7fb59a", Role.FLOATING: "#b59ac4"}
 LAYER_COLOUR = "#eef0e4"

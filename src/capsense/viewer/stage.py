@@ -1,0 +1,156 @@
+"""The sensor, the bodies and a plane of the potential, in three dimensions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.design import Design
+from capsense.design.draw import ROLE_COLOURS
+from capsense.design.geometry import Surface
+from capsense.scene import Body, Scene, ShapeKind
+from capsense.viewer.plane import Plane, picture
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+QUIET: Colour = (214, 219, 222)
+"""An electrode without a signal."""
+LOUD: Colour = (213, 94, 0)
+"""An electrode with the largest signal so far."""
+LAYER: Colour = (206, 212, 178)
+CONDUCTIVE: Colour = (120, 134, 150)
+DIELECTRIC: Colour = (150, 190, 205)
+SHRUNK = 3e-4
+"""So much [m] is taken off the faces of layers, so that sheets on them are in front of them."""
+MAX_LABELS = 32
+"""A design of more electrodes shows no names."""
+_FACETED = (ShapeKind.BOX, ShapeKind.CYLINDER, ShapeKind.MESH)
+_TURNS = ((0.5, 0.5, 0.5, 0.5), (0.5**0.5, 0.5**0.5, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+"""By the axis a plane crosses: what turns a picture's x and y into the plane's (w, x, y, z)."""
+
+
+class Stage:
+    """Draws into a server; lengths are metres in the sensor frame.
+
+    Args:
+        server: Shows it to all who are connected.
+        design: The sensor.
+    """
+
+    def __init__(self, server: ViserServer, design: Design) -> None:
+        self._scene = server.scene
+        self._bodies: list[tuple[Body, Any]] = []
+        self._plane: tuple[Plane, Any] | None = None
+        self._shown: list[Colour] = []
+        server.scene.configure_default_lights(cast_shadow=False)
+        self._draw_domain(design)
+        self._draw_stack(design)
+        self._electrodes = [
+            self._sheet(f"/electrodes/{k}", e.surface, QUIET)
+            for k, e in enumerate(design.electrodes)
+        ]
+        if len(design.electrodes) <= MAX_LABELS:
+            for k, e in enumerate(design.electrodes):
+                self._scene.add_label(
+                    f"/labels/{k}", e.name, position=e.surface.bounds.mean(axis=0),
+                    anchor="center-center", font_screen_scale=0.8, depth_test=True,
+                )  # fmt: skip
+        low, high = np.array([e.surface.bounds for e in design.electrodes]).transpose(1, 0, 2)
+        middle = (low.min(axis=0) + high.max(axis=0)) / 2
+        reach = max(0.08, float(np.ptp([low.min(axis=0), high.max(axis=0)], axis=0).max()))
+        camera = server.initial_camera
+        camera.near, camera.far = 1e-3, 20.0
+        camera.look_at = middle + np.array([0.0, 0.0, 0.25 * reach])
+        camera.position = middle + reach * np.array([1.0, -1.5, 1.1])
+        camera.fov = 0.9
+
+    def show_signals(self, strength: Array) -> None:
+        """Colour the electrodes by their signals, 0 to 1, shape (M,)."""
+        part = np.clip(strength, 0.0, 1.0)[:, None]
+        mixed = np.array(QUIET) + part * (np.array(LOUD) - QUIET)
+        colours: list[Colour] = [(int(r), int(g), int(b)) for r, g, b in mixed]
+        for k, (handle, colour) in enumerate(zip(self._electrodes, colours, strict=True)):
+            if not self._shown or self._shown[k] != colour:
+                handle.color = colour
+        self._shown = colours
+
+    def show_bodies(self, scene: Scene) -> None:
+        """Put the bodies where they stand; those of other shapes are made anew."""
+        bodies = list(scene)
+        same = len(bodies) == len(self._bodies) and all(
+            new.shape is old.shape for new, (old, _) in zip(bodies, self._bodies, strict=True)
+        )
+        if not same:
+            for _, handle in self._bodies:
+                handle.remove()
+            self._bodies = [(b, self._solid(f"/bodies/{k}", b)) for k, b in enumerate(bodies)]
+        for body, (_, handle) in zip(bodies, self._bodies, strict=True):
+            x, y, z, w = body.pose.quaternion
+            handle.wxyz, handle.position = (w, x, y, z), body.pose.position
+
+    def show_plane(self, plane: Plane, potential: Array) -> None:
+        """Paint the potential, at the lattice's nodes [V], shape (n,), on a plane."""
+        image = picture(plane.sample(potential))
+        if self._plane is not None and self._plane[0] is plane:
+            self._plane[1].image = image
+            return
+        self.hide_plane()
+        centre = np.zeros(3)
+        centre[plane.axis] = plane.at
+        centre[plane.sides] = (plane.low + plane.high) / 2
+        width, height = (float(v) for v in plane.high - plane.low)
+        handle = self._scene.add_image(
+            "/potential", image, width, height, format="png", wxyz=_TURNS[plane.axis],
+            position=centre, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self._plane = plane, handle
+
+    def hide_plane(self) -> None:
+        """Take the plane away."""
+        if self._plane is not None:
+            self._plane[1].remove()
+            self._plane = None
+
+    def _draw_domain(self, design: Design) -> None:
+        low, high = design.domain.lower, design.domain.upper
+        corners = np.array([[(low, high)[n >> k & 1][k] for k in range(3)] for n in range(8)])
+        edges = [(a, a | 1 << k) for a in range(8) for k in range(3) if not a >> k & 1]
+        self._scene.add_line_segments(
+            "/domain", corners[np.array(edges)], (170, 178, 184), thickness=1.0,
+            thickness_units="screen",
+        )  # fmt: skip
+
+    def _draw_stack(self, design: Design) -> None:
+        for k, layer in enumerate(design.layers):
+            less = min(SHRUNK, 0.2 * float(layer.upper[2] - layer.lower[2]))
+            size = layer.upper - layer.lower - [0.0, 0.0, 2 * less]
+            self._scene.add_box(
+                f"/layers/{k}", color=LAYER, dimensions=tuple(size), opacity=0.9,
+                position=(layer.lower + layer.upper) / 2, cast_shadow=False,
+            )  # fmt: skip
+        for k, conductor in enumerate(design.conductors):
+            value = ROLE_COLOURS[conductor.role].removeprefix("#")
+            red, green, blue = bytes.fromhex(value)
+            self._sheet(f"/conductors/{k}", conductor.surface, (red, green, blue))
+
+    def _sheet(self, name: str, surface: Surface, colour: Colour) -> Any:
+        corners = surface.triangles.reshape(-1, 3)
+        return self._scene.add_mesh_simple(
+            name, corners, np.arange(len(corners)).reshape(-1, 3), color=colour, side="double",
+            flat_shading=True, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+    def _solid(self, name: str, body: Body) -> Any:
+        mesh = body.shape.to_trimesh()
+        conducts = body.material.is_conductor()
+        return self._scene.add_mesh_simple(
+            name, mesh.vertices, mesh.faces, color=CONDUCTIVE if conducts else DIELECTRIC,
+            opacity=0.6, flat_shading=body.shape.kind in _FACETED, cast_shadow=False,
+            receive_shadow=False,
+        )  # fmt: skip

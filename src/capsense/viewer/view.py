@@ -1,0 +1,134 @@
+"""A page in a browser that shows what a player plays."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import threading
+
+import numpy as np
+
+from capsense.errors import MissingDependencyError, ServerError
+from capsense.viewer.charts import heat_map, make_charts, strip
+from capsense.viewer.controls import PlaneControls, TimeControls, status
+from capsense.viewer.player import Player
+from capsense.viewer.stage import Stage
+
+try:
+    from viser import ViserServer
+except ImportError as error:
+    raise MissingDependencyError(
+        'the view needs viser; install it with: pip install "capsense[view]"'
+    ) from error
+
+PERIOD = 0.05
+"""The page changes no more often [s]."""
+
+
+class View:
+    """Serves a page until :meth:`stop`; :meth:`run` keeps it up to date.
+
+    Args:
+        player: What is shown; whoever sees the page can pause and move it.
+        host: Address that it listens at.
+        port: Its port; 0 for any free one.
+
+    Raises:
+        ServerError: The address or port cannot be had.
+    """
+
+    def __init__(self, player: Player, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        check_address(host, port)
+        self._player = player
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
+            self._server = _Server(host=host, port=port, verbose=False)
+        gui, source = self._server.gui, player.source
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.set_panel_label("capsense")
+        gui.main_panel.dock_right()
+        self._stage = Stage(self._server, source.design)
+        self._status = gui.add_html("")
+        self._time = TimeControls(gui, player)
+        self._plane = PlaneControls(gui, player) if source.lattice is not None else None
+        panel = gui.add_panel()
+        with panel.add_tab("signals"):
+            self._charts = make_charts(gui, source.channels)
+            self._matrix = gui.add_html("")
+        panel.dock_left()
+        self._loudest = 1e-21
+        self._drawn: tuple[object, ...] = ()
+        self._painted: tuple[object, ...] = ()
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        host = self._server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+
+    def run(self, stop: threading.Event) -> None:
+        """Keep the page up to date until told to stop."""
+        while not stop.wait(PERIOD):
+            if self._server.get_clients():
+                self.refresh()
+
+    def refresh(self) -> None:
+        """Show the newest, if it is not shown already."""
+        player, shot = self._player, self._player.newest
+        state = (shot, player.playing, player.failure)
+        if shot is not None and state != self._drawn:
+            self._drawn = state
+            with self._server.atomic():
+                self._status.content = status(player, shot)
+                self._time.show(shot)
+                self._stage.show_bodies(shot.scene)
+                times, changes = strip(player.source.times, player.changes, shot.index)
+                for chart in self._charts:
+                    chart.show(times, changes)
+                own = np.abs(np.diag(shot.reading.delta))
+                self._loudest = max(self._loudest, float(own.max()))
+                self._stage.show_signals(np.sqrt(own / self._loudest))
+                self._matrix.content = heat_map(shot.reading.electrode_names, shot.reading.delta)
+        self._paint()
+
+    def stop(self) -> None:
+        """Close the page."""
+        self._server.stop()
+
+    def _paint(self) -> None:
+        """Show the potential, where there is one and it is wanted."""
+        if self._plane is None:
+            return
+        plane, shot, driven = self._plane.plane, self._player.with_field, self._plane.driven
+        if (plane, shot, driven) == self._painted:
+            return
+        self._painted = (plane, shot, driven)
+        if plane is None:
+            self._stage.hide_plane()
+        elif shot is not None and shot.potentials is not None:
+            self._stage.show_plane(plane, shot.potentials[:, driven])
+
+
+class _Server(ViserServer):
+    """Without viser's tunnel to a public host, which any client could ask for."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Refuse."""
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise unless one can listen there.
+
+    Raises:
+        ServerError: One cannot.
+    """
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except (OSError, OverflowError) as error:
+        raise ServerError(
+            f"cannot listen at {host}, port {port}: {error}; give another --host or --port, or "
+            "--port 0 for any free one"
+        ) from None
