@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +12,13 @@ from maxwell import random_maxwell
 from relative import near
 
 from capsense.errors import ReadOutError
+from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import Pattern, self_patterns
 from capsense.readout.chips import CHIPS
 from capsense.readout.converter import CapDac, LinearLaw
 from capsense.readout.counts import join
-from capsense.readout.detector import Detector, ExponentialTracker
-from capsense.readout.noise import Flicker, Mains, White
+from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
+from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.read_out import ReadOut
 from capsense.readout.schedule import Schedule
 from capsense.readout.wiring import Wiring
@@ -145,6 +148,35 @@ def test_every_chip_step_by_step(chip):
     again = join([readout.sample(t, c) for t, c in zip(times, matrices, strict=True)])
     assert same(again, whole)
     assert len(whole) > 3
+
+
+def everything():
+    """Every part of a read-out that has a state or holds arrays."""
+    return plain(
+        dac=CapDac(1e-12, 8, follow=True), wiring=Wiring(crosstalk=0.01),
+        stages=(
+            LinearSensor([1.0, 1.1, 0.9], 1e-14, 1e-16, 0.0),
+            ClimateDrift(1e-16, temperature=Profile.of([(0, 25), (1, 30)], "temperature")),
+            RandomWalk(1e-16), Flicker(1e-15), Mains(1e-15), White(1e-15, 1e-3),
+        ),
+        detector=Detector(1e5, 1e4, SteppingTracker()),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r))])
+def test_copies_go_on_where_the_original_stands(duplicate):
+    """Invariant: to the last bit, and what one does the other does not feel."""
+    rng = np.random.default_rng(0)
+    times = np.arange(60) * 0.01
+    matrices = moving(times, rng)
+    readout = everything()
+    for k in range(30):
+        readout.sample(times[k], matrices[k])
+    twin, third = duplicate(readout), duplicate(readout)
+    original = join([readout.sample(times[k], matrices[k]) for k in range(30, 60)])
+    assert len(original) > 100
+    for other in (twin, third):
+        assert same(join([other.sample(times[k], matrices[k]) for k in range(30, 60)]), original)
 
 
 def test_start_shifts_everything():

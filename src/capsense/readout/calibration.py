@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -157,11 +158,12 @@ class LinearSensor:
             per_channel("calibration", name, getattr(self, name), context.channels)
             for name in ("gain", "offset", "drift")
         )
+        return partial(self._apply, gain, offset, drift)
 
-        def process(channel: Ints, time: Array, value: Array) -> Array:
-            return value * gain[channel] + offset[channel] + drift[channel] * (time - self.epoch)
-
-        return process
+    def _apply(
+        self, gain: Array, offset: Array, drift: Array, channel: Ints, time: Array, value: Array
+    ) -> Array:
+        return value * gain[channel] + offset[channel] + drift[channel] * (time - self.epoch)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,11 @@ class Pattern:
             )
         object.__setattr__(self, "drive", MappingProxyType(drive))
         object.__setattr__(self, "name", label)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A read-only mapping is neither copied nor pickled by itself.
+        figures = (self.floating, self.rest, self.shield, self.name)
+        return type(self), (self.sense, dict(self.drive), *figures)
 
     @property
     def is_self(self) -> bool:

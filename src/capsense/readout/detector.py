@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -55,13 +56,11 @@ class ExponentialTracker:
 
     def start(self, channels: int) -> TrackerProcess:
         """Return the process."""
-        share = -math.expm1(-1.0 / self.samples)
+        return partial(self._follow, -math.expm1(-1.0 / self.samples))
 
-        def process(channel: Ints, signal: Array, touched: Bools) -> Array:
-            step = share * signal
-            return np.where(touched, 0.0, step) if self.hold else step
-
-        return process
+    def _follow(self, share: float, channel: Ints, signal: Array, touched: Bools) -> Array:
+        step = share * signal
+        return np.where(touched, 0.0, step) if self.hold else step
 
 
 @dataclass(frozen=True)
@@ -106,20 +105,23 @@ class SteppingTracker:
         )
         lasted = np.zeros(channels, dtype=np.int64)
         waited = np.zeros(channels, dtype=np.int64)
+        return partial(_step, table, lasted, waited)
 
-        def process(channel: Ints, signal: Array, touched: Bools) -> Array:
-            setting = np.where(touched, 2, np.where(signal > 0, 0, 1))
-            small, step, count, delay = table[setting].T
-            due = waited[channel] >= delay
-            waited[channel] = np.where(due, 0, waited[channel] + 1)
-            within = np.abs(signal) <= small
-            run = np.where(within, 0, lasted[channel] + due)
-            moved = due & (run > count)
-            lasted[channel] = np.where(moved, 0, run)
-            limited = np.sign(signal) * np.minimum(step, np.abs(signal))
-            return np.where(due & within, signal, np.where(moved, limited, 0.0))
 
-        return process
+def _step(
+    table: Ints, lasted: Ints, waited: Ints, channel: Ints, signal: Array, touched: Bools
+) -> Array:
+    """Baselines' changes; ``lasted`` and ``waited`` count samples of each channel, shape (K,)."""
+    setting = np.where(touched, 2, np.where(signal > 0, 0, 1))
+    small, step, count, delay = table[setting].T
+    due = waited[channel] >= delay
+    waited[channel] = np.where(due, 0, waited[channel] + 1)
+    within = np.abs(signal) <= small
+    run = np.where(within, 0, lasted[channel] + due)
+    moved = due & (run > count)
+    lasted[channel] = np.where(moved, 0, run)
+    limited = np.sign(signal) * np.minimum(step, np.abs(signal))
+    return np.where(due & within, signal, np.where(moved, limited, 0.0))
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadOutError
@@ -41,13 +43,11 @@ class White:
 
     def start(self, context: Context) -> Process:
         """Return the process."""
-        rng, rms, relative = context.rng, self.rms, self.relative
+        return partial(self._add, context.rng)
 
-        def process(channel: Ints, time: Array, value: Array) -> Array:
-            scale = np.hypot(rms, relative * value) if relative else rms
-            return value + scale * rng.standard_normal(len(value))
-
-        return process
+    def _add(self, rng: Generator, channel: Ints, time: Array, value: Array) -> Array:
+        scale = np.hypot(self.rms, self.relative * value) if self.relative else self.rms
+        return value + scale * rng.standard_normal(len(value))
 
 
 @dataclass(frozen=True)
@@ -85,13 +85,7 @@ class Flicker:
         keep = np.exp(-context.period / taus)
         kick = np.sqrt(variance * -np.expm1(-2 * context.period / taus))
         state = math.sqrt(variance) * rng.standard_normal((context.channels, len(taus)))
-
-        def process(channel: Ints, time: Array, value: Array) -> Array:
-            states = kick * rng.standard_normal((len(value), len(taus)))
-            _recur(states, keep, state, channel)
-            return value + states.sum(axis=1)
-
-        return process
+        return partial(_add_flicker, rng, keep, kick, state)
 
 
 @dataclass(frozen=True)
@@ -106,16 +100,24 @@ class RandomWalk:
 
     def start(self, context: Context) -> Process:
         """Return the process."""
-        rng = context.rng
         step = self.rate * math.sqrt(context.period)
-        state = np.zeros(context.channels)
+        return partial(_add_walk, context.rng, step, np.zeros(context.channels))
 
-        def process(channel: Ints, time: Array, value: Array) -> Array:
-            walked = step * rng.standard_normal(len(value))
-            _recur(walked, 1.0, state, channel)
-            return value + walked
 
-        return process
+def _add_flicker(
+    rng: Generator, keep: Array, kick: Array, state: Array, channel: Ints, time: Array, value: Array
+) -> Array:
+    states = kick * rng.standard_normal((len(value), len(kick)))
+    _recur(states, keep, state, channel)
+    return value + states.sum(axis=1)
+
+
+def _add_walk(
+    rng: Generator, step: float, state: Array, channel: Ints, time: Array, value: Array
+) -> Array:
+    walked = step * rng.standard_normal(len(value))
+    _recur(walked, 1.0, state, channel)
+    return value + walked
 
 
 def _recur(kicks: Array, keep: Array | float, state: Array, channel: Ints) -> None:
@@ -158,12 +160,10 @@ class Mains:
         """Return the process."""
         phase = 2 * math.pi * context.rng.random()
         passed = self.amplitude * float(np.sinc(self.frequency * context.conversion)) ** self.order
-        omega = 2 * math.pi * self.frequency
+        return partial(self._add, passed, phase)
 
-        def process(channel: Ints, time: Array, value: Array) -> Array:
-            return value + passed * np.sin(omega * time + phase)
-
-        return process
+    def _add(self, passed: float, phase: float, channel: Ints, time: Array, value: Array) -> Array:
+        return value + passed * np.sin(2 * math.pi * self.frequency * time + phase)
 
 
 @dataclass(frozen=True)
@@ -220,15 +220,14 @@ class ClimateDrift:
 
     def start(self, context: Context) -> Process:
         """Return the process."""
+        return self._drift
 
-        def process(channel: Ints, time: Array, value: Array) -> Array:
-            warmer = self.temperature.at(time) - self.reference[0]
-            damper = self.humidity.at(time) - self.reference[1]
-            gain = 1 + self.gain_per_kelvin * warmer + self.gain_per_percent * damper
-            offset = self.offset_per_kelvin * warmer + self.offset_per_percent * damper
-            return gain * value + offset
-
-        return process
+    def _drift(self, channel: Ints, time: Array, value: Array) -> Array:
+        warmer = self.temperature.at(time) - self.reference[0]
+        damper = self.humidity.at(time) - self.reference[1]
+        gain = 1 + self.gain_per_kelvin * warmer + self.gain_per_percent * damper
+        offset = self.offset_per_kelvin * warmer + self.offset_per_percent * damper
+        return gain * value + offset
 
 
 def allan_deviation(values: ArrayLike, averages: Sequence[int] | NDArray[np.int64]) -> Array:

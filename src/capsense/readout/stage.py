@@ -33,7 +33,11 @@ class Context:
 
 
 class Process(Protocol):
-    """A stage at work."""
+    """A stage at work.
+
+    A copy of a read-out copies its processes: keep what changes in objects that can be copied, as
+    the arguments of a ``functools.partial``, and not in the variables of an enclosing function.
+    """
 
     def __call__(self, channel: Ints, time: Array, value: Array) -> Array:
         """Return the new capacitances of a batch [F], shape (n,).
