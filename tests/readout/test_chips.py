@@ -179,9 +179,51 @@ def test_leads_load_the_shunt():
     assert found == near(expected, rel=3e-3)
 
 
+def test_drift_with_temperature():
+    """Analytic: the chip's own figures, or those given; zero is a figure, too."""
+    empty = 2e-12
+    cases = [
+        ("fdc1004", {}, empty * (1 - 10 * 37.5e-6) + 10 * 46e-15 / 165),
+        ("fdc1004", {"gain_per_kelvin": 0.0}, empty + 10 * 46e-15 / 165),
+        ("ad7147", {"offset_per_kelvin": 3e-15}, empty + 30e-15),
+        ("ad7147", {"gain_per_kelvin": 0.0}, empty),
+    ]
+    for name, options, expected in cases:
+        readout = ReadOut.preset(name, NAMES[:1], noise=False, temperature=35.0, **options)
+        found = readout([0.0, 1.0], np.full((2, 1), empty)).capacitance
+        assert found == pytest.approx(np.full(len(found), expected), abs=0.13e-15)
+    damp = {"humidity": 80.0, "offset_per_percent": 1e-16, "gain_per_percent": 1e-4}
+    readout = ReadOut.preset("fdc1004", NAMES[:1], noise=False, **damp)
+    found = readout([0.0, 1.0], np.full((2, 1), empty)).capacitance
+    assert found == pytest.approx(np.full(len(found), empty * 1.003 + 3e-15), abs=1e-18)
+
+
+def test_pace_and_latency_of_the_host():
+    """A chip that is asked every 50 ms, and answers 4 ms later."""
+    readout = ReadOut.preset("fdc1004", NAMES[:2], period=0.05, latency=4e-3)
+    counts = readout([0.0, 0.25], np.full((2, 2), LEVEL))
+    assert counts.of("E0").time == near(0.014 + 0.05 * np.arange(5), rel=1e-9)
+    assert counts.of("E1").time == near(0.024 + 0.05 * np.arange(5), rel=1e-9)
+
+
+def test_noise_of_ones_own():
+    """Statistical: white noise given takes the place of the chip's, in every chip."""
+    for name in ("ad7746", "mpr121", "teensy"):
+        readout, counts = still(name, 40, white=5e-13 if name == "teensy" else 5e-14, flicker=0.0)
+        assert counts.capacitance.std() == near(readout.stages[0].rms, rel=0.1)
+        quiet, _ = still(name, 1, white=0.0, flicker=0.0)
+        assert quiet.stages == ()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (("ad7147", {"temperature": 30.0}), "temperature changes nothing, as no such drift of the"),
+        (("fdc1004", {"humidity": 30.0}), "humidity changes nothing.* offset_per_percent or gain"),
+        (("fdc1004", {"gain_per_percent": 1e-3}), "does nothing without a humidity"),
+        (("fdc1004", {"period": 0.01}), "a period of 0.01 s is too short"),
+        (("fdc1004", {"latency": "long"}), "latency is 'long'"),
+        (("fdc1004", {"white": -1e-15}), "rms is -1e-15"),
         (("fdc1004", {"rate": "400"}), "no rate of '400' conversions per second"),
         (("fdc1004", {"flicker": "low"}), "floor is 'low'"),
         (("mpr121", {"expected": "10 pF"}), "expected is '10 pF'"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,7 +12,9 @@ from relative import near
 from capsense.errors import ReadOutError
 from capsense.readout.calibration import LinearSensor, calibrate
 from capsense.readout.config import choose_readout, load_readout, parse_readout
+from capsense.readout.converter import ResonanceLaw, ShuntLaw
 from capsense.readout.detector import ExponentialTracker, SteppingTracker
+from capsense.readout.front_end import ShuntFrontEnd
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
 from capsense.readout.read_out import ReadOut
 
@@ -20,6 +22,8 @@ NAMES = ("E1", "E2", "E3")
 FULL = """
 chip = "fdc1004"
 rate = 400
+period = 0.02
+latency = 0.003
 seed = 7
 
 [[channel]]
@@ -39,6 +43,7 @@ coupling = 3e-14
 crosstalk = 0.001
 
 [noise]
+white = 7e-16
 flicker = 2e-16
 walk = 1e-18
 mains = 1e-15
@@ -48,6 +53,7 @@ mains_frequency = 60
 temperature = [[0, 22.0], [600, 30.0]]
 humidity = 40
 offset_per_kelvin = 1e-16
+gain_per_percent = 2e-5
 
 [detector]
 touch = 5000
@@ -68,7 +74,9 @@ def parse(text):
 def test_everything_is_taken_over():
     readout = parse(FULL)
     assert readout.channel_names == ("E1", "difference")
-    assert readout.schedule.conversion == near(2.5e-3, rel=1e-12)
+    plan = readout.schedule
+    assert (plan.conversion, plan.period) == (near(2.5e-3, rel=1e-12), near(0.02, rel=1e-12))
+    assert plan.latency == 0.003
     assert readout.wiring.trace == [1e-12, 2e-12]
     assert readout.wiring.coupling == 3e-14
     sensor, climate, walk, flicker, mains, white = readout.stages
@@ -81,10 +89,12 @@ def test_everything_is_taken_over():
     assert isinstance(climate, ClimateDrift)
     assert climate.temperature.at(np.array([300.0]))[0] == near(26.0, rel=1e-12)
     assert climate.offset_per_kelvin == 1e-16
+    assert climate.gain_per_kelvin == -37.5e-6  # the chip's
+    assert climate.gain_per_percent == 2e-5
     assert walk == RandomWalk(1e-18)
     assert flicker == Flicker(2e-16)
     assert mains == Mains(1e-15, 60.0)
-    assert white == White(1e-15)
+    assert white == White(7e-16)
     assert readout.detector is not None
     assert readout.detector.tracker == ExponentialTracker(500)
     patterns = readout.bank.patterns
@@ -127,6 +137,20 @@ def test_pairs_and_stepping_baseline():
     assert (readout.detector.release, readout.detector.tracker) == (5.0, SteppingTracker())
 
 
+def test_a_tank_or_front_end_of_ones_own():
+    """What a file leaves out stays as the chip has it; the wiring loads the shunt as well."""
+    law = parse('chip = "fdc2214"\n[tank]\ninductance = 10e-6\ncapacitance = 20e-12\n').law
+    assert law == ResonanceLaw(10e-6, 20e-12, 40e6)
+    law = parse(
+        'chip = "sdr"\n[front_end]\nfrequency = 5e5\nshunt = 2e3\nbandwidth = 3e6\n'
+        "parasitic = 1e-12\nfull_scale = 0.5\nbits = 14\n[wiring]\ntrace = 4e-12\n"
+    ).law
+    assert isinstance(law, ShuntLaw)
+    assert law.front_end.parasitic == near(5e-12, rel=1e-12)
+    rest = replace(law, front_end=replace(law.front_end, parasitic=0.0))
+    assert rest == ShuntLaw(ShuntFrontEnd(5e5, 2e3, 20.0, 1.0, 3e6), 0.5, 14)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -151,9 +175,20 @@ def test_pairs_and_stepping_baseline():
         ('chip = "fdc1004"\n[wiring]\ntrace = -1', "wiring: trace = -1 must be from 0"),
         ('chip = "fdc1004"\n[wiring]\ntrace = [1e-12]', "trace is .*one per channel"),
         ('chip = "fdc1004"\n[calibration]\ngain = [1.0]', "gain is .*one per channel"),
-        ('chip = "fdc1004"\n[calibration]\ngain = 0', "a gain is 0"),
+        ('chip = "fdc1004"\n[calibration]\ngain = 0', "my.toml: calibration: .*a gain is 0"),
         ('chip = "fdc1004"\n[climate]\noffset_per_kelvin = 1e-16', "without a temperature"),
-        ('chip = "fdc1004"\n[noise]\nwhite = 1', "noise: unknown key 'white'"),
+        ('chip = "fdc1004"\n[noise]\npink = 1', "noise: unknown key 'pink'"),
+        ('chip = "fdc1004"\n[noise]\nwhite = 1', "white = 1 must be from 0 to 1e-09 F"),
+        ('chip = "fdc1004"\n[tank]\nreference = 4e7', "has no tank; it goes with chip = fdc2214"),
+        ('chip = "fdc2214"\n[front_end]\ngain = 2', "no front_end; it goes with chip = sdr"),
+        ('chip = "fdc2214"\n[tank]\nreference = 40', "tank: reference = 40 must be from 1000"),
+        (
+            'chip = "sdr"\n[front_end]\ngane = 2',
+            "front_end: unknown key 'gane'; did you mean 'gain",
+        ),
+        ('chip = "sdr"\n[front_end]\ngain = 1e-6', "my.toml: front_end: the codes run from 0 to 0"),
+        ('chip = "fdc1004"\nperiod = 0.01', "a period of 0.01 s is too short"),
+        ('chip = "fdc1004"\nlatency = -1', "latency = -1 must be from 0"),
         ('chip = "fdc1004"\n[climate]\ntemperature = [[1, 2], [1, 3]]', "times must rise"),
         ('chip = "fdc1004"\n[detector]\ntouch = 5\nrelease = 9', "release = 9 must be from"),
         ('chip = "fdc1004"\n[detector]\nrelease = 9', "detector: missing key 'touch'"),

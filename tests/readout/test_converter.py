@@ -92,6 +92,19 @@ def test_resonance_law():
     assert change == near(-0.5 * 0.01 / 35, rel=1e-3)
 
 
+def test_a_weak_amplifier_ends_the_range():
+    """Where it gives less than full scale, a code means a finite capacitance up to the last."""
+    law = ShuntLaw(ShuntFrontEnd(1e6, 1e3, 0.5, 1.0), 1.0)
+    assert law.high == 2**14 - 1
+    code, flags = quantise(law, np.array([1e-9, 1e-3, -1e-3]))
+    assert flags.tolist() == [Range.INSIDE, Range.ABOVE, Range.BELOW]
+    assert code.tolist()[1:] == [law.high, -law.high]
+    reported = law.capacitance(code)
+    assert np.isfinite(reported).all()
+    assert reported[1] > reported[0] > 0
+    assert reported[2] == -reported[1]
+
+
 def test_dac_moves_the_range():
     """Analytic: a capacitance far out of the law's range is converted, to half a code."""
     dac = CapDac(3e-12, 32)
@@ -143,6 +156,8 @@ def test_dac_follows_only_if_it_may():
         (lambda: ReciprocalLaw(1e-6, 1e-6, 1.2), "codes run from 598 to 426"),
         (lambda: ResonanceLaw(0.0, 1e-12, 4e7), "inductance is 0.0"),
         (lambda: ShuntLaw(ShuntFrontEnd(), math.nan), "full_scale is nan"),
+        (lambda: ShuntLaw(ShuntFrontEnd(gain=1e-9), 1.0), "codes run from 0 to 0"),
+        (lambda: ShuntLaw(ShuntFrontEnd(), 1.0, 1), "bits is 1"),
         (lambda: LinearLaw("fine", 0, 1), "lsb is 'fine'"),
         (lambda: CapDac(1e-12, 8, start="low"), "is 'low'; give a whole number"),
         (lambda: CapDac(0.0, 32), "step is 0.0"),

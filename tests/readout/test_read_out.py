@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -36,6 +36,7 @@ def plain(schedule=None, **options):
 def full(seed=0):
     """Everything that has a state."""
     return plain(
+        Schedule(((0,), (1,), (2,)), 2e-3, 1e-4, latency=7e-3),
         dac=CapDac(1e-12, 8, follow=True),
         wiring=Wiring(trace=[1e-13, 2e-13, 0.0], cable=1e-12, shield_gain=0.9, crosstalk=0.01),
         stages=(Flicker(1e-15), Mains(1e-15), White(1e-15, 1e-3)),
@@ -137,6 +138,7 @@ def test_every_chip_step_by_step(chip):
     matrices = moving(times, rng)
     readout = ReadOut.preset(
         chip, NAMES, seed=5, expected=4e-12, mains=1e-15, temperature=[(0, 25), (1, 30)],
+        offset_per_kelvin=1e-16,
         wiring=Wiring(crosstalk=0.02),
     )  # fmt: skip
     whole = readout(times, matrices)
@@ -187,6 +189,24 @@ def test_start_shifts_everything():
     assert later.time - 3600.0 == pytest.approx(now.time, abs=1e-9)
     # Instants relative to the start are rounded differently, by 1e-13 s or so.
     assert np.abs(later.capacitance - now.capacitance).max() < 1e-20
+
+
+def test_latency_only_delays():
+    """Analytic: the same conversions, as much later, and none before its time."""
+    times = np.arange(40) * 0.013
+    matrices = moving(times, np.random.default_rng(1))
+    prompt = plain(stages=(White(1e-15),))
+    late = plain(replace(prompt.schedule, latency=0.02), stages=(White(1e-15),))
+    now, then = prompt(times, matrices), late(times, matrices)
+    assert len(now) > len(then) > 150
+    assert (then.code == now.code[: len(then)]).all()
+    assert then.time == pytest.approx(now.time[: len(then)] + 0.02, abs=1e-12)
+    assert late.schedule.lag == pytest.approx(0.021, abs=1e-12)
+    assert np.array_equal(late.due(0.5), prompt.due(0.5))
+    for time, matrix in zip(times, matrices, strict=True):
+        counts = late.sample(time, matrix)
+        assert (counts.time <= time + 1e-9).all()
+        assert (counts.time > time - 0.013 - 1e-9).all()
 
 
 def test_wiring():

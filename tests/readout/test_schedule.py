@@ -28,7 +28,7 @@ PLANS = [
     Schedule.sequential(3, 1e-3, period=0.016),
     Schedule.simultaneous(4, 0.01),
     Schedule.simultaneous(4, 0.01, period=0.03),
-    Schedule(((2, 0), (1,), (3, 4)), 1e-3, 2e-4, 3e-4),
+    Schedule(((2, 0), (1,), (3, 4)), 1e-3, 2e-4, 3e-4, 5e-3),
 ]
 
 
@@ -67,6 +67,7 @@ def test_inputs_of_several_chips_run_side_by_side():
         (lambda: Schedule(((0,),), float("nan")), "conversion is nan"),
         (lambda: Schedule(((0,),), 1.0, -1.0), "gap is -1.0"),
         (lambda: Schedule(((0,),), 1.0, 0.0, float("inf")), "idle is inf"),
+        (lambda: Schedule(((0,),), 1.0, latency=-1.0), "latency is -1.0"),
         (lambda: Schedule((), 1.0), "list each of 0, 1, 2"),
         (lambda: Schedule(((0, 0),), 1.0), "list each of 0, 1, 2"),
         (lambda: Schedule(((0, 2),), 1.0), "list each of 0, 1, 2"),

@@ -57,6 +57,7 @@ FDC1004 = Chip(
     rates=_white(0.5 * FF, 100.0, (100.0, 200.0, 400.0)),
     inputs=4, flicker=0.15 * FF,
     dac=CapDac(3.125 * PF, 32, bit_errors=(0.0, 0.0, -0.13 * PF, 1.25 * PF)),
+    offset_per_kelvin=46 * FF / 165, gain_per_kelvin=-37.5e-6,
     facts=(
         Fact("range", "±15 pF; 24-bit two's complement, 2^19 codes per pF, clipped at ±16 pF",
              _CONFIRMED, _FDC1004 + "1 Features; 24 bit and clipping: TI E2E forum threads "
@@ -71,6 +72,9 @@ FDC1004 = Chip(
              _FDC1004 + "1 Features; 6.3.2 The CAPDAC"),
         Fact("CAPDAC jump", "−1.4 pF from code 7 to 8, on one specimen; laid on bits 2 and 3",
              _CONFIRMED, "TI E2E forum thread 1178477, table of readings"),
+        Fact("temperature drift", "gain −37.5 ppm/K; offset 46 fF from −40 to 125 °C, taken as "
+             "even: 0.28 fF/K", _CONFIRMED, _FDC1004 + "5.5 Electrical Characteristics, as quoted "
+             "in TI E2E forum thread 1054072"),
         Fact("shields", "two, up to 400 pF each", _CONFIRMED, _FDC1004 + "1 Features"),
         Fact("excitation", "25 kHz", _REMEMBERED, _FDC1004 + "5.5 Electrical Characteristics"),
         Fact("flicker floor", "0.15 fF", _ASSUMED, ""),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,15 +12,17 @@ from capsense._validate import read_toml, suggest
 from capsense.errors import ReadOutError
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
+from capsense.readout.chip import Chip
 from capsense.readout.chips import CHIPS
+from capsense.readout.converter import Law, ResonanceLaw, ShuntLaw
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
 from capsense.readout.presets import Options, build, chip_of, expected_of
 from capsense.readout.read_out import Reading, ReadOut
 from capsense.readout.wiring import Wiring
 
 TOP_KEYS = (
-    "chip", "rate", "seed", "random", "expected", "mode", "pairs", "rest", "channel", "wiring",
-    "noise", "climate", "detector", "calibration",
+    "chip", "rate", "period", "latency", "seed", "random", "expected", "mode", "pairs", "rest",
+    "channel", "tank", "front_end", "wiring", "noise", "climate", "detector", "calibration",
 )  # fmt: skip
 
 
@@ -78,8 +81,13 @@ def parse_readout(
         options["rate"] = top.number("rate", 1e-3, 1e7, unit="Hz")
     if "expected" in top:
         options["expected"] = top.number("expected", 1e-15, 1e-6, unit="F")
+    if "period" in top:
+        options["period"] = top.number("period", 1e-6, 1e6, unit="s")
+    options["latency"] = top.number("latency", 0.0, 1e3, 0.0, unit="s")
     options["seed"] = top.integer("seed", 0, 2**63 - 1, 0)
     options["noise"] = top.boolean("random", True)
+    if "tank" in top or "front_end" in top:
+        options["law"] = _law(top, chip)
     for key, read in (
         ("wiring", _wiring), ("noise", _noise), ("climate", _climate), ("detector", _detector),
         ("calibration", _calibration),
@@ -91,6 +99,43 @@ def parse_readout(
         return build(chip, electrodes, Options.of(options))
     except ReadOutError as error:
         raise top.error(str(error)) from None
+
+
+def _law(top: Table, chip: Chip) -> Law:
+    """A tank or front end of one's own; what the file leaves out is as the chip has it."""
+    law = chip.law
+    for key, kind in (("tank", ResonanceLaw), ("front_end", ShuntLaw)):
+        if key in top and not isinstance(law, kind):
+            fitting = ", ".join(c.name for c in CHIPS.values() if isinstance(c.law, kind))
+            raise top.error(f"the {chip.name} has no {key}; it goes with chip = {fitting}")
+    if isinstance(law, ResonanceLaw):
+        table = Table(top.data["tank"], top.source, "tank")
+        table.only(("inductance", "capacitance", "reference"))
+        return replace(
+            law,
+            inductance=table.number("inductance", 1e-9, 1.0, law.inductance, "H"),
+            fixed=table.number("capacitance", 1e-15, 1e-3, law.fixed, "F"),
+            reference=table.number("reference", 1e3, 1e9, law.reference, "Hz"),
+        )
+    assert isinstance(law, ShuntLaw)
+    table = Table(top.data["front_end"], top.source, "front_end")
+    limits = {
+        "frequency": (1.0, 1e10, "Hz"), "shunt": (1e-3, 1e12, "Ω"), "gain": (1e-6, 1e9, ""),
+        "amplitude": (1e-6, 1e6, "V"), "bandwidth": (1.0, 1e12, "Hz"),
+        "parasitic": (0.0, 1e-6, "F"),
+    }  # fmt: skip
+    table.only((*limits, "full_scale", "bits"))
+    figures = {
+        key: table.number(key, low, high, unit=unit)
+        for key, (low, high, unit) in limits.items()
+        if key in table
+    }
+    full_scale = table.number("full_scale", 1e-9, 1e6, law.full_scale, "V")
+    bits = table.integer("bits", 2, 32, law.bits)
+    try:
+        return ShuntLaw(replace(law.front_end, **figures), full_scale, bits)
+    except ReadOutError as error:
+        raise table.error(str(error)) from None
 
 
 def _patterns(top: Table, mode: str, electrodes: Sequence[str]) -> tuple[Pattern, ...]:
@@ -177,8 +222,8 @@ def _wiring(table: Table) -> dict[str, Any]:
 
 def _noise(table: Table) -> dict[str, Any]:
     limits = {
-        "flicker": (0.0, 1e-9, "F"), "walk": (0.0, 1e-9, "F/√s"), "mains": (0.0, 1e-9, "F"),
-        "mains_frequency": (1.0, 1e3, "Hz"),
+        "white": (0.0, 1e-9, "F"), "flicker": (0.0, 1e-9, "F"), "walk": (0.0, 1e-9, "F/√s"),
+        "mains": (0.0, 1e-9, "F"), "mains_frequency": (1.0, 1e3, "Hz"),
     }  # fmt: skip
     table.only(limits)
     return {
@@ -191,7 +236,7 @@ def _noise(table: Table) -> dict[str, Any]:
 def _climate(table: Table) -> dict[str, Any]:
     coefficients = {
         "offset_per_kelvin": (1e-9, "F/K"), "gain_per_kelvin": (1.0, "1/K"),
-        "offset_per_percent": (1e-9, "F"),
+        "offset_per_percent": (1e-9, "F"), "gain_per_percent": (1.0, ""),
     }  # fmt: skip
     table.only(("temperature", "humidity", *coefficients))
     out: dict[str, Any] = {
@@ -230,4 +275,7 @@ def _calibration(table: Table) -> dict[str, Any]:
         if key in table:
             figures[key] = table.series(key, low, high, unit)
     epoch = table.number("epoch", -1e12, 1e12, 0.0)
-    return {"stages": (LinearSensor(**figures, epoch=epoch),)}
+    try:
+        return {"stages": (LinearSensor(**figures, epoch=epoch),)}
+    except ReadOutError as error:
+        raise table.error(str(error)) from None

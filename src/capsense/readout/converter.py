@@ -178,16 +178,19 @@ class ShuntLaw:
 
     def __post_init__(self) -> None:
         require("shunt law", "full_scale", self.full_scale, 0.0, "V", open_=True)
+        require_whole("shunt law", "bits", self.bits, 2)
+        _require_codes(self.low, self.high)
 
     @property
     def low(self) -> int:
-        """Smallest code."""
-        return -self.high - 1
+        """Smallest code; the one below it has no counterpart."""
+        return -self.high
 
     @property
     def high(self) -> int:
-        """Largest code."""
-        return 2 ** (self.bits - 1) - 1
+        """Largest code: the radio's, or the last below what the amplifier gives for any C."""
+        most = self.front_end.gain * self.front_end.amplitude / self.full_scale
+        return min(2 ** (self.bits - 1) - 1, math.ceil(most * 2 ** (self.bits - 1)) - 1)
 
     def level(self, capacitance: Array) -> Array:
         """Code before rounding."""
@@ -205,7 +208,7 @@ def _require_codes(low: int, high: int) -> None:
     if not low < high:
         raise ReadOutError(
             f"the codes run from {low} to {high}; widen the range (at a reciprocal law, raise the "
-            "supply or lower the headroom)"
+            "supply or lower the headroom; at a shunt law, lower the full scale)"
         )
 
 

@@ -19,7 +19,7 @@ from capsense.readout.converter import Law, ReciprocalLaw, ShuntLaw
 from capsense.readout.detector import Detector
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.read_out import ReadOut
-from capsense.readout.schedule import Schedule
+from capsense.readout.schedule import Schedule, idle_of
 from capsense.readout.stage import Stage
 from capsense.readout.wiring import Wiring
 
@@ -37,9 +37,15 @@ class Options:
     """Channels; by default all electrodes, or all pairs, as the chip measures."""
     rate: float | None = None
     """Conversions per second [Hz], one of the chip's; by default its first."""
+    period: float | None = None
+    """Time from one round of all channels to the next [s]; by default as soon as it is done."""
+    latency: float = 0.0
+    """Time from the end of a conversion until its result can be read [s]."""
     seed: int = 0
     noise: bool = True
     """Whether the chip's noise is on; quantisation and saturation stay."""
+    white: float | None = None
+    """White noise of one conversion, rms [F], instead of the chip's."""
     flicker: float | None = None
     """Allan deviation of the floor [F], instead of the chip's."""
     walk: float = 0.0
@@ -56,11 +62,15 @@ class Options:
     """[F/K], instead of the chip's."""
     gain_per_kelvin: float | None = None
     """[1/K], instead of the chip's."""
-    offset_per_percent: float = 0.0
+    offset_per_percent: float | None = None
     """[F] per percent of relative humidity."""
+    gain_per_percent: float | None = None
+    """Per percent of relative humidity."""
     wiring: Wiring | None = None
     expected: float | None = None
     """Capacitance that a chip which adapts to it is set up for [F]."""
+    law: Law | None = None
+    """The converter's law, instead of the chip's: another tank, another front end."""
     stages: Sequence[Stage] = ()
     """Further analogue stages, before the chip's noise."""
     detector: Detector | None = None
@@ -113,10 +123,12 @@ def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None =
         raise ReadOutError(
             f"{part.name} has no rate of {chosen.rate!r} conversions per second; it has {rates}"
         )
+    plan = schedule_of(part, patterns, 1.0 / rate.per_second - part.gap)
+    idle = idle_of(chosen.period, plan.period)
     return ReadOut(
         patterns,
         electrodes,
-        schedule_of(part, patterns, 1.0 / rate.per_second - part.gap),
+        dataclasses.replace(plan, idle=idle, latency=chosen.latency),
         law_of(part, chosen, len(patterns)),
         dac=part.dac,
         wiring=chosen.wiring,
@@ -162,15 +174,16 @@ def law_of(chip: Chip, options: Options, channels: int) -> Law:
     One that charges is set up for the capacitance expected. Over a shunt lies what the leads have
     to ground, their mean: there is one front end for all.
     """
-    if isinstance(chip.law, ShuntLaw) and options.wiring is not None:
-        load = float(options.wiring.ground(channels).mean())
-        loaded = dataclasses.replace(chip.law.front_end, parasitic=load)
-        return dataclasses.replace(chip.law, front_end=loaded)
-    if isinstance(chip.law, ReciprocalLaw):
+    law = options.law or chip.law
+    if isinstance(law, ShuntLaw) and options.wiring is not None:
+        load = law.front_end.parasitic + float(options.wiring.ground(channels).mean())
+        loaded = dataclasses.replace(law.front_end, parasitic=load)
+        return dataclasses.replace(law, front_end=loaded)
+    if options.law is None and isinstance(law, ReciprocalLaw):
         expected = EXPECTED if options.expected is None else options.expected
         require("read-out", "expected", expected, 0.0, "F", open_=True)
         return charge_for(expected)
-    return chip.law
+    return law
 
 
 def expected_of(empty: Array) -> float:
@@ -205,20 +218,7 @@ def charge_for(capacitance: float) -> ReciprocalLaw:
 
 def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
     """Climate, random walk, flicker, mains and white noise, those that are not zero."""
-    out: list[Stage] = []
-    _require_climate(options)
-    if options.temperature is not None or options.humidity is not None:
-        temperature = 25.0 if options.temperature is None else options.temperature
-        humidity = 50.0 if options.humidity is None else options.humidity
-        out.append(
-            ClimateDrift(
-                _first(options.offset_per_kelvin, chip.offset_per_kelvin),
-                _first(options.gain_per_kelvin, chip.gain_per_kelvin),
-                options.offset_per_percent,
-                temperature=Profile.of(temperature, "temperature"),
-                humidity=Profile.of(humidity, "humidity"),
-            )
-        )
+    out = _climate(chip, options)
     if options.walk:
         out.append(RandomWalk(options.walk))
     floor = _first(options.flicker, chip.flicker if options.noise else 0.0)
@@ -226,21 +226,39 @@ def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
         out.append(Flicker(floor))
     if options.mains:
         out.append(Mains(options.mains, options.mains_frequency))
-    if options.noise and (rms or chip.relative_noise):
+    if options.white is not None:
+        out += [White(options.white)] if options.white else []
+    elif options.noise and (rms or chip.relative_noise):
         out.append(White(rms, chip.relative_noise))
     return out
 
 
-def _require_climate(options: Options) -> None:
-    """Refuse coefficients of a temperature or humidity that is not given."""
-    for quantity, coefficients in (
-        ("temperature", ("offset_per_kelvin", "gain_per_kelvin")),
-        ("humidity", ("offset_per_percent",)),
-    ):
-        for name in coefficients:
-            if getattr(options, name) and getattr(options, quantity) is None:
-                raise ReadOutError(f"{name} does nothing without a {quantity}; give one")
+def _climate(chip: Chip, options: Options) -> list[Stage]:
+    """Drift with temperature and humidity, where one is given; what would do nothing is refused."""
+    figures = {
+        "offset_per_kelvin": chip.offset_per_kelvin, "gain_per_kelvin": chip.gain_per_kelvin,
+        "offset_per_percent": 0.0, "gain_per_percent": 0.0,
+    }  # fmt: skip
+    chosen = {name: getattr(options, name) for name in figures}
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    figures.update(chosen)
+    for quantity, unit in (("temperature", "kelvin"), ("humidity", "percent")):
+        names = [f"offset_per_{unit}", f"gain_per_{unit}"]
+        if getattr(options, quantity) is None:
+            for name in names:
+                if chosen.get(name):
+                    raise ReadOutError(f"{name} does nothing without a {quantity}; give one")
+        elif not any(name in chosen or figures[name] for name in names):
+            raise ReadOutError(
+                f"{quantity} changes nothing, as no such drift of the {chip.name} is known; give "
+                f"{' or '.join(names)}"
+            )
+    if options.temperature is None and options.humidity is None:
+        return []
+    temperature, humidity = _first(options.temperature, 25.0), _first(options.humidity, 50.0)
+    profiles = Profile.of(temperature, "temperature"), Profile.of(humidity, "humidity")
+    return [ClimateDrift(**figures, temperature=profiles[0], humidity=profiles[1])]
 
 
-def _first(value: float | None, otherwise: float) -> float:
+def _first(value: Any, otherwise: Any) -> Any:
     return otherwise if value is None else value

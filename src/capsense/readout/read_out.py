@@ -139,11 +139,11 @@ class ReadOut:
         self._detect = None if self.detector is None else self.detector.start(k, rising)
         self._start = start
         self._seen = 0  # samples whose instant has passed
-        # Instants [s], channels and values [F] of samples whose conversion is not finished.
+        # Instants [s], channels and values [F] of samples whose result cannot be read yet.
         self._waiting = (np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
         self._last: tuple[float, Array] | None = None
         self._next_instant = float(plan.instant(np.array(0))) - plan.slack
-        self._next_stamp = self._next_instant + 0.5 * plan.conversion
+        self._next_stamp = self._next_instant + plan.lag
         self._none = self._report(-math.inf)
 
     def due(self, until: float) -> Array:
@@ -302,12 +302,12 @@ class ReadOut:
         return values + self._offset
 
     def _report(self, now: float) -> Counts:
-        """Process the waiting samples whose conversion is finished at ``now`` [s]."""
+        """Process the waiting samples whose result can be read at ``now`` [s]."""
         plan = self.schedule
         if -math.inf < now < self._next_stamp:
             return self._none
         instant, channel, value = self._waiting
-        late = 0.5 * plan.conversion - plan.slack
+        late = plan.lag - plan.slack
         ready = int((instant + late).searchsorted(now, "right"))
         self._waiting = (instant[ready:], channel[ready:], value[ready:])
         left = self._next_instant + plan.slack if ready == len(instant) else float(instant[ready])
@@ -316,7 +316,7 @@ class ReadOut:
         watched = self._detect is not None
         counts = Counts(
             self.bank.names,
-            time=self._start + (instant + 0.5 * plan.conversion),
+            time=self._start + (instant + plan.lag),
             channel=channel[:ready],
             code=np.empty(ready, dtype=np.int64),
             capacitance=np.empty(ready),

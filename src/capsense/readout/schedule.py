@@ -3,8 +3,8 @@
 Time runs in cycles. A cycle is a row of slots, one after another; the channels of a slot are
 converted at the same time. A conversion is an average over its window. For a world that moves
 evenly that is the value at the middle of the window, which is therefore the channel's *instant*;
-the result can be read at the end of the window, the sample's *time stamp*. The neglected term is
-T²/24 times the second derivative of the capacitance, T being the conversion time.
+the result can be read at the end of the window, or a latency later: the sample's *time stamp*. The
+neglected term is T²/24 times the second derivative of the capacitance, T being the conversion time.
 """
 
 from __future__ import annotations
@@ -34,11 +34,14 @@ class Schedule:
     """Time before each conversion, to switch over and to settle [s]."""
     idle: float = 0.0
     """Pause at the end of a cycle [s]."""
+    latency: float = 0.0
+    """Time from the end of a conversion until its result can be read: bus, driver, host [s]."""
 
     def __post_init__(self) -> None:
         require("schedule", "conversion", self.conversion, 0.0, "s", open_=True)
         require("schedule", "gap", self.gap, 0.0, "s")
         require("schedule", "idle", self.idle, 0.0, "s")
+        require("schedule", "latency", self.latency, 0.0, "s")
         if not all(self.slots):
             raise ReadOutError("schedule: a slot holds no channel; leave it out")
         channels = sorted(c for slot in self.slots for c in slot)
@@ -73,7 +76,7 @@ class Schedule:
         slots = tuple(
             tuple(range(first, channels, per_chip)) for first in range(min(per_chip, channels))
         )
-        return cls(slots, conversion, gap, _idle(period, len(slots) * (conversion + gap)))
+        return cls(slots, conversion, gap, idle_of(period, len(slots) * (conversion + gap)))
 
     @classmethod
     def simultaneous(
@@ -86,7 +89,7 @@ class Schedule:
         """
         require_whole("schedule", "the number of channels", channels, 1)
         require("schedule", "conversion", conversion, 0.0, "s", open_=True)
-        return cls((tuple(range(channels)),), conversion, 0.0, _idle(period, conversion))
+        return cls((tuple(range(channels)),), conversion, 0.0, idle_of(period, conversion))
 
     @cached_property
     def period(self) -> float:
@@ -120,6 +123,11 @@ class Schedule:
         return cycle * self.period + self.offsets[place], self.order[place]
 
     @property
+    def lag(self) -> float:
+        """Time from a sample's instant to its time stamp [s]."""
+        return 0.5 * self.conversion + self.latency
+
+    @property
     def slack(self) -> float:
         """Two times closer than this [s] count as the same."""
         return 1e-9 * self.conversion
@@ -132,8 +140,12 @@ class Schedule:
         return int(near[0] + np.count_nonzero(self.instant(near) - self.slack <= time))
 
 
-def _idle(period: float | None, busy: float) -> float:
-    """What is left of a cycle's period [s] after ``busy`` seconds of conversions."""
+def idle_of(period: float | None, busy: float) -> float:
+    """What is left of a cycle's period [s] after ``busy`` seconds of conversions.
+
+    Raises:
+        ReadOutError: The period is no positive number, or too short.
+    """
     if period is None:
         return 0.0
     require("schedule", "period", period, 0.0, "s", open_=True)
