@@ -190,6 +190,7 @@ def test_each_sensor_has_its_own_chip() -> None:
     skin = arm.skin("six_patch_bare", readout="fdc1004")
     chips = {id(s.readout) for s in skin.sensors.values()}
     assert len(chips) == 3
+    assert [s.readout.seed for s in skin.sensors.values()] == [0, 1, 2]  # noise is not shared
     for k in range(3):
         arm.move(k)
         readings = skin.read()

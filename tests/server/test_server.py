@@ -111,7 +111,7 @@ def test_readout(dome: np.ndarray) -> None:
     simulator = Simulator("six_patch")
     readout = cs.ReadOut.preset("fdc1004", simulator.electrode_names)
     with RunningServer(readout="fdc1004") as server, server.client() as client:
-        sensor = client.open()
+        sensor, other = client.open(), client.open()
         assert sensor.channel_names == readout.channel_names
         times = 100.0 + 0.01 * np.arange(30)
         here, there = [], []
@@ -122,6 +122,11 @@ def test_readout(dome: np.ndarray) -> None:
             there += sensor.step(frame, time=t).conversions["code"].tolist()
         assert len(there) > 5
         assert there == here
+        readout.reset(start=0.0, seed=other.number)  # noise of its own
+        simulator.reset()
+        for t in (0.0, 0.2):
+            expected = readout.sample(t, simulator.step(cs.DepthFrame(dome))).code.tolist()
+            assert other.step(dome, time=t).conversions["code"].tolist() == expected
         for t, words in ((1e12, "leaps"), (99.0, "must not go back")):
             with pytest.raises(ProtocolError, match=words) as caught:
                 sensor.step(dome, time=t)

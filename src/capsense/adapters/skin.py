@@ -17,7 +17,8 @@ class AttachedSkin:
 
     Args:
         sensors: Name → sensor; they share one source of their world.
-        readout: Name of the chip behind every sensor, or None.
+        readout: Name of the chip behind every sensor, or None. Each has noise of its own: their
+            seeds count up, in the order of the sensors.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
@@ -32,8 +33,10 @@ class AttachedSkin:
         """The sensors, as ``attach`` makes them."""
         self._source = next(iter(self.sensors.values())).source
         self._crew = Crew(threads)
-        for sensor in self.sensors.values():
+        for number, sensor in enumerate(self.sensors.values()):
             sensor.use_readout(readout)
+            if sensor.readout is not None:
+                sensor.readout.reset(seed=sensor.readout.seed + number)
 
     def read(self, time: float | None = None) -> dict[str, Reading]:
         """The readings of the simulator's present state, by name.

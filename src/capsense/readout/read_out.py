@@ -109,6 +109,11 @@ class ReadOut:
         )
 
     @property
+    def seed(self) -> int:
+        """Seed of the random numbers; :meth:`reset` takes another one."""
+        return self._seed
+
+    @property
     def channel_names(self) -> tuple[str, ...]:
         """Names of the channels."""
         return self.bank.names

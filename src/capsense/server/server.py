@@ -81,7 +81,7 @@ class Server:
                 raise ServerError(f"two designs are named {simulator.design.name!r}")
             self._templates[simulator.design.name] = simulator
             simulator.step(DepthFrame(np.full((8, 8), 0.1)))
-            self._make_readout(simulator)
+            self._make_readout(simulator, 0)
         self._sessions: dict[int, Session] = {}
         self._counter = 0
         self._readings = 0
@@ -152,7 +152,7 @@ class Server:
                 f"design {name!r} is not served; {suggest(name, self.design_names)}", "scene"
             )
         simulator = self._templates[name].sibling()
-        return ServedSensor(wanted, simulator, self._make_readout(simulator))
+        return ServedSensor(wanted, simulator, self._make_readout(simulator, wanted.sensor))
 
     async def work(self, job: Callable[[], T]) -> T:
         """Do a job in a worker thread."""
@@ -199,11 +199,14 @@ class Server:
             return _json(HTTPStatus.NOT_FOUND, {"error": "there are / (WebSocket) and /health"})
         return None
 
-    def _make_readout(self, simulator: Simulator) -> ReadOut | None:
+    def _make_readout(self, simulator: Simulator, number: int) -> ReadOut | None:
+        """The read-out of a client's sensor; by their numbers, sensors have noise of their own."""
         choice = self.options.readout
         if choice is None:
             return None
-        return choose_readout(choice, simulator.electrode_names, simulator.step(Scene()))
+        readout = choose_readout(choice, simulator.electrode_names, simulator.step(Scene()))
+        readout.reset(seed=readout.seed + number)
+        return readout
 
 
 def _json(status: HTTPStatus, content: dict[str, Any]) -> Response:
