@@ -11,7 +11,7 @@ from capsense.cli.run import build_simulator, progress_shown, sample_rate
 from capsense.cli.serve import read_token
 
 if TYPE_CHECKING:
-    from capsense.viewer.source import Source
+    from capsense.viewer.source import Seekable
 
 NAME = "view"
 HELP = "show a sensor at work, live in a web browser"
@@ -93,7 +93,7 @@ def _check(args: argparse.Namespace) -> None:
         raise ScenarioError("there is nothing to show; give a scenario file, or --replay FILE.mcap")
 
 
-def _source(args: argparse.Namespace) -> Source:
+def _source(args: argparse.Namespace) -> Seekable:
     from capsense.cli.progress import BuildProgress
     from capsense.viewer import source
 

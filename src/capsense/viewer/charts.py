@@ -13,7 +13,7 @@ from capsense.design.draw import COLOURS
 from capsense.scenario import Channel
 
 if TYPE_CHECKING:
-    from viser import GuiApi
+    from viser import GuiApi, GuiTabHandle, GuiUplotHandle
 
 Array = NDArray[np.float64]
 
@@ -32,70 +32,79 @@ class Chart:
     """The strongest of some channels against time, as changes in femtofarads.
 
     Args:
-        gui: Where it is drawn.
+        gui: Where it is drawn, together with ``tab``.
+        tab: The part of the page it is in.
         title: Above it.
         columns: The channels' columns in the table of changes.
         labels: Their names.
     """
 
     def __init__(
-        self, gui: GuiApi, title: str, columns: Sequence[int], labels: Sequence[str]
-    ) -> None:
+        self, gui: GuiApi, tab: GuiTabHandle, title: str, columns: Sequence[int],
+        labels: Sequence[str],
+    ) -> None:  # fmt: skip
+        self._gui, self._tab, self._title = gui, tab, title
         self._columns, self._labels = np.array(columns), labels
-        count = min(MAX_LINES, len(columns))
-        self._drawn = np.arange(count)
-        self._handle = gui.add_uplot(
-            (np.array([0.0, 1.0]), *np.zeros((count, 2))), self._series(), title=title, height=190,
-            scales={"x": {"time": False}, "y": {"auto": True}}, axes=({"label": "s"}, {"size": 48}),
-            legend={"show": True, "live": False},
-        )  # fmt: skip
+        self._peaks = np.zeros(len(columns))
+        self._drawn = np.arange(min(MAX_LINES, len(columns)))
+        self._handle = self._draw((np.array([0.0, 1.0]), *np.zeros((len(self._drawn), 2))))
 
     def show(self, times: Array, changes: Array) -> None:
-        """Draw samples: times [s], shape (n,), and changes [F], shape (n, all channels)."""
+        """Draw samples, as :func:`strip` gives them: times [s], changes of all channels [F]."""
         values = changes[:, self._columns]
-        strongest = np.argsort(-np.abs(values).max(axis=0), kind="stable")[: len(self._drawn)]
-        drawn = np.sort(strongest)
-        if not np.array_equal(drawn, self._drawn):
-            self._drawn = drawn
-            self._handle.series = self._series()
-        columns = np.ascontiguousarray(FEMTO * values[:, drawn].T)
-        self._handle.data = (np.ascontiguousarray(times), *columns)
+        self._peaks = np.maximum(self._peaks, np.abs(values).max(axis=0))
+        drawn = np.sort(np.argsort(-self._peaks, kind="stable")[: len(self._drawn)])
+        lines = np.ascontiguousarray(FEMTO * values[:, drawn].T)
+        data = (np.ascontiguousarray(times), *lines)
+        if np.array_equal(drawn, self._drawn):
+            self._handle.data = data
+            return
+        # A chart whose lines are exchanged in place loses its axis of time, so it is made anew.
+        self._drawn, old = drawn, self._handle
+        self._handle = self._draw(data, old.order)
+        old.remove()
 
-    def _series(self) -> tuple[Any, ...]:
+    def _draw(self, data: tuple[Array, ...], order: float | None = None) -> GuiUplotHandle:
         lines = [
             {"label": self._labels[int(k)], "stroke": COLOURS[n % len(COLOURS)], "width": 1.6}
             for n, k in enumerate(self._drawn)
         ]
-        return ({"label": "s"}, *lines)
+        series: Any = ({"label": "s"}, *lines)
+        with self._tab:
+            return self._gui.add_uplot(
+                data, series, title=self._title, height=190, order=order,
+                scales={"x": {"time": False}, "y": {"auto": True}},
+                axes=({"label": "s", "labelSize": 16, "size": 28}, {"size": 52}),
+                legend={"show": True, "live": False},
+            )  # fmt: skip
 
 
-def make_charts(gui: GuiApi, channels: Sequence[Channel]) -> list[Chart]:
+def make_charts(gui: GuiApi, tab: GuiTabHandle, channels: Sequence[Channel]) -> list[Chart]:
     """One chart of the electrodes' own channels, one of the pairs', as far as there are any."""
     charts = []
     for title, wanted in (("electrodes, ΔC [fF]", True), ("pairs, ΔC [fF]", False)):
         columns = [k for k, c in enumerate(channels) if (c.row == c.column) == wanted]
         if columns:
-            charts.append(Chart(gui, title, columns, [channels[k].label for k in columns]))
+            charts.append(Chart(gui, tab, title, columns, [channels[k].label for k in columns]))
     return charts
 
 
-def strip(times: Array, changes: Array, position: int) -> tuple[Array, Array]:
-    """The samples before one that charts show.
+def strip(times: Array, changes: Array) -> tuple[Array, Array]:
+    """The end of a history, as charts show it.
 
     Args:
-        times: Of all samples [s], shape (N,).
-        changes: Of all samples [F], shape (N, K), NaN where they are not known.
-        position: The last one shown.
+        times: Of samples [s], increasing, shape (n,), at least one.
+        changes: Of their channels [F], shape (n, K).
 
     Returns:
-        Times, shape (n,), and changes, shape (n, K), of at most :data:`MAX_POINTS` known samples of
-        the last :data:`WINDOW` seconds, the last known one among them.
+        At most :data:`MAX_POINTS` samples of the last :data:`WINDOW` seconds, the last one among
+        them; the only one twice, since a chart needs two.
     """
-    first = int(np.searchsorted(times, times[position] - WINDOW))
-    known = first + np.flatnonzero(~np.isnan(changes[first : position + 1, 0]))
-    stride = -(-len(known) // MAX_POINTS)
-    known = known[::-1][:: max(1, stride)][::-1]
-    return times[known], changes[known]
+    recent = np.arange(np.searchsorted(times, times[-1] - WINDOW), len(times))
+    kept = recent[:: -max(1, -(-len(recent) // MAX_POINTS))][::-1]
+    if len(kept) == 1:
+        return times[-1] + np.array([0.0, 0.1]), changes[[-1, -1]]
+    return times[kept], changes[kept]
 
 
 def heat_map(names: Sequence[str], delta: Array) -> str:

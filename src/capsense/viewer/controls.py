@@ -5,8 +5,10 @@ from __future__ import annotations
 import html
 from typing import TYPE_CHECKING, Any
 
-from capsense.viewer.plane import Plane
-from capsense.viewer.player import Player
+import numpy as np
+
+from capsense.viewer.plane import OCTAVES, Plane, palette, region
+from capsense.viewer.player import Playback
 
 if TYPE_CHECKING:
     from viser import GuiApi
@@ -20,54 +22,71 @@ AXES = ("x", "y", "z")
 class TimeControls:
     """Play and pause, one sample on or back, and a slider over all of them."""
 
-    def __init__(self, gui: GuiApi, player: Player) -> None:
+    def __init__(self, gui: GuiApi, player: Playback) -> None:
         self._player = player
-        last = len(player.source.times) - 1
+        self._names = ("Hold", "Follow") if player.live else ("Pause", "Play")
         with gui.add_folder("time"):
-            self._play = gui.add_button("Play")
-            steps = gui.add_button_group("step", ("⏮", "◀", "▶", "⏭"))
-            self._slider: Any = gui.add_slider("sample", 0, max(last, 1), 1, 0, disabled=last == 0)
-            speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 ×")
-            loop = gui.add_checkbox("again from the start", player.loop)
-        moves = {"⏮": -last, "◀": -1, "▶": 1, "⏭": last}
+            self._play = gui.add_button(self._names[1])
+            steps = gui.add_button_group("step", ("|<", "<", ">", ">|"))
+            self._slider: Any = gui.add_slider("sample", 0, 1, 1, 0)
+            if not player.live:
+                speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 ×")
+                speed.on_update(lambda _: player.set_speed(SPEEDS[speed.value]))
+                loop = gui.add_checkbox("loop", player.loop)
+                loop.on_update(lambda _: setattr(player, "loop", loop.value))
+        moves = {
+            "|<": lambda: player.go(player.span[0]),
+            "<": lambda: player.step(-1),
+            ">": lambda: player.step(1),
+            ">|": lambda: player.go(player.span[1]),
+        }
         self._play.on_click(lambda _: player.pause() if player.playing else player.play())
-        steps.on_click(lambda _: player.step(moves[steps.value]))
+        steps.on_click(lambda _: moves[steps.value]())
         self._slider.on_update(self._scrub)
-        speed.on_update(lambda _: player.set_speed(SPEEDS[speed.value]))
-        loop.on_update(lambda _: setattr(player, "loop", loop.value))
 
     def show(self, shot: Shot) -> None:
         """Follow the player."""
-        label = "Pause" if self._player.playing else "Play"
+        label = self._names[0] if self._player.playing else self._names[1]
         if self._play.label != label:
             self._play.label = label
+        first, last = self._player.span
+        if (self._slider.min, self._slider.max) != (first, max(last, first + 1)):
+            self._slider.min, self._slider.max = first, max(last, first + 1)
         if self._slider.value != shot.index:
             self._slider.value = shot.index
 
     def _scrub(self, event: Any) -> None:
         if event.client is not None:  # moved by somebody, not by show()
-            self._player.go(self._slider.value)
+            self._player.go(int(self._slider.value))
 
 
 class PlaneControls:
     """Which plane, and whose potential."""
 
-    def __init__(self, gui: GuiApi, player: Player) -> None:
+    def __init__(self, gui: GuiApi, player: Playback) -> None:
         assert player.source.lattice is not None
         self._player, self._lattice = player, player.source.lattice
-        self._names = player.source.design.electrode_names
-        bounds = [[round(1e3 * v, 1) for v in b] for b in self._lattice.bounds]
-        self._places = [0.0, 0.0, min(20.0, bounds[2][1])]
+        design = player.source.design
+        self._names = design.electrode_names
+        self._region = region(design)
+        self._centres = [1e3 * e.surface.bounds.mean(axis=0) for e in design.electrodes]
+        self._plane: Plane | None = None
+        middle = np.mean(self._centres, axis=0)
+        first = int(np.argmin(np.linalg.norm(self._centres - middle, axis=1).round(3)))
         with gui.add_folder("potential"):
             self._on = gui.add_checkbox("shown", True)
-            self._driven = gui.add_dropdown("1 V at", self._names, initial_value=self._names[0])
+            self._driven = gui.add_dropdown("1 V at", self._names, initial_value=self._names[first])
             self._across = gui.add_dropdown("plane across", AXES, initial_value="y")
-            self._at = [
+            self._at: list[Any] = [
                 gui.add_slider(f"{a} [mm]", low, high, 0.5, place, visible=a == "y")
-                for a, (low, high), place in zip(AXES, bounds, self._places, strict=True)
+                for a, (low, high), place in zip(
+                    AXES, np.round(1e3 * self._region, 1).tolist(), self._places(), strict=True
+                )
             ]
+            gui.add_html(legend())
         self._lay()
         self._on.on_update(self._switch)
+        self._driven.on_update(self._centre)
         self._across.on_update(lambda _: self._lay())
         for slider in self._at:
             slider.on_update(lambda _: self._lay())
@@ -82,12 +101,24 @@ class PlaneControls:
         """The plane; None where it is not wanted."""
         return self._plane if self._on.value else None
 
+    def _places(self) -> list[float]:
+        """Where planes cross the middle of the driven electrode, or 20 mm above it [mm]."""
+        x, y, z = self._centres[self.driven]
+        return [round(2 * v) / 2 for v in (x, y, min(z + 20.0, 1e3 * self._region[2, 1]))]
+
+    def _centre(self, _: object) -> None:
+        for slider, place in zip(self._at, self._places(), strict=True):
+            slider.value = place
+        self._lay()
+
     def _lay(self) -> None:
         axis = AXES.index(self._across.value)
         for k, slider in enumerate(self._at):
             if slider.visible != (k == axis):
                 slider.visible = k == axis
-        self._plane = Plane(self._lattice, axis, 1e-3 * float(self._at[axis].value))
+        at = 1e-3 * float(self._at[axis].value)
+        if self._plane is None or (self._plane.axis, self._plane.at) != (axis, at):
+            self._plane = Plane(self._lattice, self._region, axis, at)
 
     def _switch(self, _: object) -> None:
         self._player.field = self._on.value
@@ -95,14 +126,36 @@ class PlaneControls:
             self._player.pause()
 
 
-def status(player: Player, shot: Shot) -> str:
-    """What is shown, as HTML."""
-    stats, count = shot.reading.stats, len(player.source.times)
+def legend() -> str:
+    """The colours of the potential, as HTML."""
+    cells = "".join(
+        f'<td style="background:rgb({r},{g},{b})">&nbsp;</td>' for r, g, b in palette().tolist()
+    )
+    return (
+        '<div style="padding:0 0.8em 0.6em;font-size:12px"><table style="width:100%;'
+        f'border-spacing:0;line-height:0.8"><tr>{cells}</tr></table><span style="float:right">1 V'
+        f"</span>{1e3 * 2.0**-OCTAVES:.0f} mV, doubling from colour to colour</div>"
+    )
+
+
+def status(player: Playback, shot: Shot, largest: float) -> str:
+    """What is shown, as HTML.
+
+    Args:
+        player: Shows it.
+        shot: Is shown.
+        largest: Change of an electrode that colours it fully [F].
+    """
+    stats, (_, last) = shot.reading.stats, player.span
     lines = [
         f"<b>{html.escape(player.source.title)}</b>",
-        f"t = {shot.time:.3f} s, sample {shot.index + 1} of {count}",
-        f"step {1e3 * stats.wall_time:.1f} ms, {stats.iterations} iterations, "
-        f"error {1e18 * stats.error_estimate:.2g} aF",
+        f"t = {shot.time:.3f} s, sample {shot.index} of {last}",
+        f"step {1e3 * stats.wall_time:.1f} ms, {stats.iterations} "
+        f"iteration{'' if stats.iterations == 1 else 's'}, error {1e18 * stats.error_estimate:.2g} "
+        "aF",
+        'electrodes: <span style="background:linear-gradient(90deg,rgb(214,219,222),'
+        'rgb(213,94,0));padding:0 2.5em;border-radius:2px">&nbsp;</span> '
+        f"0 to {1e15 * largest:.3g} fF",
     ]
     if player.failure is not None:
         lines.append(f'<b style="color:#b00020">{html.escape(str(player.failure))}</b>')

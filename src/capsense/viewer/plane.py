@@ -1,4 +1,4 @@
-"""A plane through the lattice: potentials sampled on it, and their picture."""
+"""A plane through the lattice: potentials sampled on it, and their colours."""
 
 from __future__ import annotations
 
@@ -10,47 +10,67 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 if TYPE_CHECKING:
+    from capsense.design import Design
     from capsense.field.lattice import Lattice
 
 Array = NDArray[np.float64]
 
-PIXELS = 160
-"""Samples along each side."""
+POINTS = 240
+"""Points along the longer side."""
+REACH = 0.12
+"""Planes end so far from the electrodes [m]; twice as far along z."""
 OCTAVES = 8
 """Potentials down to two to the minus this are drawn."""
 
 
-class Plane:
-    """A plane across the domain, at a coordinate along one axis.
+def region(design: Design) -> Array:
+    """What planes cross: the surroundings of the electrodes, as far as they are in the domain.
 
-    The other two axes, in their order, are those of its picture. Potentials are linear between
-    nodes, as a product with a sparse matrix, so that a picture costs next to nothing.
+    Returns:
+        Ends along x, y and z [m], shape (3, 2).
+    """
+    low, high = np.array([e.surface.bounds for e in design.electrodes]).transpose(1, 0, 2)
+    far = np.array([REACH, REACH, 2 * REACH])
+    return np.stack(
+        [
+            np.maximum(low.min(axis=0) - far, design.domain.lower),
+            np.minimum(high.max(axis=0) + far, design.domain.upper),
+        ],
+        axis=1,
+    )
+
+
+class Plane:
+    """A plane across a region, at a coordinate along one axis, as a grid of points.
+
+    Potentials are linear between nodes, as a product with a sparse matrix, so that sampling them
+    costs next to nothing.
 
     Args:
         lattice: Where potentials are given.
+        bounds: Ends of the region that planes cross [m], shape (3, 2); within the domain.
         axis: Which coordinate is fixed: 0, 1 or 2.
-        at: Its value [m]; taken into the domain.
+        at: Its value [m]; taken into the region.
     """
 
-    def __init__(self, lattice: Lattice, axis: int, at: float) -> None:
-        bounds = np.array(lattice.bounds)
+    def __init__(self, lattice: Lattice, bounds: Array, axis: int, at: float) -> None:
         self.axis = axis
         self.at = float(np.clip(at, *bounds[axis]))
-        self.sides = [k for k in range(3) if k != axis]
-        """The axes of the picture."""
-        self.low, self.high = bounds[self.sides, 0], bounds[self.sides, 1]
-        """Ends of the picture along its axes [m]."""
-        pitch = (self.high - self.low) / PIXELS
-        u, v = (lo + p * (np.arange(PIXELS) + 0.5) for lo, p in zip(self.low, pitch, strict=True))
-        points = np.empty((PIXELS, PIXELS, 3))
-        points[..., axis] = self.at
-        points[..., self.sides[0]] = u[:, None]
-        points[..., self.sides[1]] = v[None, :]
-        self._matrix = interpolation(lattice, points.reshape(-1, 3))
+        sides = [k for k in range(3) if k != axis]
+        self.pitch = float(np.ptp(bounds[sides], axis=1).max()) / POINTS
+        """Distance of neighbouring points [m]."""
+        u, v = (np.arange(low + self.pitch / 2, high, self.pitch) for low, high in bounds[sides])
+        grid = np.empty((len(u), len(v), 3))
+        grid[..., axis] = self.at
+        grid[..., sides[0]] = u[:, None]
+        grid[..., sides[1]] = v[None, :]
+        self.points = grid
+        """Where the points stand [m], shape (rows, columns, 3)."""
+        self._matrix = interpolation(lattice, grid.reshape(-1, 3))
 
     def sample(self, potential: Array) -> Array:
-        """Potentials [V] at the pixels, shape (PIXELS, PIXELS), from those at the nodes, (n,)."""
-        return (self._matrix @ potential).reshape(PIXELS, PIXELS)
+        """Potentials [V] at the points, shape (rows, columns), from those at the nodes, (n,)."""
+        return (self._matrix @ potential).reshape(self.points.shape[:2])
 
 
 def interpolation(lattice: Lattice, points: Array) -> csr_array:
@@ -79,26 +99,20 @@ def interpolation(lattice: Lattice, points: Array) -> csr_array:
     return csr_array((np.concatenate(values), where), shape=(len(points), lattice.n_nodes))
 
 
-def picture(potential: Array) -> NDArray[np.uint8]:
-    """Colours of a sampled plane: one colour a halving of the potential, with lines between them.
+def paint(potential: Array) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
+    """Colours of a sampled plane: one colour for each halving of the potential.
 
     Args:
         potential: As :meth:`Plane.sample` gives it.
 
     Returns:
-        Red, green, blue and opacity, shape (PIXELS, PIXELS, 4); the first row is at the high end of
-        the second axis, columns run along the first.
+        Which points are shown, shape (rows, columns), and their red, green and blue, shape (n, 3).
     """
-    octave = np.log2(np.maximum(potential.T[::-1], 2.0 ** -(OCTAVES + 1)))
-    strength = np.clip(1 + octave / OCTAVES, 0.0, 1.0)
-    out = _colours()[(255 * strength).astype(int)]
-    out[..., 3] = np.where(strength > 0, 70 + 150 * strength, 0).astype(np.uint8)
-    band = np.floor(octave)
-    line = np.zeros(band.shape, dtype=bool)
-    line[:-1] |= band[:-1] != band[1:]
-    line[:, :-1] |= band[:, :-1] != band[:, 1:]
-    out[line, :3] //= 2
-    return out
+    floor = 2.0**-OCTAVES
+    band = np.floor(np.log2(np.maximum(potential, floor / 2) / floor)).astype(int)
+    band = np.minimum(band, OCTAVES - 1)
+    shown = band >= 0
+    return shown, palette()[band[shown]]
 
 
 def _own_planes(lattice: Lattice, number: int) -> NDArray[np.int64]:
@@ -115,7 +129,8 @@ def _bracket(nodes: Array, at: Array) -> tuple[NDArray[np.int64], Array]:
 
 
 @cache
-def _colours() -> NDArray[np.uint8]:
+def palette() -> NDArray[np.uint8]:
+    """The colours, from the lowest potentials to the highest, shape (OCTAVES, 3)."""
     from matplotlib import colormaps
 
-    return colormaps["viridis"](np.arange(256), bytes=True)
+    return colormaps["YlGnBu"](np.linspace(0.12, 1.0, OCTAVES), bytes=True)[:, :3]

@@ -1,15 +1,16 @@
-"""Steps through a source in a thread of its own, at the pace that was asked for."""
+"""Shows instants in the order and at the pace that was asked for: :class:`Player`."""
 
 from __future__ import annotations
 
 import threading
 import time
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import CapSenseError
-from capsense.viewer.source import Shot, Source
+from capsense.viewer.source import Seekable, Shot, Source
 
 Array = NDArray[np.float64]
 
@@ -19,32 +20,83 @@ FIELD_PERIOD = 0.1
 """While time runs, potentials are taken no more often [s]."""
 
 
-class Player:
-    """Plays a source. All methods may be called from any thread, and return at once.
+class Playback(Protocol):
+    """What a page shows, and how it is moved about in.
 
     Whoever watches looks at :attr:`newest`; what comes between two looks is not shown, and nobody
-    who watches holds up the stepping.
+    who watches holds anything up. All methods may be called from any thread.
+    """
+
+    live: bool
+    """Whether time goes on by itself, so that there is no speed and no end."""
+    loop: bool
+    """Whether the end is followed by the beginning."""
+    field: bool
+    """Whether potentials are wanted."""
+    newest: Shot | None
+    """What is to be shown."""
+    with_field: Shot | None
+    """The last one whose potentials were taken."""
+    failure: CapSenseError | None
+    """What stopped it; None again once it goes on."""
+
+    @property
+    def source(self) -> Source:
+        """Where instants come from."""
+
+    @property
+    def playing(self) -> bool:
+        """Whether time runs."""
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Numbers of the first and the last sample."""
+
+    def history(self, index: int) -> tuple[Array, Array]:
+        """The samples known up to one, for charts.
+
+        Returns:
+            Times [s], shape (n,), and changes of the channels from the empty scene [F], shape
+            (n, K).
+        """
+
+    def play(self) -> None:
+        """Let time run."""
+
+    def pause(self) -> None:
+        """Stop time."""
+
+    def go(self, index: int) -> None:
+        """Stop time, and show a sample, or the first or last if there is none of that number."""
+
+    def step(self, count: int) -> None:
+        """Stop time, and go ``count`` samples on, or back."""
+
+    def set_speed(self, speed: float) -> None:
+        """Set how many seconds of the source pass a second; 0 for as fast as it goes."""
+
+    def stop(self) -> None:
+        """End it, and close the source."""
+
+
+class Player:
+    """Asks a source for its samples, in a thread of its own. A :class:`Playback`.
 
     Args:
         source: Used by the player's thread alone from now on; closed by :meth:`stop`.
         speed: Seconds of the source a second; 0 for as fast as it goes.
     """
 
-    def __init__(self, source: Source, *, speed: float = 1.0) -> None:
+    live = False
+
+    def __init__(self, source: Seekable, *, speed: float = 1.0) -> None:
         self.source = source
         self.loop = True
-        """Whether the end is followed by the beginning."""
         self.field = True
-        """Whether potentials are wanted."""
         self.newest: Shot | None = None
-        """What was stepped last."""
         self.with_field: Shot | None = None
-        """The last one whose potentials were taken."""
         self.failure: CapSenseError | None = None
-        """What stopped the player; None again once it goes on."""
-        self.changes: Array = np.full((len(source.times), len(source.channels)), np.nan)
-        """Change of every channel from the empty scene [F], shape (N, K); NaN before its sample
-        was stepped."""
+        self._changes: Array = np.full((len(source.times), len(source.channels)), np.nan)
         self._levels = np.array([c.read(source.empty) for c in source.channels])
         self._speed, self._playing, self._stopped = speed, False, False
         self._target: int | None = 0
@@ -61,9 +113,14 @@ class Player:
         return self._playing
 
     @property
-    def position(self) -> int:
-        """Number of the sample that was stepped last, or is being stepped."""
-        return self._position
+    def span(self) -> tuple[int, int]:
+        """Numbers of the first and the last sample."""
+        return 0, len(self.source.times) - 1
+
+    def history(self, index: int) -> tuple[Array, Array]:
+        """See :class:`Playback`; samples that were skipped are not among them."""
+        known = np.flatnonzero(~np.isnan(self._changes[: index + 1, 0]))
+        return self.source.times[known], self._changes[known]
 
     def play(self) -> None:
         """Let time run; from the beginning, where it had run out."""
@@ -122,7 +179,7 @@ class Player:
         due = not self._playing or now - self._field_taken >= FIELD_PERIOD
         shot = self.source.shot(index, field=self.field and due)
         values = [c.read(shot.reading) for c in self.source.channels]
-        self.changes[index] = np.array(values) - self._levels
+        self._changes[index] = np.array(values) - self._levels
         if shot.potentials is not None:
             self.with_field, self._field_taken = shot, now
         self.newest, self.failure = shot, None

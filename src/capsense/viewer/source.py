@@ -40,18 +40,26 @@ class Shot:
 
 
 class Source(Protocol):
-    """A row of instants, any of which can be asked for."""
+    """A sensor, and instants of it."""
 
     title: str
     design: Design
-    times: Array
-    """Of the instants [s], increasing, shape (N,)."""
     channels: tuple[Channel, ...]
     """What charts show."""
     empty: Reading
     """The reading with nothing in front of the sensor."""
     lattice: Lattice | None
     """Where potentials are given; None if they are not."""
+
+    def close(self) -> None:
+        """Let go of what is held."""
+
+
+class Seekable(Source, Protocol):
+    """A row of instants, any of which can be asked for."""
+
+    times: Array
+    """Of the instants [s], increasing, shape (N,)."""
 
     def shot(self, index: int, *, field: bool) -> Shot:
         """The instant of a number.
@@ -63,9 +71,6 @@ class Source(Protocol):
         Raises:
             CapSenseError: It could not be had.
         """
-
-    def close(self) -> None:
-        """Let go of what is held."""
 
 
 class ScenarioSource:
@@ -84,7 +89,7 @@ class ScenarioSource:
         self.lattice = _lattice_of(simulator)
 
     def shot(self, index: int, *, field: bool) -> Shot:
-        """See :class:`Source`."""
+        """See :class:`Seekable`."""
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
         reading = self._simulator.step(scene)
@@ -121,7 +126,7 @@ class RecordingSource:
         self.lattice = _lattice_of(self._simulator)
 
     def shot(self, index: int, *, field: bool) -> Shot:
-        """See :class:`Source`."""
+        """See :class:`Seekable`."""
         step, potentials = self._steps[index], None
         if field and self.lattice is not None:
             self._simulator.step(step.scene)
@@ -171,7 +176,7 @@ class ServerSource:
         self._sensor.step_scene(tables, self._clock())
 
     def shot(self, index: int, *, field: bool) -> Shot:
-        """See :class:`Source`."""
+        """See :class:`Seekable`."""
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
         answer = self._sensor.step_poses(self._poses(scene), self._clock())

@@ -11,7 +11,7 @@ from capsense.design import Design
 from capsense.design.draw import ROLE_COLOURS
 from capsense.design.geometry import Surface
 from capsense.scene import Body, Scene, ShapeKind
-from capsense.viewer.plane import Plane, picture
+from capsense.viewer.plane import Plane, paint
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -31,8 +31,6 @@ SHRUNK = 3e-4
 MAX_LABELS = 32
 """A design of more electrodes shows no names."""
 _FACETED = (ShapeKind.BOX, ShapeKind.CYLINDER, ShapeKind.MESH)
-_TURNS = ((0.5, 0.5, 0.5, 0.5), (0.5**0.5, 0.5**0.5, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-"""By the axis a plane crosses: what turns a picture's x and y into the plane's (w, x, y, z)."""
 
 
 class Stage:
@@ -46,7 +44,6 @@ class Stage:
     def __init__(self, server: ViserServer, design: Design) -> None:
         self._scene = server.scene
         self._bodies: list[tuple[Body, Any]] = []
-        self._plane: tuple[Plane, Any] | None = None
         self._shown: list[Colour] = []
         server.scene.configure_default_lights(cast_shadow=False)
         self._draw_domain(design)
@@ -59,16 +56,16 @@ class Stage:
             for k, e in enumerate(design.electrodes):
                 self._scene.add_label(
                     f"/labels/{k}", e.name, position=e.surface.bounds.mean(axis=0),
-                    anchor="center-center", font_screen_scale=0.8, depth_test=True,
+                    anchor="center-center", font_screen_scale=0.8,
                 )  # fmt: skip
         low, high = np.array([e.surface.bounds for e in design.electrodes]).transpose(1, 0, 2)
         middle = (low.min(axis=0) + high.max(axis=0)) / 2
         reach = max(0.08, float(np.ptp([low.min(axis=0), high.max(axis=0)], axis=0).max()))
         camera = server.initial_camera
         camera.near, camera.far = 1e-3, 20.0
-        camera.look_at = middle + np.array([0.0, 0.0, 0.25 * reach])
-        camera.position = middle + reach * np.array([1.0, -1.5, 1.1])
-        camera.fov = 0.9
+        camera.look_at = middle + np.array([0.0, 0.0, 0.4 * reach])
+        camera.position = middle + reach * np.array([1.3, -3.0, 1.7])
+        camera.fov = 0.8
 
     def show_signals(self, strength: Array) -> None:
         """Colour the electrodes by their signals, 0 to 1, shape (M,)."""
@@ -95,27 +92,19 @@ class Stage:
             handle.wxyz, handle.position = (w, x, y, z), body.pose.position
 
     def show_plane(self, plane: Plane, potential: Array) -> None:
-        """Paint the potential, at the lattice's nodes [V], shape (n,), on a plane."""
-        image = picture(plane.sample(potential))
-        if self._plane is not None and self._plane[0] is plane:
-            self._plane[1].image = image
-            return
-        self.hide_plane()
-        centre = np.zeros(3)
-        centre[plane.axis] = plane.at
-        centre[plane.sides] = (plane.low + plane.high) / 2
-        width, height = (float(v) for v in plane.high - plane.low)
-        handle = self._scene.add_image(
-            "/potential", image, width, height, format="png", wxyz=_TURNS[plane.axis],
-            position=centre, cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
-        self._plane = plane, handle
+        """Paint the potential, at the lattice's nodes [V], shape (n,), on a plane.
+
+        As points, which hide and are hidden as they should be: an image would be sorted as a whole
+        among the bodies that light passes through.
+        """
+        shown, colours = paint(plane.sample(potential))
+        self._scene.add_point_cloud(
+            "/potential", plane.points[shown], colours, point_size=plane.pitch, point_shape="square"
+        )
 
     def hide_plane(self) -> None:
         """Take the plane away."""
-        if self._plane is not None:
-            self._plane[1].remove()
-            self._plane = None
+        self._scene.remove_by_name("/potential")
 
     def _draw_domain(self, design: Design) -> None:
         low, high = design.domain.lower, design.domain.upper
@@ -131,7 +120,7 @@ class Stage:
             less = min(SHRUNK, 0.2 * float(layer.upper[2] - layer.lower[2]))
             size = layer.upper - layer.lower - [0.0, 0.0, 2 * less]
             self._scene.add_box(
-                f"/layers/{k}", color=LAYER, dimensions=tuple(size), opacity=0.9,
+                f"/layers/{k}", color=LAYER, dimensions=tuple(size),
                 position=(layer.lower + layer.upper) / 2, cast_shadow=False,
             )  # fmt: skip
         for k, conductor in enumerate(design.conductors):
@@ -151,6 +140,6 @@ class Stage:
         conducts = body.material.is_conductor()
         return self._scene.add_mesh_simple(
             name, mesh.vertices, mesh.faces, color=CONDUCTIVE if conducts else DIELECTRIC,
-            opacity=0.6, flat_shading=body.shape.kind in _FACETED, cast_shadow=False,
+            opacity=0.4, flat_shading=body.shape.kind in _FACETED, cast_shadow=False,
             receive_shadow=False,
         )  # fmt: skip

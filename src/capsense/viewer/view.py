@@ -12,7 +12,7 @@ import numpy as np
 from capsense.errors import MissingDependencyError, ServerError
 from capsense.viewer.charts import heat_map, make_charts, strip
 from capsense.viewer.controls import PlaneControls, TimeControls, status
-from capsense.viewer.player import Player
+from capsense.viewer.player import Playback
 from capsense.viewer.stage import Stage
 
 try:
@@ -38,10 +38,10 @@ class View:
         ServerError: The address or port cannot be had.
     """
 
-    def __init__(self, player: Player, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, player: Playback, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         check_address(host, port)
         self._player = player
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's words
             self._server = _Server(host=host, port=port, verbose=False)
         gui, source = self._server.gui, player.source
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -52,8 +52,9 @@ class View:
         self._time = TimeControls(gui, player)
         self._plane = PlaneControls(gui, player) if source.lattice is not None else None
         panel = gui.add_panel()
-        with panel.add_tab("signals"):
-            self._charts = make_charts(gui, source.channels)
+        tab = panel.add_tab("signals")
+        self._charts = make_charts(gui, tab, source.channels)
+        with tab:
             self._matrix = gui.add_html("")
         panel.dock_left()
         self._loudest = 1e-21
@@ -79,21 +80,22 @@ class View:
         if shot is not None and state != self._drawn:
             self._drawn = state
             with self._server.atomic():
-                self._status.content = status(player, shot)
                 self._time.show(shot)
                 self._stage.show_bodies(shot.scene)
-                times, changes = strip(player.source.times, player.changes, shot.index)
+                window = strip(*player.history(shot.index))
                 for chart in self._charts:
-                    chart.show(times, changes)
+                    chart.show(*window)
                 own = np.abs(np.diag(shot.reading.delta))
                 self._loudest = max(self._loudest, float(own.max()))
-                self._stage.show_signals(np.sqrt(own / self._loudest))
+                self._status.content = status(player, shot, self._loudest)
+                self._stage.show_signals(own / self._loudest)
                 self._matrix.content = heat_map(shot.reading.electrode_names, shot.reading.delta)
         self._paint()
 
     def stop(self) -> None:
         """Close the page."""
-        self._server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     def _paint(self) -> None:
         """Show the potential, where there is one and it is wanted."""
