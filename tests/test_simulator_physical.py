@@ -32,6 +32,16 @@ def assert_scene_is_physical(sim: cs.Simulator, scene: cs.Scene) -> Array:
     return reading.capacitance
 
 
+def test_a_conductor_in_matter_that_pierces_a_board(simulators):
+    """Regression: a node inside the conductor was left with a rounding error for a diagonal."""
+    place = (0.016916099161560477, 0.019810284747223086, -0.005360690263346889)
+    turn = (0.7731738179387911, -0.527943391589105, -0.14355154018568464, 0.32073505864134044)
+    size = (0.041486721124519406, 0.0588776255399766, 0.10139544156963942)
+    matter = cs.Body(cs.Box(size), cs.Pose(place, turn), cs.Material("matter", 10.0))
+    metal = cs.Body(wedge(), cs.Pose(place, (0.0, 0.0, 0.0, 1.0)), "steel", "floating")
+    assert_scene_is_physical(simulators("meander"), cs.Scene([matter, metal]))
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_random_scenes(simulators, seed):
     """Invariant: 25 random scenes a seed, in one warm-started walk."""

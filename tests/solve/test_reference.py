@@ -47,6 +47,11 @@ def sim(request, simulators) -> cs.Simulator:
     return simulators(design, settings=COARSE, **TIGHT)
 
 
+def random_turn(rng: np.random.Generator) -> tuple[float, ...]:
+    turn = rng.normal(size=4)
+    return tuple(turn / np.linalg.norm(turn))
+
+
 def assert_agree(sim: cs.Simulator, scene: cs.Scene) -> None:
     """All terminals, before the design's own floating conductors are eliminated."""
     expected = reference_delta(sim.background, scene)
@@ -88,6 +93,18 @@ def test_layers_of_matter(sim):
     for count in range(1, len(sheets) + 1):
         assert_agree(sim, cs.Scene(sheets[:count]))
         assert_agree(sim, cs.Scene([around, *sheets[:count]]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_matter_around_what_conducts_through_the_sheets(sim, seed):
+    """Differential: where matter fills more of a column than the conductor at a node in it."""
+    rng = np.random.default_rng(seed)
+    place = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(-0.01, 0.01)])
+    grounding = ("grounded", "floating", 1e-12)[seed]
+    metal = cs.Body(wedge(), cs.Pose(tuple(place), random_turn(rng)), "steel", grounding)
+    matter = cs.Body(cs.Box((0.04, 0.06, 0.1)), cs.Pose(tuple(place), random_turn(rng)), "glass")
+    sim.reset()
+    assert_agree(sim, cs.Scene([matter, metal]))
 
 
 @pytest.mark.parametrize("seed", range(8))

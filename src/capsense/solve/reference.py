@@ -307,13 +307,31 @@ class _Problem:
                 continue
             resistance = self._resistance(axis, link, on, link.starts, link.ends)
             if abs(resistance - 1.0) > 1e-9:
-                drop = self._end_value(link, 0) - self._end_value(link, 1)
-                change = link.weight / resistance - link.weight
-                self.energy += change * np.outer(drop, drop)
-                for node, sign in zip(link.nodes, (-1.0, 1.0), strict=True):
-                    if node >= 0:
-                        self.load[node] += sign * change * drop
-                self._change(axis, link, change)
+                self._lay_dielectric(axis, link, link.weight / resistance - link.weight)
+
+    def _lay_dielectric(self, axis: int, link: _Link, change: float) -> None:
+        """Change the weight of a link or half-link that no conductor meets in this share."""
+        held = [k for k in range(2) if link.nodes[k] in self.inside]
+        if held:
+            # one end is at the potential of a conductor that fills less of the column
+            self._tie_to_inside(link.nodes[held[0]], link.nodes[1 - held[0]], change,
+                                self._end_value(link, 1 - held[0]))  # fmt: skip
+            return
+        drop = self._end_value(link, 0) - self._end_value(link, 1)
+        self.energy += change * np.outer(drop, drop)
+        for node, sign in zip(link.nodes, (-1.0, 1.0), strict=True):
+            if node >= 0:
+                self.load[node] += sign * change * drop
+        self._change(axis, link, change)
+
+    def _tie_to_inside(self, inside: int, node: int, weight: float, background: Array) -> None:
+        """Tie a node (−1: a sheet) to the conductor around another, given a potential there."""
+        value = background.copy()
+        value[self.n_terminals + self.conductors.index(self.inside[inside])] = -1.0
+        self.energy += weight * np.outer(value, value)
+        if node >= 0 and self.background.lattice.owner[node] == FREE:
+            self.load[node] -= weight * value
+            self._tie(node, weight)
 
     def _change(self, axis: int, link: _Link, change: float) -> None:
         """Add to the weight of a link or half-link."""
@@ -435,26 +453,28 @@ class _Problem:
 
     def close_nodes_inside(self) -> None:
         """Turn what is left of links at nodes inside conductors into ties."""
-        la = self.background.lattice
-        for node, body in self.inside.items():
-            value = np.zeros(self.n_lanes)
-            value[: self.n_terminals] = self.background.potentials[node]
-            value[self.n_terminals + self.conductors.index(body)] = -1.0
+        la, phi = self.background.lattice, self.background.potentials
+        for node in self.inside:
+            here = np.zeros(self.n_lanes)
+            here[: self.n_terminals] = phi[node]
+            half = 0.0
             for axis in range(3):
                 stride = int(la.beyond(axis, np.array(node))) - node
-                for lower, other in ((node, node + stride), (node - stride,) * 2):
+                ends = ((node, node + stride), (node - stride,) * 2)
+                for side, (lower, other) in enumerate(ends):
                     weight = self.links_left.pop((axis, lower), 0.0)
                     whole = float(la.weights[axis, lower])
-                    if other in self.inside:
+                    if (axis, lower) in self.cut_of:
+                        half += self.background.half_weights[self.cut_of[axis, lower], side]
+                    elif other in self.inside:
                         drop = np.zeros(self.n_lanes)
-                        phi = self.background.potentials
                         drop[: self.n_terminals] = phi[node] - phi[other]
                         self.energy += weight * np.outer(drop, drop)
                     elif weight > 1e-5 * whole:
-                        self.energy += weight * np.outer(value, value)
-                        if la.owner[other] == FREE:
-                            self.load[other] -= weight * value
-                            self._tie(other, weight)
+                        self._tie_to_inside(node, other, weight, here)
+            rest = self.diagonal.pop(node, 0.0)
+            if rest > 1e-5 * half:
+                self._tie_to_inside(node, -1, rest, here)
 
     # -- solution ---------------------------------------------------------------------------
 

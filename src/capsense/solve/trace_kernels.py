@@ -210,7 +210,7 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, store
             )  # fmt: skip
             if status != FULL:
                 return status
-    if not _close_inside(storeys, nodes, links, stored, weight, extra, inside, inside_nodes, ties,
+    if not _close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes, ties,
                          energies, couples, within, counts):  # fmt: skip
         return SHORT
     for i in range(counts[0]):
@@ -339,6 +339,23 @@ def _add_energy(energies, counts, a, b, end, weight, drives):
     counts[1] += 1
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_tie(ties, counts, extra, node, conductor, point, end, weight):
+    """Tie a node (−1: a held end) to a conductor, where the background has a node's potential.
+
+    That of the node ``point``; of the held ``end`` if this is −1.
+    """
+    tie = ties[counts[0]]
+    tie.node, tie.conductor, tie.weight = node, conductor, weight
+    for k in range(4):
+        tie.point[k], tie.coef[k] = max(point, 0), 0.0
+    tie.coef[0] = 1.0 if point >= 0 else 0.0
+    tie.end, tie.end_coef = end, 1.0 if point < 0 else 0.0
+    if node >= 0:
+        extra[node] += weight
+    counts[0] += 1
+
+
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, aside,
               nodes, cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
@@ -395,20 +412,27 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
         return
     if pos < pb:
         resist += (pb - pos) / length
-    if first_c < 0:
-        # dielectric only
-        if abs(resist - 1.0) > 1e-9:
-            change = w / resist - w
-            if link.cut < 0:
-                weight[axis, a] += change
-            else:
-                extra[na if na >= 0 else nb] += change
-            _add_energy(energies, counts, na, nb, end, change, True)
-        return
     inside_a = na >= 0 and inside[na] >= 0
     inside_b = nb >= 0 and inside[nb] >= 0
     free_a = na >= 0 and nodes[na].owner == -1
     free_b = nb >= 0 and nodes[nb].owner == -1
+    if first_c < 0:
+        # dielectric only
+        if abs(resist - 1.0) <= 1e-9:
+            return
+        change = w / resist - w
+        if inside_a or inside_b:
+            # one end is at the potential of a conductor that fills less of the column
+            near, far = (na, nb) if inside_a else (nb, na)
+            free = free_b if inside_a else free_a
+            _add_tie(ties, counts, extra, far if free else -1, inside[near], far, end, change)
+            return
+        if link.cut < 0:
+            weight[axis, a] += change
+        else:
+            extra[na if na >= 0 else nb] += change
+        _add_energy(energies, counts, na, nb, end, change, True)
+        return
     if (
         link.cut < 0 and not parted
         and first_deep and last_deep and first_r <= 0.0 and resist <= 0.0
@@ -504,7 +528,7 @@ def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _close_inside(storeys, nodes, links, stored, weight, extra, inside, inside_nodes, ties,
+def _close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes, ties,
                   energies, couples, within, counts):  # fmt: skip
     """Turn what is left of links from a node inside a conductor to one outside into ties.
 
@@ -527,14 +551,16 @@ def _close_inside(storeys, nodes, links, stored, weight, extra, inside, inside_n
                 weight[axis, a] = 0.0
             for k in range(within.shape[0]):
                 within[k] += stored[a, k]
+        half = 0.0
         for axis in range(3):
             for way in range(1 if deep else 0, 2):
                 lower = a if way == 0 else a - strides[axis]
                 b = a + strides[axis] if way == 0 else lower
-                if way == 1 and inside[b] >= 0:
-                    continue
                 link = links[axis, lower]
-                if link.cut >= 0 or link.weight == 0.0:
+                if link.cut >= 0:
+                    half += cuts[link.cut].half[way]
+                    continue
+                if link.weight == 0.0 or (way == 1 and inside[b] >= 0):
                     continue
                 if not _room(ties, energies, couples, counts):
                     return False
@@ -547,16 +573,12 @@ def _close_inside(storeys, nodes, links, stored, weight, extra, inside, inside_n
                 if w <= 1e-5 * link.weight:
                     continue
                 free = nodes[b].owner == -1
-                tie = ties[counts[0]]
-                tie.node = b if free else -1
-                tie.weight = w
-                tie.conductor = inside[a]
-                point, coef = tie.point, tie.coef
-                for k in range(4):
-                    point[k], coef[k] = a, 0.0
-                coef[0] = 1.0
-                tie.end, tie.end_coef = -3, 0.0
-                if free:
-                    extra[b] += w
-                counts[0] += 1
+                _add_tie(ties, counts, extra, b if free else -1, inside[a], a, -3, w)
+        # what conductors leave of half-links to sheets
+        rest = extra[a]
+        extra[a] = 0.0
+        if rest > 1e-5 * half:
+            if not _room(ties, energies, couples, counts):
+                return False
+            _add_tie(ties, counts, extra, -1, inside[a], a, -3, rest)
     return True
