@@ -210,8 +210,8 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, store
             )  # fmt: skip
             if status != FULL:
                 return status
-    if not _close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes, ties,
-                         energies, couples, within, counts):  # fmt: skip
+    if not _close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes,
+                         ties, energies, couples, within, counts):  # fmt: skip
         return SHORT
     for i in range(counts[0]):
         if ties[i].node >= 0:
@@ -530,7 +530,7 @@ def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes, ties,
                   energies, couples, within, counts):  # fmt: skip
-    """Turn what is left of links from a node inside a conductor to one outside into ties.
+    """Turn what conductors leave of the links from nodes inside them into ties.
 
     Returns False if the findings do not fit.
     """
