@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from capsense import humans
-    from capsense.adapters import mujoco, pybullet
+    from capsense.adapters import coppeliasim, mujoco, pybullet
     from capsense.design.loader import available_designs, load_design
     from capsense.design.model import Design
     from capsense.errors import (
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         ScenarioError,
         SceneError,
         ServerError,
+        SimulatorError,
         SkinError,
         SolveError,
     )
@@ -84,6 +85,7 @@ __all__ = [
     "SceneError",
     "ServerError",
     "Simulator",
+    "SimulatorError",
     "Skin",
     "SkinError",
     "SolveError",
@@ -91,6 +93,7 @@ __all__ = [
     "TriMesh",
     "__version__",
     "available_designs",
+    "coppeliasim",
     "decode_permittivity",
     "encode_permittivity",
     "humans",
@@ -120,6 +123,7 @@ _HOMES = {
         "ScenarioError",
         "SceneError",
         "ServerError",
+        "SimulatorError",
         "SkinError",
         "SolveError",
     ),
@@ -145,6 +149,7 @@ _HOMES = {
     "capsense.skin": ("Skin",),
 }
 _SUBMODULES = {
+    "coppeliasim": "capsense.adapters.coppeliasim",
     "humans": "capsense.humans",
     "mujoco": "capsense.adapters.mujoco",
     "pybullet": "capsense.adapters.pybullet",

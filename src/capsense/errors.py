@@ -29,6 +29,10 @@ class FieldError(CapSenseError, RuntimeError):
     """The background field could not be built."""
 
 
+class SimulatorError(CapSenseError, RuntimeError):
+    """A robot simulator cannot be reached, refused a call, or is too old."""
+
+
 class SolveError(CapSenseError, RuntimeError):
     """A step did not reach its tolerance."""
 

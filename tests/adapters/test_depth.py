@@ -64,27 +64,59 @@ def pybullet_eye(
     )
 
 
-EYES = {"mujoco": mujoco_eye, "pybullet": pybullet_eye}
+def coppeliasim_eye(
+    things: list[Thing], simulator: cs.Simulator, folder: Path, resolution: int = 64, **options: Any
+) -> Any:
+    """A sensor in the stand-in for CoppeliaSim that sees a square image of 0.1 m."""
+    from coppelia_stand_in import StandIn
+
+    server = StandIn()
+    link = server.add("link", local=SENSOR)
+    server.add("pad", cs.Box((0.1, 0.1, 0.002)), on=link)
+    for thing in things:
+        server.add(thing.name, thing.shape, SENSOR @ thing.pose)
+    sim = cs.coppeliasim.connect(port=server.port)
+    sim.startSimulation()
+    sensor = cs.coppeliasim.attach(sim, "/link/pad", simulator, resolution=resolution, **options)
+    sensor.server = server
+    return sensor
+
+
+EYES = {"coppeliasim": coppeliasim_eye, "mujoco": mujoco_eye, "pybullet": pybullet_eye}
+MODULES = {"coppeliasim": "coppeliasim_zmqremoteapi_client"}
+
+
+@pytest.fixture(params=sorted(EYES))
+def adapter(request: pytest.FixtureRequest) -> str:
+    """The name of an adapter whose simulator, or its client, is installed."""
+    module = MODULES.get(request.param, request.param)
+    pytest.importorskip(module, reason=f"{module} is not installed")
+    return str(request.param)
 
 
 @pytest.fixture
 def eye(adapter: str, tiny_simulator: cs.Simulator, tmp_path: Path) -> Iterator[Callable[..., Any]]:
     """``eye(things, **options)``: a sensor that sees a depth image."""
-    clients: list[int] = []
+    sensors: list[Any] = []
 
     def make(things: list[Thing], **options: Any) -> Any:
-        sensor = EYES[adapter](things, tiny_simulator, tmp_path, **options)
-        if adapter == "pybullet":
-            clients.append(sensor.client)
+        sensors.append(EYES[adapter](things, tiny_simulator, tmp_path, **options))
         tiny_simulator.reset()
-        return sensor
+        return sensors[-1]
 
     yield make
-    if clients:
+    for sensor in sensors:
+        close(sensor)
+
+
+def close(sensor: Any) -> None:
+    """End the simulator of a sensor."""
+    if hasattr(sensor, "server"):
+        sensor.server.close()
+    elif hasattr(sensor, "client"):
         import pybullet as p
 
-        for client in clients:
-            p.disconnect(physicsClientId=client)
+        p.disconnect(physicsClientId=sensor.client)
 
 
 def error(found: cs.Reading, expected: cs.Reading) -> float:
@@ -124,23 +156,28 @@ def test_an_empty_view_changes_nothing(eye: Callable[..., Any]) -> None:
     assert np.abs(sensor.read().delta).max() == 0.0
 
 
-def test_options_of_the_other_world_are_refused(eye: Callable[..., Any]) -> None:
-    """By name."""
+def test_wrong_options_are_refused(adapter: str, eye: Callable[..., Any]) -> None:
+    """By name; so are those of the other world, where there is one."""
     things = [Thing("block", BLOCK, AHEAD)]
-    for options, message in (
-        ({"grounding": {"block": "floating"}}, 'grounding goes with world="geometry"'),
-        ({"hull": ["block"]}, 'hull goes with world="geometry"'),
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"back": "full"}, "back is 'full'"),
         ({"default_grounding": 0.0}, "grounding is 0.0 F"),
-    ):
+    ]
+    if adapter != "coppeliasim":
+        cases += [
+            ({"grounding": {"block": "floating"}}, 'grounding goes with world="geometry"'),
+            ({"hull": ["block"]}, 'hull goes with world="geometry"'),
+        ]
+    for options, message in cases:
         with pytest.raises(cs.SceneError, match=message):
             eye(things, **options).read()
 
 
-def test_both_simulators_see_the_same(tiny_simulator: cs.Simulator, tmp_path: Path) -> None:
-    """Differential: one scene through both depth paths, within 1 %."""
+def test_all_simulators_see_the_same(tiny_simulator: cs.Simulator, tmp_path: Path) -> None:
+    """Differential: one scene through all depth paths, within 1 %."""
     for name in EYES:
-        pytest.importorskip(name, reason=f"{name} is not installed")
+        module = MODULES.get(name, name)
+        pytest.importorskip(module, reason=f"{module} is not installed")
     things = [
         Thing("block", BLOCK, AHEAD),
         Thing("ball", cs.Sphere(0.01), cs.Pose((0.03, 0.03, 0.06))),
@@ -148,13 +185,16 @@ def test_both_simulators_see_the_same(tiny_simulator: cs.Simulator, tmp_path: Pa
     readings = []
     for make in EYES.values():
         tiny_simulator.reset()
-        readings.append(make(things, tiny_simulator, tmp_path).read())
-    assert error(*readings) < 0.01
+        sensor = make(things, tiny_simulator, tmp_path)
+        readings.append(sensor.read())
+        close(sensor)
+    for other in readings[1:]:
+        assert error(other, readings[0]) < 0.01
 
 
 def test_materials_of_drawn_links(tiny_simulator: cs.Simulator, tmp_path: Path) -> None:
     """PyBullet's image tells links apart: a dielectric, a conductor, one left out."""
-    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    pytest.importorskip("pybullet", reason="PyBullet is not installed")
     things = [
         Thing(n, cs.Sphere(0.008), cs.Pose((x, 0, 0.03)))
         for n, x in (("glass", -0.03), ("steel", 0.0), ("gone", 0.03))
@@ -168,7 +208,7 @@ def test_materials_of_drawn_links(tiny_simulator: cs.Simulator, tmp_path: Path) 
     assert len(scene) == 2
     assert {b.grounding for b in scene} == {"floating"}
     assert sensor.frame().points()[:, 0].max() < 0.01
-    p.disconnect(physicsClientId=sensor.client)
+    close(sensor)
 
 
 def test_wrong_cameras_are_refused(tiny_simulator: cs.Simulator) -> None:

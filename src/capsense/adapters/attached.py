@@ -69,11 +69,7 @@ class AttachedSensor(ABC):
         Raises:
             ReadOutError: There is no such chip or file, or the file is wrong.
         """
-        if isinstance(readout, str):
-            empty = self.simulator.step(Scene())
-            self.simulator.reset()
-            readout = choose_readout(readout, self.electrode_names, empty)
-        self.readout = readout
+        self.readout = make_readout(readout, self.simulator)
 
     @property
     def time(self) -> float:
@@ -265,6 +261,19 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
         FieldError: The background field could not be built.
     """
     return design if isinstance(design, Simulator) else Simulator(design)
+
+
+def make_readout(readout: ReadOut | str | None, simulator: Simulator) -> ReadOut | None:
+    """The read-out given, or that of a chip or a file for a simulator's electrodes.
+
+    Raises:
+        ReadOutError: There is no such chip or file, or the file is wrong.
+    """
+    if not isinstance(readout, str):
+        return readout
+    empty = simulator.step(Scene())
+    simulator.reset()
+    return choose_readout(readout, simulator.electrode_names, empty)
 
 
 def check_world(

@@ -1,0 +1,229 @@
+"""Sensors in CoppeliaSim: ``cs.coppeliasim.attach(sim, "/Robot/link/pad")``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from capsense.adapters.attached import check_image, make_readout, make_simulator
+from capsense.adapters.coppeliasim_calls import Remote, translated
+from capsense.adapters.coppeliasim_vision import (
+    CoppeliaSensor,
+    Eye,
+    Paint,
+    carrier,
+    find_eye,
+    make_eye,
+)
+from capsense.adapters.rules import Rules, as_material
+from capsense.design.model import Design
+from capsense.errors import MissingDependencyError, SceneError, SimulatorError
+from capsense.readout.read_out import ReadOut
+from capsense.scene import Material, Pose
+from capsense.scene.body import Grounding, checked_grounding
+from capsense.simulator import Simulator
+
+__all__ = ["CoppeliaSensor", "attach", "connect", "running"]
+
+_TRIES = 10
+"""Steps after which a started simulation must be running."""
+
+
+def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -> Any:
+    """Connect to a running CoppeliaSim.
+
+    Unlike with the client alone, which would wait for ever, every call fails where CoppeliaSim
+    does not answer in time.
+
+    Args:
+        host: Where CoppeliaSim runs.
+        port: Port of its ZeroMQ remote API server.
+        timeout: How long a call may take [s], a simulation step included.
+
+    Returns:
+        CoppeliaSim's ``sim``.
+
+    Raises:
+        MissingDependencyError: The client is not installed.
+        SimulatorError: Nobody answers there, or in another version of the protocol.
+    """
+    try:
+        import zmq
+        from coppeliasim_zmqremoteapi_client import RemoteAPIClient
+    except ImportError:
+        raise MissingDependencyError(
+            "CoppeliaSim's client is not installed; pip install 'capsense[coppelia]'"
+        ) from None
+    if not timeout > 0:
+        raise SimulatorError(f"timeout is {timeout!r}; give seconds above zero")
+    client = RemoteAPIClient(host, port)
+    client.socket.setsockopt(zmq.LINGER, 0)
+    for way in (zmq.SNDTIMEO, zmq.RCVTIMEO):
+        client.socket.setsockopt(way, round(1000 * timeout))
+    try:
+        return client.require("sim")
+    except zmq.Again:
+        raise SimulatorError(
+            f"nobody answers at {host}:{port} within {timeout:g} s; start CoppeliaSim with its "
+            "ZMQ remote API server, or give its host and port"
+        ) from None
+    except Exception as error:  # the client raises nothing finer
+        raise translated('client.require("sim")', error) from error
+
+
+@contextmanager
+def running(sim: Any) -> Iterator[Callable[[], float]]:
+    """Run the simulation step by step: ``with running(sim) as step: step(); sensor.read()``.
+
+    CoppeliaSim waits between steps. A simulation that is stopped is started, and stopped at the
+    end; one that runs already goes on afterwards.
+
+    Args:
+        sim: What :func:`connect` or ``client.require("sim")`` returned.
+
+    Yields:
+        A function that makes one step and returns the simulation time [s].
+
+    Raises:
+        SimulatorError: CoppeliaSim does not answer, does not start, or was stopped by someone
+            else.
+    """
+    remote = Remote(sim)
+    remote.call("setStepping", True)
+    ours = remote.is_stopped()
+    if ours:
+        _start(remote)
+
+    def step() -> float:
+        remote.call("step")
+        if remote.is_stopped():
+            raise SimulatorError("the simulation was stopped from elsewhere; run it again")
+        return float(remote.call("getSimulationTime"))
+
+    def leave() -> None:
+        if ours:
+            remote.call("stopSimulation")
+        remote.call("setStepping", False)
+
+    try:
+        yield step
+    except BaseException:
+        with suppress(SimulatorError):  # what went wrong first is what matters
+            leave()
+        raise
+    leave()
+
+
+def _start(remote: Remote) -> None:
+    remote.call("startSimulation")
+    for _ in range(_TRIES):
+        if not remote.is_stopped():
+            return
+        remote.call("step")
+    raise SimulatorError("the simulation does not start; look for messages in CoppeliaSim")
+
+
+def attach(
+    sim: Any,
+    object: int | str,
+    design: Design | str | Path | Simulator = "six_patch",
+    *,
+    pose_in_object: Pose | None = None,
+    materials: Mapping[str, Material | str] | None = None,
+    default_material: Material | str | None = None,
+    default_grounding: Grounding = "grounded",
+    exclude: Sequence[str] = (),
+    exclude_own: bool = True,
+    size: float | None = None,
+    resolution: int | None = None,
+    back: str | float = "fill",
+    readout: ReadOut | str | None = None,
+) -> CoppeliaSensor:
+    """Attach a sensor to an object; call ``read()`` after every step.
+
+    It sees the depth image of an orthographic vision sensor, and by the red channel what that is
+    made of; see :func:`~capsense.scene.depth.decode_permittivity`.
+
+    Where the object neither is a vision sensor nor carries one as its child, one is made, in the
+    render mode "auxiliary channels", which knows no light, and what materials say is written into
+    the auxiliary colours of all shapes in the scene. Patterns are shell patterns, tried on a
+    shape's name and on its path, such as ``/Person/arm``. Permittivities of dielectrics are
+    rounded to whole numbers. Shapes added later want :meth:`CoppeliaSensor.refresh`.
+
+    A vision sensor of the scene's own is taken as it is, and so is the red channel of its image.
+
+    Args:
+        sim: What :func:`connect` or ``client.require("sim")`` returned.
+        object: The object that carries the sensor, by its path or handle.
+        design: A design, a packaged name, a design file, or a ready simulator.
+        pose_in_object: The sensor frame in the object's frame, by default that frame itself:
+            origin at the centre of the electrode plane, z out of the sensor. A vision sensor of
+            the scene's own is itself the sensor frame.
+        materials: Name pattern → material; the first that fits decides.
+        default_material: Material of everything else, steel by default. With a vision sensor of
+            the scene's own: of everything seen, instead of what the red channel says.
+        default_grounding: Grounding of all conductors, which are one body.
+        exclude: Name patterns of shapes that the sensor does not see.
+        exclude_own: Leave out the shape that the object is or stands on, which the design itself
+            describes.
+        size: Width and height of the image [m]; by default the width of the domain.
+        resolution: Pixels along each side of the image, 64 by default.
+        back: Where what is seen ends: ``"fill"``, at the end of the domain, or after an assumed
+            thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`.
+        readout: A read-out whose counts readings are to hold, a chip's name, or a file's; see
+            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+
+    Raises:
+        SceneError: There is no such object, a pattern fits nothing, its vision sensor is in
+            perspective or of another resolution, or options do not go with that.
+        SimulatorError: CoppeliaSim does not answer, or is too old.
+        DesignError: The design is wrong.
+        ReadOutError: There is no such chip.
+    """
+    if pose_in_object is not None and not isinstance(pose_in_object, Pose):
+        raise SceneError(f"pose_in_object is {pose_in_object!r}; give a Pose(position, quaternion)")
+    remote = Remote(sim)
+    handle = remote.find(object)
+    eye = find_eye(remote, handle)
+    grounding = checked_grounding(default_grounding)
+    if eye is not None:
+        made_only = {
+            "materials": materials is not None, "exclude": len(exclude) > 0,
+            "pose_in_object": pose_in_object is not None, "size": size is not None,
+            "exclude_own=False": not exclude_own,
+        }  # fmt: skip
+        _check_own(eye, made_only, resolution)
+    material = None if default_material is None else as_material(default_material)
+    rules = Rules(materials or {}, {}, material or "steel", exclude=exclude)
+    simulator = make_simulator(design)
+    domain = simulator.design.domain
+    pixels = 64 if resolution is None else resolution
+    size, pixels = check_image(size, pixels, max(domain.size[:2]))
+    chip = make_readout(readout, simulator)
+    paint = None
+    if eye is None:  # all is checked: only now the scene is changed
+        paint = Paint(remote, rules, carrier(remote, handle) if exclude_own else None)
+        pose, far = pose_in_object or Pose(), float(domain.upper[2])
+        eye = make_eye(remote, handle, pose, size, far, pixels, paint.collection)
+        material = None  # the colours say it
+    sensor = CoppeliaSensor(remote, eye, simulator, grounding, back, paint, material)
+    sensor.readout = chip
+    return sensor
+
+
+def _check_own(eye: Eye, made_only: Mapping[str, bool], resolution: int | None) -> None:
+    """Refuse what does not go with a vision sensor of the scene's own."""
+    for name, given in made_only.items():
+        if given:
+            raise SceneError(
+                f"{name} goes with a vision sensor that attach makes, but {eye.path!r} is there; "
+                "leave one of them out"
+            )
+    rows, columns = eye.resolution
+    if resolution is not None and (rows, columns) != (resolution, resolution):
+        raise SceneError(
+            f"vision sensor {eye.path!r} has {columns} x {rows} pixels, not {resolution} x "
+            f"{resolution}; leave resolution out, or set it there"
+        )

@@ -1,0 +1,286 @@
+"""Orthographic vision sensors of CoppeliaSim: found, made, and read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.adapters.attached import DepthSensor
+from capsense.adapters.coppeliasim_calls import Remote
+from capsense.adapters.rules import Rules
+from capsense.errors import SceneError, SimulatorError
+from capsense.scene import Material, Pose
+from capsense.scene.body import Grounding
+from capsense.scene.camera import OrthographicCamera
+from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
+from capsense.simulator import Simulator
+
+NEAR = 1e-4
+"""Near clipping plane of the sensors made here [m], the least that CoppeliaSim takes."""
+_SLACK = 1e-5
+"""What is not this much nearer than the far clipping plane, relative to that, is background: the
+depth buffer and single precision round."""
+_OPTIONS = 1 + 4 + 64 + 128
+"""Of ``sim.createVisionSensor``: handled explicitly, frustum not shown, no fog, own background."""
+_AUXILIARY_CHANNELS = 1
+"""Render mode that draws the auxiliary colours of shapes as they are, without light."""
+_REMOVED = 1
+"""Option of ``sim.addItemToCollection``."""
+_CHILDREN = 1 + 2
+"""Options of ``sim.getObjectsInTree``: not the object itself, and its own children alone."""
+_ALIAS = "capsense"
+"""Name of the vision sensors made here."""
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A vision sensor. Its frame is the sensor frame: z out of the sensor."""
+
+    handle: int
+    path: str
+    camera: OrthographicCamera
+    resolution: tuple[int, int]
+    """Rows and columns."""
+
+
+class CoppeliaSensor(DepthSensor):
+    """A sensor on an object in CoppeliaSim; made by :func:`capsense.adapters.coppeliasim.attach`.
+
+    Args:
+        remote: The simulator.
+        eye: What it sees with.
+        simulator: The sensor itself.
+        grounding: Of all conductors.
+        back: Where what is seen ends.
+        paint: What colours the world's shapes, if it was to be coloured.
+        material: What everything is made of; None to tell by the red channel.
+    """
+
+    def __init__(
+        self,
+        remote: Remote,
+        eye: Eye,
+        simulator: Simulator,
+        grounding: Grounding,
+        back: str | float,
+        paint: Paint | None,
+        material: Material | None,
+    ) -> None:
+        super().__init__(simulator)
+        self.eye = eye
+        """The vision sensor it sees with."""
+        self._remote, self._paint = remote, paint
+        self._grounding, self._back, self._material = grounding, back, material
+
+    def _time(self) -> float:
+        return float(self._remote.call("getSimulationTime"))
+
+    @property
+    def pose(self) -> Pose:
+        world = self._remote.constant("handle_world")
+        numbers = self._remote.call("getObjectPose", self.eye.handle, world)
+        return Pose(numbers[:3], numbers[3:])
+
+    def frame(self) -> DepthFrame:
+        """The depth image of the present state.
+
+        Raises:
+            SceneError: The simulation is not running, or the vision sensor was changed.
+            SimulatorError: CoppeliaSim does not answer.
+        """
+        remote, handle = self._remote, self.eye.handle
+        if remote.is_stopped():
+            raise SceneError(
+                "the simulation is not running; call sim.startSimulation() and sim.step(), or "
+                "step in capsense.coppeliasim.running(sim)"
+            )
+        remote.call("handleVisionSensor", handle)
+        depth = self._image("getVisionSensorDepth", np.dtype("<f4"), 1, 1)
+        seen: Any = self._material
+        if seen is None:
+            seen = self._image("getVisionSensorImg", np.dtype("u1"), 3)
+        return DepthFrame(depth, seen, self.eye.camera, grounding=self._grounding, back=self._back)
+
+    def refresh(self) -> None:
+        """Colour the world's shapes again, after some were added.
+
+        Raises:
+            SceneError: A name pattern fits nothing.
+            SimulatorError: CoppeliaSim does not answer.
+        """
+        if self._paint is not None:
+            self._paint.refresh()
+
+    def _image(
+        self, name: str, kind: np.dtype[Any], channels: int, *options: int
+    ) -> NDArray[np.generic]:
+        data, (columns, rows) = self._remote.call(name, self.eye.handle, *options)
+        if (rows, columns) != self.eye.resolution:
+            raise SceneError(
+                f"vision sensor {self.eye.path!r} now has {columns} x {rows} pixels, not "
+                f"{self.eye.resolution[1]} x {self.eye.resolution[0]}; attach again"
+            )
+        if len(data) != rows * columns * channels * kind.itemsize:
+            raise SimulatorError(
+                f"sim.{name} gave {len(data)} bytes for {columns} x {rows} pixels of "
+                f"{channels * kind.itemsize} bytes"
+            )
+        image = np.frombuffer(data, kind)
+        return image.reshape((rows, columns, channels)[: 3 if channels > 1 else 2])
+
+
+class Paint:
+    """Writes into the auxiliary colours of all shapes what they are made of.
+
+    The red channel holds :func:`~capsense.scene.depth.encode_permittivity`.
+
+    Raises:
+        SceneError: A name pattern fits nothing, or there is no code for a permittivity.
+
+    Args:
+        remote: The simulator.
+        rules: What shapes are made of, and which are not seen; patterns are tried on a shape's
+            name and on its path.
+        own: A shape that is not seen, if any.
+    """
+
+    def __init__(self, remote: Remote, rules: Rules, own: int | None) -> None:
+        self._remote, self._rules = remote, rules
+        shapes = self._shapes()  # refuses wrong patterns before the scene is changed
+        self.collection = int(remote.call("createCollection", 0))
+        """Handle of the collection of what is seen."""
+        every = remote.constant("handle_all")
+        remote.call("addItemToCollection", self.collection, every, -1, 0)
+        self._hidden: set[int] = set()
+        if own is not None:
+            self._hide(own)
+        self._colour(shapes)
+
+    def refresh(self) -> None:
+        """Colour the shapes that there are now.
+
+        Raises:
+            SceneError: A name pattern fits nothing.
+        """
+        self._colour(self._shapes())
+
+    def _shapes(self) -> dict[int, tuple[tuple[str, str], float]]:
+        """Names and code, from 0 to 1, of every shape in the scene.
+
+        Raises:
+            SceneError: A name pattern fits nothing, or there is no code for a permittivity.
+        """
+        remote, rules = self._remote, self._rules
+        scene, kind = remote.constant("handle_scene"), remote.constant("sceneobject_shape")
+        shapes = remote.call("getObjectsInTree", scene, kind)
+        called = {int(h): (str(remote.call("getObjectAlias", h)), remote.path(h)) for h in shapes}
+        rules.check(list(called.values()))
+        out = {}
+        for handle, names in called.items():
+            matter = rules.material_of(names)
+            code = encode_permittivity(np.inf if matter.is_conductor() else matter.eps_r)
+            out[handle] = names, int(code) / CONDUCTOR_CODE
+        return out
+
+    def _colour(self, shapes: dict[int, tuple[tuple[str, str], float]]) -> None:
+        component = self._remote.constant("colorcomponent_auxiliary")
+        for handle, (names, red) in shapes.items():
+            if self._rules.excludes(names) and handle not in self._hidden:
+                self._hide(handle)
+            self._remote.call("setShapeColor", handle, None, component, [red, 0.0, 0.0])
+
+    def _hide(self, handle: int) -> None:
+        self._hidden.add(handle)
+        single = self._remote.constant("handle_single")
+        self._remote.call("addItemToCollection", self.collection, single, handle, _REMOVED)
+
+
+def find_eye(remote: Remote, handle: int) -> Eye | None:
+    """The vision sensor that an object is, or carries; None where it has none.
+
+    Those that :func:`make_eye` made for it earlier do not count.
+
+    Raises:
+        SceneError: It has several, or the one is in perspective.
+    """
+    if remote.call("getObjectType", handle) == remote.constant("sceneobject_visionsensor"):
+        return _read_eye(remote, handle)
+    found = [eye for eye, name in _children(remote, handle).items() if name != _ALIAS]
+    if len(found) > 1:
+        paths = ", ".join(repr(remote.path(h)) for h in found)
+        raise SceneError(
+            f"{remote.path(handle)!r} carries {len(found)} vision sensors ({paths}); name one"
+        )
+    return _read_eye(remote, found[0]) if found else None
+
+
+def make_eye(
+    remote: Remote, handle: int, pose: Pose, size: float, far: float, resolution: int, seen: int
+) -> Eye:
+    """An orthographic vision sensor on an object, in the place of one made there earlier.
+
+    Args:
+        remote: The simulator.
+        handle: The object.
+        pose: The sensor frame in the object's frame.
+        size: Width and height of the image [m].
+        far: Depth up to which it sees [m].
+        resolution: Pixels along each side.
+        seen: Handle of the collection of what it sees.
+    """
+    for old, name in _children(remote, handle).items():
+        if name == _ALIAS:
+            entity = remote.constant("visionintparam_entity_to_render")
+            remote.call("destroyCollection", remote.call("getObjectInt32Param", old, entity))
+            remote.call("removeObjects", [old])
+    sizes = [NEAR, far, size, 0.01] + [0.0] * 7
+    eye = int(remote.call("createVisionSensor", _OPTIONS, [resolution] * 2 + [0, 0], sizes))
+    remote.call("setObjectAlias", eye, _ALIAS)
+    remote.call("setObjectParent", eye, handle, False)
+    remote.call("setObjectPose", eye, [*pose.position, *pose.quaternion], handle)
+    for name, value in (("render_mode", _AUXILIARY_CHANNELS), ("entity_to_render", seen)):
+        remote.call("setObjectInt32Param", eye, remote.constant(f"visionintparam_{name}"), value)
+    return _read_eye(remote, eye)
+
+
+def carrier(remote: Remote, handle: int) -> int | None:
+    """The shape that an object is or stands on, if any."""
+    shape = remote.constant("sceneobject_shape")
+    while handle >= 0 and remote.call("getObjectType", handle) != shape:
+        handle = int(remote.call("getObjectParent", handle))
+    return handle if handle >= 0 else None
+
+
+def _children(remote: Remote, handle: int) -> dict[int, str]:
+    """The vision sensors that an object carries, and their names."""
+    kind = remote.constant("sceneobject_visionsensor")
+    found = remote.call("getObjectsInTree", handle, kind, _CHILDREN)
+    return {int(eye): str(remote.call("getObjectAlias", eye)) for eye in found}
+
+
+def _read_eye(remote: Remote, handle: int) -> Eye:
+    def number(name: str) -> float:
+        get = "getObjectInt32Param" if name.startswith("visionint") else "getObjectFloatParam"
+        return float(remote.call(get, handle, remote.constant(name)))
+
+    path = remote.path(handle)
+    if number("visionintparam_perspective_operation"):
+        raise SceneError(
+            f"vision sensor {path!r} is in perspective; depth must come from parallel rays, so "
+            "clear its perspective mode"
+        )
+    columns = int(number("visionintparam_resolution_x"))
+    rows = int(number("visionintparam_resolution_y"))
+    pixel = number("visionfloatparam_ortho_size") / max(columns, rows)
+    # CoppeliaSim's camera looks along its frame's z, with y up and x to the left: its view matrix
+    # is the frame's inverse turned half round about y. Rows are read from the bottom.
+    camera = OrthographicCamera(
+        columns * pixel, rows * pixel, Pose(),
+        near=number("visionfloatparam_near_clipping"),
+        far=number("visionfloatparam_far_clipping") * (1 - _SLACK),
+        rows="+y", columns="-x",
+    )  # fmt: skip
+    return Eye(handle, path, camera, (rows, columns))

@@ -1,0 +1,278 @@
+"""CoppeliaSim: the real client against a stand-in that speaks the simulator's wire format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import capsense as cs
+
+pytest.importorskip(
+    "coppeliasim_zmqremoteapi_client", reason="CoppeliaSim's client is not installed"
+)
+from coppelia_stand_in import TIME_STEP, UNPAINTED, StandIn
+
+BLOCK = cs.Box((0.03, 0.024, 0.01))
+BALL = cs.Sphere(0.012)
+AHEAD = cs.Pose((0.004, -0.003, 0.03))
+
+
+@pytest.fixture
+def server() -> Iterator[StandIn]:
+    """A scene of one dummy, ``/Robot/flange``."""
+    stand_in = StandIn()
+    robot = stand_in.add("Robot", local=cs.Pose((0.3, -0.2, 0.5), (0.1, 0.3, -0.2, 0.9)))
+    stand_in.add("flange", on=robot, local=cs.Pose((0, 0, 0.1), (0, 0.5, 0, 1)))
+    yield stand_in
+    stand_in.close()
+
+
+@pytest.fixture
+def sim(server: StandIn) -> Any:
+    """What the real client makes of it."""
+    return cs.coppeliasim.connect(port=server.port, timeout=5.0)
+
+
+def put(server: StandIn, name: str, shape: Any = BLOCK, pose: cs.Pose = AHEAD) -> int:
+    """Add a shape before the flange."""
+    flange = server.pose(server.getObject("/Robot/flange"))
+    return server.add(name, shape, flange @ pose)
+
+
+def error(found: cs.Reading, simulator: cs.Simulator, *bodies: cs.Body) -> float:
+    """Largest difference of self-capacitance changes from those of the shapes, relative."""
+    simulator.reset()
+    expected = np.diag(simulator.step(cs.Scene(bodies)).delta)
+    simulator.reset()
+    return float(np.abs(np.diag(found.delta) / expected - 1).max())
+
+
+def test_a_moving_block_reads_as_its_shape_does(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """Differential, along a path: as the geometry, step by step, with times.
+
+    The block's edges lie between pixels, so that its image is as wide as itself.
+    """
+    block = put(server, "block")
+    flange = server.pose(server.getObject("/Robot/flange"))
+
+    def place(time: float) -> cs.Pose:
+        return cs.Pose((0.2 * time - 0.02, 0.01, 0.05 - 0.1 * time))
+
+    def move(time: float) -> None:
+        server.things[block].local = flange @ place(time)
+
+    server.on_step = move
+    sensor = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator, back=0.01, resolution=100)
+    with cs.coppeliasim.running(sim) as step:
+        assert server.stepping
+        for k in range(1, 5):
+            now = step()
+            assert now == pytest.approx(k * TIME_STEP)
+            assert sensor.time == now
+            reading = sensor.read()
+            assert error(reading, tiny_simulator, cs.Body(BLOCK, place(now), "steel")) < 1e-3
+    assert not server.running
+    assert not server.stepping
+
+
+def test_the_red_channel_tells_materials(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """Differential: as a frame made by hand; what is left out hides nothing."""
+    put(server, "left_glass", pose=cs.Pose((-0.02, 0, 0.03)))
+    put(server, "right_steel", pose=cs.Pose((0.02, 0, 0.03)))
+    screen = put(server, "screen", cs.Box((0.08, 0.08, 0.001)), cs.Pose((0, 0, 0.01)))
+    sensor = cs.coppeliasim.attach(
+        sim, "/Robot/flange", tiny_simulator, materials={"*glass": "glass"}, exclude=["/scr*"],
+        default_grounding="floating", back=0.01, resolution=100,
+    )  # fmt: skip
+    sim.startSimulation()
+    frame = sensor.frame()
+    assert set(np.unique(frame.permittivity)) == {0.0, 5.0, np.inf}
+    assert frame.resolution == (100, 100)
+    by_hand = cs.DepthFrame(
+        np.where(frame.valid[0], 0.025, np.inf), np.array(frame.permittivity[0]),
+        cs.OrthographicCamera(0.1, 0.1, far=0.1, columns="-x"), back=0.01, grounding="floating",
+    )  # fmt: skip
+    x = frame.camera.pixel_centres((100, 100))[0]
+    (seen,) = np.nonzero(frame.permittivity[0, 50])
+    assert set(np.floor(1000 * x[seen]).astype(int)) == {*range(-35, -5), *range(5, 35)}
+    assert (np.isinf(frame.permittivity[0, 50, seen]) == (x[seen] > 0)).all()
+    expected = tiny_simulator.step(by_hand).delta
+    tiny_simulator.reset()
+    assert sensor.read().delta == pytest.approx(expected, rel=1e-3)
+    late = put(server, "late_glass", pose=cs.Pose((0, 0.03, 0.03)))
+    assert server.things[late].colour == UNPAINTED
+    sensor.refresh()
+    assert server.things[late].colour == pytest.approx((5 / 255, 0, 0))
+    assert server.collections[server.things[sensor.eye.handle].parameters["entity_to_render"]] == {
+        screen
+    }
+
+
+def test_a_sensor_rides_on_its_object(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """Its pose and what it sees follow; the shape it stands on is seen on request alone."""
+    flange = server.getObject("/Robot/flange")
+    pad = server.add("pad", cs.Box((0.05, 0.04, 0.03)), on=flange)
+    put(server, "ball", BALL, cs.Pose((0, 0, 0.045)))
+    on_pad = cs.Pose((0, 0, 0.014), (0, 0, 1, 0))
+    sensor = cs.coppeliasim.attach(sim, "/Robot/flange/pad", tiny_simulator, pose_in_object=on_pad)
+    sim.startSimulation()
+    near = sensor.frame()
+    assert near.points()[:, 2].min() == pytest.approx(0.045 - 0.014 - 0.012, abs=2e-4)
+    server.things[flange].local @= cs.Pose((0, 0, -0.01))
+    assert sensor.pose.position == pytest.approx((server.pose(pad) @ on_pad).position)
+    assert sensor.pose.quaternion == pytest.approx((server.pose(pad) @ on_pad).quaternion)
+    far = sensor.frame()
+    assert far.points()[:, 2].min() == pytest.approx(0.045 - 0.004 - 0.012, abs=2e-4)
+    own = cs.coppeliasim.attach(sim, pad, tiny_simulator, exclude_own=False)
+    assert own.frame().points()[:, 2].min() == pytest.approx(0.015, abs=1e-6)
+
+
+def test_attaching_again_replaces_what_was_made(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """Scripts that run many times leave one vision sensor and one collection behind."""
+    flange = server.getObject("/Robot/flange")
+    first = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    assert [t.alias for t in server.things.values() if t.parent == flange] == ["capsense"]
+    assert len(server.collections) == 1
+    sim.startSimulation()
+    with pytest.raises(cs.SimulatorError, match=r"sim.handleVisionSensor: Object does not exist"):
+        first.read()
+
+
+def test_a_vision_sensor_of_the_scene_is_taken_as_it_is(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """Its image, and its frame; materials by its red channel, or one for all."""
+    flange = server.getObject("/Robot/flange")
+    eye = server.add_vision("eye", flange, render_mode=1)
+    put(server, "ball")
+    for name in ("/Robot/flange", "/Robot/flange/eye", eye):
+        sensor = cs.coppeliasim.attach(sim, name, tiny_simulator, resolution=64)
+        assert sensor.eye.handle == eye
+    sim.startSimulation()
+    seen = sensor.frame()
+    assert set(np.unique(seen.permittivity)) == {0.0, round(255 * UNPAINTED[0])}
+    sensor = cs.coppeliasim.attach(
+        sim, eye, tiny_simulator, default_material="steel", back=0.01, readout="fdc1004"
+    )
+    assert error(sensor.read(), tiny_simulator, cs.Body(BLOCK, AHEAD, "steel")) < 0.05
+    sim.step()
+    counts = sensor.read().counts
+    assert counts is not None
+    assert len(counts.time) > 0
+    with pytest.raises(cs.SceneError, match=r"exclude goes with a vision sensor that attach makes"):
+        cs.coppeliasim.attach(sim, eye, tiny_simulator, exclude=["ball"])
+    with pytest.raises(cs.SceneError, match=r"has 64 x 64 pixels, not 32 x 32"):
+        cs.coppeliasim.attach(sim, eye, tiny_simulator, resolution=32)
+    server.things[eye].parameters["resolution_y"] = 48
+    with pytest.raises(cs.SceneError, match=r"now has 64 x 48 pixels, not 64 x 64; attach again"):
+        sensor.read()
+    server.things[eye].parameters["perspective_operation"] = 1
+    with pytest.raises(cs.SceneError, match=r"'/Robot/flange/eye' is in perspective"):
+        cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    server.add_vision("other", flange)
+    with pytest.raises(cs.SceneError, match=r"2 vision sensors \('/Robot/flange/eye', .*name one"):
+        cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+
+
+def test_slips_are_refused_before_the_scene_is_changed(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """By name: objects, patterns, options; and nothing is left behind."""
+    put(server, "ball")
+    for thing, options, message in (
+        ("/Robot/flang", {}, "no object named '/Robot/flang'; did you mean '/Robot/flange'"),
+        (999, {}, "no object of handle 999"),
+        (None, {}, "object is None; give a path"),
+        ("/Robot/flange", {"materials": {"bal": "glass"}}, "nothing is named 'bal'; did you mean"),
+        ("/Robot/flange", {"materials": {"ball": cs.Material("x", 300.0)}}, "eps_r is 300.0"),
+        ("/Robot/flange", {"exclude": "ball"}, "exclude is 'ball'; give a list"),
+        ("/Robot/flange", {"resolution": 0}, "resolution is 0"),
+        ("/Robot/flange", {"size": -0.1}, "size is -0.1"),
+        ("/Robot/flange", {"default_grounding": "grouded"}, "grounding is 'grouded'"),
+        ("/Robot/flange", {"pose_in_object": (0, 0, 1)}, r"pose_in_object is \(0, 0, 1\)"),
+    ):
+        with pytest.raises(cs.SceneError, match=message):
+            cs.coppeliasim.attach(sim, thing, tiny_simulator, **options)
+    with pytest.raises(cs.ReadOutError):
+        cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator, readout="fdc1005")
+    assert len(server.things) == 3
+    assert not server.collections
+
+
+def test_a_reading_wants_a_running_simulation(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """Refused before the start; a start that takes some steps is waited for."""
+    sensor = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    with pytest.raises(cs.SceneError, match=r"not running; call sim.startSimulation\(\)"):
+        sensor.read()
+    server.starts_late = 3
+    with cs.coppeliasim.running(sim) as step:
+        assert np.abs(sensor.read().delta).max() == 0.0
+        with cs.coppeliasim.running(sim):  # goes on, as it ran before
+            pass
+        assert server.running
+        server.running = False
+        with pytest.raises(cs.SimulatorError, match="stopped from elsewhere"):
+            step()
+    server.starts_late = 1000
+    with pytest.raises(cs.SimulatorError, match="does not start"), cs.coppeliasim.running(sim):
+        pass
+
+
+def test_an_error_within_a_run_stops_it(server: StandIn, sim: Any) -> None:
+    """The simulation is stopped and the error goes on, even if CoppeliaSim is gone by then."""
+    with pytest.raises(ZeroDivisionError), cs.coppeliasim.running(sim):
+        raise ZeroDivisionError
+    assert not server.running
+    short = cs.coppeliasim.connect(port=server.port, timeout=0.2)
+
+    def crash() -> None:
+        server.close()
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), cs.coppeliasim.running(short):
+        crash()
+
+
+def test_a_lost_simulator_is_named(server: StandIn, tiny_simulator: cs.Simulator) -> None:
+    """One that never answers, one that vanished, and the broken connection afterwards."""
+    sim = cs.coppeliasim.connect(port=server.port, timeout=0.2)
+    sensor = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    sim.startSimulation()
+    server.close()
+    with pytest.raises(cs.SimulatorError, match=r"did not answer sim.getSimulationState in time"):
+        sensor.read()
+    with pytest.raises(cs.SimulatorError, match="connection to CoppeliaSim is broken"):
+        sensor.read()
+    with pytest.raises(cs.SimulatorError, match=rf"nobody answers at localhost:{server.port}"):
+        cs.coppeliasim.connect(port=server.port, timeout=0.1)
+    with pytest.raises(cs.SimulatorError, match="timeout is 0"):
+        cs.coppeliasim.connect(timeout=0)
+
+
+def test_other_versions_are_named(tiny_simulator: cs.Simulator) -> None:
+    """The first version of the protocol; a ``sim`` that lacks a function; no ``sim`` at all."""
+    old = StandIn(protocol=1)
+    with pytest.raises(cs.SimulatorError, match=r"another version .* CoppeliaSim 4\.6 or later"):
+        cs.coppeliasim.connect(port=old.port)
+    old.close()
+    poor = StandIn(without=("getVisionSensorDepth", "sceneobject_shape"))
+    sim = cs.coppeliasim.connect(port=poor.port)
+    with pytest.raises(cs.SimulatorError, match=r"no sim\.getVisionSensorDepth.* 4\.6 or later"):
+        cs.coppeliasim.attach(sim, "/Robot", tiny_simulator)
+    poor.close()
+    with pytest.raises(cs.SimulatorError, match=r"sim is 'sim'; give what"):
+        cs.coppeliasim.attach("sim", "/Robot", tiny_simulator)
