@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numba import njit
 
 from capsense.errors import SceneError
-from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Pose, Sphere
+from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Pose, Sphere, TriMesh
 from capsense.scene.kernels import body_line_interval, line_interval
 
 SHAPES = [
@@ -162,6 +162,18 @@ def test_bounds_volume_and_surface_mesh(shape):
     np.testing.assert_allclose(mesh.bounds, shape.bounds(), atol=2e-4)
     assert mesh.volume == pytest.approx(shape.volume, rel=6e-3)
     assert np.abs(shape.signed_distance(mesh.vertices)).max() < 1e-9
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.1, 1.5])
+def test_surface_meshes_of_any_size_are_closed(scale):
+    """Small ones too: every kind, as a solid of triangles of the same volume."""
+    kinds = (
+        Box((scale, 2 * scale, scale)), Sphere(scale), Capsule(scale, 4 * scale),
+        Cylinder(scale, 2 * scale), Ellipsoid((scale, 2 * scale, 3 * scale)),
+    )  # fmt: skip
+    for shape in kinds:
+        mesh = shape.to_trimesh()
+        assert TriMesh(mesh.vertices, mesh.faces).volume == pytest.approx(shape.volume, rel=6e-3)
 
 
 @shapes

@@ -226,7 +226,9 @@ class Capsule(Shape):
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
 
-        mesh = trimesh.creation.capsule(height=self.length, radius=self.radius, count=(64, 64))
+        # made for radius 1, as trimesh drops triangles of less than 1e-8
+        mesh = trimesh.creation.capsule(height=self.length / self.radius, count=(64, 64))
+        mesh.apply_scale(self.radius)
         mesh.apply_translation(-mesh.bounds.mean(axis=0))
         return mesh
 
@@ -274,7 +276,9 @@ class Cylinder(Shape):
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
 
-        return trimesh.creation.cylinder(radius=self.radius, height=self.length, sections=128)
+        mesh = trimesh.creation.cylinder(1.0, height=self.length / self.radius, sections=128)
+        mesh.apply_scale(self.radius)
+        return mesh
 
 
 @dataclass(frozen=True)
