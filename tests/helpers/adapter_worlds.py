@@ -1,8 +1,8 @@
-"""One world of things, made in plain CapSense, in MuJoCo and in PyBullet.
+"""One world of things, made in plain CapSense and in every simulator, seen in every way.
 
-Every builder takes things in the world's frame and the pose of the sensor in it, and returns a
-function that gives the sensor's reading. The link that carries the sensor has a box of its own
-that would hide the electrodes if it were seen.
+Every builder takes things in the world's frame and the pose of the sensor in it, and returns the
+attached sensor. The link that carries it has a box of its own that would hide the electrodes if it
+were seen. ``WAYS`` lists what the contract is checked on: to add an adapter, add its builder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,11 @@ import numpy as np
 import capsense as cs
 
 CARRIER_BOX = (0.05, 0.04, 0.03)
+IMAGE, PIXELS = 0.1, 64
+"""Width of depth images [m], that of the small sensor's domain, and their pixels."""
 _COUNT = itertools.count()
+
+Builder = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,18 @@ def plain_reading(
     return simulator.step(
         cs.Scene([cs.Body(t.shape, world @ t.pose, name=t.name, **body) for t in things])
     )
+
+
+def image_reading(things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simulator) -> cs.Reading:
+    """The reading of the depth image of our own rasteriser, for comparison."""
+    depth = np.full((PIXELS, PIXELS), np.nan)
+    for thing in things:
+        mesh = thing.shape.to_trimesh()
+        vertices = (sensor.inverse() @ thing.pose).apply(mesh.vertices)
+        raster = cs.rasterise(vertices, mesh.faces, (IMAGE, IMAGE), (PIXELS, PIXELS))
+        depth = np.fmin(depth, np.where(raster.depth > 0, raster.depth, np.nan))
+    simulator.reset()
+    return simulator.step(cs.DepthFrame(depth, camera=cs.OrthographicCamera(IMAGE, IMAGE)))
 
 
 # -- MuJoCo ------------------------------------------------------------------------------------
@@ -71,8 +87,11 @@ def mjcf_geom(thing: Thing) -> tuple[str, str]:
     return f'<geom name="{thing.name}_geom" {geom}/>', asset
 
 
-def mjcf(things: Sequence[Thing], sensor: cs.Pose, extra: str = "") -> str:
-    """A model of the things, each a free body, and of the sensor's carrier."""
+def mjcf(things: Sequence[Thing], sensor: cs.Pose, pixels: int | None = None) -> str:
+    """A model of the things, each a free body, and of the sensor's carrier.
+
+    With ``pixels``, the sensor has a depth camera of so many along each side.
+    """
 
     def frame(pose: cs.Pose) -> str:
         x, y, z, w = pose.quaternion
@@ -83,13 +102,21 @@ def mjcf(things: Sequence[Thing], sensor: cs.Pose, extra: str = "") -> str:
         f'<body name="{t.name}" {frame(t.pose)}><freejoint/>{geom}</body>' for t, geom, _ in parts
     )
     offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
+    eye, reader = "", ""
+    if pixels is not None:
+        view = frame(offset @ cs.Pose((0, 0, 0), (1, 0, 0, 0)))
+        eye = (
+            f'<camera name="pad" {view} projection="orthographic" fovy="{IMAGE}" '
+            f'resolution="{pixels} {pixels}"/>'
+        )
+        reader = '<sensor><rangefinder camera="pad" data="depth"/></sensor>'
     return (
         '<mujoco><option gravity="0 0 0"/><default><geom contype="0" conaffinity="0"/></default>'
-        f"<asset>{''.join(a for _, _, a in parts)}</asset>{extra}<worldbody>{bodies}"
+        f"<asset>{''.join(a for _, _, a in parts)}</asset><worldbody>{bodies}"
         f'<body name="carrier" {frame(sensor @ offset.inverse())}><freejoint/>'
         f'<geom name="carrier_geom" type="box" size="{numbers(np.divide(CARRIER_BOX, 2))}" '
         f"{frame(offset)}/>"
-        f'<site name="pad" {frame(offset)}/></body></worldbody></mujoco>'
+        f'<site name="pad" {frame(offset)}/>{eye}</body></worldbody>{reader}</mujoco>'
     )
 
 
@@ -99,7 +126,8 @@ def mujoco_sensor(
     """A sensor in MuJoCo, after one step."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string(mjcf(things, sensor))
+    pixels = options.pop("resolution", PIXELS) if options.get("world") == "depth" else None
+    model = mujoco.MjModel.from_xml_string(mjcf(things, sensor, pixels))
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
     return cs.mujoco.attach(model, data, "pad", simulator, **options)
@@ -149,6 +177,11 @@ def urdf_geometry(thing: Thing, folder: Path) -> str:
     return f'<mesh filename="{file}"/>'
 
 
+def _as_mesh(shape: Any) -> cs.TriMesh:
+    mesh = shape.to_trimesh()
+    return cs.TriMesh(mesh.vertices, mesh.faces)
+
+
 def load(client: int, text: str, pose: cs.Pose, folder: Path) -> int:
     """Load a URDF so that its link frame stands at a pose."""
     import pybullet as p
@@ -161,9 +194,15 @@ def load(client: int, text: str, pose: cs.Pose, folder: Path) -> int:
 def pybullet_sensor(
     things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simulator, folder: Path, **options: Any
 ) -> Any:
-    """A sensor in PyBullet, after one step; the caller disconnects ``sensor.client``."""
+    """A sensor in PyBullet, after one step; the caller disconnects ``sensor.client``.
+
+    What a depth image is to show is given as meshes, as PyBullet draws its own round shapes as
+    coarse polyhedra.
+    """
     import pybullet as p
 
+    if options.get("world") == "depth":
+        things = [Thing(t.name, _as_mesh(t.shape), t.pose) for t in things]
     client = p.connect(p.DIRECT)
     for thing in things:
         load(client, urdf(thing.name, urdf_geometry(thing, folder)), thing.pose, folder)
@@ -176,4 +215,52 @@ def pybullet_sensor(
     return cs.pybullet.attach(client, carrier, "carrier_link", offset, simulator, **options)
 
 
-SENSORS: dict[str, Callable[..., Any]] = {"mujoco": mujoco_sensor, "pybullet": pybullet_sensor}
+def release(sensor: Any) -> None:
+    """Give back what the sensor's simulator holds."""
+    client = getattr(sensor, "client", None)
+    if client is not None:
+        import pybullet as p
+
+        p.disconnect(physicsClientId=client)
+
+
+# -- what the contract is checked on -----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way in which an adapter sees a world."""
+
+    package: str
+    """What must be installed."""
+    build: Builder
+    """``build(things, pose, simulator, folder, **options)``: the attached sensor."""
+    options: dict[str, Any]
+    """Of the builder, for this way."""
+    expected: Callable[..., cs.Reading]
+    """What a reading is compared with: ``expected(things, pose, simulator)``."""
+    same: float
+    """Largest difference from that, relative to the largest change."""
+    moved: float
+    """Largest difference of two readings of one scene in another place, relative likewise."""
+    has_clock: bool
+    """Whether the simulator tells its time."""
+
+    @property
+    def sees_shapes(self) -> bool:
+        """Whether it sees the shapes themselves, with their names."""
+        return self.expected is plain_reading
+
+
+WAYS = {
+    # PyBullet keeps some poses in single precision
+    "mujoco": Way("mujoco", mujoco_sensor, {}, plain_reading, 1e-4, 1e-4, True),
+    "pybullet": Way("pybullet", pybullet_sensor, {}, plain_reading, 1e-4, 1e-4, False),
+    # rays hit round bodies, our rasteriser draws meshes of them
+    "mujoco depth": Way(
+        "mujoco", mujoco_sensor, {"world": "depth"}, image_reading, 0.03, 1e-4, True
+    ),
+    "pybullet depth": Way(
+        "pybullet", pybullet_sensor, {"world": "depth"}, image_reading, 1e-3, 1e-3, False
+    ),
+}
