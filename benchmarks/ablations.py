@@ -1,4 +1,4 @@
-"""What each choice of the step is worth: ``python benchmarks/ablations.py [--steps 150]``.
+"""What each choice of the step is worth: ``python benchmarks/ablations.py [--steps N]``.
 
 ``six_patch_bare`` and a bar at 0.116 m/s sampled at 100 Hz; each line changes one setting of the
 defaults. Errors are the largest of ΔC's diagonal at gaps from 5 to 100 mm, against boundary
@@ -8,10 +8,12 @@ elements.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,12 +55,14 @@ class Afresh(cs.Simulator):
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/ablations.json"))
     parser.add_argument("--steps", type=int, default=150)
     args = parser.parse_args()
     on_one_core()
-    machine = describe_machine(())
+    machine = describe_machine(("capsense", "numpy", "numba"))
     print(f"{machine['processor']}, one core, load {machine['load']:.1f}")
     print(f"{'':36s} {'nodes':>7s} {'iterations':>10s} {'median ms':>9s} {'error %':>8s}")
+    rows = []
     for title, options, afresh in variants():
         sim = (Afresh if afresh else cs.Simulator)(DESIGN, **options)
         times, iterations = Times(), []
@@ -68,8 +72,13 @@ def main() -> None:
         worst = max(
             abs(diagonal_error(sim.step(reference_bar(gap=1e-3 * g)).delta, g)) for g in GAPS
         )
-        print(f"{title:36s} {sim.describe()['nodes']:7d} {np.median(iterations):10.0f} "
-              f"{times.summary()['median_ms']:9.2f} {100 * worst:8.2f}", flush=True)  # fmt: skip
+        rows.append({"title": title, "nodes": sim.describe()["nodes"], "worst": worst,
+                     "iterations": float(np.median(iterations[WARM_UP:])),
+                     **times.summary()})  # fmt: skip
+        print("{title:36s} {nodes:7d} {iterations:10.0f} {median_ms:9.2f}".format(**rows[-1]),
+              f"{100 * worst:8.2f}", flush=True)  # fmt: skip
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    args.output.write_text(json.dumps({**machine, "results": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 ``six_patch``, a bar at 0.116 m/s sampled at 100 Hz, lattices from 10,000 to a million tetrahedra,
 each in a process of its own so that its peak memory is its own (fields are built before, in another
-process, and cached). Times are the processor's, see ``machine.Times``; "clock" is the median by
+process, and cached). Times are the processor's (``capsense.bench.Times``); "clock" is the median by
 the clock. The bound is the bytes that a step must move over the bandwidth of a triad
 (a ← b + s c) on arrays of together the same size, on one core.
 """

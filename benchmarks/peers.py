@@ -1,15 +1,15 @@
 """CapSense, the paper's scheme and off-the-shelf solvers at one task: time and error of each.
 
-    python benchmarks/peers.py                        # all of it: a quarter of an hour, out/peers/
+    python benchmarks/peers.py                        # all of it: half an hour, out/peers/
     python benchmarks/peers.py --quick                # 30,000 tetrahedra only, few steps
     python benchmarks/peers.py --plot docs/images/frontier.png
 
 The task: ``six_patch_bare``, a grounded bar of 150 × 150 × 20 mm that moves at 0.116 m/s, 100 times
 a second; the bar's nodes found, the operator brought up to date, six right-hand sides solved, the
-6 × 6 matrix returned. One core; times are the processor's, see ``machine.Times``. Methods of a
+6 × 6 matrix returned. One core; times are the processor's (``capsense.bench.Times``). Methods of a
 group take turns, so that whatever else the machine does meets all of them; a turn's first step is
-not counted. Errors are those of the diagonal of ΔC
-against boundary elements good to 0.1 %. The peers:
+not counted. Errors are those of the diagonal of ΔC against boundary elements good to 0.1 %. Ratios
+are taken within a group. The peers:
 
     pip install ".[peers]" "scikit-sparse<0.5"
 
@@ -33,7 +33,7 @@ import numpy as np
 from machine import Times, describe_machine, on_one_core
 from peers_capsense import CapSense, PaperOnLattice, PaperScheme
 from peers_direct import Cholmod, Pardiso
-from peers_iterative import AmgCg, AmgRebuiltCg, JacobiCg, ScikitFem
+from peers_iterative import AmgCg, AmgRebuiltCg, JacobiCg, PlainCg, ScikitFem
 from peers_ngsolve import NgSolve, NgSolveRemeshed
 from peers_report import plot, report
 from peers_task import (
@@ -69,6 +69,7 @@ def on_mesh(scale: float, folder: Path, names: tuple[str, ...]) -> Makers:
         "pardiso": lambda: Pardiso(system),
         "cholmod": lambda: Cholmod(system),
         "jacobi": lambda: JacobiCg(system),
+        "plain cg": lambda: PlainCg(system),
         "amg": lambda: AmgCg(system),
         "amg rebuilt": lambda: AmgRebuiltCg(system),
         "skfem": lambda: ScikitFem(system),
@@ -80,7 +81,8 @@ def on_mesh(scale: float, folder: Path, names: tuple[str, ...]) -> Makers:
 def groups(folder: Path) -> dict[str, Callable[[], Makers]]:
     """What is measured together, by name; meshes are made when a group's turn comes."""
     everyone = (
-        "paper", "pardiso", "cholmod", "jacobi", "amg", "amg rebuilt", "skfem", "ngsolve",
+        "paper", "pardiso", "cholmod", "jacobi", "plain cg", "amg", "amg rebuilt", "skfem",
+        "ngsolve",
     )  # fmt: skip
     return {
         "30k": lambda: {
@@ -100,7 +102,7 @@ def groups(folder: Path) -> dict[str, Callable[[], Makers]]:
         "300k": lambda: on_mesh(0.7, folder, ("pardiso", "jacobi", "ngsolve")),
         "1M": lambda: on_mesh(0.48, folder, ("pardiso", "jacobi", "ngsolve")),
         "2M": lambda: on_mesh(0.38, folder, ("jacobi", "ngsolve")),
-        "remeshed": lambda: {"ngsolve": NgSolveRemeshed},
+        "remeshed": lambda: {"capsense": CapSense, "ngsolve": NgSolveRemeshed},
         "finer": lambda: {"capsense": lambda: CapSense(1.5)},
         "finest": lambda: {"capsense": lambda: CapSense(2.2)},
     }  # fmt: skip

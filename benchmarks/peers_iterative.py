@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 from peers_task import Array, System
 
@@ -73,6 +74,26 @@ class JacobiCg:
 
     def _pick(self, inverse: Array, free: Array) -> Apply:
         return lambda r: inverse * r
+
+
+class PlainCg:
+    """SciPy's own CG as its manual has it: for one electrode after the other, from zero."""
+
+    name = "SciPy cg, plain"
+    settings = "scipy.sparse.linalg.cg with the diagonal, from zero, rtol 1e-5, charges from loads"
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self.n_tets, self.unknowns = system.n_tets, len(system.loads)
+
+    def step(self, x: float, gap: float) -> Array:
+        """C [F] with the bar at x [m], gap [m]."""
+        system = self._system
+        inside = np.flatnonzero(~system.held(x, gap))
+        matrix, loads = system.matrix[inside][:, inside], system.loads[inside]
+        scale = spla.LinearOperator(matrix.shape, (1.0 / matrix.diagonal()).__mul__, dtype=float)
+        solution = np.column_stack([spla.cg(matrix, b, rtol=1e-5, M=scale)[0] for b in loads.T])
+        return system.fixed_energy - loads.T @ solution
 
 
 class AmgCg(JacobiCg):

@@ -82,12 +82,14 @@ class NgSolveRemeshed:
 
     The mesh goes through the bar, and is solved with and without it: only in the difference on one
     mesh do the errors of C⁰, large against ΔC, cancel. :meth:`step` therefore returns ΔC.
+    The settings are the fastest among sixteen (maxh 40 to 100 mm, grading 0.3 to 0.6, one to three
+    levels, orders 2 and 3) that keep ΔC within 3 %.
     """
 
     name = "NGSolve, remeshed"
     returns_change = True
     settings = (
-        "Netgen with maxh 60 mm, grading 0.4; RefineHP of two levels, factor 0.15, at the "
+        "Netgen with maxh 100 mm, grading 0.4; RefineHP of two levels, factor 0.15, at the "
         "electrodes' edges; order 3, condensed; sparsecholesky, with and without the bar"
     )
 
@@ -103,7 +105,7 @@ class NgSolveRemeshed:
         """ΔC [F] with the bar at x [m], gap [m]."""
         ng = self._ng
         netgen_mesh = self._geometry(x, gap).GenerateMesh(
-            maxh=60, grading=0.4, parallel_meshing=False
+            maxh=100, grading=0.4, parallel_meshing=False
         )
         mesh = ng.Mesh(netgen_mesh)
         mesh.RefineHP(2, factor=0.15)

@@ -1,14 +1,18 @@
-"""Where the time of a step goes: ``python benchmarks/step_profile.py``.
+"""Where the time of a step goes: ``python benchmarks/step_profile.py [-o out/step_profile.json]``.
 
 Every compiled kernel that the solver calls is timed from outside; what is left over is Python: the
 scene's packing, numpy, and the calls themselves, of which each costs about a microsecond more here
-than it does otherwise.
+than it does otherwise. Times are the processor's.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import time
 from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -17,10 +21,11 @@ from machine import describe_machine, on_one_core
 from numba.core.registry import CPUDispatcher
 
 import capsense as cs
-from capsense.bench import WORLDS
+from capsense.bench import DESIGN, WORLDS, World
 from capsense.solve import perturbation
 
 STEPS, WARM_UP = 300, 20
+Parts = dict[str, float]
 
 
 def watch(spent: dict[str, float]) -> None:
@@ -38,39 +43,51 @@ def _last(module: ModuleType) -> str:
 
 def _timed(kernel: Any, name: str, spent: dict[str, float]) -> Any:
     def call(*args: Any) -> Any:
-        start = time.perf_counter()
+        start = time.process_time()
         out = kernel(*args)
-        spent[name] += time.perf_counter() - start
+        spent[name] += time.process_time() - start
         return out
 
     return call
 
 
+def profile(sim: cs.Simulator, world: Callable[[int], World], spent: dict[str, float]) -> Parts:
+    """Median time [ms] of each part of a step in a world, the largest first."""
+    times: dict[str, list[float]] = defaultdict(list)
+    for k in range(WARM_UP + STEPS):
+        scene = world(145 + k)
+        spent.clear()
+        start = time.process_time()
+        sim.step(scene)
+        whole = time.process_time() - start
+        if k >= WARM_UP:
+            for name, seconds in spent.items():
+                times[name].append(1e3 * seconds)
+            times["Python"].append(1e3 * (whole - sum(spent.values())))
+            times["whole step"].append(1e3 * whole)
+    medians = {name: float(np.median(values)) for name, values in times.items()}
+    return dict(sorted(medians.items(), key=lambda item: -item[1]))
+
+
 def main() -> None:
     """Entry point."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split(":")[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/step_profile.json"))
+    args = parser.parse_args()
     on_one_core()
     spent: dict[str, float] = defaultdict(float)
     watch(spent)
     machine = describe_machine(("capsense", "numpy", "numba"))
     print(f"{machine['processor']}, one core, load {machine['load']:.1f}")
+    found: dict[str, Parts] = {}
     for title, world in WORLDS.items():
-        sim = cs.Simulator("six_patch")
-        parts: dict[str, list[float]] = defaultdict(list)
-        for k in range(WARM_UP + STEPS):
-            scene = world(145 + k)
-            spent.clear()
-            start = time.perf_counter()
-            sim.step(scene)
-            whole = time.perf_counter() - start
-            if k >= WARM_UP:
-                for name, seconds in spent.items():
-                    parts[name].append(1e3 * seconds)
-                parts["Python"].append(1e3 * (whole - sum(spent.values())))
-                parts["whole step"].append(1e3 * whole)
+        found[title] = profile(cs.Simulator(DESIGN), world, spent)
         print(f"{title}: median [ms]")
-        for name, values in sorted(parts.items(), key=lambda item: -float(np.median(item[1]))):
-            if np.median(values) > 0.002:
-                print(f"  {name:32s} {np.median(values):7.3f}")
+        for name, value in found[title].items():
+            if value > 0.002:
+                print(f"  {name:32s} {value:7.3f}")
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    args.output.write_text(json.dumps({**machine, "worlds": found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,7 +25,10 @@ SPEED, RATE = 0.116, 100.0
 """Speed of the bar [m/s], and samples a second [Hz]."""
 WARM_UP = 10
 """Steps left out of the statistics: they compile or load code and fill the warm start."""
+STARTS = 3
+"""Fresh processes whose starts are timed."""
 World = cs.Scene | DepthFrame
+_T = TypeVar("_T")
 
 
 def reference_bar(x: float = 0.0, gap: float = 0.03) -> cs.Scene:
@@ -58,33 +64,95 @@ WORLDS: dict[str, Callable[[int], World]] = {
     "12 capsules": moving_limbs,
     "64x64 depth frame": moving_depth,
 }
-REFERENCE_GAP = 0.02
-REFERENCE_DIAGONAL = 1e-12 * np.array([0.15444, 0.13807, 0.15444, 0.15444, 0.13807, 0.15444])
-"""Change [F] of the diagonal by the bar at that gap: boundary elements, good to 4.4e-4 pF."""
+CHECKS: dict[str, tuple[Callable[[], World], tuple[float, ...]]] = {
+    "bar": (
+        partial(reference_bar, gap=0.02),
+        (0.15444, 0.13807, 0.15444, 0.15444, 0.13807, 0.15444),
+    ),
+    "12 capsules": (
+        partial(moving_limbs, 0),
+        (0.009747, 0.004081, 0.00433, 0.024104, 0.006431, 0.006734),
+    ),
+    "64x64 depth frame": (
+        partial(moving_depth, 0),
+        (0.014932, 0.014065, 0.014932, 0.014932, 0.014064, 0.014931),
+    ),
+}
+"""By world: a sample of it, and what it changes in the diagonal [pF].
+
+The bar by boundary elements, good to 4.4e-4 pF; the others on a lattice of a million tetrahedra,
+``python benchmarks/steps.py``."""
+
+
+@dataclass
+class Times:
+    """Times of calls [ms], by the clock and by what the processor spent on the calling thread.
+
+    On a machine that other programs use too, a long call is interrupted more often than a short
+    one, and the clock makes it look longer than it is; the processor's time does not. Threads that
+    a library keeps spinning beside the call do not count.
+    """
+
+    clock: list[float] = field(default_factory=list)
+    processor: list[float] = field(default_factory=list)
+
+    def take(self, call: Callable[[], _T], keep: bool = True) -> _T:
+        """Make a call, and keep its times if wanted."""
+        clock, processor = time.perf_counter(), time.thread_time()
+        out = call()
+        spent, passed = time.thread_time() - processor, time.perf_counter() - clock
+        if keep:
+            self.clock.append(1e3 * passed)
+            self.processor.append(1e3 * spent)
+        return out
+
+    def summary(self) -> dict[str, float]:
+        """Median, mean, p95 and p99 of the processor's time [ms], and the same by the clock."""
+        out: dict[str, float] = {"steps": len(self.clock)}
+        for prefix, times in (("", self.processor), ("clock_", self.clock)):
+            out[f"{prefix}median_ms"] = float(np.median(times))
+            out[f"{prefix}mean_ms"] = float(np.mean(times))
+            out[f"{prefix}p95_ms"], out[f"{prefix}p99_ms"] = np.percentile(times, (95, 99)).tolist()
+        return out
 
 
 def time_steps(sim: Simulator, world: Callable[[int], World], steps: int) -> dict[str, float]:
-    """Step times [ms] and iterations of ``steps`` samples; making the worlds is not timed."""
-    times, iterations = [], []
+    """:meth:`Times.summary` and iterations of ``steps`` samples; making the worlds is not timed."""
+    times, iterations = Times(), []
     for k in range(WARM_UP + steps):
-        scene = world(k)
-        start = time.perf_counter()
-        reading = sim.step(scene)
-        times.append(1e3 * (time.perf_counter() - start))
+        reading = times.take(partial(sim.step, world(k)), keep=k >= WARM_UP)
         iterations.append(reading.stats.iterations)
-    ms = np.array(times[WARM_UP:])
-    return {
-        "median_ms": float(np.median(ms)),
-        "p95_ms": float(np.percentile(ms, 95)),
-        "p99_ms": float(np.percentile(ms, 99)),
-        "iterations": float(np.median(iterations[WARM_UP:])),
-    }
+    return {**times.summary(), "iterations": float(np.median(iterations[WARM_UP:]))}
 
 
-def import_time() -> float:
-    """Time [s] of ``import capsense`` in a fresh interpreter."""
-    code = "import time; t = time.perf_counter(); import capsense; print(time.perf_counter() - t)"
-    return float(subprocess.check_output([sys.executable, "-c", code], text=True))
+_START = f"""
+import json, time
+t = [time.perf_counter()]
+import capsense as cs
+t.append(time.perf_counter())
+sim = cs.Simulator("{DESIGN}")
+t.append(time.perf_counter())
+sim.step(cs.Scene([cs.Body(cs.Sphere(0.05), cs.Pose((0, 0, 0.1)))]))
+t.append(time.perf_counter())
+print(json.dumps([after - before for before, after in zip(t, t[1:])]))
+"""
+
+
+def start_times() -> dict[str, float]:
+    """Median times [s] of import, ``Simulator`` and first step in fresh interpreters."""
+    runs = [
+        json.loads(subprocess.check_output([sys.executable, "-c", _START], text=True))
+        for _ in range(STARTS)
+    ]
+    names = ("import_s", "simulator_s", "first_step_s")
+    return dict(zip(names, np.median(runs, axis=0).tolist(), strict=True))
+
+
+def check_error(sim: Simulator, name: str) -> float:
+    """Largest error of ΔC's diagonal in a world's sample of CHECKS, as a part of the largest."""
+    sample, picofarads = CHECKS[name]
+    wrong = 1e12 * np.diag(sim.step(sample()).delta) - picofarads
+    return float(np.abs(wrong).max() / max(picofarads))
 
 
 def measure(steps: int = 300) -> dict[str, Any]:
@@ -94,9 +162,9 @@ def measure(steps: int = 300) -> dict[str, Any]:
         steps: Timed steps of each world, 1 or more.
 
     Returns:
-        The machine and its load, versions, ``import_s``, ``start_s`` (Simulator and first step
-        in this process, cached field), and per world the step times [ms], the iterations and
-        ``error``: the largest relative error of the diagonal, None without a reference.
+        The machine and its load, versions, the times of :func:`start_times` (cached field, compiled
+        code), and per world the times of :meth:`Times.summary`, the iterations and ``error``, see
+        :func:`check_error`.
 
     Raises:
         ValueError: ``steps`` is less than 1.
@@ -104,25 +172,18 @@ def measure(steps: int = 300) -> dict[str, Any]:
     if steps < 1:
         raise ValueError(f"steps is {steps}; give 1 or more")
     load = os.getloadavg()[0]
-    imported = import_time()
-    Simulator(DESIGN)  # builds the field if it is not cached
-    start = time.perf_counter()
-    sim = Simulator(DESIGN)
-    sim.step(moving_bar(0))
-    started = time.perf_counter() - start
-    rows: dict[str, dict[str, float | None]] = {}
-    for name, world in WORLDS.items():
-        rows[name] = {**time_steps(sim, world, steps), "error": None}
-    change = np.diag(sim.step(reference_bar(gap=REFERENCE_GAP)).delta)
-    rows["bar"]["error"] = float(np.abs(change / REFERENCE_DIAGONAL - 1).max())
+    sim = Simulator(DESIGN)  # builds the field if it is not cached
+    sim.step(moving_bar(0))  # compiles the kernels if they are not cached
     return {
         "machine": platform.platform(),
         "cpus": os.cpu_count(),
         "load": load,
         "versions": {n: version(n) for n in ("capsense", "numpy", "scipy", "numba")},
+        "design": DESIGN,
         "tetrahedra": sim.describe()["tetrahedra"],
-        "steps": steps,
-        "import_s": imported,
-        "start_s": started,
-        "worlds": rows,
+        **start_times(),
+        "worlds": {
+            name: {**time_steps(sim, world, steps), "error": check_error(sim, name)}
+            for name, world in WORLDS.items()
+        },
     }

@@ -59,7 +59,7 @@ class Point:
     method: Method
     tetrahedra: int
     median: float
-    """Time of a step [ms], and …"""
+    """Processor's time of a step [ms], and …"""
     p95: float
     p99: float
     iterations: float
@@ -216,8 +216,8 @@ def _plot(points: list[Point]) -> Figure:
         times.loglog(cells, [p.median for p in mine], f"{marker}-", color=colour, label=label)
         worst = [100 * max(p.errors) for p in mine]
         errors.loglog(cells, worst, f"{marker}-", color=colour)
-    times.set_ylabel("time of a step [ms], median")
-    errors.set_ylabel("largest error of ΔC$_{ii}$, gaps 5 to 100 mm [%]")
+    times.set_ylabel("time of a step, median [ms]")
+    errors.set_ylabel("largest error of ΔC$_{ii}$,\ngaps 5 to 100 mm [%]")
     for axes in (times, errors):
         axes.set_xlabel("tetrahedra")
         axes.grid(which="major", color="0.9")
@@ -228,8 +228,9 @@ def _plot(points: list[Point]) -> Figure:
 
 NOTES = (
     "The paper's times are read off its Fig. 8: three electrodes, one step of residual update and "
-    "solve, an i7 at 3.40 GHz. CapSense's are whole calls of `Simulator.step` on this machine, as "
-    "found: bodies in, six electrodes, full matrix out.",
+    "solve, an i7 at 3.40 GHz. CapSense's are whole calls of `Simulator.step` on this machine: "
+    "bodies in, six electrodes, full matrix out. Both of this machine's are what the processor "
+    "spent, which is what the clock shows where nothing else runs.",
     'The paper\'s scheme is `method="masked"`: every tetrahedron whose centroid lies in the bar is '
     "held at 0 V, and Jacobi-CG solves the whole problem for one electrode after the other, from "
     "the last step's solution. It runs on the planes of CapSense's lattice without the thinning "
