@@ -215,13 +215,36 @@ def pybullet_sensor(
     return cs.pybullet.attach(client, carrier, "carrier_link", offset, simulator, **options)
 
 
+# -- CoppeliaSim -------------------------------------------------------------------------------
+
+
+def coppeliasim_sensor(
+    things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simulator, folder: Path, **options: Any
+) -> Any:
+    """A sensor in the stand-in for CoppeliaSim."""
+    from coppelia_stand_in import StandIn
+
+    server = StandIn()
+    offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
+    box = server.add("carrier", cs.Box(CARRIER_BOX), sensor)
+    for thing in things:
+        server.add(thing.name, thing.shape, thing.pose)
+    sim = cs.coppeliasim.connect(port=server.port)
+    sim.startSimulation()
+    on = server.add("link", local=offset.inverse(), on=box)
+    made = cs.coppeliasim.attach(sim, on, simulator, pose_in_object=offset, **options)
+    made.server = server
+    return made
+
+
 def release(sensor: Any) -> None:
     """Give back what the sensor's simulator holds."""
-    client = getattr(sensor, "client", None)
-    if client is not None:
+    if hasattr(sensor, "server"):
+        sensor.server.close()
+    elif hasattr(sensor, "client"):
         import pybullet as p
 
-        p.disconnect(physicsClientId=client)
+        p.disconnect(physicsClientId=sensor.client)
 
 
 # -- what the contract is checked on -----------------------------------------------------------
@@ -262,5 +285,8 @@ WAYS = {
     ),
     "pybullet depth": Way(
         "pybullet", pybullet_sensor, {"world": "depth"}, image_reading, 1e-3, 1e-3, False
+    ),
+    "coppeliasim": Way(
+        "coppeliasim_zmqremoteapi_client", coppeliasim_sensor, {}, image_reading, 0.02, 1e-3, True
     ),
 }
