@@ -1,0 +1,99 @@
+"""Connections that bound what a client can make the event loop do beneath its session."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from dataclasses import dataclass
+from typing import Any, cast
+
+from websockets.asyncio.server import ServerConnection
+from websockets.frames import Frame, Opcode
+
+POLICY, TRY_LATER = 1008, 1013
+"""Codes with which connections are closed on errors, and when there are too many."""
+FLOOD = "flood"
+"""Reason with which a client that talks idly is cut off."""
+READ_SIZE = 16384
+"""Bytes that are read at a time: then it is the others' turn."""
+SEND_BUFFER = 262144
+"""What the system may hold for a client that does not receive [bytes]."""
+SMALL = 1024
+"""Size [bytes] from which on a fragment of a message counts as content."""
+IDLE_FRAMES = 100.0
+"""Pings, pongs and small fragments that a client may send at once, and again every second."""
+
+
+@dataclass
+class Door:
+    """Connections of a server, those that still shake hands included."""
+
+    most: int
+    """More are closed at once."""
+    open: int = 0
+
+
+class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
+    """A connection that reads a little at a time, and is cut off when its client talks idly.
+
+    Whole messages are paced by their session. Pings, pongs and fragments of a message that never
+    ends do not get that far, yet would keep the event loop busy and fill the memory.
+    """
+
+    def __init__(self, *args: Any, door: Door, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.flooded = False
+        """Whether it was cut off."""
+        self._door = door
+        self._buffer = bytearray(READ_SIZE)
+        self._idle_frames, self._counted = IDLE_FRAMES, time.monotonic()
+
+    # -- called by asyncio ------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._door.open += 1
+        super().connection_made(transport)
+        raw = transport.get_extra_info("socket")
+        if raw is not None:
+            raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        if self._door.open > self._door.most:
+            cast(asyncio.Transport, transport).abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._door.open -= 1
+        super().connection_lost(exc)
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.data_received(bytes(memoryview(self._buffer)[:nbytes]))
+
+    # -- called by websockets ---------------------------------------------------------------------
+
+    def process_event(self, event: Any) -> None:
+        if self.flooded:
+            return
+        if isinstance(event, Frame) and _idle(event) and not self._may_idle():
+            self.flooded = True
+            self.protocol.fail(POLICY, FLOOD)
+            for data in filter(None, self.protocol.data_to_send()):
+                self.transport.write(data)
+            self.transport.close()
+            return
+        super().process_event(event)
+
+    def _may_idle(self) -> bool:
+        now = time.monotonic()
+        regained = (now - self._counted) * IDLE_FRAMES
+        self._idle_frames = min(IDLE_FRAMES, self._idle_frames + regained) - 1
+        self._counted = now
+        return self._idle_frames >= 0
+
+
+def _idle(frame: Frame) -> bool:
+    """Whether a frame is none that sessions hear of; what ends a message is."""
+    return frame.opcode in (Opcode.PING, Opcode.PONG) or (
+        not frame.fin and len(frame.data) < SMALL
+    )
