@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -142,12 +144,15 @@ def test_attaching_again_replaces_what_was_made(
     """Scripts that run many times leave one vision sensor and one collection behind."""
     flange = server.getObject("/Robot/flange")
     first = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
-    cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    second = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
     assert [t.alias for t in server.things.values() if t.parent == flange] == ["capsense"]
     assert len(server.collections) == 1
     sim.startSimulation()
     with pytest.raises(cs.SimulatorError, match=r"sim.handleVisionSensor: Object does not exist"):
         first.read()
+    second.remove()
+    assert not [t for t in server.things.values() if t.parent == flange]
+    assert not server.collections
 
 
 def test_a_vision_sensor_of_the_scene_is_taken_as_it_is(
@@ -276,3 +281,19 @@ def test_other_versions_are_named(tiny_simulator: cs.Simulator) -> None:
     poor.close()
     with pytest.raises(cs.SimulatorError, match=r"sim is 'sim'; give what"):
         cs.coppeliasim.attach("sim", "/Robot", tiny_simulator)
+
+
+def test_the_check_list_runs(server: StandIn, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is offered to those who have the simulator: all right here, wrong where mirrored."""
+    check = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "coppeliasim_check.py"))
+    before = set(server.things)
+    check["main"](server.port)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "all as it should be"
+    assert all(line.startswith("ok") for line in lines[:-1])
+    server.mirrored = True
+    with pytest.raises(SystemExit, match="checks failed"):
+        check["main"](server.port)
+    assert "WRONG  the glass block is in its place" in capsys.readouterr().out
+    assert set(server.things) == before
+    assert not server.collections

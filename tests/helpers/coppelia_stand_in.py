@@ -27,7 +27,8 @@ TIME_STEP = 0.05
 UNPAINTED = (0.5, 0.25, 0.0)
 CONSTANTS = {
     "colorcomponent_auxiliary": 5, "handle_all": -2, "handle_scene": -12, "handle_single": -4,
-    "handle_world": -1, "sceneobject_shape": SHAPE, "sceneobject_visionsensor": VISION,
+    "handle_world": -1, "primitiveshape_cuboid": 3, "sceneobject_shape": SHAPE,
+    "shapeintparam_static": 3003, "sceneobject_visionsensor": VISION,
     "simulation_stopped": 0, "visionfloatparam_far_clipping": 1001,
     "visionfloatparam_near_clipping": 1000, "visionfloatparam_ortho_size": 1005,
     "visionintparam_entity_to_render": 1008, "visionintparam_perspective_operation": 1018,
@@ -76,6 +77,8 @@ class StandIn:
         self.starts_late = 0
         """Steps that pass until a start takes effect."""
         self.stepping = False
+        self.mirrored = False
+        """Whether images come with the top row first, as they should not."""
         self.on_step: Callable[[float], None] = lambda time: None
         self.calls: list[str] = []
         self._without, self._protocol = without, protocol
@@ -150,6 +153,8 @@ class StandIn:
                 image[closer] = np.rint(np.multiply(thing.colour, 255))
             else:  # with light, as seen from the front
                 image[closer] = 200
+        if self.mirrored:
+            depth, image = depth[::-1], image[::-1]
         metres = near + depth.astype(np.float32) * np.float32(far - near)
         eye.depth, eye.image = metres.astype("<f4").tobytes(), image.tobytes()
 
@@ -268,7 +273,7 @@ class StandIn:
 
     def setObjectPose(self, handle: int, pose: list[float], relative_to: int) -> None:
         thing = self._thing(handle)
-        assert relative_to == thing.parent
+        assert relative_to == thing.parent  # -1 is the world
         thing.local = cs.Pose(pose[:3], pose[3:])
 
     def getObjectPose(self, handle: int, relative_to: int) -> list[float]:
@@ -296,6 +301,13 @@ class StandIn:
         assert component == CONSTANTS["colorcomponent_auxiliary"]
         self._thing(handle).colour = tuple(rgb)  # type: ignore[assignment]
 
+    def createDummy(self, size: float) -> int:
+        return self.add("Dummy")
+
+    def createPrimitiveShape(self, kind: int, sizes: list[float], options: int) -> int:
+        assert (kind, options) == (CONSTANTS["primitiveshape_cuboid"], 0)
+        return self.add("Cuboid", cs.Box(tuple(sizes)))
+
     def createVisionSensor(self, options: int, whole: list[int], real: list[float]) -> int:
         assert (len(whole), len(real)) == (4, 11)
         handle = next(self._count)
@@ -314,7 +326,8 @@ class StandIn:
         return float(self._thing(handle).parameters[_NAMES[which].partition("param_")[2]])
 
     def setObjectInt32Param(self, handle: int, which: int, value: int) -> None:
-        self._thing(handle).parameters[_NAMES[which].partition("param_")[2]] = value
+        if which != CONSTANTS["shapeintparam_static"]:
+            self._thing(handle).parameters[_NAMES[which].partition("param_")[2]] = value
 
     def handleVisionSensor(self, handle: int) -> int:
         self._draw(self._thing(handle), self.pose(handle))

@@ -114,6 +114,15 @@ class CoppeliaSensor(DepthSensor):
         if self._paint is not None:
             self._paint.refresh()
 
+    def remove(self) -> None:
+        """Take the vision sensor that was made for this one out of the scene again.
+
+        Raises:
+            SimulatorError: CoppeliaSim does not answer, or it is gone already.
+        """
+        if self._paint is not None:
+            _remove_eye(self._remote, self.eye.handle)
+
     def _image(
         self, name: str, kind: np.dtype[Any], channels: int, *options: int
     ) -> NDArray[np.generic]:
@@ -233,9 +242,7 @@ def make_eye(
     """
     for old, name in _children(remote, handle).items():
         if name == _ALIAS:
-            entity = remote.constant("visionintparam_entity_to_render")
-            remote.call("destroyCollection", remote.call("getObjectInt32Param", old, entity))
-            remote.call("removeObjects", [old])
+            _remove_eye(remote, old)
     sizes = [NEAR, far, size, 0.01] + [0.0] * 7
     eye = int(remote.call("createVisionSensor", _OPTIONS, [resolution] * 2 + [0, 0], sizes))
     remote.call("setObjectAlias", eye, _ALIAS)
@@ -252,6 +259,13 @@ def carrier(remote: Remote, handle: int) -> int | None:
     while handle >= 0 and remote.call("getObjectType", handle) != shape:
         handle = int(remote.call("getObjectParent", handle))
     return handle if handle >= 0 else None
+
+
+def _remove_eye(remote: Remote, eye: int) -> None:
+    """Remove a vision sensor made here, and the collection of what it sees."""
+    entity = remote.constant("visionintparam_entity_to_render")
+    remote.call("destroyCollection", remote.call("getObjectInt32Param", eye, entity))
+    remote.call("removeObjects", [eye])
 
 
 def _children(remote: Remote, handle: int) -> dict[int, str]:
