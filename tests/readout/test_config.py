@@ -16,6 +16,7 @@ from capsense.readout.converter import ResonanceLaw, ShuntLaw
 from capsense.readout.detector import ExponentialTracker, SteppingTracker
 from capsense.readout.front_end import ShuntFrontEnd
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
+from capsense.readout.presets import charge_for
 from capsense.readout.read_out import ReadOut
 
 NAMES = ("E1", "E2", "E3")
@@ -218,6 +219,8 @@ def test_choosing_by_name_or_file(tmp_path):
     empty = Reading(matrix, np.diag(matrix))
     readout = choose_readout("mpr121", NAMES, empty)
     assert not readout([0.0, 1.0], np.stack([matrix, matrix])).flags.any()
+    least = Reading(1e-15 * np.eye(3), np.full(3, 1e-15))  # less than any setting charges
+    assert choose_readout("MPR121", NAMES, least).law == charge_for(0.2e-12)
     path = tmp_path / "mine.toml"
     path.write_text('chip = "fdc1004"\nrate = 400\n', encoding="utf-8")
     assert choose_readout(path, NAMES, empty).schedule.conversion == near(2.5e-3, rel=1e-12)
@@ -228,3 +231,5 @@ def test_choosing_by_name_or_file(tmp_path):
 def test_missing_files_are_refused(tmp_path):
     with pytest.raises(ReadOutError, match="there is no read-out file"):
         load_readout(tmp_path / "none.toml", NAMES)
+    with pytest.raises(ReadOutError, match="there is no read-out file fdc1004"):
+        load_readout("fdc1004", NAMES)

@@ -158,7 +158,7 @@ def test_damage_is_told(recorded: Recorded, tmp_path: Path) -> None:
         assert len(steps) == 12
         for step, reading in zip(steps, readings, strict=True):
             assert step.reading.capacitance.tobytes() == reading.capacitance.tobytes()
-    assert refused > 30
+    assert refused > 20  # indexes, schemas and checksums aside, everything is read
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import recorded_scenes
 
@@ -176,6 +177,16 @@ def test_a_readout_of_ones_own(sim: cs.Simulator, path: Path) -> None:
         again = [run.step(scene(k), 0.1 * k).counts for k in range(3)]
     assert [c.code.tolist() for c in again if c] == [c.code.tolist() for c in first if c]
     assert cs.replay(path).counts is None
+
+
+def test_a_chip_by_name_is_set_up_for_the_electrodes(sim: cs.Simulator, path: Path) -> None:
+    """An MPR121 is in range, in the recording as in its replay."""
+    with cs.record(path, sim, readout="mpr121") as run:
+        counts = [run.step(cs.Scene(), 0.1 * k).counts for k in range(4)]
+    flags = np.concatenate([c.flags for c in counts if c is not None])
+    assert len(flags) > 6
+    assert not flags.any()
+    assert cs.replay(path).same
 
 
 def test_a_readout_file(sim: cs.Simulator, path: Path, tmp_path: Path) -> None:

@@ -131,8 +131,10 @@ def _build(args: argparse.Namespace, recording: Recording) -> dict[str, ReadOut]
         chip = chip_of(name)
         patterns = default_patterns(chip, recording.electrodes)
         empty = recording.empty_channels(ChannelBank(patterns, recording.electrodes))
-        expected = expected_of(empty)
-        options = Options(patterns, args.rate, args.seed, not args.no_noise, expected=expected)
+        options = Options(
+            patterns=patterns, rate=args.rate, seed=args.seed, noise=not args.no_noise,
+            expected=expected_of(empty),
+        )  # fmt: skip
         out[chip.name] = build(chip, recording.electrodes, options)
     return out
 

@@ -59,10 +59,30 @@ def choose_readout(choice: str | Path, electrodes: Sequence[str], empty: Reading
     Raises:
         ReadOutError: There is no such chip or file, or the file is wrong.
     """
+    content = file_content(choice, electrodes, empty)
+    return parse_readout(content, electrodes, source=Path(choice).name)
+
+
+def file_content(
+    choice: str | Path, electrodes: Sequence[str], empty: Reading | None = None
+) -> dict[str, Any]:
+    """What a read-out file holds, or would hold to say the same as the name of a chip.
+
+    Args:
+        choice: A chip's name, or the path of a read-out file, ``.toml``.
+        electrodes: Electrode names of the sensor, in matrix order.
+        empty: The sensor's reading of an empty scene, which a named chip is set up for.
+
+    Raises:
+        ReadOutError: There is no such chip or file, or it is not TOML.
+    """
     if str(choice).endswith(".toml"):
-        return load_readout(choice, electrodes)
-    values = build(str(choice), electrodes).channel_values(empty)
-    return build(str(choice), electrodes, Options(expected=expected_of(values)))
+        return read_toml(Path(choice), "read-out", ReadOutError)
+    chip = chip_of(str(choice))
+    if empty is None:
+        return {"chip": chip.name}
+    values = build(chip, electrodes).channel_values(empty)
+    return {"chip": chip.name, "expected": expected_of(values)}
 
 
 def parse_readout(

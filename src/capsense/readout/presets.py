@@ -29,7 +29,7 @@ LEAST_EXPECTED = 0.2e-12
 """Least capacitance that a chip can be set up for [F]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Options:
     """What may be chosen about a chip."""
 
@@ -235,29 +235,30 @@ def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
 
 def _climate(chip: Chip, options: Options) -> list[Stage]:
     """Drift with temperature and humidity, where one is given; what would do nothing is refused."""
-    figures = {
-        "offset_per_kelvin": chip.offset_per_kelvin, "gain_per_kelvin": chip.gain_per_kelvin,
-        "offset_per_percent": 0.0, "gain_per_percent": 0.0,
-    }  # fmt: skip
-    chosen = {name: getattr(options, name) for name in figures}
-    chosen = {name: value for name, value in chosen.items() if value is not None}
-    figures.update(chosen)
+    known = {"temperature": chip.offset_per_kelvin or chip.gain_per_kelvin, "humidity": 0.0}
     for quantity, unit in (("temperature", "kelvin"), ("humidity", "percent")):
-        names = [f"offset_per_{unit}", f"gain_per_{unit}"]
+        given = {n: getattr(options, n) for n in (f"offset_per_{unit}", f"gain_per_{unit}")}
         if getattr(options, quantity) is None:
-            for name in names:
-                if chosen.get(name):
+            for name, value in given.items():
+                if value:
                     raise ReadOutError(f"{name} does nothing without a {quantity}; give one")
-        elif not any(name in chosen or figures[name] for name in names):
+        elif not known[quantity] and all(value is None for value in given.values()):
             raise ReadOutError(
                 f"{quantity} changes nothing, as no such drift of the {chip.name} is known; give "
-                f"{' or '.join(names)}"
+                f"{' or '.join(given)}"
             )
     if options.temperature is None and options.humidity is None:
         return []
-    temperature, humidity = _first(options.temperature, 25.0), _first(options.humidity, 50.0)
-    profiles = Profile.of(temperature, "temperature"), Profile.of(humidity, "humidity")
-    return [ClimateDrift(**figures, temperature=profiles[0], humidity=profiles[1])]
+    return [
+        ClimateDrift(
+            _first(options.offset_per_kelvin, chip.offset_per_kelvin),
+            _first(options.gain_per_kelvin, chip.gain_per_kelvin),
+            _first(options.offset_per_percent, 0.0),
+            _first(options.gain_per_percent, 0.0),
+            temperature=Profile.of(_first(options.temperature, 25.0), "temperature"),
+            humidity=Profile.of(_first(options.humidity, 50.0), "humidity"),
+        )
+    ]
 
 
 def _first(value: Any, otherwise: Any) -> Any:

@@ -11,10 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from capsense._validate import read_toml
 from capsense.adapters.attached import AttachedSensor
 from capsense.errors import ReadOutError, RecordingError
-from capsense.readout.config import parse_readout
+from capsense.readout.config import file_content, parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.recording.design_json import design_to_json
 from capsense.recording.live import LiveTopics
@@ -76,8 +75,8 @@ class Recorder:
         check_name(name)
         if readout is not None and self._sensor is not None and self._sensor.readout is not None:
             raise ReadOutError("the sensor has a read-out of its own; leave out readout=")
-        self._readout, config = make_readout(readout, self._simulator.electrode_names)
         empty = self._simulator.step(Scene())
+        self._readout, config = make_readout(readout, self._simulator.electrode_names, empty)
         self.reset()
         self._live = None if ros_domain is None else LiveTopics(ros_domain)
         self._file = McapFile(self.path, overwrite=overwrite)
@@ -270,22 +269,21 @@ def check_name(name: str) -> None:
 
 
 def make_readout(
-    readout: ReadOut | str | Path | None, electrodes: Sequence[str]
+    readout: ReadOut | str | Path | None, electrodes: Sequence[str], empty: Reading | None = None
 ) -> tuple[ReadOut | None, Mapping[str, Any] | None]:
     """A read-out, and the content of its file where it has one or could have.
 
     Args:
         readout: A chip's name, the path of a read-out file, a read-out, or None.
         electrodes: Electrode names in matrix order.
+        empty: The reading of an empty scene, which a named chip is set up for.
 
     Raises:
         ReadOutError: There is no such chip or file, or anything in it is wrong.
     """
     if readout is None or isinstance(readout, ReadOut):
         return readout, None
-    config: Mapping[str, Any] = {"chip": str(readout)}
-    if str(readout).endswith(".toml"):
-        config = read_toml(Path(readout), "read-out", ReadOutError)
+    config = file_content(readout, electrodes, empty)
     return parse_readout(config, electrodes, source=str(readout)), config
 
 
