@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
 from capsense.errors import SceneError, SkinError
-from capsense.skin import Crew, make_simulators
+from capsense.skin import make_simulators
 
 Array = np.ndarray
 
@@ -140,27 +139,6 @@ def test_a_failing_sensor_does_not_lose_the_others(tiny: cs.Simulator) -> None:
     with pytest.raises(SkinError, match=r"2 of 4 sensors failed; 'middle': .*so did 'right'"):
         skin.step_views(views)  # type: ignore[arg-type]
     assert set(skin.step(good)) == set(POSES), "and the next step is sound"
-
-
-def test_crew_runs_tasks_beside_each_other() -> None:
-    """Two tasks that wait for each other finish with two threads."""
-    meet = threading.Barrier(2, timeout=20)
-
-    def task() -> int:
-        return meet.wait()
-
-    assert set(Crew(2).read({"a": task, "b": task}).values()) == {0, 1}  # type: ignore[dict-item]
-
-
-def test_crew_passes_on_what_it_did_not_foresee() -> None:
-    """A bug in a task is not taken for a failing sensor."""
-
-    def broken() -> int:
-        raise ZeroDivisionError
-
-    for threads in (1, 2):
-        with pytest.raises(ZeroDivisionError):
-            Crew(threads).read({"a": broken, "b": broken})  # type: ignore[dict-item]
 
 
 def test_refused(tiny: cs.Simulator) -> None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from capsense.design.loader import available_designs, load_design
     from capsense.design.model import Design
     from capsense.errors import (
+        BatchError,
         CapSenseError,
         DesignError,
         FieldError,
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MATERIALS",
+    "BatchError",
     "Body",
     "Box",
     "CapSenseError",
@@ -112,6 +114,7 @@ _HOMES = {
     "capsense.design.loader": ("available_designs", "load_design"),
     "capsense.design.model": ("Design",),
     "capsense.errors": (
+        "BatchError",
         "CapSenseError",
         "DesignError",
         "FieldError",

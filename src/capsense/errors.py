@@ -37,17 +37,25 @@ class SolveError(CapSenseError, RuntimeError):
     """A step did not reach its tolerance."""
 
 
-class SkinError(CapSenseError, RuntimeError):
-    """Some sensors of a skin failed; the readings of the others are kept."""
+class PartialError(CapSenseError, RuntimeError):
+    """Some of many readings failed; those that did not are kept."""
 
     def __init__(
-        self, message: str, readings: dict[str, Any], failures: dict[str, CapSenseError]
+        self, message: str, readings: dict[Any, Any], failures: dict[Any, CapSenseError]
     ) -> None:
         super().__init__(message)
         self.readings = readings
-        """Name → reading of the sensors that did not fail."""
+        """Name of a sensor, or number of a scene → reading, of those that did not fail."""
         self.failures = failures
-        """Name → error of those that did."""
+        """Name or number → error, of those that did."""
+
+
+class SkinError(PartialError):
+    """Some sensors of a skin failed; the readings of the others are kept, by name."""
+
+
+class BatchError(PartialError):
+    """Some scenes of a batch failed; the readings of the others are kept, by number from 0."""
 
 
 class MissingDependencyError(CapSenseError, ImportError):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
@@ -11,9 +12,10 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._crew import Crew, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design, Role
-from capsense.errors import FieldError, SceneError
+from capsense.errors import BatchError, FieldError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
@@ -154,6 +156,7 @@ class Simulator:
                 self.background, tolerance=tolerance, relative_tolerance=relative_tolerance,
                 frequency=frequency,
             )  # fmt: skip
+        self._batch: list[Simulator] = []
         n = len(self.design.electrodes)
         floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
         names = self.background.terminals
@@ -182,13 +185,9 @@ class Simulator:
             SolveError: The solver did not reach its tolerance.
         """
         start = time.perf_counter()
+        _check_view("step takes", scene)
         if isinstance(scene, DepthFrame):
             scene = scene.scene()
-        if not isinstance(scene, Scene):
-            raise SceneError(
-                f"step takes a Scene or a DepthFrame, not {type(scene).__name__}; "
-                "write Scene([...])"
-            )
         self.steps += 1
         change, iterations, error, goal = self._solver.solve(scene)
         if len(self._floating):
@@ -201,6 +200,47 @@ class Simulator:
             self.baseline + delta, delta.copy(), stats, self.electrode_names,
             total[:n, n:].sum(axis=1),
         )  # fmt: skip
+
+    def step_batch(
+        self, scenes: Sequence[Scene | DepthFrame], *, threads: int | None = None
+    ) -> list[Reading]:
+        """Return the readings of scenes that have nothing to do with each other.
+
+        Each is solved from rest, on whichever thread is free: a reading is that of
+        :meth:`reset` and :meth:`step`, to the last bit, whatever stands beside it in the batch and
+        however many threads there are. This sensor's own last step and count stay as they are.
+
+        Args:
+            scenes: Scenes or depth frames, in the sensor frame.
+            threads: How many threads solve; by default as many as the process may use processors.
+
+        Raises:
+            SceneError: Something in ``scenes`` is neither a scene nor a depth frame, or
+                ``threads`` is not a positive whole number.
+            BatchError: Some scenes failed; it holds the readings of the others.
+        """
+        for number, scene in enumerate(scenes):
+            _check_view(f"scenes[{number}]: a batch holds", scene)
+        crew = Crew(threads)
+        while len(self._batch) < min(crew.threads, len(scenes)):
+            self._batch.append(self.sibling())
+        idle = deque(self._batch)
+
+        def solve(scene: Scene | DepthFrame) -> Callable[[], Reading]:
+            def task() -> Reading:
+                sensor = idle.popleft()
+                try:
+                    sensor.reset()
+                    return sensor.step(scene)
+                finally:
+                    idle.append(sensor)
+
+            return task
+
+        readings, failures = crew.run({k: solve(v) for k, v in enumerate(scenes)})
+        if failures:
+            raise BatchError(some_failed("scenes", failures, len(scenes)), readings, failures)
+        return list(readings.values())
 
     def potentials(self) -> Array:
         """Potentials of the last step at the nodes of ``background.lattice`` [V].
@@ -255,3 +295,10 @@ class Simulator:
         cross = matrix[np.ix_(keep, self._floating)]
         own = matrix[np.ix_(self._floating, self._floating)]
         return inner - cross @ np.linalg.solve(own, cross.T)
+
+
+def _check_view(where: str, scene: object) -> None:
+    if not isinstance(scene, Scene | DepthFrame):
+        raise SceneError(
+            f"{where} a Scene or a DepthFrame, not {type(scene).__name__}; write Scene([...])"
+        )

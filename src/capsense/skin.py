@@ -2,83 +2,21 @@
 
 from __future__ import annotations
 
-import os
-from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._crew import Crew, some_failed
 from capsense._validate import suggest
 from capsense.design.model import Design
-from capsense.errors import CapSenseError, SceneError, SkinError
+from capsense.errors import SceneError, SkinError
 from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Reading, Simulator
 
 Array = NDArray[np.float64]
 AnyDesign = Design | str | Path | Simulator
-
-
-class Crew:
-    """Threads that share the reading of sensors, the calling thread among them.
-
-    The solver's kernels run beside each other; Python between them does not. A reading does not
-    depend on the number of threads, since no two sensors share anything that changes.
-
-    Args:
-        threads: How many; by default as many as the process may use processors.
-
-    Raises:
-        SceneError: ``threads`` is not a positive whole number.
-    """
-
-    def __init__(self, threads: int | None = None) -> None:
-        if threads is None:
-            threads = len(os.sched_getaffinity(0))
-        if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
-            raise SceneError(f"threads is {threads!r}; give a whole number from 1")
-        self.threads = threads
-        """How many threads read, the calling one included."""
-        self._pool = (
-            ThreadPoolExecutor(threads - 1, thread_name_prefix="skin") if threads > 1 else None
-        )
-
-    def read(self, tasks: Mapping[str, Callable[[], Reading]]) -> dict[str, Reading]:
-        """Read all sensors: name → what reads it.
-
-        Raises:
-            SkinError: Some of them failed; it holds the readings of the others.
-        """
-        queue = deque(tasks.items())
-        readings: dict[str, Reading] = {}
-        failures: dict[str, CapSenseError] = {}
-
-        def work() -> None:
-            while True:
-                try:
-                    name, task = queue.popleft()
-                except IndexError:
-                    return
-                try:
-                    readings[name] = task()
-                except CapSenseError as error:
-                    failures[name] = error
-
-        helpers = min(self.threads, len(tasks)) - 1
-        futures = [self._pool.submit(work) for _ in range(helpers)] if self._pool else []
-        try:
-            work()
-        finally:
-            queue.clear()  # after an error that nobody foresaw
-            for future in futures:
-                future.result()
-        readings = {name: readings[name] for name in tasks if name in readings}
-        if failures:
-            failures = {name: failures[name] for name in tasks if name in failures}
-            raise SkinError(_report(failures, len(tasks)), readings, failures)
-        return readings
 
 
 class Skin:
@@ -156,7 +94,9 @@ class Skin:
         def task(simulator: Simulator, view: Scene | DepthFrame) -> Callable[[], Reading]:
             return lambda: simulator.step(view)
 
-        return self._crew.read({n: task(self.simulators[n], view) for n, view in views.items()})
+        return read_all(
+            self._crew, {n: task(self.simulators[n], view) for n, view in views.items()}
+        )
 
     def reset(self) -> None:
         """Forget the previous step."""
@@ -209,10 +149,13 @@ def make_simulators(designs: Mapping[str, AnyDesign]) -> dict[str, Simulator]:
     return simulators
 
 
-def _report(failures: Mapping[str, CapSenseError], count: int) -> str:
-    name, error = next(iter(failures.items()))
-    rest = f" (and so did {', '.join(map(repr, list(failures)[1:]))})" if len(failures) > 1 else ""
-    return (
-        f"{len(failures)} of {count} sensors failed; {name!r}: {error}{rest}; "
-        "the others' readings are in this error's readings"
-    )
+def read_all(crew: Crew, tasks: Mapping[str, Callable[[], Reading]]) -> dict[str, Reading]:
+    """Read sensors together: name → what reads it.
+
+    Raises:
+        SkinError: Some of them failed; it holds the readings of the others.
+    """
+    readings, failures = crew.run(tasks)
+    if failures:
+        raise SkinError(some_failed("sensors", failures, len(tasks)), readings, failures)
+    return readings

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
+from capsense._crew import Crew
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
 from capsense.errors import SceneError
 from capsense.scene import Pose
 from capsense.simulator import Reading, Simulator
-from capsense.skin import AnyDesign, Crew, make_simulators
+from capsense.skin import AnyDesign, make_simulators, read_all
 
 
 class AttachedSkin:
@@ -58,7 +59,7 @@ class AttachedSkin:
         def task(sensor: GeometrySensor) -> Callable[[], Reading]:
             return lambda: sensor.read(time, sensor.scene(links))
 
-        return self._crew.read({name: task(sensor) for name, sensor in self.sensors.items()})
+        return read_all(self._crew, {name: task(sensor) for name, sensor in self.sensors.items()})
 
     @property
     def poses(self) -> dict[str, Pose]:

@@ -110,9 +110,7 @@ def build_background(
     tell("calibration", 0.92)
     weights, half = lattice.weights, half_link_weights(lattice)
     if math.isfinite(settings.calibration):
-        weights, half = calibrate(
-            lattice, potentials, charges.capacitance, settings.calibration
-        )
+        weights, half = calibrate(lattice, potentials, charges.capacitance, settings.calibration)
     _require_finite(design, potentials, charges.capacitance, weights, half)
     tell("done", 1.0)
     return BackgroundField(

@@ -1,0 +1,90 @@
+"""Threads that do the same kind of work for many sensors or scenes."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+from capsense.errors import CapSenseError, SceneError
+
+Key = TypeVar("Key", bound=Hashable)
+Result = TypeVar("Result")
+
+
+class Crew:
+    """Threads that share the work of reading, the calling thread among them.
+
+    The solver's kernels run beside each other; Python between them does not. No two tasks may
+    share anything that changes; results then do not depend on the number of threads.
+
+    Args:
+        threads: How many; by default as many as the process may use processors.
+
+    Raises:
+        SceneError: ``threads`` is not a positive whole number.
+    """
+
+    def __init__(self, threads: int | None = None) -> None:
+        if threads is None:
+            threads = len(os.sched_getaffinity(0))
+        if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
+            raise SceneError(f"threads is {threads!r}; give a whole number from 1")
+        self.threads = threads
+        """How many threads read, the calling one included."""
+        self._pool = (
+            ThreadPoolExecutor(threads - 1, thread_name_prefix="capsense") if threads > 1 else None
+        )
+
+    def run(
+        self, tasks: Mapping[Key, Callable[[], Result]]
+    ) -> tuple[dict[Key, Result], dict[Key, CapSenseError]]:
+        """Do all tasks; return what they gave and the errors of those that failed, by key.
+
+        Both are in the order of the tasks.
+        """
+        queue = deque(tasks.items())
+        results: dict[Key, Result] = {}
+        failures: dict[Key, CapSenseError] = {}
+
+        def work() -> None:
+            while True:
+                try:
+                    key, task = queue.popleft()
+                except IndexError:
+                    return
+                try:
+                    results[key] = task()
+                except CapSenseError as error:
+                    failures[key] = error
+
+        helpers = min(self.threads, len(tasks)) - 1
+        futures = [self._pool.submit(work) for _ in range(helpers)] if self._pool else []
+        try:
+            work()
+        finally:
+            queue.clear()  # after an error that nobody foresaw
+            for future in futures:
+                future.result()
+        return (
+            {key: results[key] for key in tasks if key in results},
+            {key: failures[key] for key in tasks if key in failures},
+        )
+
+
+def some_failed(what: str, failures: Mapping[Key, CapSenseError], count: int) -> str:
+    """The message for some of ``count`` readings that failed."""
+    first, error = next(iter(failures.items()))
+    others = [repr(key) for key in failures][1:]
+    rest = f" (and so did {_listed(others)})" if others else ""
+    return (
+        f"{len(failures)} of {count} {what} failed; {first!r}: {error}{rest}; "
+        "the others' readings are in this error's readings"
+    )
+
+
+def _listed(names: list[str], most: int = 8) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

@@ -1,0 +1,59 @@
+"""Threads that share tasks."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from capsense._crew import Crew, some_failed
+from capsense.errors import SceneError
+
+
+def test_tasks_run_beside_each_other() -> None:
+    """Two tasks that wait for each other finish with two threads."""
+    meet = threading.Barrier(2, timeout=20)
+    results, failures = Crew(2).run({"a": meet.wait, "b": meet.wait})
+    assert set(results.values()) == {0, 1}
+    assert not failures
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_results_and_failures_are_in_the_order_of_the_tasks(threads: int) -> None:
+    """Every task is done once, whatever fails beside it."""
+
+    def task(k: int) -> int:
+        if k % 3 == 0:
+            raise SceneError(f"no {k}")
+        return k * k
+
+    results, failures = Crew(threads).run({k: lambda k=k: task(k) for k in range(20)})
+    assert list(results.items()) == [(k, k * k) for k in range(20) if k % 3]
+    assert [(k, str(e)) for k, e in failures.items()] == [(k, f"no {k}") for k in range(0, 20, 3)]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_it_did_not_foresee_is_passed_on(threads: int) -> None:
+    """A bug in a task is not taken for a failing sensor."""
+
+    def broken() -> int:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        Crew(threads).run({"a": broken, "b": broken})
+
+
+def test_a_report_names_the_first_failure_and_lists_the_others() -> None:
+    """Not all of hundreds."""
+    failures = {k: SceneError(f"no {k}") for k in range(3, 40)}
+    assert some_failed("scenes", failures, 50) == (
+        "37 of 50 scenes failed; 3: no 3 (and so did 4, 5, 6, 7, 8, 9, 10, 11 and 28 more); "
+        "the others' readings are in this error's readings"
+    )
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1.5, True, "2"])
+def test_refused(threads: object) -> None:
+    """Not a positive whole number."""
+    with pytest.raises(SceneError, match=r"threads is .*give a whole number from 1"):
+        Crew(threads)  # type: ignore[arg-type]

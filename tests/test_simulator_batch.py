@@ -1,0 +1,95 @@
+"""Batches: the readings of scenes that have nothing to do with each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_scenes import random_scene
+from tiny_field import SETTINGS, tiny_design
+
+import capsense as cs
+from capsense.errors import BatchError, SceneError, SolveError
+
+
+@pytest.fixture
+def tiny(field_cache: Path) -> cs.Simulator:
+    """A square and a disc in a 0.1 m box."""
+    return cs.Simulator(tiny_design(), settings=SETTINGS, cache_dir=field_cache)
+
+
+def scenes(count: int = 20) -> list[cs.Scene]:
+    """Scenes of every kind, empty ones among them."""
+    rng = np.random.default_rng(7)
+    return [random_scene(rng) if k % 5 else cs.Scene() for k in range(count)]
+
+
+def frame() -> cs.DepthFrame:
+    """A flat thing 20 mm before the sensor."""
+    return cs.DepthFrame(np.full((16, 16), 0.02), 10.0, cs.OrthographicCamera(0.1))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 7, None])
+def test_each_reading_is_that_of_a_step_from_rest(tiny: cs.Simulator, threads: int | None) -> None:
+    """Differential: to the last bit, whatever stands beside it; and again in a second batch."""
+    views = [*scenes(), frame()]
+    alone = tiny.sibling()
+    expected = []
+    for view in views:
+        alone.reset()
+        expected.append(alone.step(view))
+    for _ in range(2):
+        readings = tiny.step_batch(views, threads=threads)
+        assert len(readings) == len(views)
+        for a, b in zip(readings, expected, strict=True):
+            np.testing.assert_array_equal(a.delta, b.delta)
+            np.testing.assert_array_equal(a.self_capacitance, b.self_capacitance)
+            assert a.stats.iterations == b.stats.iterations
+        views, expected = views[::-1], expected[::-1]
+
+
+def test_the_sensor_itself_is_left_alone(tiny: cs.Simulator) -> None:
+    """Its walk goes on as if there had been no batch."""
+    other = tiny.sibling()
+    walk = scenes(6)
+    for sim in (tiny, other):
+        sim.step(walk[1])
+    tiny.step_batch(scenes())
+    assert tiny.steps == 1
+    np.testing.assert_array_equal(tiny.step(walk[2]).delta, other.step(walk[2]).delta)
+
+
+def test_an_empty_batch_gives_nothing(tiny: cs.Simulator) -> None:
+    """Nor does it start anything."""
+    assert tiny.step_batch([]) == []
+
+
+def test_a_failing_scene_does_not_lose_the_others(
+    tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error names it by its number and holds the readings of the others."""
+    views = scenes(6)
+    step = cs.Simulator.step
+
+    def fail(self: cs.Simulator, scene: cs.Scene) -> cs.Reading:
+        if scene is views[2]:
+            raise SolveError("no convergence")
+        return step(self, scene)
+
+    monkeypatch.setattr(cs.Simulator, "step", fail)
+    with pytest.raises(BatchError, match=r"1 of 6 scenes failed; 2: no convergence;") as caught:
+        tiny.step_batch(views, threads=2)
+    assert list(caught.value.readings) == [0, 1, 3, 4, 5]
+    assert isinstance(caught.value.failures[2], SolveError)
+    monkeypatch.undo()
+    assert len(tiny.step_batch(views, threads=2)) == 6, "and the next batch is sound"
+
+
+def test_refused_before_any_work(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By name, with the mend."""
+    monkeypatch.setattr(cs.Simulator, "step", lambda *_: pytest.fail("worked"))
+    with pytest.raises(SceneError, match=r"scenes\[2\]: a batch holds a Scene .*, not list"):
+        tiny.step_batch([cs.Scene(), cs.Scene(), []])  # type: ignore[list-item]
+    with pytest.raises(SceneError, match="threads is 0"):
+        tiny.step_batch([cs.Scene()], threads=0)
