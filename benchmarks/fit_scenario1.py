@@ -1,19 +1,29 @@
 """Fit scenario 1 of ``capsense reproduce`` to the measured panels of the paper's Fig. 9.
 
 Prints the figures for ``src/capsense/reproduce/data/scenario1.toml``, how far the table that the
-fit interpolates is from the simulation, and, with ``--pairs``, the fit of every choice of
-electrode pairs. ``python benchmarks/fit_scenario1.py`` takes half a minute, with ``--pairs`` two.
+fit interpolates is from the simulation, and, if asked, how well other assumptions fit and how well
+one panel is foretold from the other. ``python benchmarks/fit_scenario1.py`` takes a minute, each
+option half a minute more, ``--pours`` several, most of them for the fields.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 
 import numpy as np
 
 from capsense.reproduce.metrics import cross_correlation, rmse
-from capsense.reproduce.scenario1_fit import Grid, Table, fit, predicted, tabulate
+from capsense.reproduce.scenario1_fit import (
+    Fit,
+    Grid,
+    Table,
+    fit,
+    fit_without,
+    predicted,
+    tabulate,
+)
 from capsense.reproduce.scenario1_setup import PANEL_SAMPLES, Setup, load_panel, load_setup
 from capsense.reproduce.scenario1_signal import matrices, mutual, normalised
 from capsense.simulator import Simulator
@@ -26,9 +36,36 @@ def report(stage: str, fraction: float) -> None:
     print(f"  {stage}", file=sys.stderr)
 
 
-def compare_pairs(setup: Setup, grids: dict[str, Grid]) -> None:
-    """The fit of every choice of pairs, the best first."""
-    found = []
+def simulators(setup: Setup) -> dict[str, Simulator]:
+    """Of both boards."""
+    return {
+        name: Simulator(setup.boards[name].sensor(setup.pour), frequency=setup.frequency)
+        for name in PANELS
+    }
+
+
+def tables_of(setup: Setup, grids: dict[str, Grid]) -> dict[str, Table]:
+    """Tables of the set-up's pairs."""
+    return {name: grid.table(setup.boards[name].pair) for name, grid in grids.items()}
+
+
+def likeness(setup: Setup, name: str, table: Table) -> tuple[float, float]:
+    """Zero-mean correlation and rms error of a board's curve by the table against hardware."""
+    measured = load_panel(setup.boards[name].panel).measured
+    curve = predicted(setup, name, table)
+    return cross_correlation(curve, measured), rmse(curve, measured)
+
+
+def held_out(setup: Setup, tables: dict[str, Table]) -> list[tuple[str, float, float]]:
+    """For each board: its name, and correlation and rms error if its panel is held out."""
+    return [(n, *likeness(fit_without(setup, tables, n), n, tables[n])) for n in PANELS]
+
+
+def all_pairs(
+    setup: Setup, grids: dict[str, Grid]
+) -> dict[tuple[str, str], tuple[Fit, list[float]]]:
+    """The fit of every choice of pairs, and the rms errors of both boards, the best first."""
+    found = {}
     choices = {
         name: [(a, b) for k, a in enumerate(grid.names) for b in grid.names[k + 1 :]]
         for name, grid in grids.items()
@@ -37,29 +74,13 @@ def compare_pairs(setup: Setup, grids: dict[str, Grid]) -> None:
         for other in choices["patch"]:
             tables = {"stripe": grids["stripe"].table(one), "patch": grids["patch"].table(other)}
             result = fit(setup, tables)
-            errors = [
-                rmse(predicted(result.setup, name, tables[name]), load_panel(
-                    setup.boards[name].panel).measured)
-                for name in PANELS
-            ]  # fmt: skip
-            found.append((result.cost, one, other, errors))
-    print("\nrms error by pair: stripe, patch")
-    for _, one, other, errors in sorted(found):
-        print("-".join(one), "-".join(other), *(f"{error:.4f}" for error in errors))
+            errors = [likeness(result.setup, name, tables[name])[1] for name in PANELS]
+            found["-".join(one), "-".join(other)] = result, errors
+    return dict(sorted(found.items(), key=lambda item: item[1][0].cost))
 
 
-def main() -> None:
-    """Tabulate, fit, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pairs", action="store_true", help="try every choice of pairs")
-    args = parser.parse_args()
-    setup = load_setup()
-    sims = {name: Simulator(name, frequency=setup.frequency) for name in PANELS}
-    grids = {}
-    for name, sim in sims.items():
-        report(f"tabulating {name}", 0.0)
-        grids[name] = tabulate(sim, setup)
-    tables: dict[str, Table] = {n: grids[n].table(setup.boards[n].pair) for n in PANELS}
+def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]) -> None:
+    """The figures, and each board's curve by the simulation itself."""
     result = fit(setup, tables, report=report)
     print(f"cost {result.cost:.6f}, correlation of successive residuals {result.memory:.3f}\n")
     for key, deviation in result.setup.uncertainty.items():
@@ -71,17 +92,44 @@ def main() -> None:
         poses = result.setup.poses("T2", setup.panel_speed, times)
         values = mutual(matrices(sim, setup, poses), sim.electrode_names, board.pair)
         curve = normalised(result.setup, board, values, tables[name].empty, noise=False)
-        apart = np.abs(curve - predicted(result.setup, name, tables[name])).max()
+        apart = rmse(curve, predicted(result.setup, name, tables[name]))
         steps = np.diff(panel.measured)
         noise = np.median(np.abs(steps)) / 0.6745 / np.sqrt(2) / board.level
         noise *= tables[name].empty + result.setup.stray
         print(
             f"{name}: correlation {cross_correlation(curve, panel.measured):.4f}, rms error "
-            f"{rmse(curve, panel.measured):.4f}; the table is within {apart:.4f} of the "
-            f"simulation; noise of the measurement {noise:.2g} F"
+            f"{rmse(curve, panel.measured):.4f}; coupling {1e15 * tables[name].empty:.2f} fF; the "
+            f"table is within {apart:.4f} rms of the simulation; noise of the measurement "
+            f"{noise:.2g} F"
         )
+
+
+def main() -> None:
+    """Tabulate, fit, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--held-out", action="store_true", help="foretell each panel by the other")
+    parser.add_argument("--pairs", action="store_true", help="try every choice of pairs")
+    parser.add_argument("--pours", action="store_true", help="try all pairs with floating pours")
+    args = parser.parse_args()
+    setup = load_setup()
+    sims = simulators(setup)
+    grids = {name: tabulate(sim, setup) for name, sim in sims.items()}
+    tables = tables_of(setup, grids)
+    print_fit(setup, sims, tables)
+    if args.held_out:
+        print("\nheld out: zero-mean correlation, rms error")
+        for name, correlation, error in held_out(setup, tables):
+            print(f"{name}: {correlation:.4f}, {error:.4f}")
     if args.pairs:
-        compare_pairs(setup, grids)
+        print("\nrms error by pair: stripe, patch")
+        for pairs, (_, errors) in all_pairs(setup, grids).items():
+            print(*pairs, *(f"{error:.4f}" for error in errors))
+    if args.pours:
+        other = replace(setup, pour="floating")
+        found = {name: tabulate(sim, other) for name, sim in simulators(other).items()}
+        print("\nfloating pours, the best pairs: rms error of stripe, patch; stray capacitance")
+        for pairs, (result, errors) in list(all_pairs(other, found).items())[:3]:
+            print(*pairs, *(f"{error:.4f}" for error in errors), f"{result.setup.stray:.3g} F")
 
 
 if __name__ == "__main__":

@@ -202,6 +202,8 @@ def studies(folder: Path) -> str:
             blocks.append(f"### {name}\n\nNot run in this edition: `capsense reproduce {name}`.")
             continue
         found = json.loads(path.read_text(encoding="utf-8"))
+        if found["reduced"]:
+            raise SystemExit(f"{path} is of the reduced form; run: capsense reproduce {name}")
         lines = [
             (r["what"], f"{r['value']:.4g} {r['unit']}".strip(), r["target"], r["verdict"])
             for r in found["rows"]

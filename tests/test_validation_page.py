@@ -55,11 +55,15 @@ def test_rows_of_a_study(validation: ModuleType, tmp_path: Path) -> None:
     name = next(iter(STUDIES))
     (tmp_path / name).mkdir()
     row = {"what": "r", "value": 0.5, "unit": "%", "target": "> 0.4", "verdict": "met"}
-    text = json.dumps({"title": "A title", "rows": [row]})
-    (tmp_path / name / "rows.json").write_text(text, encoding="utf-8")
+    content = {"title": "A title", "reduced": False, "rows": [row]}
+    (tmp_path / name / "rows.json").write_text(json.dumps(content), encoding="utf-8")
     found = validation.studies(tmp_path)
     assert "### A title" in found
     assert "| r | 0.5 % | > 0.4 | met |" in found
+    content["reduced"] = True
+    (tmp_path / name / "rows.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(SystemExit, match="reduced form"):
+        validation.studies(tmp_path)
 
 
 def test_page_is_of_the_present_studies() -> None:

@@ -56,6 +56,8 @@ def test_file_is_checked() -> None:
         return out
 
     cases = {
+        "pour = 'shield' is not known": lambda d: d.update(pour="shield"),
+        "pair = .*two electrodes": lambda d: d["board"][1].update(pair=["E1"]),
         "unknown key 'spede'": lambda d: d.update(spede=1),
         "missing key 'gap'": lambda d: d["path"].pop("gap"),
         "no figure 'stripe.gap'": lambda d: d["uncertainty"].update({"stripe.gap": 1.0}),
@@ -64,6 +66,15 @@ def test_file_is_checked() -> None:
     for message, change in cases.items():
         with pytest.raises(ScenarioError, match=message):
             parse_setup(changed(change))
+
+
+def test_pours() -> None:
+    """Grounded pours are those of the packaged board; floating ones are another sensor."""
+    packaged = cs.load_design("stripe")
+    assert STRIPE.sensor(SETUP.pour).content_hash() == packaged.content_hash()
+    floating = STRIPE.sensor("floating")
+    assert floating.content_hash() != packaged.content_hash()
+    assert {part.role for part in floating.conductors} == {"floating"}
 
 
 def test_panels() -> None:
@@ -93,7 +104,7 @@ def test_stored_figures_are_those_of_the_fit() -> None:
     """Fitted again on a coarser table, from another gap: within its own error, every figure."""
     tables = {}
     for name in ("stripe", "patch"):
-        grid = tabulate(cs.Simulator(name, frequency=SETUP.frequency), SETUP, coarser=1.6)
+        grid = tabulate(cs.Simulator(name, frequency=SETUP.frequency), SETUP, coarser=2.4)
         tables[name] = grid.table(SETUP.boards[name].pair)
     found = fit(SETUP, tables, starts=(1.3,))
     for key, uncertainty in SETUP.uncertainty.items():

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.errors import MissingDependencyError
 from capsense.reproduce import limb_rides, limb_worlds, scenario2
 from capsense.reproduce.limb_rides import PARTICIPANTS, clearance, course, rides, sensor_pose
 from capsense.reproduce.study import Outcome
@@ -81,14 +80,6 @@ def test_worlds_show_the_limb(simulator: str, simulators: object) -> None:
         expected = sim.step(cs.Scene(bodies))
         tolerance = 1e-3 * np.abs(expected.delta).max()
         assert found == pytest.approx(expected.self_capacitance, abs=tolerance)
-
-
-def test_missing_simulator(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """It is named before any work is done."""
-    monkeypatch.setattr(limb_worlds, "find_spec", lambda name: None)
-    with pytest.raises(MissingDependencyError, match=r"capsense\[mujoco\]"):
-        scenario2.run(tmp_path, reduced=True, report=lambda stage, fraction: None)
-    assert not list(tmp_path.iterdir())
 
 
 def test_codes_follow_the_capacitance() -> None:

@@ -10,6 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from capsense.cli.main import main
+from capsense.reproduce import registry
 from capsense.reproduce.registry import STUDIES, load_study
 from capsense.reproduce.store import Store
 from capsense.reproduce.study import Outcome, Report, Row, Table, judged
@@ -114,6 +115,27 @@ def test_long_tables_are_named(tmp_path: Path) -> None:
     long = Table(("k",), tuple((k,) for k in range(MAX_ROWS + 1)))
     write_outcome(Outcome("T", (), {"long": long}), tmp_path)
     assert f"- [long.csv](long.csv), {MAX_ROWS + 1} rows" in (tmp_path / "report.md").read_text()
+
+
+def test_reduced_form_is_told(tmp_path: Path) -> None:
+    """A check is not taken for a result."""
+    write_outcome(Outcome("T", ()), tmp_path)
+    assert not json.loads((tmp_path / "rows.json").read_text())["reduced"]
+    assert "Reduced" not in (tmp_path / "report.md").read_text()
+    write_outcome(Outcome("T", ()), tmp_path, reduced=True)
+    assert json.loads((tmp_path / "rows.json").read_text())["reduced"]
+    assert "# T\n\nReduced form" in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize("study", ["scenario2", "all"])
+def test_missing_package(
+    study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is named, with the line that installs it, before any study begins."""
+    monkeypatch.setattr(registry, "find_spec", lambda name: None if name == "mujoco" else name)
+    assert main(["reproduce", study, "-o", str(tmp_path / "out")]) == 2
+    assert "pip install 'capsense[mujoco]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_every_registered_study_is_there() -> None:

@@ -91,8 +91,9 @@ def _carry_out(name: str, study: Study, folder: Path, *, reduced: bool) -> int:
 
     with BuildProgress(shown=sys.stderr.isatty(), prefix=f"{name}: ") as progress:
         outcome = study(folder, reduced=reduced, report=progress)
-    written = write_outcome(outcome, folder)
-    print(f"{outcome.title}\n\n{table(ROW_HEADER, [row_cells(row) for row in outcome.rows])}\n")
+    written = write_outcome(outcome, folder, reduced=reduced)
+    title = outcome.title + (", reduced" if reduced else "")
+    print(f"{title}\n\n{table(ROW_HEADER, [row_cells(row) for row in outcome.rows])}\n")
     print(f"wrote {_listed(written)} to {folder}", outcome.parts, sep="\n", end="\n\n", flush=True)
     return len(outcome.missed)
 

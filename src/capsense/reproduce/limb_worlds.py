@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -13,7 +12,6 @@ import numpy as np
 
 import capsense as cs
 from capsense.adapters.attached import AttachedSensor
-from capsense.errors import MissingDependencyError
 from capsense.humans.export import mjcf_body
 from capsense.reproduce.limb_rides import Course
 from capsense.scene import Pose
@@ -98,19 +96,6 @@ class PybulletWorld:
 
         p.resetBasePositionAndOrientation(
             self._body, pose.position, pose.quaternion, physicsClientId=self._client
-        )
-
-
-def require(simulator: str) -> None:
-    """Check that a simulator is installed.
-
-    Raises:
-        MissingDependencyError: It is not.
-    """
-    if find_spec(simulator) is None:
-        raise MissingDependencyError(
-            f"scenario 2 rides in {simulator}, which is not installed; "
-            f"pip install 'capsense[{simulator}]'"
         )
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import cast
 
+from capsense.errors import MissingDependencyError
 from capsense.reproduce.study import Study
 
 STUDIES: dict[str, str] = {
@@ -14,6 +16,8 @@ STUDIES: dict[str, str] = {
     "fig8": "capsense.reproduce.fig8:run",
 }
 """``"module:function"`` of each study, in the order of ``capsense reproduce all``."""
+NEEDS: dict[str, tuple[str, ...]] = {"scenario2": ("mujoco", "pybullet")}
+"""Optional packages of a study, which are named like the extras that bring them."""
 
 
 def load_study(name: str) -> Study:
@@ -23,5 +27,11 @@ def load_study(name: str) -> Study:
         KeyError: There is no such study.
         MissingDependencyError: It needs an optional package.
     """
+    missing = [package for package in NEEDS.get(name, ()) if find_spec(package) is None]
+    if missing:
+        raise MissingDependencyError(
+            f"study {name} needs {' and '.join(missing)}, not installed here; "
+            f"pip install 'capsense[{','.join(missing)}]'"
+        )
     module, function = STUDIES[name].split(":")
     return cast(Study, getattr(import_module(module), function))

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from capsense.design import load_design
 from capsense.reproduce.metrics import (
     correlation_of_change,
     cross_correlation,
     raw_correlation,
     rmse,
 )
+from capsense.reproduce.paper import correlations
 from capsense.reproduce.scenario1_plots import plot_panels, plot_trajectories
 from capsense.reproduce.scenario1_setup import (
     PANEL_SAMPLES,
@@ -88,8 +88,8 @@ def cases_of(setup: Setup, *, reduced: bool) -> list[Case]:
 
 
 @lru_cache(maxsize=3)
-def _simulator(design: str, frequency: float) -> Simulator:
-    return Simulator(design, frequency=frequency)
+def _simulator(board: Board, pour: str, frequency: float) -> Simulator:
+    return Simulator(board.sensor(pour), frequency=frequency)
 
 
 def curve_of(setup: Setup, case: Case, store: Store) -> Curve:
@@ -98,12 +98,12 @@ def curve_of(setup: Setup, case: Case, store: Store) -> Curve:
     poses = setup.poses(case.trajectory, case.speed, case.times)
 
     def compute() -> dict[str, Array]:
-        sim = _simulator(board.design, setup.frequency)
+        sim = _simulator(board, setup.pour, setup.frequency)
         values = mutual(matrices(sim, setup, poses), sim.electrode_names, board.pair)
         return {"values": values, "empty": mutual(sim.baseline, sim.electrode_names, board.pair)}
 
     inputs = {
-        "design": load_design(board.design).content_hash(),
+        "design": board.sensor(setup.pour).content_hash(),
         "pair": board.pair,
         "frequency": setup.frequency,
         "bar": [setup.size, setup.material],
@@ -139,7 +139,10 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         and curve.case.board.design in panels
     }
     rows, compared = _compare(shown, panels)
-    tables = {"comparison": compared, "fitted": _fitted(setup), "curves": _listed(curves)}
+    tables = {
+        "comparison": compared, "hardware_of_the_paper_eq12": _table_1(setup),
+        "fitted": _fitted(setup), "curves": _listed(curves),
+    }  # fmt: skip
     tables |= {f"panel_{name}": _panel(shown[name], panels[name]) for name in shown}
     tables |= {curve.case.name: _curve(curve) for curve in curves}
     plots = {
@@ -181,6 +184,15 @@ def _compare(shown: dict[str, Curve], panels: dict[str, Panel]) -> tuple[tuple[R
             cells.append((name, what, ours, theirs))
     header = ("board", "against hardware", "CapSense", "the paper's simulation")
     return tuple(rows), Table(header, tuple(cells))
+
+
+def _table_1(setup: Setup) -> Table:
+    """The paper's Table I, simulation against hardware over all trajectories."""
+    rows = [
+        (speed, *(correlations(1)[f"{speed:g}"][name] for name in setup.boards))
+        for speed in setup.speeds
+    ]
+    return Table(("speed [m/s]", *setup.boards), tuple(rows))
 
 
 def _fitted(setup: Setup) -> Table:

@@ -6,7 +6,7 @@ interpolated while fitting; the final curves come from the simulation itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,9 +18,9 @@ from capsense.reproduce.scenario1_signal import matrices, mutual
 from capsense.scene import Pose
 from capsense.simulator import Simulator
 
-STEP, REACH = 0.006, 0.252
+STEP, REACH = 0.004, 0.252
 """The table's spacing and reach along x [m]."""
-NEAREST, FARTHEST, HEIGHTS = 0.005, 0.160, 26
+NEAREST, FARTHEST, HEIGHTS = 0.005, 0.160, 36
 """Gaps of the table [m], and their number; they grow by a constant factor."""
 
 
@@ -70,7 +70,7 @@ def tabulate(sim: Simulator, setup: Setup, coarser: float = 1.0) -> Grid:
     Args:
         sim: A simulator of the board.
         setup: The scenario.
-        coarser: Factor between grid points; 1 is 85 x 26 steps.
+        coarser: Factor between grid points; 1 is 127 x 36 steps.
     """
     x = np.linspace(-REACH, REACH, round(2 * REACH / STEP / coarser) + 1)
     gaps = np.geomspace(NEAREST, FARTHEST, round(HEIGHTS / coarser))
@@ -107,10 +107,11 @@ def fit(
     setup: Setup,
     tables: Mapping[str, Table],
     *,
+    keys: Sequence[str] | None = None,
     starts: tuple[float, ...] = (0.5, 1.0, 1.6),
     report: Callable[[str, float], None] = lambda stage, fraction: None,
 ) -> Fit:
-    """Least squares over the panels of all tables, in the figures that have an uncertainty.
+    """Least squares over the panels of all tables.
 
     Residuals are not white: what is left is mostly the model's, and lasts several samples. So
     the covariance s²(JᵀJ)⁻¹ is widened by (1 + ρ)/(1 − ρ), where ρ is the correlation of
@@ -119,10 +120,11 @@ def fit(
     Args:
         setup: Where to begin.
         tables: By board, of :meth:`Grid.table`.
-        starts: Factors on the gap; the fit begins from each, and the best one counts.
+        keys: The figures to be fitted, by default all that have an uncertainty.
+        starts: Factors on the gap, if it is fitted; the fit begins from each, and the best counts.
         report: Told of each start.
     """
-    keys = list(setup.uncertainty)
+    keys = list(setup.uncertainty if keys is None else keys)
     panels: dict[str, Panel] = {name: load_panel(setup.boards[name].panel) for name in tables}
     start = np.array([setup.value(key) for key in keys])
     scale = np.where(start == 0, 1.0, np.abs(start))
@@ -134,10 +136,10 @@ def fit(
         )
 
     best = None
-    for number, factor in enumerate(starts):
+    for number, factor in enumerate(starts if "gap" in keys else (1.0,)):
         report(f"start {number + 1} of {len(starts)}", number / len(starts))
         begin = start / scale
-        begin[keys.index("gap")] *= factor
+        begin *= [factor if key == "gap" else 1.0 for key in keys]
         found = least_squares(residuals, begin, x_scale=0.1, max_nfev=60)
         if best is None or found.cost < best.cost:
             best = found
@@ -147,6 +149,24 @@ def fit(
     variance = 2 * best.cost / (len(best.fun) - len(keys)) * (1 + memory) / (1 - memory)
     deviation = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)) * variance) * scale
     values = dict(zip(keys, best.x * scale, strict=True))
-    uncertainty = dict(zip(keys, deviation.tolist(), strict=True))
+    uncertainty = dict(setup.uncertainty) | dict(zip(keys, deviation.tolist(), strict=True))
     fitted = replace(setup.changed(values), uncertainty=uncertainty)
     return Fit(fitted, float(best.cost), memory)
+
+
+def fit_without(setup: Setup, tables: Mapping[str, Table], name: str) -> Setup:
+    """Fit with a board's panel held out, but for what belongs to that panel alone.
+
+    What both boards share is fitted to the other panels; then the held-out board's own figures,
+    its sample rate and the stripe panel's level, to its panel.
+
+    Args:
+        setup: Where to begin.
+        tables: By board.
+        name: The board that is held out.
+    """
+    own = [key for key in setup.uncertainty if key.startswith(f"{name}.")]
+    rest = [key for key in setup.uncertainty if key not in own]
+    others = {board: table for board, table in tables.items() if board != name}
+    shared = fit(setup, others, keys=rest).setup
+    return fit(shared, {name: tables[name]}, keys=own).setup

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense.design import Design, Role, load_design
 from capsense.errors import ScenarioError
 from capsense.scenario.schema import Table
 from capsense.scenario.trajectory import Trajectory
@@ -40,6 +41,17 @@ class Board:
     panel: str = ""
     """File with the curves of the paper's figure; empty without one."""
 
+    def sensor(self, pour: str) -> Design:
+        """The packaged design with its pour and back plane at a potential.
+
+        Args:
+            pour: ``"ground"``, as packaged, or ``"floating"``.
+        """
+        design = load_design(self.design)
+        role = Role(pour)
+        copper = tuple(dataclasses.replace(part, role=role) for part in design.conductors)
+        return dataclasses.replace(design, conductors=copper)
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -48,6 +60,8 @@ class Setup:
     speeds: tuple[float, ...]
     panel_speed: float
     frequency: float
+    pour: str
+    """Potential of the boards' pours and back planes, see :meth:`Board.sensor`."""
     size: tuple[float, float, float]
     material: str
     half_line: float
@@ -115,8 +129,8 @@ def load_setup() -> Setup:
     return parse_setup(tomllib.loads((DATA / FILE).read_text(encoding="utf-8")))
 
 
-_TOP = ("speeds", "panel_speed", "frequency", "bar", "path", "trajectories", "front_end", "board",
-        "uncertainty")  # fmt: skip
+_TOP = ("speeds", "panel_speed", "frequency", "pour", "bar", "path", "trajectories", "front_end",
+        "board", "uncertainty")  # fmt: skip
 _PATH = {"half_line": 1.0, "depth": 1.0, "gap": 1.0, "tilt": 45.0, "offset": 1.0, "rest": 1e3}
 _FRONT_END = {"stray": 1e-9, "shunt": 1e9, "full_scale": 1e3, "conversion": 10.0, "noise": 1e-9}
 
@@ -141,6 +155,7 @@ def parse_setup(data: Mapping[str, Any]) -> Setup:
         speeds=tuple(speeds) if isinstance(speeds, list) else (speeds,),
         panel_speed=top.number("panel_speed", 1e-6, 1e3, unit="m/s"),
         frequency=top.number("frequency", 1.0, 1e12, unit="Hz"),
+        pour=top.choice("pour", (Role.GROUND, Role.FLOATING)),
         size=(a, b, c),
         material=bar.string("material"),
         **{key: path.number(key, -limit, limit) for key, limit in _PATH.items()},
@@ -162,6 +177,8 @@ def parse_setup(data: Mapping[str, Any]) -> Setup:
 def _board(table: Table) -> Board:
     table.only([f.name for f in dataclasses.fields(Board)])
     pair = table.raw("pair", '["E1", "E2"]')
+    if not (isinstance(pair, list) and len(pair) == 2):
+        raise table.error(f'pair = {pair!r} must be two electrodes, like ["E1", "E2"]')
     return Board(
         table.string("design"),
         (str(pair[0]), str(pair[1])),

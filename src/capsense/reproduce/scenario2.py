@@ -6,11 +6,9 @@ the paper's scheme, and depth cameras, against the accurate method on the limbs'
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,8 +17,9 @@ from numpy.typing import NDArray
 
 import capsense as cs
 from capsense.reproduce.limb_rides import PARTICIPANTS, RIDES, SEED, Ride, course, rides
-from capsense.reproduce.limb_worlds import PIXELS, View, opened, read_poses, require
+from capsense.reproduce.limb_worlds import PIXELS, View, opened, read_poses
 from capsense.reproduce.metrics import cross_correlation, raw_correlation
+from capsense.reproduce.paper import correlations
 from capsense.reproduce.store import Store
 from capsense.reproduce.study import Cell, Outcome, Report, Row, Table, judged
 from capsense.scene.body import Grounding
@@ -78,13 +77,7 @@ Changes = dict[str, Array]
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
-    """Carry the study out; see :class:`capsense.reproduce.study.Study`.
-
-    Raises:
-        MissingDependencyError: MuJoCo or PyBullet is not installed.
-    """
-    for how in RUNS.values():
-        require(how.simulator)
+    """Carry the study out; see :class:`capsense.reproduce.study.Study`."""
     store = Store(folder)
     people = list(PARTICIPANTS)[: 2 if reduced else None]
     count = 2 if reduced else RIDES
@@ -246,7 +239,7 @@ def _tables(found: Mapping[str, Changes], codes: Mapping[str, Changes]) -> dict[
             tables[f"{what}_{label}"] = _grid(people, values, electrodes)
     again = _scores(codes, AGAIN)[..., 1]
     tables["accurate_method_read_twice_zero_mean"] = _grid(people, again, electrodes)
-    hardware = np.array([_table_2()[f"participant_{p}"] for p in PARTICIPANTS])
+    hardware = np.array([correlations(2)[f"participant_{p}"] for p in PARTICIPANTS])
     tables["hardware_of_the_paper_eq12"] = _grid(list(PARTICIPANTS), hardware, electrodes)
     sizes: list[tuple[Cell, ...]] = []
     for name, build in PARTICIPANTS.items():
@@ -268,13 +261,6 @@ def _grid(people: list[str], values: Array, electrodes: tuple[str, ...]) -> Tabl
     return Table(
         ("participant", *electrodes), tuple((p, *(f"{v:.3f}" for v in line)) for p, line in lines)
     )
-
-
-def _table_2() -> dict[str, list[float]]:
-    """Table II of Schöffmann et al. 2022: Eq. 12 of their simulation against their hardware."""
-    text = (resources.files("capsense.reproduce") / "data" / "table_2.json").read_text("utf-8")
-    table: dict[str, list[float]] = json.loads(text)["normalised cross-correlation"]
-    return table
 
 
 def _ride_plot(codes: Mapping[str, Changes], ways: Mapping[str, list[Ride]]) -> Figure:

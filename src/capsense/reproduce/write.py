@@ -12,9 +12,10 @@ from capsense.reproduce.study import Cell, Outcome, Row
 
 MAX_ROWS = 40
 """Longer tables are not shown in the report, only named."""
+REDUCED = "Reduced form: fewer cases, less resolution. The figures are no results, but a check."
 
 
-def write_outcome(outcome: Outcome, folder: Path) -> list[str]:
+def write_outcome(outcome: Outcome, folder: Path, *, reduced: bool = False) -> list[str]:
     """Write ``report.md``, ``rows.json``, a csv per table and a png per plot.
 
     The report is written last, so that where there is one, the rest is there.
@@ -22,6 +23,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> list[str]:
     Args:
         outcome: What to write.
         folder: Where; it exists.
+        reduced: Whether the study was carried out in its reduced form, which is told.
 
     Returns:
         Names of the files.
@@ -36,9 +38,10 @@ def write_outcome(outcome: Outcome, folder: Path) -> list[str]:
     for name, figure in outcome.plots.items():
         figure.savefig(folder / f"{name}.png", dpi=110)
         names.append(f"{name}.png")
-    rows = {"title": outcome.title, "rows": [asdict(row) for row in outcome.rows]}
-    _write(folder / "rows.json", json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False))
-    _write(folder / "report.md", markdown(outcome))
+    rows = [asdict(row) for row in outcome.rows]
+    found = {"title": outcome.title, "reduced": reduced, "rows": rows}
+    _write(folder / "rows.json", json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False))
+    _write(folder / "report.md", markdown(outcome, reduced=reduced))
     return [*names, "rows.json", "report.md"]
 
 
@@ -50,9 +53,10 @@ def row_cells(row: Row) -> tuple[str, str, str, str, str]:
 ROW_HEADER = ("what", "value", "unit", "target", "verdict")
 
 
-def markdown(outcome: Outcome) -> str:
+def markdown(outcome: Outcome, *, reduced: bool = False) -> str:
     """The outcome as a page in Markdown; it refers to tables and plots in its own folder."""
-    blocks = [f"# {outcome.title}", _grid(ROW_HEADER, [row_cells(row) for row in outcome.rows])]
+    blocks = [f"# {outcome.title}"] + ([REDUCED] if reduced else [])
+    blocks.append(_grid(ROW_HEADER, [row_cells(row) for row in outcome.rows]))
     blocks += [f"![{name.replace('_', ' ')}]({name}.png)" for name in outcome.plots]
     short = {n: t for n, t in outcome.tables.items() if len(t.rows) <= MAX_ROWS}
     for name, table in short.items():
