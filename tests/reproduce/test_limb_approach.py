@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsense.reproduce.limb_approach import (
+from capsense.reproduce.limb_approach import run
+from capsense.reproduce.limb_curves import (
     FITS,
     RANGES,
     counts,
     distances,
-    run,
     slopes,
     zero_distance,
 )

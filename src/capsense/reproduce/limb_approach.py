@@ -1,216 +1,34 @@
-"""One electrode comes down onto a forearm: counts against distance, and how steeply they fall.
-
-The limb is a capsule that lies across the electrode's middle. Distance is that between the
-electrode's plane and the nearest skin. Readings are tared at a stated pose, as capacitive
-distance sensors are: :data:`RETREAT`, to the side of the limb and along it.
-"""
+"""One electrode comes down onto a forearm: counts against distance, and how steeply they fall."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-import capsense as cs
-from capsense.design.loader import parse_design
-from capsense.field.background import BuildSettings
-from capsense.field.lattice import LatticeSettings
+from capsense.reproduce.limb_curves import (
+    BACKINGS,
+    BOX,
+    BOXES,
+    CHECK,
+    FITS,
+    GROUNDINGS,
+    MAIN,
+    RADII,
+    RANGES,
+    SIZES,
+    Curves,
+    Setup,
+    counts,
+    distances,
+    read_curves,
+    slopes,
+    zero_distance,
+)
+from capsense.reproduce.limb_plots import plot_approach
 from capsense.reproduce.store import Store
 from capsense.reproduce.study import Cell, Outcome, Report, Row, Table, judged
-from capsense.scene.body import Grounding
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from capsense.design.model import Design
-
-Array = NDArray[np.float64]
-
-RANGES = ((0.01, 0.03), (0.03, 0.06), (0.06, 0.10), (0.10, 0.15))
-"""Distances [m] between which slopes are taken."""
-NEAR = (0.001, 0.002, 0.003, 0.005, 0.007)
-"""Distances below the ranges [m]; at zero a bare electrode would touch the skin."""
-SIZES = (0.03, 0.06, 0.10)
-"""Edges of the square electrodes [m]."""
-RADII = (0.025, 0.04, 0.055)
-"""Radii of the limbs [m]: a wrist, a forearm, a strong upper arm."""
-MAIN = RADII[1]
-"""The limb's radius [m] where only one is looked at."""
-GROUNDINGS: dict[str, Grounding] = {"grounded": "grounded", "100 pF": 1e-10, "floating": "floating"}
-BACKINGS = ("free", "ground plane")
-"""What is behind the electrode: nothing up to the middle of the box, or a plane 10 mm away."""
-PLANE = 0.01
-"""Distance of the ground plane behind the electrode [m]."""
-LIMB_LENGTH = 0.30
-"""Of the limb without its round ends [m]."""
-BOX = 1.5
-"""Edge of the grounded box around it all [m]."""
-BOXES = (0.5, 1.0, 1.5, 2.0)
-"""Boxes that are compared [m]."""
-RETREAT = (0.20, 0.20, 0.15)
-"""The limb at the tare [m]: along itself, to the side, and its distance above the electrode."""
-ACROSS = (0.0, float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)))
-"""Turns a capsule's axis from z to x."""
-
-FITS = {
-    "board": (0.9966, 6.714),
-    "first holder": (0.7825, 7.513),
-    "second holder": (0.8438, 4.681),
-}
-"""(k, b) of readings k/d − b, d in metres, fitted to a sensor on a PR2 above a person's forearm.
-
-From the source code published with Z. Erickson et al., "Tracking Human Pose During Robot-Assisted
-Dressing using Single-Axis Capacitive Proximity Sensing", IEEE RA-L 2018 (arXiv 1709.07957):
-``hrl_dressing/src/hrl_dressing/capacitivepr2.py`` of github.com/gt-ros-pkg/hrl-assistive. The scan
-there rises from touch to 15 cm at 1 cm/s, tared 20 cm along the arm and 20 cm to its side."""
-
-
-@dataclass(frozen=True)
-class Setup:
-    """An electrode and the box around it."""
-
-    size: float = 0.03
-    """Edge of the electrode [m]."""
-    backing: str = "free"
-    box: float = BOX
-    """Edge of the box [m]."""
-    fine: bool = False
-    """Mesh as by default, and not coarser towards the walls."""
-
-    @property
-    def design(self) -> Design:
-        """One square electrode in the box."""
-        back = PLANE if self.backing == "ground plane" else 0.5 * self.box
-        return parse_design(
-            {
-                "name": f"approach_{self.size * 1e3:.0f}mm",
-                "domain": {"size": [self.box] * 3, "backplane": back},
-                "electrode": [{"name": "E1", "shape": "rectangle", "size": [self.size] * 2}],
-            }
-        )
-
-    @property
-    def settings(self) -> BuildSettings:
-        """Boxes of a metre and more are mostly far from everything: larger cells there."""
-        if self.fine:
-            return BuildSettings()
-        far = 0.12 if self.box <= 1.0 else 0.24
-        scale = 1.7 if self.box <= 1.0 else 2.0
-        return BuildSettings(LatticeSettings(far=far, tall=0.12), panel_scale=scale)
-
-
-CHECK = Setup(box=0.5, fine=True)
-"""Tells what the coarser mesh costs."""
-
-
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """What one electrode reads, for each limb radius and grounding."""
-
-    radii: tuple[float, ...]
-    """Of the limbs [m]."""
-    groundings: tuple[str, ...]
-    distance: Array
-    """[m], rising, shape (n,)."""
-    away: Array
-    """Without a limb [F]."""
-    value: Array
-    """At each distance [F], shape (radii, groundings, n)."""
-    retreat: Array
-    """At the tare [F], shape (radii, groundings)."""
-
-    def readings(self, radius: float = MAIN, grounding: str = "grounded") -> tuple[Array, float]:
-        """Readings at each distance [F], shape (n,), and at the tare [F]."""
-        case = self.radii.index(radius), self.groundings.index(grounding)
-        return self.value[case], float(self.retreat[case])
-
-    def change(
-        self, radius: float = MAIN, grounding: str = "grounded", *, tared: bool = True
-    ) -> Array:
-        """Readings less the tare, or less the reading without a limb [F], shape (n,)."""
-        values, retreat = self.readings(radius, grounding)
-        return values - (retreat if tared else self.away)
-
-
-def distances(per_range: int) -> Array:
-    """Distances to be read at [m]; those of a range are even on a log scale."""
-    parts = [np.geomspace(low, high, per_range) for low, high in RANGES]
-    return np.unique(np.round(np.concatenate([NEAR, *parts]), 9))
-
-
-def slopes(distance: Array, change: Array) -> list[float]:
-    """Log–log slope in each of :data:`RANGES`, by least squares; NaN where nothing is left."""
-    out = []
-    for low, high in RANGES:
-        part = (distance > low - 1e-9) & (distance < high + 1e-9)
-        d, c = distance[part], change[part]
-        out.append(float(np.polyfit(np.log(d), np.log(c), 1)[0]) if (c > 0).all() else np.nan)
-    return out
-
-
-def zero_distance(distance: Array, change: Array) -> float:
-    """k/b of the best fit k/d − b from 1 to 15 cm, even in distance: where it reads zero [m]."""
-    even = np.linspace(RANGES[0][0], RANGES[-1][1], 57)
-    k, minus_b = np.polyfit(1 / even, np.interp(even, distance, change), 1)
-    return float(-k / minus_b)
-
-
-def read_curves(
-    store: Store, setup: Setup, radii: tuple[float, ...], names: tuple[str, ...], per_range: int
-) -> Curves:
-    """The curves of one electrode over limbs of these radii [m] and groundings.
-
-    They come from disk if they are there.
-    """
-    design, z = setup.design, distances(per_range)
-
-    def compute() -> dict[str, Array]:
-        sim = cs.Simulator(design, settings=setup.settings)
-        values = np.empty((len(radii), len(names), len(z)))
-        retreat = np.empty(values.shape[:2])
-        for i, k in np.ndindex(retreat.shape):
-            x, y, height = RETREAT
-            retreat[i, k] = _read(sim, radii[i], names[k], (x, y, height))
-            for n in reversed(range(len(z))):
-                values[i, k, n] = _read(sim, radii[i], names[k], (0.0, 0.0, z[n]))
-        return {"away": sim.baseline[0, 0], "value": values, "retreat": retreat}
-
-    inputs = {
-        "design": design.content_hash(), "settings": repr(setup.settings), "radii": list(radii),
-        "groundings": list(names), "distance": z, "retreat": list(RETREAT), "length": LIMB_LENGTH,
-    }  # fmt: skip
-    label = f"{setup.size * 1e3:.0f}mm-{setup.backing.replace(' ', '-')}-{setup.box:g}m"
-    found = store.get(label, inputs, compute)
-    return Curves(radii, names, z, found["away"], found["value"], found["retreat"])
-
-
-def _read(
-    sim: cs.Simulator, radius: float, grounding: str, place: tuple[float, float, float]
-) -> float:
-    x, y, distance = place
-    limb = cs.Body(
-        cs.Capsule(radius, LIMB_LENGTH), cs.Pose((x, y, distance + radius), ACROSS), "human",
-        GROUNDINGS[grounding],
-    )  # fmt: skip
-    return float(sim.step(cs.Scene([limb])).self_capacitance[0])
-
-
-def counts(values: Array, tare: float) -> Array:
-    """Tared codes of an AD7147 that rests half a second at each reading [F], averaged, (n,)."""
-    readout = cs.ReadOut.preset("ad7147", ["E1"], seed=1)
-    held = np.concatenate([[tare], values])
-    start = 0.5 * np.arange(len(held))
-    times = np.stack([start, start + 0.499], axis=1).ravel()
-    found = readout(times, np.repeat(held, 2)[:, None])
-    pose, within = np.divmod(found.time, 0.5)
-    rests = (within > 0.01) & (within < 0.49)  # no conversion on the way to the next
-    pose = pose[rests].astype(int)
-    mean = np.bincount(pose, found.code[rests]) / np.bincount(pose)
-    return mean[1:] - mean[0]
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
@@ -236,7 +54,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         "Limb approach: one electrode above a forearm",
         tuple(_rows(first, cases, in_boxes, curves[CHECK])),
         _tables(first, cases, in_boxes),
-        {"limb_approach": _plot(cases, in_boxes)},
+        {"limb_approach": plot_approach(cases, in_boxes)},
         NOTES,
         store.told(),
     )
@@ -333,52 +151,6 @@ def _tables(
 def _cells(values: list[float]) -> tuple[str, ...]:
     """Slopes as text; a dash where the tared reading is not positive throughout."""
     return tuple("–" if np.isnan(v) else f"{v:.2f}" for v in values)
-
-
-def _plot(cases: dict[Setup, Curves], boxes: dict[Setup, Curves]) -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4.2))
-    left, middle, right = figure.subplots(1, 3)
-    for setup, found in cases.items():
-        left.plot(
-            1e2 * found.distance, 1e15 * found.change(), _line(setup),
-            color=f"C{SIZES.index(setup.size)}",
-            label=f"{setup.size * 1e3:.0f} mm, {setup.backing}",
-        )  # fmt: skip
-    found = next(iter(cases.values()))
-    z, change = found.distance, found.change()
-    for name in GROUNDINGS:
-        middle.plot(1e2 * z, 1e15 * found.change(MAIN, name), label=name)
-    meet = 0.03  # where the hardware's curves are laid on ours
-    scale = float(np.interp(meet, z, change))
-    for n, (name, (k, b)) in enumerate(FITS.items()):
-        fit = k / z - b
-        seen = np.where((fit > 0) & (z > 0.009), fit * scale / (k / meet - b), np.nan)
-        grey = f"{0.2 + 0.25 * n}"
-        middle.plot(1e2 * z, 1e15 * seen, color=grey, lw=1, ls=":", label=f"hardware, {name}")
-    for setup, c in boxes.items():
-        right.plot(
-            1e2 * c.distance, 1e15 * c.change(tared=False), _line(setup),
-            color=f"C{BOXES.index(setup.box)}", label=f"{setup.box:g} m, {setup.backing}",
-        )  # fmt: skip
-    titles = (
-        "electrode; limb grounded, 40 mm", "path to ground; 30 mm free",
-        "box; 30 mm, limb away as tare",
-    )  # fmt: skip
-    for axis, title in zip((left, middle, right), titles, strict=True):
-        axis.set(xscale="log", yscale="log", xlabel="distance, cm", title=title, xlim=(0.1, 15))
-        axis.set_xticks([0.1, 0.3, 1, 3, 6, 15], labels=["0.1", "0.3", "1", "3", "6", "15"])
-        axis.minorticks_off()
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=7, loc="lower left")
-    left.set_ylabel("change of capacitance, fF")
-    figure.tight_layout()
-    return figure
-
-
-def _line(setup: Setup) -> str:
-    return "-" if setup.backing == "free" else "--"
 
 
 NOTES = (
