@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +52,20 @@ def test_any_input_makes_another_unit(tmp_path: Path) -> None:
         assert (store.computed, store.reused) == (6, 6 * round_)
 
 
-def test_a_damaged_part_is_computed_again(tmp_path: Path) -> None:
-    """A file cut short is replaced; no half-written file takes a part's name."""
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole[:100],
+        lambda whole: b"",
+        lambda whole: whole[:60] + bytes(20) + whole[80:],  # inflate fails
+        lambda whole: whole.replace(b"PK\x01\x02", b"PK\x01\x03"),
+    ],
+)
+def test_a_damaged_part_is_computed_again(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    """A file cut short or with wrong bytes is replaced; no half-written one takes its name."""
     Store(tmp_path).get("u", {}, lambda: {"a": np.arange(1000)})
     (part,) = (tmp_path / "parts").iterdir()
-    part.write_bytes(part.read_bytes()[:100])
+    part.write_bytes(damage(part.read_bytes()))
     store = Store(tmp_path)
     np.testing.assert_array_equal(store.get("u", {}, lambda: {"a": [7]})["a"], [7])
     assert store.computed == 1

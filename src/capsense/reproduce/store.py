@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import sys
-import zipfile
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -82,8 +81,10 @@ def _load(path: Path) -> Arrays | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {key: file[key] for key in file.files}
-    except (FileNotFoundError, zipfile.BadZipFile, ValueError, EOFError):
-        return None  # not there, or damaged: computed again
+    except FileNotFoundError:
+        return None
+    except Exception:  # damaged, of which zip, inflate and numpy's reader each complain differently
+        return None
 
 
 def _digest(inputs: Mapping[str, Any], module: str) -> str:
