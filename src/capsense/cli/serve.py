@@ -52,6 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--origin", metavar="URL", action="append", default=[],
         help="web page that may connect; may be repeated",
     )  # fmt: skip
+    parser.add_argument(
+        "--watch", action="store_true", help="let clients watch others' sensors (capsense view)"
+    )
     for name, what in _LIMITS.items():
         parser.add_argument(f"--max-{name}", metavar="N", type=int, help=what)
     parser.add_argument("-q", "--quiet", action="store_true", help="log faults only")
@@ -77,7 +80,7 @@ def execute(args: argparse.Namespace) -> int:
 
     options = Options(
         tuple(args.design), args.readout, args.host, args.port, read_token(args.token_file),
-        tuple(args.origin), _limits(args),
+        tuple(args.origin), _limits(args), args.watch,
     )  # fmt: skip
     logger = _logger(quiet=args.quiet)
     with Interrupt(), BuildProgress(shown=not args.quiet and sys.stderr.isatty()) as progress:

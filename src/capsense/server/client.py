@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import MissingDependencyError, ProtocolError
-from capsense.server.frames import PROTOCOL, ReadingMessage, pack_depth, unpack_reading
+from capsense.server.frames import (
+    PROTOCOL,
+    DepthMessage,
+    ReadingMessage,
+    is_depth,
+    pack_depth,
+    unpack_depth,
+    unpack_reading,
+)
 
 Array = NDArray[np.float64]
 
@@ -107,13 +115,17 @@ class Client:
             found = self.receive(limit - time.monotonic())
             if isinstance(found, ReadingMessage):
                 self._keep(found)
+            elif isinstance(found, DepthMessage):
+                continue
             elif found["type"] == "error":
                 raise ProtocolError(found["message"], found["code"])
             elif found["type"] == answer:
                 return found
 
-    def receive(self, timeout: float | None = None) -> ReadingMessage | dict[str, Any]:
-        """The next message: a reading, or a control message.
+    def receive(
+        self, timeout: float | None = None
+    ) -> ReadingMessage | DepthMessage | dict[str, Any]:
+        """The next message: a reading, a control message, or what a watched sensor sees.
 
         Raises:
             ProtocolError: Nothing came in time, or the connection is closed.
@@ -127,7 +139,9 @@ class Client:
             raise ProtocolError(f"no answer within {self.timeout:g} s", "timeout") from None
         except ConnectionClosed as error:
             raise _closed(error) from None
-        return unpack_reading(message) if isinstance(message, bytes) else json.loads(message)
+        if isinstance(message, str):
+            return json.loads(message)
+        return unpack_depth(message) if is_depth(message) else unpack_reading(message)
 
     def reading(self, sensor: int, sequence: int) -> ReadingMessage:
         """Wait for the reading of a frame; readings of other sensors are kept for their turn.
@@ -145,6 +159,8 @@ class Client:
             found = self.receive(limit - time.monotonic())
             if isinstance(found, ReadingMessage):
                 self._keep(found)
+            elif isinstance(found, DepthMessage):
+                continue
             elif found["type"] == "error" and found.get("sensor", sensor) == sensor:
                 raise ProtocolError(found["message"], found["code"])
 

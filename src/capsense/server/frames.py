@@ -129,7 +129,12 @@ def pack_depth(
 _EXTRA: dict[Flag, np.dtype] = {Flag.CODES: np.dtype("u1"), Flag.FLOATS: np.dtype("<f4")}
 
 
-def unpack_depth(message: bytes, max_pixels: int) -> DepthMessage:
+def is_depth(message: bytes) -> bool:
+    """Whether a binary message claims to be a depth image."""
+    return len(message) >= HEADER.size and HEADER.unpack_from(message)[2] == Kind.DEPTH
+
+
+def unpack_depth(message: bytes, max_pixels: int = 2**32) -> DepthMessage:
     """The depth image in a message; its arrays look into ``message``.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NoReturn, cast
 
@@ -41,6 +41,8 @@ CODES = {
     "sensor": "no sensor of that number is open, or one is already",
     "sequence": "a sequence number does not exceed the one before",
     "scene": "a depth frame, body, material or design is wrong",
+    "watch": "this server does not let its clients watch sensors, or a client would both watch "
+    "and have sensors",
     "readout": "the read-out cannot go from the last time to this one",
     "solve": "the solver did not reach its tolerance",
     "internal": "a fault of the server; its log says more",
@@ -79,6 +81,17 @@ class Open:
     """Of frames without permittivities."""
     grounding: Grounding
     back: Literal["fill"] | float
+    table: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    """The message itself."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """A sensor of another client is to be watched."""
+
+    client: int | None
+    """Number of the client; None for whichever sensor was opened last."""
+    sensor: int
 
 
 @dataclass(frozen=True)
@@ -89,6 +102,8 @@ class Bodies:
     sequence: int
     time: float
     bodies: tuple[Body, ...]
+    tables: tuple[Mapping[str, Any], ...]
+    """What the client said of them; they may have moved since."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +183,21 @@ def read_open(table: Table) -> Open:
         read_material(options),
         read_grounding(options),
         back,
+        table.data,
     )
+
+
+def read_watch(table: Table) -> Watch:
+    """Read a ``watch``.
+
+    Raises:
+        ProtocolError: A key, type or number is wrong.
+    """
+    table.only(("type", "client", "sensor"))
+    if "client" not in table:
+        table.only(("type",))
+        return Watch(None, 0)
+    return Watch(table.integer("client", 0, MAX_SEQUENCE), _sensor(table))
 
 
 def _read_camera(table: Table) -> OrthographicCamera:
@@ -205,7 +234,7 @@ def read_scene(table: Table, max_bodies: int) -> Bodies:
             raise table.error("meshes and trajectories are not taken here; send depth frames, or "
                               "a new pose for every step")  # fmt: skip
     bodies = read_bodies(ScenarioTable({"body": raw}, "message", "scene"), Path())
-    return Bodies(*read_address(table), tuple(b.body for b in bodies))
+    return Bodies(*read_address(table), tuple(b.body for b in bodies), tuple(raw))
 
 
 def read_poses(table: Table, max_bodies: int) -> Poses:

@@ -66,6 +66,8 @@ class Options:
     origins: tuple[str, ...] = ()
     """Web pages that may connect, such as ``http://localhost:3000``; other programs always may."""
     limits: Limits = field(default_factory=Limits)
+    watch: bool = False
+    """Whether clients may watch the sensors of others."""
 
     def __post_init__(self) -> None:
         if not self.designs:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import json
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,7 @@ from capsense.server.frames import (
     NO_DETECTOR,
     DepthMessage,
     ReadingMessage,
+    pack_depth,
     pack_reading,
 )
 from capsense.server.messages import Bodies, Open, Poses
@@ -26,6 +30,13 @@ from capsense.simulator import Reading, Simulator
 MAX_CONVERSIONS = 10_000
 """A step in time that spans more conversions of the read-out than this is refused."""
 Frame = DepthMessage | Bodies
+
+
+class Watcher(Protocol):
+    """Somebody who watches a sensor."""
+
+    def show(self, *messages: str | bytes) -> None:
+        """Send these, in place of any that are not sent yet."""
 
 
 class ServedSensor:
@@ -54,7 +65,12 @@ class ServedSensor:
         """Frames that newer ones replaced."""
         self._waiting: Frame | None = None
         self._last = -1
+        self.watchers: set[Watcher] = set()
+        """Who is shown what this sensor sees and reads."""
+        self.left = False
+        """Whether it was closed."""
         self._bodies: dict[str, Body] = {}
+        self._tables: tuple[Mapping[str, Any], ...] = ()
         self._time: float | None = None
 
     def offer(self, frame: Frame | Poses) -> None:
@@ -74,6 +90,7 @@ class ServedSensor:
             frame = self._moved(frame)
         if isinstance(frame, Bodies):
             self._bodies = {str(b.name): b for b in frame.bodies}
+            self._tables = frame.tables
         self.frames += 1
         self.dropped += self._waiting is not None
         self._waiting = frame
@@ -114,6 +131,23 @@ class ServedSensor:
             )
         )  # fmt: skip
 
+    def show(self, frame: Frame, reading: bytes) -> None:
+        """Let all who watch see a frame, and the reading that answers it."""
+        if self.watchers:
+            seen = scene_message(frame) if isinstance(frame, Bodies) else pack_depth(
+                frame.sensor, frame.sequence, frame.time, frame.depth, frame.eps_r
+            )  # fmt: skip
+            for watcher in self.watchers:
+                watcher.show(seen, reading)
+
+    def leave(self) -> None:
+        """Tell all who watch that there is nothing more to see."""
+        self.left = True
+        gone = json.dumps({"type": "unwatched", "sensor": self.options.sensor})
+        for watcher in self.watchers:
+            watcher.show(gone)
+        self.watchers.clear()
+
     def _moved(self, message: Poses) -> Bodies:
         for name in message.poses:
             if name not in self._bodies:
@@ -121,7 +155,7 @@ class ServedSensor:
                 raise ProtocolError(f"the last scene has no body {name!r}; it has {known}", "scene")
         moved = {name: self._bodies[name].moved(pose) for name, pose in message.poses.items()}
         bodies = tuple({**self._bodies, **moved}.values())
-        return Bodies(message.sensor, message.sequence, message.time, bodies)
+        return Bodies(message.sensor, message.sequence, message.time, bodies, self._tables)
 
     def _world(self, frame: Frame) -> Scene | DepthFrame:
         if isinstance(frame, Bodies):
@@ -150,6 +184,22 @@ class ServedSensor:
         counts = self.readout.sample(time, reading)
         self._time = time
         return counts
+
+
+def scene_message(frame: Bodies) -> str:
+    """The ``scene`` that is these bodies where they stand."""
+    bodies = [
+        {key: value for key, value in table.items() if key != "pose"}
+        | {
+            "pose": {
+                "position": list(map(float, body.pose.position)),
+                "quaternion": list(map(float, body.pose.quaternion)),
+            }
+        }
+        for table, body in zip(frame.tables, frame.bodies, strict=True)
+    ]
+    address = {"sensor": frame.sensor, "sequence": frame.sequence, "time": frame.time}
+    return json.dumps({"type": "scene", **address, "body": bodies})
 
 
 def _conversions(counts: Counts | None) -> NDArray[np.void]:

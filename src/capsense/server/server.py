@@ -22,7 +22,7 @@ from capsense.readout.read_out import ReadOut
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
 from capsense.server.frames import PROTOCOL
-from capsense.server.messages import Open
+from capsense.server.messages import Open, Watch
 from capsense.server.options import Options
 from capsense.server.sensor import ServedSensor
 from capsense.simulator import Simulator
@@ -153,6 +153,27 @@ class Server:
             )
         simulator = self._templates[name].sibling()
         return ServedSensor(wanted, simulator, self._make_readout(simulator, wanted.sensor))
+
+    def find(self, wanted: Watch) -> tuple[int, ServedSensor]:
+        """A sensor that is to be watched, and the number of its client.
+
+        Raises:
+            ProtocolError: It is not open, or none may be watched.
+        """
+        if not self.options.watch:
+            raise ProtocolError(
+                "sensors of this server may not be watched; start it with --watch", "watch"
+            )
+        there = [(n, s) for n, c in self._sessions.items() for s in c.sensors.values()]
+        address = wanted.client, wanted.sensor
+        found = [
+            p for p in there if wanted.client is None or address == (p[0], p[1].options.sensor)
+        ]
+        if not found:
+            what = "sensor" if wanted.client is None else f"sensor {address[0]}:{address[1]}"
+            known = ", ".join(f"{n}:{s.options.sensor}" for n, s in there) or "none"
+            raise ProtocolError(f"there is no {what} to watch; open are {known}", "sensor")
+        return found[-1]
 
     async def work(self, job: Callable[[], T]) -> T:
         """Do a job in a worker thread."""

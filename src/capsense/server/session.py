@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from websockets.exceptions import ConnectionClosed
 
 from capsense.errors import CapSenseError, ProtocolError
+from capsense.recording.design_json import design_to_json
 from capsense.server import messages
 from capsense.server.frames import PROTOCOL, unpack_depth
 from capsense.server.options import Options
@@ -41,6 +42,8 @@ class Hall(Protocol):
 
     def make_sensor(self, wanted: messages.Open) -> ServedSensor: ...
 
+    def find(self, wanted: messages.Watch) -> tuple[int, ServedSensor]: ...
+
     async def work(self, job: Callable[[], T]) -> T: ...
 
     def log(self, event: str, **fields: Any) -> None: ...
@@ -70,10 +73,12 @@ class Session:
         self._limits = hall.options.limits
         self._wake = asyncio.Event()
         self._left = False
+        self._watched: ServedSensor | None = None
+        self._to_show: tuple[str | bytes, ...] = ()
         self._allowance, self._counted = ALLOWANCE, time.monotonic()
         self._handlers: dict[str, Callable[[messages.Table], Any]] = {
             "open": self._open, "close": self._close, "reset": self._reset,
-            "scene": self._scene, "poses": self._poses,
+            "scene": self._scene, "poses": self._poses, "watch": self._watch,
         }  # fmt: skip
 
     async def run(self) -> None:
@@ -96,7 +101,15 @@ class Session:
         finally:
             self._left = True
             self._wake.set()
+            self._unwatch()
+            for sensor in self.sensors.values():
+                sensor.leave()
             await solver
+
+    def show(self, *messages: str | bytes) -> None:
+        """Send what a watched sensor sees, in place of what is not sent yet."""
+        self._to_show = messages
+        self._wake.set()
 
     async def dismiss(self, code: str, text: str, close_code: int = POLICY) -> None:
         """Say what is wrong, and close the connection."""
@@ -163,6 +176,8 @@ class Session:
 
     async def _open(self, table: messages.Table) -> None:
         wanted = messages.read_open(table)
+        if self._watched is not None:
+            raise ProtocolError("a client that watches opens no sensors; connect again", "watch")
         if wanted.sensor in self.sensors:
             raise ProtocolError(f"sensor {wanted.sensor} is open already; close it first", "sensor")
         if len(self.sensors) >= self._limits.sensors:
@@ -189,11 +204,34 @@ class Session:
         number = sensor.options.sensor
         async with sensor.lock:
             del self.sensors[number]
+        sensor.leave()
         self._hall.log("closed", client=self.number, sensor=number)
         await self._tell(
             "closed", sensor=number, frames=sensor.frames, readings=sensor.readings,
             dropped=sensor.dropped,
         )  # fmt: skip
+
+    async def _watch(self, table: messages.Table) -> None:
+        wanted = messages.read_watch(table)
+        if self.sensors:
+            raise ProtocolError("a client that has sensors watches none; close them", "watch")
+        client, sensor = self._hall.find(wanted)
+        design = await self._hall.work(lambda: design_to_json(sensor.simulator.design))
+        self._unwatch()
+        await self._tell(
+            "watching", client=client, sensor=sensor.options.sensor, open=sensor.options.table,
+            design=json.loads(design), baseline=sensor.simulator.baseline.tolist(),
+        )  # fmt: skip
+        self._hall.log("watches", client=self.number, watched=client, sensor=sensor.options.sensor)
+        self._watched = sensor
+        sensor.watchers.add(self)
+        if sensor.left:  # meanwhile
+            sensor.leave()
+
+    def _unwatch(self) -> None:
+        if self._watched is not None:
+            self._watched.watchers.discard(self)
+        self._watched, self._to_show = None, ()
 
     async def _reset(self, table: messages.Table) -> None:
         sensor = self._sensor(messages.read_sensor(table))
@@ -232,10 +270,21 @@ class Session:
                         await self._solve(sensor, frame)
                 if self._left:
                     return
+            await self._send_shown()
+
+    async def _send_shown(self) -> None:
+        shown, self._to_show = self._to_show, ()
+        try:
+            for message in shown:
+                await self._send(message)
+        except ConnectionClosed:
+            self._left = True
 
     async def _solve(self, sensor: ServedSensor, frame: Frame) -> None:
         try:
-            await self._send(await self._hall.work(lambda: sensor.solve(frame)))
+            reading = await self._hall.work(lambda: sensor.solve(frame))
+            await self._send(reading)
+            sensor.show(frame, reading)
             self.readings += 1
         except ConnectionClosed:
             self._left = True
