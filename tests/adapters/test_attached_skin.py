@@ -197,6 +197,32 @@ def test_each_sensor_has_its_own_chip() -> None:
     assert all(r.counts is not None and len(r.counts.time) for r in readings.values())
 
 
+def test_chips_start_at_the_simulators_time(tiny_simulator: cs.Simulator) -> None:
+    """Sensors attached, or reset, in the middle of a simulation do not report what was before."""
+    arm = MujocoArm()
+    arm.data.time = 50.0
+    skin = arm.skin(tiny_simulator, readout="fdc1004")
+    for start in (50.0, 70.0):
+        arm.data.time = start
+        skin.reset()
+        arm.data.time = start + 0.1
+        for reading in skin.read().values():
+            assert start < reading.counts.time.min() <= start + 0.0101
+    arm.data.time = 90.0
+    sensor = arm.single("a", tiny_simulator)
+    sensor.use_readout("fdc1004")
+    sensor.restart_readout(seed=5)
+    arm.data.time = 90.1
+    assert sensor.read().counts.time.min() > 90.0
+    assert sensor.readout.seed == 5
+
+
+def test_a_readout_is_not_shared(tiny_simulator: cs.Simulator) -> None:
+    readout = cs.ReadOut.preset("fdc1004", tiny_simulator.electrode_names)
+    with pytest.raises(cs.ReadOutError, match="would be shared by all sensors"):
+        MujocoArm().skin(tiny_simulator, readout=readout)
+
+
 def test_mujoco_names(tiny_simulator: cs.Simulator) -> None:
     """Slips in names are refused."""
     arm = MujocoArm()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from capsense._validate import suggest
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import SceneError
+from capsense.errors import ReadOutError, SceneError
 from capsense.readout.config import choose_readout
 from capsense.readout.read_out import ReadOut
 from capsense.scene import DepthFrame, Pose, Scene
@@ -59,17 +59,32 @@ class AttachedSensor(ABC):
         reading = self.simulator.step(world)
         return replace(reading, counts=self.readout.sample(now, reading))
 
-    def use_readout(self, readout: ReadOut | str | None) -> None:
-        """Read through a chip from now on.
+    def use_readout(self, readout: ReadOut | str | Path | None) -> None:
+        """Read through a chip from now on: it starts at the simulator's time, or at 0 s.
 
         Args:
-            readout: A read-out, the name of a chip with its usual settings, the path of a read-out
-                file (``.toml``), or None.
+            readout: A read-out of this sensor alone, the name of a chip with its usual settings,
+                the path of a read-out file (``.toml``), or None.
 
         Raises:
             ReadOutError: There is no such chip or file, or the file is wrong.
         """
         self.readout = make_readout(readout, self.simulator)
+        self.restart_readout()
+
+    def restart_readout(self, seed: int | None = None) -> None:
+        """Switch the chip on anew, at the simulator's time, or at 0 s if that is not told.
+
+        Args:
+            seed: Of its noise from now on; by default random numbers repeat.
+        """
+        if self.readout is None:
+            return
+        try:
+            start = self._time()
+        except SceneError:
+            start = 0.0
+        self.readout.reset(start=start, seed=seed)
 
     @property
     def time(self) -> float:
@@ -125,8 +140,7 @@ class AttachedSensor(ABC):
     def reset(self) -> None:
         """Forget the previous step, as after the simulator was set back; restart the read-out."""
         self.simulator.reset()
-        if self.readout is not None:
-            self.readout.reset()
+        self.restart_readout()
 
 
 class DepthSensor(AttachedSensor):
@@ -263,14 +277,16 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
     return design if isinstance(design, Simulator) else Simulator(design)
 
 
-def make_readout(readout: ReadOut | str | None, simulator: Simulator) -> ReadOut | None:
+def make_readout(readout: ReadOut | str | Path | None, simulator: Simulator) -> ReadOut | None:
     """The read-out given, or that of a chip or a file for a simulator's electrodes.
 
     Raises:
         ReadOutError: There is no such chip or file, or the file is wrong.
     """
-    if not isinstance(readout, str):
+    if readout is None or isinstance(readout, ReadOut):
         return readout
+    if not isinstance(readout, str | Path):
+        raise ReadOutError(f"readout is {readout!r}; give a chip's name, a file, or a ReadOut")
     empty = simulator.step(Scene())
     simulator.reset()
     return choose_readout(readout, simulator.electrode_names, empty)

@@ -139,7 +139,7 @@ def attach(
     size: float | None = None,
     resolution: int | None = None,
     back: str | float = "fill",
-    readout: ReadOut | str | None = None,
+    readout: ReadOut | str | Path | None = None,
 ) -> CoppeliaSensor:
     """Attach a sensor to an object; call ``read()`` after every step.
 
@@ -209,7 +209,7 @@ def attach(
         eye = make_eye(remote, handle, pose, size, far, pixels, paint.collection)
         material = None  # the colours say it
     sensor = CoppeliaSensor(remote, eye, simulator, grounding, back, paint, material)
-    sensor.readout = chip
+    sensor.use_readout(chip)
     return sensor
 
 

@@ -50,7 +50,7 @@ def attach(
     groups: Collection[int] | None = None,
     camera: str | None = None,
     back: str | float = "fill",
-    readout: ReadOut | str | None = None,
+    readout: ReadOut | str | Path | None = None,
 ) -> MujocoSensor | MujocoDepthSensor:
     """Attach a sensor to a site of a model; call ``read()`` after every ``mj_step``.
 
@@ -143,7 +143,7 @@ def attach_skin(
     exclude_own: bool = True,
     hull: Sequence[str] = (),
     groups: Collection[int] | None = None,
-    readout: str | None = None,
+    readout: str | Path | None = None,
     threads: int | None = None,
 ) -> AttachedSkin:
     """Attach a sensor to each of several sites; one ``read()`` reads them all, in parallel.
@@ -165,7 +165,7 @@ def attach_skin(
         exclude_own: Leave out the geoms of the body that carries a sensor, for that sensor.
         hull: Name patterns of mesh geoms that are taken as their convex hulls.
         groups: See only geoms of these groups; default all.
-        readout: Name of the chip behind every sensor.
+        readout: Name of the chip behind every sensor, or the path of a read-out file.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:

@@ -57,7 +57,7 @@ def attach(
     size: float | None = None,
     resolution: int = 64,
     back: str | float = "fill",
-    readout: ReadOut | str | None = None,
+    readout: ReadOut | str | Path | None = None,
 ) -> PybulletSensor | PybulletDepthSensor:
     """Attach a sensor to a link; call ``read()`` after every ``stepSimulation``.
 
@@ -152,7 +152,7 @@ def attach_skin(
     exclude_own: bool = True,
     hull: Sequence[str] = (),
     sheet_thickness: float = 1e-3,
-    readout: str | None = None,
+    readout: str | Path | None = None,
     threads: int | None = None,
 ) -> AttachedSkin:
     """Attach several sensors to a robot's links; one ``read()`` reads them all, in parallel.
@@ -175,7 +175,7 @@ def attach_skin(
         exclude_own: Leave out the link that carries a sensor, for that sensor.
         hull: Name patterns of links whose visual meshes are taken as their convex hulls.
         sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
-        readout: Name of the chip behind every sensor.
+        readout: Name of the chip behind every sensor, or the path of a read-out file.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:

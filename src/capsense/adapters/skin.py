@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 
 from capsense._crew import Crew
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
-from capsense.errors import SceneError
+from capsense.errors import ReadOutError, SceneError
+from capsense.readout.read_out import ReadOut
 from capsense.scene import Pose
 from capsense.simulator import Reading, Simulator
 from capsense.skin import AnyDesign, make_simulators, read_all
@@ -18,18 +20,22 @@ class AttachedSkin:
 
     Args:
         sensors: Name → sensor; they share one source of their world.
-        readout: Name of the chip behind every sensor, or None. Each has noise of its own: their
-            seeds count up, in the order of the sensors.
+        readout: Name of the chip behind every sensor, the path of a read-out file, or None. Each
+            has noise of its own: their seeds count up, in the order of the sensors.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
         SceneError: ``threads`` is not a positive whole number.
-        ReadOutError: There is no such chip.
+        ReadOutError: There is no such chip or file, or the file is wrong.
     """
 
     def __init__(
-        self, sensors: Mapping[str, GeometrySensor], readout: str | None, threads: int | None
+        self, sensors: Mapping[str, GeometrySensor], readout: str | Path | None, threads: int | None
     ) -> None:
+        if isinstance(readout, ReadOut):
+            raise ReadOutError(
+                f"{readout!r} would be shared by all sensors; give a chip's name or a file"
+            )
         self.sensors = dict(sensors)
         """The sensors, as ``attach`` makes them."""
         self._source = next(iter(self.sensors.values())).source
@@ -37,7 +43,7 @@ class AttachedSkin:
         for number, sensor in enumerate(self.sensors.values()):
             sensor.use_readout(readout)
             if sensor.readout is not None:
-                sensor.readout.reset(seed=sensor.readout.seed + number)
+                sensor.restart_readout(sensor.readout.seed + number)
 
     def read(self, time: float | None = None) -> dict[str, Reading]:
         """The readings of the simulator's present state, by name.
