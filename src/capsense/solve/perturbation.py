@@ -81,6 +81,7 @@ class PerturbationSolver:
         self._inside, self._inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
         self._counts = np.zeros(4, np.int64)
         self._found = _Found(self._mesh, max(4096, n // 4))
+        self._pool: list[_Block] = []
         self._blocks: list[_Block] = []
         self._lanes: tuple[object, ...] = ()
         self._rested = True
@@ -106,7 +107,7 @@ class PerturbationSolver:
         conductors = _Conductors(scene, self.frequency)
         n_tie, n_energy, n_couple = self._trace(scene, conductors)
         lanes, grounds = conductors.lanes(n_terminals)
-        self._prepare(scene, conductors, lanes, n_terminals + len(grounds))
+        self._prepare(scene, lanes, n_terminals + len(grounds))
         energy, iterations, left, goal = self._solve_blocks(n_tie, n_energy, lanes)
         energy = energy[: n_terminals + len(grounds), : n_terminals + len(grounds)]
         conductors.add_couplings(energy, self._found.couples[:n_couple], lanes)
@@ -174,9 +175,7 @@ class PerturbationSolver:
                 )
             self._found = _Found(mesh, 2 * len(found.ties))
 
-    def _prepare(
-        self, scene: Scene, conductors: _Conductors, lanes: NDArray[np.int64], n_lanes: int
-    ) -> None:
+    def _prepare(self, scene: Scene, lanes: NDArray[np.int64], n_lanes: int) -> None:
         """Build diagonal and preconditioner; carry the last solution over."""
         la = self.background.lattice
         found, mesh = self._found, self._mesh
@@ -186,12 +185,7 @@ class PerturbationSolver:
         )  # fmt: skip
         signature = (len(scene), *lanes.tolist())
         if signature != self._lanes:
-            old = self._blocks
-            self._blocks = self._make_blocks(n_lanes)
-            for block, last in zip(self._blocks, old, strict=False):
-                keep = min(LANES, self._n_terminals - block.first)
-                if keep > 0:
-                    block.u[:, :keep] = last.u[:, :keep]
+            self._assign_lanes(n_lanes)
             self._lanes = signature
         if not self._rested:
             woken = self._woken[:n_woken]
@@ -199,18 +193,13 @@ class PerturbationSolver:
                 block.u[woken] = -block.phi[woken]
         self._rested = False
 
-    def _make_blocks(self, n_lanes: int) -> list[_Block]:
-        phi = self.background.potentials
-        n = len(phi)
-        blocks = []
-        for first in range(0, n_lanes, LANES):
-            block = np.zeros((n, LANES), np.float32)
-            part = phi[:, first : first + LANES]
-            block[:, : part.shape[1]] = part
-            held = np.arange(first, first + LANES)
-            held[held >= self._n_terminals] = -1
-            blocks.append(_Block(first, block, held))
-        return blocks
+    def _assign_lanes(self, n_lanes: int) -> None:
+        """Have as many blocks as needed; the lanes of terminals keep their solution."""
+        for first in range(LANES * len(self._pool), n_lanes, LANES):
+            self._pool.append(_Block(first, self.background.potentials))
+        self._blocks = self._pool[: -(-n_lanes // LANES)]
+        for block in self._blocks:
+            block.u[:, max(0, self._n_terminals - block.first) :] = 0.0
 
     def _solve_blocks(
         self, n_tie: int, n_energy: int, lanes: NDArray[np.int64]
@@ -336,11 +325,19 @@ class _Conductors:
 
 
 class _Block:
-    """Eight right-hand sides."""
+    """Eight right-hand sides, from lane ``first`` on."""
 
-    def __init__(self, first: int, phi: Array32, held: NDArray[np.int64]) -> None:
-        self.first, self.phi, self.held = first, phi, held
-        self.rhs, self.u, self.r, self.z, self.p, self.ap = (np.zeros_like(phi) for _ in range(6))
+    def __init__(self, first: int, potentials: Array) -> None:
+        self.first = first
+        self.phi = np.zeros((len(potentials), LANES), np.float32)
+        part = potentials[:, first : first + LANES]
+        self.phi[:, : part.shape[1]] = part
+        self.held = np.arange(first, first + LANES)
+        """Terminal of each lane, or −1."""
+        self.held[part.shape[1] :] = -1
+        self.rhs, self.u, self.r, self.z, self.p, self.ap = (
+            np.zeros_like(self.phi) for _ in range(6)
+        )
         self.value = np.empty((0, LANES))
         self.drop = np.empty((0, LANES))
 
