@@ -33,12 +33,14 @@ class Playback(Protocol):
     """Whether the end is followed by the beginning."""
     field: bool
     """Whether potentials are wanted."""
-    newest: Shot | None
-    """What is to be shown."""
     with_field: Shot | None
     """The last one whose potentials were taken."""
     failure: CapSenseError | None
     """What stopped it; None again once it goes on."""
+
+    @property
+    def newest(self) -> Shot | None:
+        """What is to be shown; None before there is any."""
 
     @property
     def source(self) -> Source:

@@ -1,26 +1,23 @@
-"""Where the shots of a view come from: a scenario, a recording, or a server."""
+"""Where the shots of a view come from: a scenario, or a recording."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design import Design
-from capsense.errors import RecordingError, ScenarioError
-from capsense.recording.session import reading_of
+from capsense.errors import RecordingError
 from capsense.scenario import Channel, Scenario
 from capsense.scene import Scene
-from capsense.simulator import Reading, Simulator, StepStats
+from capsense.simulator import Reading, Simulator
 
 if TYPE_CHECKING:
     from capsense.field.lattice import Lattice
     from capsense.recording.reader import Recording
-    from capsense.server.client import Client
-    from capsense.server.frames import ReadingMessage
 
 Array = NDArray[np.float64]
 
@@ -55,6 +52,24 @@ class Source(Protocol):
         """Let go of what is held."""
 
 
+class Stream(Source, Protocol):
+    """Instants that come by themselves."""
+
+    def next(self, timeout: float) -> Shot | None:
+        """The next one; None if none came within a time [s].
+
+        Raises:
+            CapSenseError: There will be none, or not before another call finds a new beginning.
+        """
+
+    def potentials(self, shot: Shot) -> Array:
+        """Potentials of an instant at the lattice's nodes [V], shape (n, terminals).
+
+        Raises:
+            CapSenseError: They could not be had.
+        """
+
+
 class Seekable(Source, Protocol):
     """A row of instants, any of which can be asked for."""
 
@@ -86,7 +101,7 @@ class ScenarioSource:
         self.times, self.channels = scenario.times, scenario.channels
         self._scenario, self._simulator = scenario, simulator
         self.empty = simulator.step(Scene())
-        self.lattice = _lattice_of(simulator)
+        self.lattice = lattice_of(simulator)
 
     def shot(self, index: int, *, field: bool) -> Shot:
         """See :class:`Seekable`."""
@@ -123,7 +138,7 @@ class RecordingSource:
         self.times = np.array([step.clock for step in self._steps])
         self.channels, self.empty = session.channels, session.empty
         self._simulator = session.simulator(progress=progress)
-        self.lattice = _lattice_of(self._simulator)
+        self.lattice = lattice_of(self._simulator)
 
     def shot(self, index: int, *, field: bool) -> Shot:
         """See :class:`Seekable`."""
@@ -137,75 +152,6 @@ class RecordingSource:
         """Nothing is held."""
 
 
-class ServerSource:
-    """Plays a scenario to a server's sensor, and shows what it answers; no potentials.
-
-    Args:
-        client: A connection, closed by :meth:`close`.
-        scenario: What happens.
-        bodies: Tables of the scenario file's ``[[body]]``; the server has no meshes.
-
-    Raises:
-        ProtocolError: The server refused.
-        ScenarioError: The server's design has other electrodes.
-    """
-
-    lattice: Lattice | None = None
-
-    def __init__(
-        self, client: Client, scenario: Scenario, bodies: Sequence[Mapping[str, Any]]
-    ) -> None:
-        self.title, self.design = scenario.name, scenario.design
-        self.times, self.channels = scenario.times, scenario.channels
-        self._client, self._scenario = client, scenario
-        self._sensor = client.open(design=self.design.name)
-        if self._sensor.electrode_names != self.design.electrode_names:
-            raise ScenarioError(
-                f"the server's {self.design.name!r} has electrodes "
-                f"{', '.join(self._sensor.electrode_names)}, the scenario's has "
-                f"{', '.join(self.design.electrode_names)}; give both the same design"
-            )
-        self._sent = 0
-        self.empty = self._reading(self._sensor.step_scene([], self._clock()))
-        at_start = self._poses(scenario.scene_at(0.0))
-        tables = [
-            {k: v for k, v in table.items() if k not in ("pose", "trajectory")}
-            | {"pose": at_start[table["name"]]}
-            for table in bodies
-        ]
-        self._sensor.step_scene(tables, self._clock())
-
-    def shot(self, index: int, *, field: bool) -> Shot:
-        """See :class:`Seekable`."""
-        time = float(self.times[index])
-        scene = self._scenario.scene_at(time)
-        answer = self._sensor.step_poses(self._poses(scene), self._clock())
-        return Shot(index, time, scene, self._reading(answer), None)
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._client.close()
-
-    def _clock(self) -> float:
-        """Time of the next frame [s]; it goes on where the scenario begins anew."""
-        self._sent += 1
-        return (self._sent - 1) / self._scenario.sample_rate
-
-    def _reading(self, answer: ReadingMessage) -> Reading:
-        coupling = answer.self_capacitance - np.diag(answer.capacitance)
-        stats = StepStats(answer.iterations, answer.error_estimate, float("nan"), answer.wall_time)
-        return reading_of(self.design, answer.capacitance, answer.delta, coupling, stats)
-
-    @staticmethod
-    def _poses(scene: Scene) -> dict[str, dict[str, list[float]]]:
-        return {
-            str(b.name): {
-                "position": list(map(float, b.pose.position)),
-                "quaternion": list(map(float, b.pose.quaternion)),
-            }
-            for b in scene
-        }
-
-
-def _lattice_of(simulator: Simulator) -> Lattice | None:
+def lattice_of(simulator: Simulator) -> Lattice | None:
+    """Where a simulator gives potentials; None if it does not."""
     return simulator.background.lattice if simulator.method == "perturbation" else None

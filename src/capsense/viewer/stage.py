@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from capsense.design import Design
 from capsense.design.draw import ROLE_COLOURS
 from capsense.design.geometry import Surface
-from capsense.scene import Body, Scene, ShapeKind
+from capsense.scene import Body, Layers, Scene, ShapeKind
 from capsense.viewer.plane import Plane, paint
 
 if TYPE_CHECKING:
@@ -99,8 +99,9 @@ class Stage:
         """
         shown, colours = paint(plane.sample(potential))
         self._scene.add_point_cloud(
-            "/potential", plane.points[shown], colours, point_size=plane.pitch, point_shape="square"
-        )
+            "/potential", plane.points[shown], colours, point_size=plane.pitch,
+            point_shape="square", point_shading="flat",
+        )  # fmt: skip
 
     def hide_plane(self) -> None:
         """Take the plane away."""
@@ -136,10 +137,23 @@ class Stage:
         )  # fmt: skip
 
     def _solid(self, name: str, body: Body) -> Any:
+        colour = CONDUCTIVE if body.material.is_conductor() else DIELECTRIC
+        if isinstance(body.shape, Layers):
+            return self._dots(name, body.shape, colour)
         mesh = body.shape.to_trimesh()
-        conducts = body.material.is_conductor()
         return self._scene.add_mesh_simple(
-            name, mesh.vertices, mesh.faces, color=CONDUCTIVE if conducts else DIELECTRIC,
-            opacity=0.4, flat_shading=body.shape.kind in _FACETED, cast_shadow=False,
+            name, mesh.vertices, mesh.faces, color=colour, opacity=0.4, flat_shading=body.shape.kind in _FACETED, cast_shadow=False,
             receive_shadow=False,
+        )  # fmt: skip
+
+    def _dots(self, name: str, layers: Layers, colour: Colour) -> Any:
+        """What a depth camera saw: a dot for every pixel, with gaps to look through."""
+        slot, row, column = np.nonzero(layers.hit)
+        x, y, _ = layers.grid.origin
+        width, height = layers.pixel
+        front = layers.fields[slot, row, column, 0]
+        points = np.column_stack([x + column * width, y + row * height, front])
+        return self._scene.add_point_cloud(
+            name, points, colour, point_size=0.5 * min(width, height), point_shape="circle",
+            point_shading="flat",
         )  # fmt: skip
