@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -17,6 +18,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("websockets", reason='needs websockets: pip install "capsense[serve]"')
+
+from raw_websocket import HELLO, raw_websocket
 
 from capsense.cli.main import main
 from capsense.errors import ProtocolError
@@ -60,6 +63,19 @@ def test_serves_until_a_signal(number: signal.Signals, tmp_path: Path) -> None:
     assert all({"time", "level", "event"} <= set(entry) for entry in entries)
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -15)])
+def test_a_second_signal_stops_at_once(number: signal.Signals, code: int) -> None:
+    """Without waiting for a client that does not answer."""
+    with serving() as (process, url), raw_websocket(int(url.rpartition(":")[2]), HELLO):
+        assert process.stderr is not None
+        process.send_signal(number)
+        while json.loads(process.stderr.readline())["event"] != "stopping":
+            pass
+        process.send_signal(number)
+        assert process.wait(10) == code
+        assert '"stopped"' not in process.stderr.read()
+
+
 def test_quiet() -> None:
     """No line for what goes well."""
     with socket.socket() as free:
@@ -94,7 +110,10 @@ def test_address_in_use(capsys: pytest.CaptureFixture[str]) -> None:
         (["--design", "patch", "--design", "patch"], "two designs are named 'patch'"),
         (["--design", "patch", "--host", "0.0.0.0"], "give a token"),
         (["--design", "patch", "--token-file", "nowhere"], "--token-file nowhere cannot be read"),
+        (["--design", "patch", "--token-file", os.devnull], "fewer than 8 characters"),
         (["--design", "patch", "--max-pixels", "0"], "pixels is 0"),
+        (["--design", "patch", "--max-connections", "-1"], "connections is -1"),
+        (["--design", "patch", "--port", "70000"], "port is 70000"),
     ],
 )
 def test_bad_input(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
+from raw_websocket import HELLO, OPEN, masked, raw_websocket
 from running_server import RunningServer
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -22,9 +23,6 @@ from capsense.server.client import Client
 from capsense.server.frames import HEADER, pack_depth
 from capsense.server.options import Limits
 from capsense.server.sensor import ServedSensor
-
-HELLO = json.dumps({"type": "hello", "protocol": 1})
-OPEN = json.dumps({"type": "open", "sensor": 0})
 
 
 @contextmanager
@@ -187,27 +185,14 @@ def test_client_that_does_not_receive(dome: np.ndarray, monkeypatch: pytest.Monk
     limits = Limits(send_timeout=0.5)
     with RunningServer(limits=limits) as server, server.client(timeout=5) as client:
         sensor = client.open()
-        with socket.create_connection(("127.0.0.1", server.port)) as deaf:
-            deaf.sendall(
-                b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-                b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-            )
+        with raw_websocket(server.port) as deaf:
             for message in (HELLO, '{"type": "open", "sensor": 9}', pack_depth(9, 0, 0.0, dome)):
-                deaf.sendall(masked(message))
+                deaf.send(masked(message))
             deadline = time.monotonic() + 10
             while not server.logged("too slow") and time.monotonic() < deadline:
                 sensor.step(dome)
         assert [e["client"] for e in server.logged("too slow")] == [2]
         assert sensor.step(dome).dropped == 0
-
-
-def masked(message: str | bytes) -> bytes:
-    """A WebSocket message as a client sends it, with a mask of zeros."""
-    data = message.encode() if isinstance(message, str) else message
-    kind = b"\x81" if isinstance(message, str) else b"\x82"
-    size = len(data)
-    length = bytes([0x80 | size]) if size < 126 else b"\xfe" + size.to_bytes(2, "big")
-    return kind + length + bytes(4) + data
 
 
 def test_connections_are_limited(dome: np.ndarray) -> None:
@@ -271,6 +256,35 @@ def test_client_that_vanishes(served: RunningServer, witness: None, dome: np.nda
     assert served.get("/health")[1]["clients"] <= before
 
 
+def test_others_sensors_are_out_of_reach(served: RunningServer, dome: np.ndarray) -> None:
+    """Whatever a client says of a number is said of its own sensors."""
+    ball = {"name": "ball", "shape": "sphere", "radius": 0.03, "material": "water"}
+    with served.client() as owner, served.client() as other:
+        sensor = owner.open(7)
+        before = sensor.step_scene([{**ball, "pose": {"position": [0, 0, 0.06]}}])
+        address = {"sensor": 7, "sequence": 99}
+        for message in (
+            {"type": "reset", "sensor": 7}, {"type": "close", "sensor": 7},
+            {"type": "scene", **address, "body": []},
+            {"type": "poses", **address, "poses": {"ball": {"position": [0, 0, 0.03]}}},
+        ):  # fmt: skip
+            with pytest.raises(ProtocolError, match="there is no sensor 7; open are none"):
+                other.ask("answer", **message)
+        other.send(pack_depth(7, 99, 0.0, dome))
+        answer = other.receive()
+        assert isinstance(answer, dict)
+        assert (answer["code"], answer["sensor"], answer["sequence"]) == ("sensor", 7, 99)
+        own = other.open(7)
+        with pytest.raises(ProtocolError, match="no body 'ball'; it has none"):
+            own.step_poses({"ball": {"position": [0, 0, 0.03]}})
+        own.step(dome)
+        assert own.close() == {"frames": 1, "readings": 1, "dropped": 0}
+        after = sensor.step_poses({"ball": {"position": [0, 0, 0.06]}})
+        assert after.sequence == 1
+        assert np.allclose(after.delta, before.delta, rtol=1e-4)
+        assert sensor.close() == {"frames": 2, "readings": 2, "dropped": 0}
+
+
 @pytest.mark.parametrize(
     ("error", "code", "level"),
     [
@@ -303,9 +317,33 @@ def test_steps_that_fail(
     assert entry["level"] == level
 
 
+def test_faults_outside_of_steps(dome: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They end one session, and are logged in full."""
+
+    def fail(table: object) -> object:
+        raise RuntimeError("a secret of the server")
+
+    with RunningServer() as server, server.client() as client:
+        sensor = client.open()
+        with monkeypatch.context() as patch:
+            patch.setattr("capsense.server.messages.read_hello", fail)
+            with pytest.raises(ProtocolError, match="1011") as caught:
+                server.client()
+        assert "secret" not in str(caught.value)
+        assert sensor.step(dome).sequence == 0
+        (entry,) = server.logged("internal error")
+        assert (entry["level"], entry["client"]) == ("ERROR", 2)
+
+
 def test_client_waits_no_longer_than_told(served: RunningServer) -> None:
     """A reading that never comes is an error after the timeout."""
     with Client(served.url, timeout=0.2) as client:
         client.open()
         with pytest.raises(ProtocolError, match=r"no answer within 0\.2 s"):
             client.reading(0, 5)
+
+
+def test_what_is_no_server(served: RunningServer) -> None:
+    """An address where something else answers is an error that names it."""
+    with pytest.raises(ProtocolError, match=r"/health is no server for this client: .* 200"):
+        Client(served.url + "/health")

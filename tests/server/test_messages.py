@@ -160,7 +160,8 @@ def test_address_of_any_message() -> None:
     assert messages.address_of('{"type": "scene", "sensor": 2, "sequence": 7}') == {
         "sensor": 2, "sequence": 7,
     }  # fmt: skip
-    assert messages.address_of('{"type": "scene", "sensor": "2"}') == {}
+    for wrong in ('"2"', "true", "2.0", "null"):
+        assert messages.address_of('{"type": "scene", "sensor": ' + wrong + "}") == {}
     for message in ("{", b"", b"CSNS"):
         assert messages.address_of(message) == {}
 

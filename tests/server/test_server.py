@@ -10,9 +10,10 @@ import pytest
 from running_server import RunningServer
 
 import capsense as cs
-from capsense.errors import ProtocolError, ServerError
+from capsense.errors import CapSenseError, ProtocolError, ServerError
 from capsense.server.options import Limits, Options
 from capsense.server.sensor import ServedSensor
+from capsense.server.server import Server
 from capsense.simulator import Simulator
 
 TOKEN = "correct horse"
@@ -162,6 +163,36 @@ def test_newest_frame_wins(
         assert sensor.close() == {"frames": 8, "readings": 2, "dropped": 6}
 
 
+def test_frames_that_a_reset_or_the_end_overtakes(
+    served: RunningServer, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They count as dropped, and no reading of a sensor comes after it is closed."""
+    begun, go = threading.Event(), threading.Event()
+    solve = ServedSensor.solve
+
+    def slow(self: ServedSensor, frame: object) -> bytes:
+        begun.set()
+        assert go.wait(10)
+        return solve(self, frame)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ServedSensor, "solve", slow)
+    with served.client() as client:
+        busy, ended, restarted = client.open(), client.open(), client.open()
+        busy.send(dome)
+        assert begun.wait(10)
+        ended.send(dome)
+        restarted.send(dome)
+        assert ended.close() == {"frames": 1, "readings": 0, "dropped": 1}
+        restarted.reset()
+        go.set()
+        assert client.reading(busy.number, 0).sequence == 0
+        assert restarted.step(dome).dropped == 1
+        assert restarted.close() == {"frames": 2, "readings": 1, "dropped": 1}
+        assert not client.sensors[busy.number].kept
+        with pytest.raises(ProtocolError, match="no answer"):
+            client.receive(0.05)
+
+
 def test_replayed_frames_are_refused(served: RunningServer, dome: np.ndarray) -> None:
     """A number that does not rise is an error, until a reset; other sensors have their own."""
     with served.client() as client:
@@ -252,16 +283,60 @@ def test_health_and_log(dome: np.ndarray) -> None:
     assert server.logged("disconnected")[0]["readings"] == 3
 
 
-def test_stopping_closes_connections(dome: np.ndarray) -> None:
-    """Clients are told that the server goes away; the frame at hand is finished."""
-    with RunningServer() as server, server.client() as client:
+def test_stopping_closes_connections(dome: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame at hand is answered; clients are told that the server goes away, new ones too."""
+    begun, go = threading.Event(), threading.Event()
+    solve = ServedSensor.solve
+
+    def slow(self: ServedSensor, frame: object) -> bytes:
+        begun.set()
+        assert go.wait(10)
+        return solve(self, frame)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ServedSensor, "solve", slow)
+    with RunningServer() as server, server.client() as client, server.client():
         sensor = client.open()
-        sensor.step(dome)
-        server.stop()
+        sensor.send(dome)
+        assert begun.wait(10)
+        stopping = threading.Thread(target=server.stop)
+        stopping.start()
+        while not server.logged("stopping"):
+            time.sleep(0.005)
+        assert server.get("/health")[0] == 503
+        with pytest.raises(ProtocolError, match="503"):
+            server.client()
+        go.set()
+        assert client.reading(sensor.number, 0).sequence == 0
+        stopping.join(10)
         with pytest.raises(ProtocolError, match="1001"):
             sensor.step(dome)
         with pytest.raises(OSError, match="refused"):
             server.client()
+    assert server.logged("stopped")[0]["readings"] == 1
+
+
+@pytest.mark.parametrize(
+    ("designs", "readout", "words"),
+    [
+        (("patch", "pach"), None, "pach"),
+        (("patch", "six_patch", "patch"), None, "two designs are named 'patch'"),
+        (("patch",), "fdc1005", "fdc1005"),
+        (("patch",), "nowhere.toml", "nowhere"),
+    ],
+)
+def test_wrong_designs_and_readouts(
+    designs: tuple[str, ...], readout: str | None, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Refused before the field of any design is built."""
+
+    def build(*_: object, **__: object) -> None:
+        raise AssertionError("built")
+
+    monkeypatch.setattr("capsense.server.server.Simulator", build)
+    with pytest.raises(CapSenseError, match=words):
+        Server(Options(designs, readout))
+    with pytest.raises(AssertionError, match="built"):
+        Server(Options(("patch",), "fdc1004"))
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,8 @@ class Client:
         name: Told to the server, for its log.
 
     Raises:
-        ProtocolError: The server refused the connection; ``code`` says why.
+        ProtocolError: The server refused the connection; ``code`` says why. Or it is no server of
+            this kind.
         OSError: There is no server.
     """
 
@@ -45,6 +46,7 @@ class Client:
         name: str = "python",
     ) -> None:  # fmt: skip
         try:
+            from websockets.exceptions import WebSocketException
             from websockets.sync.client import connect
         except ImportError as error:
             raise MissingDependencyError(
@@ -54,9 +56,12 @@ class Client:
         self.timeout = timeout
         self.sensors: dict[int, RemoteSensor] = {}
         """Open sensors, by number."""
-        self._connection = connect(
-            url, compression=None, open_timeout=timeout, close_timeout=1.0, max_size=None
-        )
+        try:
+            self._connection = connect(
+                url, compression=None, open_timeout=timeout, close_timeout=1.0, max_size=None
+            )
+        except WebSocketException as error:
+            raise ProtocolError(f"{url} is no server for this client: {error}", "closed") from None
         try:
             self.welcome = self.ask("welcome", type="hello", protocol=PROTOCOL, token=token,
                                     client=name)  # fmt: skip

@@ -94,6 +94,4 @@ class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
 
 def _idle(frame: Frame) -> bool:
     """Whether a frame is none that sessions hear of; what ends a message is."""
-    return frame.opcode in (Opcode.PING, Opcode.PONG) or (
-        not frame.fin and len(frame.data) < SMALL
-    )
+    return frame.opcode in (Opcode.PING, Opcode.PONG) or (not frame.fin and len(frame.data) < SMALL)

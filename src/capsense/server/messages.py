@@ -294,7 +294,7 @@ def address_of(message: str | bytes) -> dict[str, int]:
     except ProtocolError:
         return {}
     keys = ("sensor", "sequence")
-    return {k: data[k] for k in keys if isinstance(data.get(k), int)}
+    return {k: data[k] for k in keys if type(data.get(k)) is int}
 
 
 def code_of(error: CapSenseError) -> str:

@@ -42,7 +42,7 @@ class Watcher(Protocol):
 class ServedSensor:
     """A simulator, its read-out, and the newest frame that waits for it.
 
-    :meth:`offer`, :meth:`take` and :meth:`restart` belong to the event loop;
+    :meth:`offer`, :meth:`take`, :meth:`drop` and :meth:`restart` belong to the event loop;
     :meth:`solve` may run in any thread, one call at a time, with :attr:`lock` held.
 
     Args:
@@ -62,7 +62,7 @@ class ServedSensor:
         self.readings = 0
         """Frames solved."""
         self.dropped = 0
-        """Frames that newer ones replaced."""
+        """Frames that newer ones replaced, or a reset or the end overtook."""
         self._waiting: Frame | None = None
         self._last = -1
         self.watchers: set[Watcher] = set()
@@ -92,7 +92,7 @@ class ServedSensor:
             self._bodies = {str(b.name): b for b in frame.bodies}
             self._tables = frame.tables
         self.frames += 1
-        self.dropped += self._waiting is not None
+        self.drop()
         self._waiting = frame
 
     def take(self) -> Frame | None:
@@ -100,9 +100,14 @@ class ServedSensor:
         frame, self._waiting = self._waiting, None
         return frame
 
+    def drop(self) -> None:
+        """Drop the frame that waits, if any."""
+        self.dropped += self.take() is not None
+
     def restart(self) -> None:
         """Forget everything but the bodies; the lock must be held."""
-        self._waiting, self._last, self._time = None, -1, None
+        self.drop()
+        self._last, self._time = -1, None
         self.simulator.reset()
 
     def solve(self, frame: Frame) -> bytes:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import socket
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from http import HTTPStatus
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 
 from capsense._validate import suggest
+from capsense.design import load_design
+from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ProtocolError, ServerError
-from capsense.readout.config import choose_readout
+from capsense.readout.config import choose_readout, file_content, parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
@@ -36,14 +38,15 @@ except ImportError as error:
         'the server needs websockets; install it with: pip install "capsense[serve]"'
     ) from error
 
-from capsense.server.session import TRY_LATER, Session
+from capsense.server.connection import FLOOD, TRY_LATER, Door, GatedConnection
+from capsense.server.session import Session
 
 if TYPE_CHECKING:
     from websockets.typing import Origin
 
 T = TypeVar("T")
-SEND_BUFFER = 262144
-"""What the system may hold for a client that does not receive [bytes]."""
+CLOSING = 2.0
+"""Longest time for answers to frames at hand, and again for connections to close [s]."""
 Progress = Callable[[str, float], None]
 
 
@@ -75,11 +78,9 @@ class Server:
         """Where it listens; empty before."""
         self._logger = logger or logging.getLogger("capsense.server")
         self._templates: dict[str, Simulator] = {}
-        for name in options.designs:
-            simulator = Simulator(name, progress=progress)
-            if simulator.design.name in self._templates:
-                raise ServerError(f"two designs are named {simulator.design.name!r}")
-            self._templates[simulator.design.name] = simulator
+        for design in self._load_designs():
+            simulator = Simulator(design, progress=progress)
+            self._templates[design.name] = simulator
             simulator.step(DepthFrame(np.full((8, 8), 0.1)))
             self._make_readout(simulator, 0)
         self._sessions: dict[int, Session] = {}
@@ -102,15 +103,16 @@ class Server:
             OSError: The address is taken or not this machine's.
         """
         options, limits = self.options, self.options.limits
+        door = Door(2 * limits.connections + 16)
         listener = serve(
             self._serve, options.host, options.port,
             process_request=self._process_request,
             origins=cast("list[Origin | None]", [None, *options.origins]),
             compression=None, server_header=None,
-            open_timeout=limits.hello_timeout, close_timeout=2.0,
+            open_timeout=limits.hello_timeout, close_timeout=CLOSING,
             max_size=limits.message, max_queue=4,
             logger=_quiet(self._logger),
-            create_connection=_gate(2 * limits.connections + 16),
+            create_connection=cast("type[ServerConnection]", partial(GatedConnection, door=door)),
         )  # fmt: skip
         try:
             async with listener as server:
@@ -120,6 +122,7 @@ class Server:
                 await stop.wait()
                 self._stopping = True
                 self.log("stopping", clients=len(self._sessions))
+                await self._finish()
         finally:
             self._pool.shutdown()
         self.log("stopped", readings=self.health()["readings"])
@@ -137,6 +140,12 @@ class Server:
             "readings": self._readings + sum(s.readings for s in sessions),
             "uptime_s": round(time.monotonic() - self._started, 3),
         }
+
+    async def _finish(self) -> None:
+        """Let all clients have the answers to their frames at hand, if that is soon."""
+        work = [asyncio.create_task(s.finish()) for s in self._sessions.values()]
+        if work:
+            await asyncio.wait(work, timeout=CLOSING)
 
     # -- what sessions need -----------------------------------------------------------------------
 
@@ -205,20 +214,38 @@ class Server:
         self.log("connected", client=session.number, peer=f"{peer[0]}:{peer[1]}")
         try:
             await session.run()
+        except Exception:
+            self.fault("internal error", client=session.number)
+            raise
         finally:
             del self._sessions[session.number]
+            if cast(GatedConnection, connection).flooded:
+                self.log("dismissed", client=session.number, code=FLOOD)
             self._readings += session.readings
             self.log("disconnected", client=session.number, readings=session.readings)
 
     def _process_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer plain HTTP; let the handshake of a WebSocket go on."""
         path = request.path.partition("?")[0]
-        if path == "/health":
-            status = HTTPStatus.SERVICE_UNAVAILABLE if self._stopping else HTTPStatus.OK
+        status = HTTPStatus.SERVICE_UNAVAILABLE if self._stopping else HTTPStatus.OK
+        if path == "/health" or self._stopping:
             return _json(status, self.health())
         if path != "/":
             return _json(HTTPStatus.NOT_FOUND, {"error": "there are / (WebSocket) and /health"})
         return None
+
+    def _load_designs(self) -> list[Design]:
+        """All designs, once none of them nor the read-out is found wrong."""
+        designs: dict[str, Design] = {}
+        for name in self.options.designs:
+            design = load_design(name)
+            if design.name in designs:
+                raise ServerError(f"two designs are named {design.name!r}")
+            designs[design.name] = design
+            if self.options.readout is not None:
+                content = file_content(self.options.readout, design.electrode_names)
+                parse_readout(content, design.electrode_names, source=str(self.options.readout))
+        return list(designs.values())
 
     def _make_readout(self, simulator: Simulator, number: int) -> ReadOut | None:
         """The read-out of a client's sensor; by their numbers, sensors have noise of their own."""
@@ -237,29 +264,6 @@ def _json(status: HTTPStatus, content: dict[str, Any]) -> Response:
          "Cache-Control": "no-store", "Connection": "close"}
     )  # fmt: skip
     return Response(status.value, status.phrase, headers, body)
-
-
-def _gate(most: int) -> type[ServerConnection]:
-    """Connections of which no more than ``most`` are open, handshakes included."""
-    count = 0
-
-    class Connection(ServerConnection):
-        def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            nonlocal count
-            count += 1
-            super().connection_made(transport)
-            raw = transport.get_extra_info("socket")
-            if raw is not None:
-                raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-            if count > most:
-                cast(asyncio.Transport, transport).abort()
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            nonlocal count
-            count -= 1
-            super().connection_lost(exc)
-
-    return Connection
 
 
 def _quiet(logger: logging.Logger) -> logging.Logger:

@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosed
 from capsense.errors import CapSenseError, ProtocolError
 from capsense.recording.design_json import design_to_json
 from capsense.server import messages
+from capsense.server.connection import POLICY
 from capsense.server.frames import PROTOCOL, unpack_depth
 from capsense.server.options import Options
 from capsense.server.sensor import Frame, ServedSensor
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
 T = TypeVar("T")
-POLICY, TRY_LATER = 1008, 1013
-"""Codes with which connections are closed on errors, and when there are too many."""
 ALLOWANCE = 5000.0
 """Work that a client may cause a second without being slowed, in units of a small message."""
 BINARY_UNIT, TEXT_UNIT = 16384, 512
@@ -73,6 +72,7 @@ class Session:
         self._limits = hall.options.limits
         self._wake = asyncio.Event()
         self._left = False
+        self._solver: asyncio.Task[None] | None = None
         self._watched: ServedSensor | None = None
         self._to_show: tuple[str | bytes, ...] = ()
         self._allowance, self._counted = ALLOWANCE, time.monotonic()
@@ -90,7 +90,7 @@ class Session:
             return
         except ConnectionClosed:
             return
-        solver = asyncio.create_task(self._solve_all())
+        self._solver = asyncio.create_task(self._solve_all())
         try:
             async for message in self._connection:
                 size = BINARY_UNIT if isinstance(message, bytes) else TEXT_UNIT
@@ -104,7 +104,14 @@ class Session:
             self._unwatch()
             for sensor in self.sensors.values():
                 sensor.leave()
-            await solver
+            await self._solver
+
+    async def finish(self) -> None:
+        """Answer the frame that is being solved, and solve no more."""
+        self._left = True
+        self._wake.set()
+        if self._solver is not None:
+            await self._solver
 
     def show(self, *messages: str | bytes) -> None:
         """Send what a watched sensor sees, in place of what is not sent yet."""
@@ -203,6 +210,7 @@ class Session:
         sensor = self._sensor(messages.read_sensor(table))
         number = sensor.options.sensor
         async with sensor.lock:
+            sensor.drop()
             del self.sensors[number]
         sensor.leave()
         self._hall.log("closed", client=self.number, sensor=number)

@@ -1,0 +1,134 @@
+"""Clients that break the rules of WebSockets, or keep them and send nothing but idle frames."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from raw_websocket import (
+    BINARY,
+    CONTINUATION,
+    HELLO,
+    OPEN,
+    PING,
+    PONG,
+    TEXT,
+    RawWebSocket,
+    masked,
+    raw_websocket,
+)
+from running_server import RunningServer
+
+from capsense.server.frames import HEADER, pack_depth
+
+
+@pytest.fixture(autouse=True)
+def witness(served: RunningServer, dome: np.ndarray) -> Iterator[None]:
+    """Another client, whose session must go on as if nothing had happened."""
+    with served.client(timeout=5) as client:
+        sensor = client.open()
+        before = sensor.step(dome)
+        yield
+        after = sensor.step(dome)
+        assert np.allclose(after.delta, before.delta, rtol=1e-4)
+        assert sensor.close() == {"frames": 2, "readings": 2, "dropped": 0}
+
+
+@pytest.mark.parametrize(
+    ("frames", "code"),
+    [
+        (b"\x81\x02{}", 1002),  # without a mask
+        (b"\xf1" + masked("{}")[1:], 1002),  # reserved bits
+        (masked(b"", 3), 1002),
+        (masked(b"", 11), 1002),
+        (masked(bytes(126), PING), 1002),
+        (masked(b"", PING, last=False), 1002),
+        (masked(b"x", CONTINUATION), 1002),
+        (masked(b"x", TEXT, last=False) + masked(b"y", TEXT), 1002),
+        (masked(b"\xff\xfe", TEXT), 1007),
+        (b"\x82\xff" + (2**62).to_bytes(8, "big") + bytes(4), 1009),
+        (b"\x82\xff" + (2**63).to_bytes(8, "big") + bytes(4), 1009),
+        (8 * masked(bytes(100_000), CONTINUATION, last=False), 1002),
+        (masked(b"x", BINARY, last=False) + 8 * masked(bytes(100_000), 0, last=False), 1009),
+    ],
+)
+def test_broken_frames(served: RunningServer, frames: bytes, code: int) -> None:
+    """The connection is closed with the code that WebSockets have for it."""
+    with raw_websocket(served.port, HELLO, OPEN) as connection:
+        with suppress(ConnectionError):
+            connection.send(frames)
+        assert connection.closed()[0] == code
+
+
+FLOODS = {
+    "pings": masked(b"", PING),
+    "pongs": masked(b"", PONG),
+    "large pings": masked(bytes(125), PING),
+    "empty fragments": masked(b"", CONTINUATION, last=False),
+    "small fragments": masked(bytes(50), CONTINUATION, last=False),
+}
+
+
+@pytest.mark.parametrize("kind", FLOODS)
+@pytest.mark.parametrize("first", [(), (HELLO, OPEN)], ids=["stranger", "client"])
+def test_floods_are_cut_off(served: RunningServer, kind: str, first: tuple[str, ...]) -> None:
+    """Frames that no session hears of are few, or the connection is closed."""
+    known = len(served.logged("dismissed"))
+    with raw_websocket(served.port, *first) as connection:
+        connection.send(masked(b"x", BINARY, last=False) if "fragments" in kind else b"")
+        with pytest.raises(ConnectionError):
+            flood(connection, FLOODS[kind])
+        # The news may be lost where the server had much left to read.
+        assert connection.closed() in ((1008, "flood"), (1006, ""))
+    wait_for(lambda: len(served.logged("dismissed")) > known)
+    assert served.logged("dismissed")[-1]["code"] == "flood"
+
+
+def flood(connection: RawWebSocket, frame: bytes) -> None:
+    """Send a million frames, or until the connection breaks."""
+    for _ in range(100):
+        connection.send(frame * 10_000)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds, for some seconds."""
+    deadline = time.monotonic() + 5
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+
+
+def test_the_reason_of_the_cut(served: RunningServer) -> None:
+    """A client that stops to listen is told."""
+    with raw_websocket(served.port, HELLO) as connection:
+        connection.send(150 * masked(b"", PONG))
+        assert connection.closed() == (1008, "flood")
+
+
+def test_what_is_no_flood(served: RunningServer, dome: np.ndarray) -> None:
+    """Some pings are answered; frames in large fragments with a small last one are read."""
+    with raw_websocket(served.port, HELLO, OPEN) as connection:
+        for k in range(50):
+            connection.send(masked(bytes([k]), PING))
+            assert connection.receive() == (PONG, bytes([k]))
+        for k in range(120):
+            message = pack_depth(0, k, 0.0, dome)
+            pieces = [message[at : at + 4095] for at in range(0, len(message), 4095)]
+            assert len(pieces[-1]) < 50
+            last = len(pieces) - 1
+            connection.send(
+                *(masked(piece, CONTINUATION if n else BINARY, last=n == last)
+                  for n, piece in enumerate(pieces))
+            )  # fmt: skip
+            opcode, reading = connection.receive()
+            assert (opcode, HEADER.unpack_from(reading)[8]) == (BINARY, k)
+
+
+def test_only_one_address(served: RunningServer) -> None:
+    """By default the server listens on 127.0.0.1 alone, and on none of the machine's others."""
+    assert served.url.startswith("ws://127.0.0.1:")
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.2", served.port), timeout=2)
