@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from capsense import humans
-    from capsense.adapters import coppeliasim, mujoco, pybullet
+    from capsense.adapters import assistive_gym, coppeliasim, mujoco, pybullet
     from capsense.design.loader import available_designs, load_design
     from capsense.design.model import Design
     from capsense.errors import (
@@ -94,6 +94,7 @@ __all__ = [
     "Sphere",
     "TriMesh",
     "__version__",
+    "assistive_gym",
     "available_designs",
     "coppeliasim",
     "decode_permittivity",
@@ -152,6 +153,7 @@ _HOMES = {
     "capsense.skin": ("Skin",),
 }
 _SUBMODULES = {
+    "assistive_gym": "capsense.adapters.assistive_gym",
     "coppeliasim": "capsense.adapters.coppeliasim",
     "humans": "capsense.humans",
     "mujoco": "capsense.adapters.mujoco",

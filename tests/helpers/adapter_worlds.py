@@ -204,6 +204,33 @@ def pybullet_sensor(
     if options.get("world") == "depth":
         things = [Thing(t.name, _as_mesh(t.shape), t.pose) for t in things]
     client = p.connect(p.DIRECT)
+    carrier, offset = fill_bullet(client, things, sensor, folder)
+    return cs.pybullet.attach(client, carrier, "carrier_link", offset, simulator, **options)
+
+
+def assistive_gym_sensor(
+    things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simulator, folder: Path, **options: Any
+) -> Any:
+    """A sensor in an environment of Assistive Gym's kind that holds an agent of its own."""
+    import small_gym
+
+    env = small_gym.Env(person=False)
+    env.iteration, env.carrier = 0, small_gym.Agent()
+    carrier, offset = fill_bullet(env.id, things, sensor, folder)
+    env.carrier.init(carrier, env.id)
+    return cs.assistive_gym.attach(env, "carrier", "carrier_link", offset, simulator, **options)
+
+
+def fill_bullet(
+    client: int, things: Sequence[Thing], sensor: cs.Pose, folder: Path
+) -> tuple[int, cs.Pose]:
+    """Fill a world of PyBullet and make a step.
+
+    Returns:
+        The body that carries the sensor, and the sensor frame in its link's.
+    """
+    import pybullet as p
+
     for thing in things:
         load(client, urdf(thing.name, urdf_geometry(thing, folder)), thing.pose, folder)
     offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
@@ -212,7 +239,7 @@ def pybullet_sensor(
     for body in range(p.getNumBodies(physicsClientId=client)):
         p.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=client)
     p.stepSimulation(physicsClientId=client)
-    return cs.pybullet.attach(client, carrier, "carrier_link", offset, simulator, **options)
+    return carrier, offset
 
 
 # -- CoppeliaSim -------------------------------------------------------------------------------
@@ -279,6 +306,7 @@ WAYS = {
     # PyBullet keeps some poses in single precision
     "mujoco": Way("mujoco", mujoco_sensor, {}, plain_reading, 1e-4, 1e-4, True),
     "pybullet": Way("pybullet", pybullet_sensor, {}, plain_reading, 1e-4, 1e-4, False),
+    "assistive gym": Way("pybullet", assistive_gym_sensor, {}, plain_reading, 1e-4, 1e-4, True),
     # rays hit round bodies, our rasteriser draws meshes of them
     "mujoco depth": Way(
         "mujoco", mujoco_sensor, {"world": "depth"}, image_reading, 0.03, 1e-4, True

@@ -28,6 +28,8 @@ _SOFT_BODY = 3
 _HEIGHT_FIELD = 9
 """Shape type of height fields."""
 _NO_FILE = b"unknown_file"
+BODY_NAME, LINK_NAME = "capsense.body", "capsense.link"
+"""Keys of user data: the name of a body, at its base, and that of a link."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +52,15 @@ def body_numbers(client: int) -> list[int]:
 
 
 def links_of(client: int, body: int) -> list[Link]:
-    """The base and the links of a body, in order."""
+    """The base and the links of a body, in order, by the names that user data give them, if any."""
     import pybullet as p
 
     base, title = (n.decode() for n in p.getBodyInfo(body, physicsClientId=client))
-    title = title or f"body{body}"
+    title = _user_data(client, body, -1, BODY_NAME) or title or f"body{body}"
     names = [base or "base"]
     for joint in range(p.getNumJoints(body, physicsClientId=client)):
         names.append(p.getJointInfo(body, joint, physicsClientId=client)[12].decode())
+    names = [_user_data(client, body, i - 1, LINK_NAME) or name for i, name in enumerate(names)]
     return [
         Link(body, i - 1, name, (name, title, f"{title}/{name}")) for i, name in enumerate(names)
     ]
@@ -69,18 +72,18 @@ def matter_of(client: int, link: Link, rules: Rules) -> tuple[Material, Tie]:
     Raises:
         SceneError: Its user data name no known material or grounding.
     """
-    said = _user_data(client, link, "capsense.material")
+    said = _user_data(client, link.body, link.link, "capsense.material")
     where = f"user data of {link.names[-1]!r}"
     material = None if said is None else read_material(said, where)
-    said = _user_data(client, link, "capsense.grounding")
+    said = _user_data(client, link.body, link.link, "capsense.grounding")
     tie = None if said is None else Tie(read_grounding(said, where), f"body {link.body} {said}")
     return rules.material_of(link.names, material), rules.tie_of(link.names, tie)
 
 
-def _user_data(client: int, link: Link, key: str) -> str | None:
+def _user_data(client: int, body: int, link: int, key: str) -> str | None:
     import pybullet as p
 
-    found = p.getUserDataId(link.body, key, link.link, physicsClientId=client)
+    found = p.getUserDataId(body, key, link, physicsClientId=client)
     return None if found < 0 else p.getUserData(found, physicsClientId=client).decode()
 
 
