@@ -51,6 +51,31 @@ def test_figures_are_found():
     assert np.abs(fit.distort(true, time) - measured).max() < 1e-23
 
 
+def test_channels_with_instants_of_their_own():
+    """Analytic: as of a sensor that reads one channel after another."""
+    true, _, time = recording(np.random.default_rng(0))
+    instants = time[:, None] + [0.0, 0.2]
+    measured = GAIN * true + OFFSET + DRIFT * (instants - 50)
+    fit = calibrate(true, measured, instants, floor=1e-18)
+    assert fit.epoch == near(50.1, rel=1e-12)
+    assert fit.offset == near(OFFSET + 0.1 * DRIFT, rel=1e-6)
+    assert fit.drift == near(DRIFT, rel=1e-6)
+    assert np.abs(fit.correct(measured, instants) - true).max() < 1e-23
+    assert np.abs(fit.distort(true, instants) - measured).max() < 1e-23
+
+
+def test_one_known_pose_tells_the_offset():
+    """Round trip: a tare at a pose; the sensor then measures what the simulator says there."""
+    rng = np.random.default_rng(0)
+    pose = np.array([2.0e-12, 2.5e-12])
+    readings = pose + OFFSET + 1e-15 * rng.standard_normal((400, 2))
+    base = base_capacitance(readings)
+    assert np.abs(tare(readings, base).mean(axis=0)).max() < 1e-26
+    fit = LinearSensor(1.0, base - pose, 0.0, 0.0)
+    assert np.abs(fit.correct(readings).mean(axis=0) - pose).max() < 1e-26
+    assert np.abs(fit.offset - OFFSET).max() < 5 * 1e-15 / np.sqrt(400)
+
+
 def test_small_changes_on_a_large_base():
     """Analytic: a change of a hundred-thousandth of C still tells the gain, to rounding."""
     time = np.linspace(0, 100, 200)
@@ -190,6 +215,8 @@ RISING = np.linspace(1, 2, 10)[:, None]
         (lambda: calibrate(ONES, ONES, drift=False), "channel 0: the recording does not tell"),
         (lambda: calibrate(RISING, RISING, np.arange(10)), "not along with time only"),
         (lambda: calibrate(ONES[:, :0], ONES[:, :0], np.arange(10)), r"give both as \(n, K\)"),
+        (lambda: calibrate(RISING, RISING, np.ones((10, 2))), r"time has shape \(10, 2\)"),
+        (lambda: LinearSensor(1.0, 0.0, 0.0, 0.0).correct([[1.0]], [np.nan]), "time: a number is"),
         (lambda: LinearSensor([1.0, 0.0], 0.0, 0.0, 0.0), "a gain is 0"),
         (lambda: LinearSensor(1.0, np.nan, 0.0, 0.0), "offset: a number is not finite"),
         (lambda: base_capacitance([]), "at least one"),

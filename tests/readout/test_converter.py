@@ -147,6 +147,21 @@ def test_dac_follows_only_if_it_may():
             assert after[1][1] == pytest.approx(14e-12, abs=1e-15)
 
 
+def test_dac_follows_both_ways_to_its_ends():
+    """Half a converter's range at a time: up, down, and no further than the DAC goes."""
+    for start, value, codes in (
+        (0, 40e-12, [3, 6, 9, 11, 11]),
+        (11, -20e-12, [8, 5, 2, 0, 0]),
+        (5, 9e-12, [5, 5, 5, 5, 5]),
+    ):
+        conversion = Conversion(LINEAR, CapDac(3e-12, 12, start=start), 1)
+        followed = []
+        for _ in codes:
+            conversion(np.zeros(1, dtype=int), np.array([value]))
+            followed.append(int(conversion.dac_codes[0]))
+        assert followed == codes
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

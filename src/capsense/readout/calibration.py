@@ -130,11 +130,14 @@ class LinearSensor:
         require("calibration", "epoch", self.epoch, -math.inf, "s")
 
     def correct(self, measured: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """True capacitances [F] from measured ones, shape (n, K); ``time`` [s] of shape (n,)."""
+        """True capacitances [F] from measured ones, shape (n, K).
+
+        ``time`` [s] is of shape (n,), or (n, K) where channels have instants of their own.
+        """
         return (np.asarray(measured, dtype=float) - self._shift(time)) / self.gain
 
     def distort(self, true: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Measured capacitances [F] from true ones, shape (n, K); ``time`` [s] of shape (n,)."""
+        """Measured capacitances [F] from true ones, shape (n, K); ``time`` as of `correct`."""
         return np.asarray(true, dtype=float) * self.gain + self._shift(time)
 
     def toml(self) -> str:
@@ -145,8 +148,9 @@ class LinearSensor:
     def _shift(self, time: ArrayLike | None) -> Array:
         if time is None:
             return self.offset
-        since = np.asarray(time, dtype=float)[..., None] - self.epoch
-        return self.offset + self.drift * since
+        at = finite("time", time)
+        at = at[..., None] if at.ndim < 2 else at
+        return self.offset + self.drift * (at - self.epoch)
 
     def start(self, context: Context) -> Process:
         """The process of a read-out's stage.
@@ -200,7 +204,8 @@ def calibrate(
         true: Capacitances that the simulator gives at the poses and times of the recording [F],
             shape (n, K).
         measured: What the sensor reported [F], shape (n, K).
-        time: Times of the samples [s], shape (n,); needed for drift.
+        time: Times of the samples [s], shape (n,), or (n, K) where channels have instants of their
+            own; needed for drift.
         drift: Whether to fit a drift that is linear in time.
         floor: Allan deviation of the flicker floor [F]; needs times that rise.
 
@@ -213,8 +218,8 @@ def calibrate(
         raise ReadOutError(f"true has shape {c.shape}, measured {m.shape}; give both as (n, K)")
     n, k = c.shape
     require("calibrate", "floor", floor, 0.0, "F")
-    t = _times(time, n, drift or floor > 0)
-    if floor > 0 and (np.diff(t) <= 0).any():
+    t = _times(time, n, k, drift or floor > 0)
+    if floor > 0 and (np.diff(t, axis=0) <= 0).any():
         raise ReadOutError("with a floor, times must rise; sort the samples")
     unknowns = 3 if drift else 2
     if n <= unknowns:
@@ -224,25 +229,27 @@ def calibrate(
     covariance = np.zeros((k, 3, 3))
     residual = np.zeros(k)
     for channel in range(k):
-        columns = [c[:, channel], np.ones(n), t - epoch][:unknowns]
-        fit = _least_squares(np.stack(columns, axis=1), m[:, channel], channel, t, floor)
+        at = t[:, channel]
+        columns = [c[:, channel], np.ones(n), at - epoch][:unknowns]
+        fit = _least_squares(np.stack(columns, axis=1), m[:, channel], channel, at, floor)
         figures[channel, :unknowns], covariance[channel, :unknowns, :unknowns] = fit[:2]
         residual[channel] = fit[2]
     return Calibration(figures[:, 0], figures[:, 1], figures[:, 2], epoch, covariance, residual, n)
 
 
-def _times(time: ArrayLike | None, count: int, needed: bool) -> Array:
+def _times(time: ArrayLike | None, count: int, channels: int, needed: bool) -> Array:
+    """Times of each channel's samples [s], shape (count, channels)."""
     if time is None:
         if needed:
             raise ReadOutError(
                 "drift and floor need the times of the samples; give time, or drift=False and "
                 "no floor"
             )
-        return np.zeros(count)
+        return np.zeros((count, channels))
     t = finite("time", time)
-    if t.shape != (count,):
+    if t.shape not in ((count,), (count, channels)):
         raise ReadOutError(f"time has shape {t.shape}; give {count} numbers, one a sample")
-    return t
+    return np.broadcast_to(t if t.ndim == 2 else t[:, None], (count, channels))
 
 
 def _least_squares(
