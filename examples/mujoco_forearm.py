@@ -1,13 +1,15 @@
 """MuJoCo: a robot arm carries six electrodes along a person's moving forearm.
 
 Run it: ``python examples/mujoco_forearm.py [FOLDER]``. It needs no display and no OpenGL. A
-table, a plot and an animation go to the folder (``out`` by default).
+table, a plot and an animation go to the folder (``out`` by default). With ``--depth`` the sensor
+sees the image of an orthographic depth camera of 64 x 64 pixels, not the shapes themselves.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -34,8 +36,11 @@ from sticks import Rod
 import capsense as cs
 from capsense.humans.export import mjcf_body
 
+PIXELS = 64
+"""Along each side of the depth image, which is as wide as the sensor's domain."""
 
-def model_text() -> str:
+
+def model_text(depth: bool) -> str:
     """The world as MJCF: floor, robot with the pad on its flange, the person's arm."""
     robot, ends = "", ""
     for name, axis, origin, end, radius in ROBOT:
@@ -50,6 +55,13 @@ def model_text() -> str:
         f'size="{_text(np.divide(PAD_SIZE, 2))}"/>'
         f'<site name="wrist_pad" pos="{_text(PAD.position)}"/>'
     )
+    sensor = ""
+    if depth:  # a camera looks along its −z, so it is turned half round
+        pad += (
+            f'<camera name="wrist_pad" pos="{_text(PAD.position)}" euler="180 0 0" '
+            f'projection="orthographic" resolution="{PIXELS} {PIXELS}" fovy="0.5"/>'
+        )
+        sensor = '<sensor><rangefinder camera="wrist_pad" data="depth"/></sensor>'
     person = mjcf_body(PERSON, SHOULDER).replace("<body ", '<body gravcomp="1" ')
     motors = [f"robot_{name}" for name, *_ in ROBOT]
     motors += [f"{PERSON.name}_{j.name}" for j in PERSON.joints]
@@ -59,8 +71,57 @@ def model_text() -> str:
         '<default><geom contype="0" conaffinity="0"/><joint armature="0.1"/></default>'
         f'<worldbody><geom name="floor" type="plane" size="2 2 .1"/>'
         f'<body name="robot" pos="{_text(ROBOT_BASE.position)}">{robot}{pad}{ends}</body>'
-        f"{person}</worldbody><actuator>{position}</actuator></mujoco>"
+        f"{person}</worldbody><actuator>{position}</actuator>{sensor}</mujoco>"
     )
+
+
+def attach(model: mujoco.MjModel, data: mujoco.MjData, depth: bool) -> Any:
+    """Six electrodes on the pad: they feel the person, and the robot's own links."""
+    if depth:
+        return cs.mujoco.attach(
+            model, data, site="wrist_pad", design="six_patch", world="depth",
+            default_material="human", default_grounding=100e-12,
+        )  # fmt: skip
+    return cs.mujoco.attach(
+        model, data, site="wrist_pad", design="six_patch",
+        materials={"right_arm*": "human"}, grounding={"right_arm*": 100e-12},
+    )  # fmt: skip
+
+
+class Ride:
+    """The way of the sensor along the arm, in simulated time."""
+
+    def __init__(self, depth: bool = False) -> None:
+        self.model = mujoco.MjModel.from_xml_string(model_text(depth))
+        self.data = mujoco.MjData(self.model)
+        self._robot = np.arange(len(ROBOT))  # of the state as of the motors: robot, then person
+        self._person = {joint.name: len(ROBOT) + k for k, joint in enumerate(PERSON.joints)}
+        data = self.data
+        data.qpos[self._robot] = REST
+        for name, angle in person_angles(0.0).items():
+            data.qpos[self._person[name]] = angle
+        for _ in range(200):  # to the beginning of the way
+            mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_comPos(self.model, data)
+            data.qpos[self._robot] = step_towards(self.model, data, sensor_target(0.0), self._robot)
+        data.ctrl[:] = data.qpos
+        mujoco.mj_forward(self.model, data)
+        self.sensor = attach(self.model, data, depth)
+
+    @property
+    def over(self) -> bool:
+        """Whether the story has ended."""
+        return self.data.time >= SECONDS - 0.5 * self.model.opt.timestep
+
+    def go_on(self, rate: float) -> None:
+        """Tell the motors where to go, and simulate up to the next reading of so many in 1 s."""
+        data = self.data
+        data.ctrl[self._robot] = step_towards(
+            self.model, data, sensor_target(data.time), self._robot
+        )
+        for name, angle in person_angles(data.time).items():
+            data.ctrl[self._person[name]] = angle
+        mujoco.mj_step(self.model, data, round(1 / (rate * self.model.opt.timestep)))
 
 
 def step_towards(
@@ -91,38 +152,17 @@ def capsules(model: mujoco.MjModel, data: mujoco.MjData) -> list[Rod]:
     return out
 
 
-def main(folder: Path) -> Record:
+def main(folder: Path, depth: bool = False) -> Record:
     """Run the story, check it, and draw it."""
-    model = mujoco.MjModel.from_xml_string(model_text())
-    data = mujoco.MjData(model)
-    joints = np.arange(len(ROBOT))  # of the state as of the motors: the robot's, the person's
-    person = {joint.name: len(ROBOT) + k for k, joint in enumerate(PERSON.joints)}
-
-    # start at the beginning of the way
-    data.qpos[joints] = REST
-    for name, angle in person_angles(0.0).items():
-        data.qpos[person[name]] = angle
-    for _ in range(200):
-        mujoco.mj_forward(model, data)
-        data.qpos[joints] = step_towards(model, data, sensor_target(0.0), joints)
-    data.ctrl[:] = data.qpos
-    mujoco.mj_forward(model, data)
-
-    sensor = cs.mujoco.attach(
-        model, data, site="wrist_pad", design="six_patch",
-        materials={"right_arm*": "human"}, grounding={"right_arm*": 100e-12},
-    )  # fmt: skip
-    record = Record(sensor.electrode_names)
-    stride = round(1 / (RATE * model.opt.timestep))
-    for step in range(round(SECONDS / model.opt.timestep)):
-        if step % stride == 0:
-            record.add(data.time, sensor.read(), sensor.pose, capsules(model, data))
-            data.ctrl[joints] = step_towards(model, data, sensor_target(data.time), joints)
-            for name, angle in person_angles(data.time).items():
-                data.ctrl[person[name]] = angle
-        mujoco.mj_step(model, data)
+    ride = Ride(depth)
+    record = Record(ride.sensor.electrode_names)
+    while not ride.over:
+        reading = ride.sensor.read()
+        record.add(ride.data.time, reading, ride.sensor.pose, capsules(ride.model, ride.data))
+        ride.go_on(RATE)
     save(record, folder)
-    draw(record, folder, "six_patch carried along a forearm, in MuJoCo")
+    seen = ", seen by a depth camera" if depth else ""
+    draw(record, folder, f"six_patch carried along a forearm, in MuJoCo{seen}")
     check(record)
     return record
 
@@ -134,4 +174,6 @@ def _text(values: object) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", nargs="?", default="out", type=Path, help="of the pictures")
-    main(parser.parse_args().folder)
+    parser.add_argument("--depth", action="store_true", help="see a depth image, not shapes")
+    options = parser.parse_args()
+    main(options.folder, options.depth)

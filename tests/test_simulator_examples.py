@@ -22,15 +22,17 @@ def example(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
     return module
 
 
-@pytest.mark.parametrize("simulator", ["mujoco", "pybullet"])
+@pytest.mark.parametrize(
+    ("simulator", "options"), [("mujoco", {}), ("mujoco", {"depth": True}), ("pybullet", {})]
+)
 def test_forearm(
-    simulator: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    simulator: str, options: dict[str, bool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     """Runs without a display, checks itself, writes a plot and an animation, prints a table."""
     pytest.importorskip(simulator, reason=f"{simulator} is not installed")
     monkeypatch.delenv("DISPLAY", raising=False)
-    record = example(f"{simulator}_forearm", monkeypatch).main(tmp_path)
+    record = example(f"{simulator}_forearm", monkeypatch).main(tmp_path, **options)
     assert (tmp_path / "forearm.png").stat().st_size > 10_000
     from PIL import Image
 
