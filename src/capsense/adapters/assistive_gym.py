@@ -78,7 +78,6 @@ def attach(
             ``exclude`` and so on.
 
     Raises:
-        MissingDependencyError: PyBullet is not installed.
         SceneError: The environment was not reset, has no such agent or link, or as for
             :func:`capsense.adapters.pybullet.attach`.
         DesignError: The design is wrong.
