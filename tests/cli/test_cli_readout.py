@@ -140,6 +140,23 @@ def test_all_chips_write_and_draw(run, tmp_path, capsys):
                  "--electrode", "E5"]) == OK  # fmt: skip
 
 
+def test_chips_are_set_up_for_the_recorded_electrodes(run, tmp_path):
+    """An MPR121 has one setting for all: that of the smallest electrode keeps all in range."""
+    folder = run()
+    with np.load(folder / "readings.npz") as data:
+        arrays = dict(data)
+    for kind, empty in (("capacitance", "baseline"), ("self_capacitance", "self_baseline")):
+        smaller = np.array([1.0, 0.8, 0.7, 0.6, 0.5, 0.45])
+        if arrays[empty].ndim == 2:
+            smaller = np.sqrt(np.outer(smaller, smaller))
+        arrays[kind], arrays[empty] = arrays[kind] * smaller, arrays[empty] * smaller
+    np.savez(folder / "readings.npz", **arrays)
+    assert main(["readout", str(folder), "--chip", "mpr121"]) == OK
+    rows = table(folder / "counts_mpr121.csv")
+    assert len({r["channel"] for r in rows}) == 6
+    assert {r["flags"] for r in rows} == {"0"}
+
+
 def test_a_file_of_options(run, tmp_path):
     folder = run()
     config = tmp_path / "mine.toml"
@@ -216,6 +233,16 @@ def test_bad_recordings_are_refused(run, tmp_path):
         (broken / name).write_bytes(content)
         with pytest.raises(ReadOutError, match=words):
             load_recording(broken / name)
+    with np.load(folder / "readings.npz") as data:
+        older = {name: data[name] for name in data.files if name != "self_capacitance"}
+    np.savez(broken / "readings.npz", **older)
+    words = "no readings.npz of this version: it lacks 'self_capacitance'; run it again"
+    with pytest.raises(ReadOutError, match=words):
+        load_recording(broken / "readings.npz")
+    names = tmp_path / "names.csv"
+    names.write_bytes(b"time_s,Cm_a_b_c_F\n0,1e-12\n")
+    with pytest.raises(ReadOutError, match="electrodes of column 'Cm_a_b_c' are not clear"):
+        load_recording(names)
     whole = tmp_path / "whole.mcap"
     whole.write_bytes(b"")
     with pytest.raises(ReadOutError, match=r"capsense export .*whole.mcap -o whole.npz"):

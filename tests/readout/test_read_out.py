@@ -276,6 +276,8 @@ def test_counts_by_channel_and_in_rows():
         counts.of("D")
     with pytest.raises(ReadOutError, match="not whole cycles"):
         counts[counts.channel != 1].table()
+    with pytest.raises(ReadOutError, match="no counts to join"):
+        join([])
 
 
 def test_representations_are_short():
@@ -289,6 +291,18 @@ def test_representations_are_short():
 def test_seeds_of_any_kind_of_integer():
     times, matrices = [0.0, 0.1], random_maxwell(np.random.default_rng(0), 3)[None].repeat(2, 0)
     assert same(full(np.int64(3))(times, matrices), full(3)(times, matrices))
+
+
+@pytest.mark.parametrize("kind", [float, np.float32, np.float64, np.int64])
+def test_numbers_of_any_kind(kind):
+    """What is a real number is taken as one, whatever library it comes from."""
+    matrix = random_maxwell(np.random.default_rng(0), 3)
+    counts = [plain(stages=(White(kind(0)),)) for _ in range(2)]
+    for readout in counts:
+        readout.sample(kind(0), matrix)
+    assert len(counts[0].sample(kind(1), matrix)) > 400
+    with pytest.raises(ReadOutError, match="give a finite time"):
+        counts[1].sample(True, matrix)
 
 
 def test_leaps_are_refused():
@@ -353,6 +367,8 @@ def test_misuse_is_refused():
         readout.sample(2.0, np.eye(2))
     with pytest.raises(ReadOutError, match="not finite"):
         readout.sample(2.0, np.array([1e-12, np.nan, 1e-12]))
+    with pytest.raises(ReadOutError, match=r"channel values have shape \(4,\); give 3"):
+        readout.sample(2.0, np.ones(4))
     with pytest.raises(ReadOutError, match=r"2 times for capacitances of shape \(3, 3\)"):
         readout([0.0, 1.0], np.ones((3, 3)))
     with pytest.raises(ReadOutError, match="times must be finite numbers that rise"):

@@ -77,6 +77,9 @@ class AttachedSensor(ABC):
 
         Args:
             seed: Of its noise from now on; by default random numbers repeat.
+
+        Raises:
+            ReadOutError: The seed is no whole number from 0 on.
         """
         if self.readout is None:
             return
