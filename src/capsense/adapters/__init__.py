@@ -1,4 +1,4 @@
-"""Sensors attached to robot simulators: :mod:`capsense.adapters.mujoco`, ``…pybullet``.
+"""Sensors attached to robot simulators: MuJoCo, PyBullet, Assistive Gym, CoppeliaSim.
 
 Every adapter hands out an :class:`~capsense.adapters.attached.AttachedSensor`. What they share:
 
