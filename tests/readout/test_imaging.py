@@ -134,6 +134,9 @@ def test_voxel_centres_are_in_the_order_of_columns(field):
     """The most sensitive voxel of an electrode lies at that electrode."""
     centres = voxel_centres(AXES)
     assert centres.shape == (np.prod(CELLS), 3)
+    for number, cell in enumerate(np.ndindex(*CELLS)):
+        middle = [(axis[k] + axis[k + 1]) / 2 for axis, k in zip(AXES, cell, strict=True)]
+        assert centres[number] == near(middle, rel=1e-12)
     _, _, _, j = field
     spot = centres[np.argmax(j[PAIRS.index((0, 0))])]
     assert spot[2] == near(0.0025, rel=1e-9)
