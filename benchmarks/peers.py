@@ -187,7 +187,8 @@ def main() -> None:
             load = os.getloadavg()[0]
             rows = measure(known[name](), 1.0 if args.quick else BUDGET)
             results[name] = {**describe_machine(PACKAGES), "load": load, "results": rows}
-            path.write_text(json.dumps(results, indent=1) + "\n")
+            ordered = {key: results[key] for key in known if key in results}
+            path.write_text(json.dumps(ordered, indent=1) + "\n")
     else:
         plot(json.loads(path.read_text()), args.plot)
     print(report(json.loads(path.read_text())))

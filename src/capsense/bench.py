@@ -25,8 +25,10 @@ SPEED, RATE = 0.116, 100.0
 """Speed of the bar [m/s], and samples a second [Hz]."""
 WARM_UP = 10
 """Steps left out of the statistics: they compile or load code and fill the warm start."""
-STARTS = 3
-"""Fresh processes whose starts are timed."""
+REPEATS = 3
+"""Starts in fresh processes, and batches, of which medians are taken."""
+BATCH = 256
+"""Scenes of a batch."""
 World = cs.Scene | DepthFrame
 _T = TypeVar("_T")
 
@@ -142,10 +144,35 @@ def start_times() -> dict[str, float]:
     """Median times [s] of import, ``Simulator`` and first step in fresh interpreters."""
     runs = [
         json.loads(subprocess.check_output([sys.executable, "-c", _START], text=True))
-        for _ in range(STARTS)
+        for _ in range(REPEATS)
     ]
     names = ("import_s", "simulator_s", "first_step_s")
     return dict(zip(names, np.median(runs, axis=0).tolist(), strict=True))
+
+
+def batch_scenes(count: int = BATCH) -> list[cs.Scene]:
+    """Scenes that have nothing in common: the bar at random places, 5 to 100 mm above."""
+    rng = np.random.default_rng(0)
+    low, high = (-0.1, -0.1, 0.015), (0.1, 0.1, 0.11)
+    bar = cs.Body(cs.Box((0.15, 0.15, 0.02)), material="steel")
+    return [cs.Scene([bar.moved(cs.Pose(place))]) for place in rng.uniform(low, high, (count, 3))]
+
+
+def time_batch(sim: Simulator, threads: int | None = None) -> dict[str, float]:
+    """Scenes a second of ``step_batch``, each from rest: by the clock, and as many as the
+    processor's time of one scene gives times the threads.
+    """
+    threads = threads or len(os.sched_getaffinity(0))
+    scenes = batch_scenes()
+    sim.step_batch(scenes[:threads], threads=threads)
+    rates = []
+    for _ in range(REPEATS):
+        clock, processor = time.perf_counter(), time.process_time()
+        sim.step_batch(scenes, threads=threads)
+        spent = time.process_time() - processor
+        rates.append((BATCH / (time.perf_counter() - clock), threads * BATCH / spent))
+    by_clock, by_processor = np.median(rates, axis=0).tolist()
+    return {"scenes": BATCH, "threads": threads, "clock_per_s": by_clock, "per_s": by_processor}
 
 
 def check_error(sim: Simulator, name: str) -> float:
@@ -163,8 +190,8 @@ def measure(steps: int = 300) -> dict[str, Any]:
 
     Returns:
         The machine and its load, versions, the times of :func:`start_times` (cached field, compiled
-        code), and per world the times of :meth:`Times.summary`, the iterations and ``error``, see
-        :func:`check_error`.
+        code), per world the times of :meth:`Times.summary`, the iterations and ``error``, see
+        :func:`check_error`, and ``batch`` of :func:`time_batch`.
 
     Raises:
         ValueError: ``steps`` is less than 1.
@@ -186,4 +213,5 @@ def measure(steps: int = 300) -> dict[str, Any]:
             name: {**time_steps(sim, world, steps), "error": check_error(sim, name)}
             for name, world in WORLDS.items()
         },
+        "batch": time_batch(sim),
     }

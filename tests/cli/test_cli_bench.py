@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from field_cases import delta_reference
 
-from capsense.bench import CHECKS, WORLDS, Times, check_error
+from capsense.bench import BATCH, CHECKS, WORLDS, Times, batch_scenes, check_error
 from capsense.cli.main import main
 from capsense.simulator import Simulator
 
@@ -27,6 +27,9 @@ def test_bench_writes_what_it_prints(tmp_path: Path, capsys: pytest.CaptureFixtu
             assert 0 < row[f"{clock}median_ms"] <= row[f"{clock}p95_ms"] <= row[f"{clock}p99_ms"]
         assert f"{row['clock_median_ms']:.2f}" in text
         assert row["error"] < 0.05
+    batch = figures["batch"]
+    assert f"{batch['clock_per_s']:.0f} scenes a second" in text
+    assert batch["clock_per_s"] > 0
     for name in ("import_s", "simulator_s", "first_step_s"):
         assert figures[name] > 0
 
@@ -45,6 +48,11 @@ def test_errors_are_of_the_world_itself(name: str) -> None:
     for other in CHECKS:
         check_error(sim, other)
     assert check_error(sim, name) == pytest.approx(first, abs=1e-4)
+
+
+def test_scenes_of_a_batch_differ() -> None:
+    places = {body.pose.position for scene in batch_scenes() for body in scene}
+    assert len(places) == BATCH
 
 
 def test_times_leave_warm_up_out() -> None:

@@ -10,11 +10,11 @@ from typing import Any
 NAME = "bench"
 HELP = "measure this machine: start, step times, error"
 DESCRIPTION = """\
-Measure import, start and step times on this machine, with the error of a step against a
-converged reference; within a minute.
+Measure import, start, step times and batches on this machine, with the error of a step against
+a converged reference; within a minute.
 
 Times are by the clock, and other programs that run meanwhile lengthen them: their load is
-stated, and the column "processor" is the median of the time spent on the step itself.
+stated, and "processor" is what the processor's time alone gives.
 """
 EXAMPLES = """\
   capsense bench
@@ -82,4 +82,9 @@ def report(figures: dict[str, Any]) -> str:
     ]
     columns = ("world", "median [ms]", "p95 [ms]", "p99 [ms]", "processor [ms]", "iterations",
                "error [%]")  # fmt: skip
-    return f"{facts(head)}\n\n{table(columns, rows)}"
+    batch = figures["batch"]
+    rates = (
+        f"batch of {batch['scenes']} scenes, {batch['threads']} threads: "
+        f"{batch['clock_per_s']:.0f} scenes a second (processor: {batch['per_s']:.0f})"
+    )
+    return f"{facts(head)}\n\n{table(columns, rows)}\n\n{rates}"
