@@ -24,7 +24,9 @@ resistance 1.
   energy, weight w (1 − r_a − r_b), is added. Conductors that face each other on one link are joined
   by a coupling. A conductor that covers all of a link, but neither of its nodes, runs beside it and
   leaves it as it is.
-- What is left of a link from a node inside a conductor to one outside is a tie too, to the node.
+- What is left of a link from a node inside a conductor to one outside is a tie too, to the node;
+  what matter that fills more of the column than the conductor adds to it is one more, whose far
+  end is at −φ⁰ of the node outside. What is left of half-links from it to sheets is a tie to none.
 
 **Energy.** With K the matrix of links and ties, f_i the loads and v the ties' values,
 
@@ -36,7 +38,6 @@ tie value −1. Floating conductors are then eliminated with what ties them to g
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -48,10 +49,9 @@ from numpy.typing import NDArray
 
 from capsense.field.background import BackgroundField
 from capsense.field.lattice import FREE, Storey
-from capsense.scene import Body, PackedScene, Scene, ShapeKind
-from capsense.scene.approach_kernels import approach, slenderness
-from capsense.solve.column_kernels import RAMP, WHOLE, part_covered, thin_factor
+from capsense.scene import Body, Scene
 from capsense.solve.perturbation import CONTACT
+from capsense.solve.reference_columns import Column, met, pierce
 from capsense.solve.trace_kernels import _LEAST, _SNAP
 
 Array = NDArray[np.float64]
@@ -151,7 +151,7 @@ class _Problem:
         out: dict[int, int] = {}
         for body in self.conductors:
             for node, z, stretches in zip(
-                free.tolist(), points[:, 2], _pierce(self.scene[body], points, 2), strict=True
+                free.tolist(), points[:, 2], pierce(self.scene[body], points, 2), strict=True
             ):
                 if any(a <= z <= b for a, b in stretches):
                     out.setdefault(node, body)
@@ -183,11 +183,13 @@ class _Problem:
             smooth = (1 if storey.first else 0, len(c) - (1 if highest else 2))
         for i in range(1, len(storey.axes[p]) - 1):
             for j in range(1, len(storey.axes[q]) - 1):
-                column = _Column.around(storey, axis, i, j)
+                column = Column.around(storey, axis, i, j)
                 found = [
                     (cover, _Stretch(a, b, body, aside))
                     for body in here
-                    for cover, a, b, aside in self._met(column, body)
+                    for cover, a, b, aside in met(
+                        self.scene[body], body, self.packed, body in self.same, column
+                    )
                 ]
                 levels = sorted({cover for cover, _ in found})
                 steps = np.diff([0.0, *levels])
@@ -197,54 +199,6 @@ class _Problem:
                 ]
                 if bundle:
                     yield _Line(axis, grid[i, j], c, smooth), bundle
-
-    def _met(self, column: _Column, number: int) -> list[tuple[float, float, float, float]]:
-        """A body's stretches in a column: weight, start, end, and how far aside they lie."""
-        body, axis = self.scene[number], column.axis
-        low, high = self.packed.bounds[number]
-        if any(end < low[a] or start > high[a] for a, (start, end) in column.bounds.items()):
-            return []
-        middle = column.at(*column.middle)
-        if number not in self.same:
-            return [(1.0, a, b, 0.0) for a, b in _pierce(body, middle[None], axis)[0]]
-        hit = _pierce(body, middle[None], axis)[0]
-        centred, point = bool(hit), middle.copy()
-        if not centred:
-            trials = np.array([column.at(*uv) for uv in column.trials(self.packed, number)])
-            hits = _pierce(body, trials, axis)
-            first = next((k for k, found in enumerate(hits) if found), None)
-            if first is None:
-                return []
-            hit, point = hits[first], trials[first].copy()
-        a, b = max(hit, key=lambda ab: ab[1] - ab[0])
-        point[axis] = 0.5 * (a + b)
-        kind, params = body.shape.kind, self.packed.params[number]
-        slender = float(slenderness(kind, params))
-        share, widths, extents, off = 1.0, [], [], []
-        for along, node in zip(column.across, column.middle, strict=True):
-            low, high = column.bounds[along]
-            chords = [
-                (a, b)
-                for a, b in _pierce(body, point[None], along)[0]
-                if a - 1e-12 <= point[along] <= b + 1e-12
-            ]
-            a, b = chords[0] if chords else (point[along], point[along])
-            inside = (max(low, a), min(high, b))
-            widths.append(high - low)
-            extents.append(max(b - a, slender))
-            share *= part_covered(low, node, high, *inside, extents[-1])
-            point[along] = 0.5 * (inside[0] + inside[1])
-            off.append(max(inside[0] - node, node - inside[1], 0.0))
-        weight = 0.5 + RAMP * (share - 0.5)
-        weight = 1.0 if weight > WHOLE else weight
-        if slender < min(widths):
-            weight *= thin_factor(*widths, *extents)
-        if weight <= 0.0:
-            return []
-        if weight == 1.0 and centred:
-            point = middle
-        aside = math.hypot(*off)
-        return [(weight, a, b, aside) for a, b in _pierce(body, point[None], axis)[0]]
 
     def _disjoint(self, raw: list[_Stretch]) -> list[_Stretch]:
         """Conductors win over dielectrics, later dielectrics over earlier ones."""
@@ -528,58 +482,3 @@ class _Problem:
 
 def _farads(body: Body) -> float:
     return 0.0 if isinstance(body.grounding, str) else float(body.grounding)
-
-
-@dataclass(frozen=True)
-class _Column:
-    """What a lattice line stands for: about half-way to its neighbours."""
-
-    axis: int
-    across: tuple[int, int]
-    middle: tuple[float, float]
-    bounds: dict[int, tuple[float, float]]
-
-    @classmethod
-    def around(cls, storey: Storey, axis: int, i: int, j: int) -> _Column:
-        p, q = [a for a in range(3) if a != axis]
-        bounds = {
-            a: (float(storey.faces[a][k - 1]), float(storey.faces[a][k]))
-            for a, k in ((p, i), (q, j))
-        }
-        return cls(axis, (p, q), (float(storey.axes[p][i]), float(storey.axes[q][j])), bounds)
-
-    def trials(self, packed: PackedScene, number: int) -> list[tuple[float, float]]:
-        """Where to look for a body that the middle misses.
-
-        Where it comes closest to the column's line, drawn into the column. For meshes and
-        layers, the middles of the column's sides, then its corners.
-        """
-        (u, v), (p, q) = self.middle, self.across
-        (pl, ph), (ql, qh) = self.bounds[p], self.bounds[q]
-        kind = packed.kinds[number]
-        if kind not in (ShapeKind.MESH, ShapeKind.LAYERS):
-            x, y, z = self.at(u, v).tolist()
-            near = approach(
-                kind, packed.params[number], packed.rotation[number], packed.position[number],
-                x, y, z, self.axis,
-            )  # fmt: skip
-            return [(float(np.clip(near[p], pl, ph)), float(np.clip(near[q], ql, qh)))]
-        return [
-            (pl, v), (ph, v), (u, ql), (u, qh), (pl, ql), (pl, qh), (ph, ql), (ph, qh)
-        ]  # fmt: skip
-
-    def at(self, u: float, v: float) -> Array:
-        """A point of the line at (u, v) across."""
-        out = np.zeros(3)
-        out[list(self.across)] = u, v
-        return out
-
-
-def _pierce(body: Body, points: Array, axis: int) -> list[list[tuple[float, float]]]:
-    """Stretches inside a body of lines along an axis: coordinates [m] of their ends."""
-    origins = points.copy()
-    origins[:, axis] = 0.0
-    back = body.pose.rotation.T
-    local = (origins - np.asarray(body.pose.position)) @ back.T
-    found = body.shape.line_intervals(local, back[:, axis]).reshape(len(origins), -1, 2)
-    return [[(float(a), float(b)) for a, b in rows if b > a] for rows in found]

@@ -14,7 +14,15 @@ import math
 import numpy as np
 from numba import njit
 
-from capsense.solve.column_kernels import MAX_STRETCHES, MESH_STRETCHES, covered_stretches, pierce
+from capsense.solve.column_kernels import MAX_STRETCHES, MESH_STRETCHES, covered_stretches
+from capsense.solve.finding_kernels import (
+    add_energy,
+    add_tie,
+    room,
+    value_beside_sheet,
+    value_on_link,
+)
+from capsense.solve.inside_kernels import close_inside, mark_inside, place
 
 _SNAP = 1e-6
 """Fraction of a link within which a surface counts as lying on a node."""
@@ -22,58 +30,6 @@ _LEAST = 1e-3
 """Smallest fraction of a link between a free node and a conductor."""
 FULL, CROWDED, SHORT = 0, 1, 2
 """Outcomes of a scan: whole; more stretches on a line than fit; more findings than fit."""
-
-
-STOREY = np.dtype(
-    [
-        ("first", np.int64),
-        ("shape", np.int64, (3,)),
-        ("begin", np.int64, (3,)),
-        ("lowest", np.int64, (3,)),
-        ("highest", np.int64, (3,)),
-    ]
-)
-"""First node and shape of a storey, where its coordinates begin along each axis, and the first and
-last node on a line whose values may be used together (the floor's and ceiling's may not)."""
-LINK = np.dtype([("weight", np.float32), ("eps_r", np.float32), ("cut", np.int64)])
-"""Weight and permittivity in the empty domain, and the number of the link's cut; −1: none."""
-NODE = np.dtype([("owner", np.int64), ("kink", np.bool_), ("plain", np.bool_)])
-"""What holds a node, whether the background field has a kink there, and whether its links along x,
-y and z to the next nodes are all whole."""
-CUT = np.dtype(
-    [
-        ("half", np.float64, (2,)),
-        ("length", np.float64, (2,)),
-        ("owner", np.int64, (2,)),
-    ]
-)
-"""Weights of both half-links, their lengths as fractions of the link, what holds their ends."""
-TIE = np.dtype(
-    [
-        ("node", np.int64),
-        ("weight", np.float64),
-        ("conductor", np.int64),
-        ("point", np.int64, (4,)),
-        ("coef", np.float64, (4,)),
-        ("end", np.int64),
-        ("end_coef", np.float64),
-    ]
-)
-"""A conductance from a node (−1: a held end) to a conductor, at a place where the background
-potential is ``Σ_k coef[k] φ[point[k]] + end_coef φ_end``."""
-ENERGY = np.dtype(
-    [
-        ("a", np.int64),
-        ("b", np.int64),
-        ("end", np.int64),
-        ("weight", np.float64),
-        ("drives", np.bool_),
-    ]
-)
-"""Adds ``weight · Δφ_i Δφ_j`` over a link from a to b (−1: the held ``end``). Where it drives, it
-loads both ends too (a dielectric)."""
-COUPLE = np.dtype([("a", np.int64), ("b", np.int64), ("weight", np.float64)])
-"""Two conductors that face each other on one link."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -131,64 +87,6 @@ def _join(joined, a, b):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _place(c, t):
-    """How many of the increasing numbers ``c`` lie below t."""
-    low, high = 0, c.shape[0]
-    while low < high:
-        middle = (low + high) >> 1
-        if c[middle] < t:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, inside_nodes, before):
-    """Mark free nodes inside conductors with the conductor's index, as seen along z.
-
-    Clears the first ``before`` marks in ``inside_nodes``; returns how many nodes lie inside now.
-    """
-    for i in range(before):
-        inside[inside_nodes[i]] = -1
-    out = np.empty((MESH_STRETCHES, 2))
-    n = 0
-    for s in range(storeys.shape[0]):
-        storey = storeys[s]
-        first, begin = storey.first, storey.begin
-        nx, ny, nz = storey.shape[0], storey.shape[1], storey.shape[2]
-        x, y = axes[begin[0] : begin[0] + nx], axes[begin[1] : begin[1] + ny]
-        z = axes[begin[2] : begin[2] + nz]
-        for m in range(bodies.shape[0]):
-            body = bodies[m]
-            bounds = body.bounds
-            if body.conductor < 0 or bounds[1, 2] < z[1] or bounds[0, 2] > z[nz - 2]:
-                continue
-            for i in range(1, nx - 1):
-                if x[i] < bounds[0, 0] or x[i] > bounds[1, 0]:
-                    continue
-                for j in range(1, ny - 1):
-                    if y[j] < bounds[0, 1] or y[j] > bounds[1, 1]:
-                        continue
-                    count = pierce(2, x[i], y[j], -math.inf, math.inf, body, grids, out)
-                    for c in range(count):
-                        k = max(1, _place(z, out[c, 0]))
-                        while k < nz - 1 and z[k] <= out[c, 1]:
-                            a = first + (i * ny + j) * nz + k
-                            if nodes[a].owner == -1 and inside[a] < 0:
-                                inside[a] = body.conductor
-                                inside_nodes[n] = a
-                                n += 1
-                            k += 1
-    for j in range(ceiling.shape[0]):
-        if inside[parent[j]] >= 0:
-            inside[ceiling[j]] = inside[parent[j]]
-            inside_nodes[n] = ceiling[j]
-            n += 1
-    return n
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, stored, bodies, grids,
           contact, joined, weight, extra, inside, inside_nodes, ties, energies, couples, within,
           counts):  # fmt: skip
@@ -210,7 +108,7 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, store
             )  # fmt: skip
             if status != FULL:
                 return status
-    if not _close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes,
+    if not close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes,
                          ties, energies, couples, within, counts):  # fmt: skip
         return SHORT
     for i in range(counts[0]):
@@ -296,7 +194,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
               counts):  # fmt: skip
     """Lay ``n`` disjoint stretches over the links of a line; False: the findings do not fit."""
     last = c.shape[0] - 1
-    m = max(0, _place(c, r0[0]) - 1)
+    m = max(0, place(c, r0[0]) - 1)
     seg = 0
     while m < last:
         while seg < n and r1[seg] <= c[m]:
@@ -304,7 +202,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
         if seg == n:
             break
         if r0[seg] >= c[m + 1]:
-            m = max(m + 1, _place(c, r0[seg]) - 1)
+            m = max(m + 1, place(c, r0[seg]) - 1)
             continue
         a = line + m * stride
         b = a + stride
@@ -312,7 +210,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
         whole_inside = link.cut < 0 and inside[a] >= 0 and inside[b] >= 0
         one_sheet = nodes[a].owner != -1 and nodes[a].owner == nodes[b].owner
         if not whole_inside and not one_sheet and (link.cut >= 0 or link.weight > 0.0):
-            if not _room(ties, energies, couples, counts):
+            if not room(ties, energies, couples, counts):
                 return False
             for part in range(1 if link.cut < 0 else 2):
                 _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1,
@@ -320,40 +218,6 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
                           energies, couples, counts)  # fmt: skip
         m += 1
     return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _room(ties, energies, couples, counts):
-    """Whether the buffers hold what one link may add."""
-    return (
-        counts[0] + 8 <= ties.shape[0]
-        and counts[1] + 4 <= energies.shape[0]
-        and counts[2] + 8 <= couples.shape[0]
-    )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_energy(energies, counts, a, b, end, weight, drives):
-    term = energies[counts[1]]
-    term.a, term.b, term.end, term.weight, term.drives = a, b, end, weight, drives
-    counts[1] += 1
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_tie(ties, counts, extra, node, conductor, point, end, weight):
-    """Tie a node (−1: a held end) to a conductor, where the background has a node's potential.
-
-    That of the node ``point``; of the held ``end`` if this is −1.
-    """
-    tie = ties[counts[0]]
-    tie.node, tie.conductor, tie.weight = node, conductor, weight
-    for k in range(4):
-        tie.point[k], tie.coef[k] = max(point, 0), 0.0
-    tie.coef[0] = 1.0 if point >= 0 else 0.0
-    tie.end, tie.end_coef = end, 1.0 if point < 0 else 0.0
-    if node >= 0:
-        extra[node] += weight
-    counts[0] += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -425,13 +289,13 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
             # one end is at the potential of a conductor that fills less of the column
             near, far = (na, nb) if inside_a else (nb, na)
             free = free_b if inside_a else free_a
-            _add_tie(ties, counts, extra, far if free else -1, inside[near], far, end, change)
+            add_tie(ties, counts, extra, far if free else -1, inside[near], far, end, change)
             return
         if link.cut < 0:
             weight[axis, a] += change
         else:
             extra[na if na >= 0 else nb] += change
-        _add_energy(energies, counts, na, nb, end, change, True)
+        add_energy(energies, counts, na, nb, end, change, True)
         return
     if (
         link.cut < 0 and not parted
@@ -475,110 +339,8 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
         away = (t - pa) / length if side == 0 else (pb - t) / length
         shift = (away - r) * (1.0 if side == 0 else -1.0)
         if link.cut >= 0:
-            _value_beside_sheet(tie, na, nb, end, (t - pa) / length, shift)
+            value_beside_sheet(tie, na, nb, end, (t - pa) / length, shift)
         else:
-            _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift)
+            value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift)
         counts[0] += 1
-    _add_energy(energies, counts, na, nb, end, inner, False)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _value_beside_sheet(tie, na, nb, end, s, shift):
-    """Background potential at fraction s of a half-link from na or to nb: linear along it."""
-    point, coef = tie.point, tie.coef
-    for k in range(4):
-        point[k], coef[k] = na if na >= 0 else nb, 0.0
-    at_b = s - shift
-    coef[0] = 1.0 - at_b if na >= 0 else at_b
-    tie.end = end
-    tie.end_coef = at_b if na >= 0 else 1.0 - at_b
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
-    """Coefficients of the background potential at t on the link from a to b.
-
-    Cubic where both neighbours beyond the link are smooth, of lower order beside an electrode or
-    a layer's face, and at the ends of the line at ``lowest`` and ``highest``. The drop over a
-    dielectric in front of the conductor is added linearly: ``phi(t) + shift (phi_a − phi_b)``.
-    """
-    stride = b - a
-    before = m > lowest and m < highest and not nodes[a].kink
-    after = m + 1 < highest and not nodes[b].kink
-    x1, x2 = c[m], c[m + 1]
-    l0, l1, l2, l3 = 0.0, (t - x2) / (x1 - x2), (t - x1) / (x2 - x1), 0.0
-    if before:
-        x0 = c[m - 1]
-        l0 = (t - x1) * (t - x2) / ((x0 - x1) * (x0 - x2))
-        l1 *= (t - x0) / (x1 - x0)
-        l2 *= (t - x0) / (x2 - x0)
-    if after:
-        x3 = c[m + 2]
-        l3 = (t - x1) * (t - x2) / ((x3 - x1) * (x3 - x2))
-        l1 *= (t - x3) / (x1 - x3)
-        l2 *= (t - x3) / (x2 - x3)
-        if before:
-            l0 *= (t - x3) / (c[m - 1] - x3)
-            l3 *= (t - c[m - 1]) / (x3 - c[m - 1])
-    point, coef = tie.point, tie.coef
-    point[0], point[1] = a - stride if before else a, a
-    point[2], point[3] = b, b + stride if after else b
-    coef[0], coef[1], coef[2], coef[3] = l0, l1 + shift, l2 - shift, l3
-    tie.end, tie.end_coef = -3, 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes, ties,
-                  energies, couples, within, counts):  # fmt: skip
-    """Turn what conductors leave of the links from nodes inside them into ties.
-
-    Returns False if the findings do not fit.
-    """
-    within[:] = 0.0
-    s = 0
-    for i in range(counts[3]):
-        a = inside_nodes[i]
-        while a < storeys[s].first:
-            s -= 1
-        while s + 1 < storeys.shape[0] and a >= storeys[s + 1].first:
-            s += 1
-        strides = (storeys[s].shape[1] * storeys[s].shape[2], storeys[s].shape[2], 1)
-        deep = nodes[a].plain
-        for axis in range(3):
-            deep = deep and inside[a + strides[axis]] >= 0
-        if deep:
-            for axis in range(3):
-                weight[axis, a] = 0.0
-            for k in range(within.shape[0]):
-                within[k] += stored[a, k]
-        half = 0.0
-        for axis in range(3):
-            for way in range(1 if deep else 0, 2):
-                lower = a if way == 0 else a - strides[axis]
-                b = a + strides[axis] if way == 0 else lower
-                link = links[axis, lower]
-                if link.cut >= 0:
-                    half += cuts[link.cut].half[way]
-                    continue
-                if link.weight == 0.0 or (way == 1 and inside[b] >= 0):
-                    continue
-                if not _room(ties, energies, couples, counts):
-                    return False
-                if inside[b] >= 0:
-                    weight[axis, lower] = 0.0
-                    _add_energy(energies, counts, a, b, -3, link.weight, False)
-                    continue
-                w = weight[axis, lower]
-                weight[axis, lower] = 0.0
-                if w <= 1e-5 * link.weight:
-                    continue
-                free = nodes[b].owner == -1
-                _add_tie(ties, counts, extra, b if free else -1, inside[a], a, -3, w)
-        # what conductors leave of half-links to sheets
-        rest = extra[a]
-        extra[a] = 0.0
-        if rest > 1e-5 * half:
-            if not _room(ties, energies, couples, counts):
-                return False
-            _add_tie(ties, counts, extra, -1, inside[a], a, -3, rest)
-    return True
+    add_energy(energies, counts, na, nb, end, inner, False)
