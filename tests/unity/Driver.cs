@@ -21,6 +21,7 @@ public static class Driver
             case "hello": Hello(url, last, words.Length > 3 ? int.Parse(words[3]) : 1); break;
             case "stay": Stay(url); break;
             case "component": Component(url, last == "reversed"); break;
+            case "sample": Sample(url); break;
             default: return 2;
         }
         return 0;
@@ -168,7 +169,7 @@ public static class Driver
     {
         SystemInfo.usesReversedZBuffer = reversed;
         World.Depth = (x, y) => Math.Abs(x - 0.06f) < 0.03f && Math.Abs(y - 0.05f) < 0.03f ? 0.06f : 1;
-        World.Code = (x, y) => 255;
+        World.Code = (x, y) => (byte)(x < 0.06f ? 3 : 9);
         var sensor = new GameObject("sensor").AddComponent<CapacitiveSensor>();
         sensor.url = url;
         sensor.permittivityCodes = true;
@@ -186,5 +187,29 @@ public static class Driver
             "received", received);
         sensor.Tell("OnDisable");
         Print("state", sensor.State.ToString());
+    }
+
+    /// <summary>The sample, a few frames long; what its bars say, and the readings.</summary>
+    private static void Sample(string url)
+    {
+        World.Depth = (x, y) => Math.Abs(x + 0.04f) < 0.05f && Math.Abs(y) < 0.03f ? 0.03f : 1;
+        var sample = new GameObject("sample").AddComponent<HandSample>();
+        sample.Tell("Start");
+        CapacitiveSensor sensor = World.Components.OfType<CapacitiveSensor>().Single();
+        sensor.url = url;
+        sensor.Tell("OnEnable");
+        var limit = Stopwatch.StartNew();
+        while (sensor.Reading == null && limit.Elapsed.TotalSeconds < 10)
+        {
+            UnityEngine.Time.time += 0.02f;
+            sample.Tell("Update");
+            sensor.Tell("LateUpdate");
+            Thread.Sleep(5);
+        }
+        var bars = World.Primitives.Where(p => p.name.StartsWith("E")).ToArray();
+        Print("names", bars.Select(b => b.name).ToArray(),
+            "heights", bars.Select(b => b.transform.localScale.y).ToArray(),
+            "delta", sensor.Reading.Delta.Cast<double>().ToArray());
+        sensor.Tell("OnDisable");
     }
 }

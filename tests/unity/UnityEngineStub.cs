@@ -21,6 +21,8 @@ namespace UnityEngine
     {
         public static Func<float, float, float> Depth = (x, y) => float.PositiveInfinity;
         public static Func<float, float, byte> Code = (x, y) => 0;
+        public static readonly List<Component> Components = new List<Component>();
+        public static readonly List<GameObject> Primitives = new List<GameObject>();
     }
 
     public class Object
@@ -34,6 +36,11 @@ namespace UnityEngine
     public class Component : Object
     {
         public GameObject gameObject;
+        public new string name
+        {
+            get { return gameObject.name; }
+            set { gameObject.name = value; }
+        }
         public Transform transform { get { return gameObject.transform; } }
     }
 
@@ -56,8 +63,17 @@ namespace UnityEngine
             this.name = name;
             transform = new Transform { gameObject = this };
         }
-        public T AddComponent<T>() where T : Component, new() { return new T { gameObject = this }; }
-        public static GameObject CreatePrimitive(PrimitiveType type) { return new GameObject(type.ToString()); }
+        public T AddComponent<T>() where T : Component, new()
+        {
+            var made = new T { gameObject = this };
+            World.Components.Add(made);
+            return made;
+        }
+        public static GameObject CreatePrimitive(PrimitiveType type)
+        {
+            World.Primitives.Add(new GameObject(type.ToString()));
+            return World.Primitives[World.Primitives.Count - 1];
+        }
     }
 
     public class Transform : Component
@@ -70,7 +86,8 @@ namespace UnityEngine
     public struct Vector3
     {
         public float x, y, z;
-        public static readonly Vector3 up = new Vector3(0, 1, 0), forward = new Vector3(0, 0, 1);
+        public static readonly Vector3 right = new Vector3(1, 0, 0), up = new Vector3(0, 1, 0),
+            forward = new Vector3(0, 0, 1);
         public Vector3(float x, float y, float z) { this.x = x; this.y = y; this.z = z; }
     }
 
@@ -172,6 +189,8 @@ namespace UnityEngine
 
         public void Render()
         {
+            if (!orthographic || enabled || allowMSAA || allowHDR || nearClipPlane != 0)
+                throw new InvalidOperationException("this camera does not measure depths");
             int n = (int)Math.Sqrt(depth.Depth.Length);
             for (int row = 0; row < n; row++)
                 for (int column = 0; column < n; column++)

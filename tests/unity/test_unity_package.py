@@ -40,10 +40,15 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package, its sample, the stub and the driver, compiled without a warning."""
     sources = [*HERE.glob("*.cs"), *PACKAGE.rglob("*.cs")]
     target = tmp_path_factory.mktemp("unity") / "driver.exe"
-    command = ["mcs", "-langversion:7.2", "-warn:4", "-warnaserror", f"-out:{target}"]
-    done = subprocess.run([*command, *map(str, sources)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    compile_sources(f"-out:{target}", *map(str, sources))
     return target
+
+
+def compile_sources(*words: str) -> None:
+    """Run the compiler; warnings are errors."""
+    command = ["mcs", "-langversion:7.2", "-warn:4", "-warnaserror", *words]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.fixture(scope="session")
@@ -65,6 +70,14 @@ def run(program: Path, *words: str) -> list[dict[str, Any]]:
 def matrix(flat: list[float]) -> np.ndarray:
     """A matrix of six electrodes."""
     return np.array(flat).reshape(6, 6)
+
+
+@needs_mono
+def test_client_needs_the_base_library_alone(tmp_path: Path) -> None:
+    """It compiles without anything of Unity's."""
+    client = ("CapSenseClient", "RemoteSensor", "Wire", "Json")
+    sources = [str(PACKAGE / "Runtime" / f"{name}.cs") for name in client]
+    compile_sources("-target:library", f"-out:{tmp_path / 'client.dll'}", *sources)
 
 
 @needs_mono
@@ -154,17 +167,28 @@ def test_component(program: Path, served: RunningServer, depth_buffer: str) -> N
     """What stands above, to the right of the component is felt by the electrode there.
 
     Unity's right is the design's −x, so that is E4; and it is as strong as the same box is for
-    the simulator, to within the half pixel that the image leaves open.
+    the simulator, whose halves have the permittivities that the red channel tells.
     """
     first, last = run(program, "component", served.url, depth_buffer)
     x, y = np.meshgrid((np.arange(64) + 0.5) / 128 - 0.25, (np.arange(64) + 0.5) / 128 - 0.25)
     box = (np.abs(x + 0.06) < 0.03) & (np.abs(y - 0.05) < 0.03)
-    here = Simulator("six_patch").step(cs.DepthFrame(np.where(box, 0.06, 0.0))).delta
+    codes = np.where(x > -0.06, 3, 9).astype(np.uint8)
+    here = Simulator("six_patch").step(cs.DepthFrame(np.where(box, 0.06, 0.0), codes)).delta
     assert np.argmax(np.diag(matrix(first["delta"]))) == 3
     assert matrix(first["delta"]) == pytest.approx(here, rel=1e-3)
     assert first["received"] == 3
     assert 0 < first["time"] < 0.5 * TIMEOUT
     assert last == {"state": "Stopped"}
+
+
+@needs_mono
+def test_sample(program: Path, served: RunningServer) -> None:
+    """A bar for each electrode, as high as its signal."""
+    (line,) = run(program, "sample", served.url)
+    assert tuple(line["names"]) == Simulator("six_patch").electrode_names
+    own = np.diag(matrix(line["delta"]))
+    assert own.min() > 1e-15
+    assert line["heights"] == pytest.approx(np.maximum(own / 1e-12, 0.001), rel=1e-6)
 
 
 json_values = st.recursive(

@@ -156,8 +156,13 @@ namespace CapSense
                 await Next(message, limit.Token).ConfigureAwait(false);
                 Handle(message);
             }
-            lock (gate) State = ClientState.Connected;
-            foreach (RemoteSensor sensor in All()) SendText(sensor.Options.ToMessage(sensor.Number));
+            RemoteSensor[] known;
+            lock (gate)
+            {
+                State = ClientState.Connected;  // whatever is added from now on opens itself
+                known = All();
+            }
+            foreach (RemoteSensor sensor in known) SendText(sensor.Options.ToMessage(sensor.Number));
             Say("connected");
         }
 

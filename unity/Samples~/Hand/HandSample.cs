@@ -18,6 +18,7 @@ public sealed class HandSample : MonoBehaviour
     {
         hand = GameObject.CreatePrimitive(PrimitiveType.Capsule).transform;
         hand.localScale = new Vector3(0.08f, 0.1f, 0.08f);  // a capsule of 80 mm, 200 mm long
+        hand.rotation = Quaternion.LookRotation(Vector3.up, Vector3.right);  // that lies along x
         var plate = new GameObject("sensor");
         plate.transform.rotation = Quaternion.LookRotation(Vector3.up, Vector3.forward);
         sensor = plate.AddComponent<CapacitiveSensor>();
