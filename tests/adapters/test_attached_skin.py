@@ -190,7 +190,7 @@ def test_each_sensor_has_its_own_chip() -> None:
     skin = arm.skin("six_patch_bare", readout="fdc1004")
     chips = {id(s.readout) for s in skin.sensors.values()}
     assert len(chips) == 3
-    assert [s.readout.seed for s in skin.sensors.values()] == [0, 1, 2]  # noise is not shared
+    assert [s.readout.seed for s in skin.sensors.values()] == [0, 2**32, 2**33]  # noise apart
     for k in range(3):
         arm.move(k)
         readings = skin.read()
@@ -204,17 +204,44 @@ def test_chips_start_at_the_simulators_time(tiny_simulator: cs.Simulator) -> Non
     skin = arm.skin(tiny_simulator, readout="fdc1004")
     for start in (50.0, 70.0):
         arm.data.time = start
-        skin.reset()
+        skin.reset(seed=3)
         arm.data.time = start + 0.1
         for reading in skin.read().values():
             assert start < reading.counts.time.min() <= start + 0.0101
     arm.data.time = 90.0
     sensor = arm.single("a", tiny_simulator)
     sensor.use_readout("fdc1004")
-    sensor.restart_readout(seed=5)
     arm.data.time = 90.1
     assert sensor.read().counts.time.min() > 90.0
-    assert sensor.readout.seed == 5
+
+
+def test_seeds_of_a_skin() -> None:
+    """Noise is each sensor's own; it repeats after a reset, unless there is another seed."""
+    arm = MujocoArm()
+    skin = arm.skin("six_patch_bare", readout="teensy")
+
+    def codes() -> dict[str, list[int]]:
+        arm.data.time = 0.1
+        found = {name: r.counts.code.tolist() for name, r in skin.read().items()}
+        arm.data.time = 0.0
+        return found
+
+    arm.data.time = 0.0
+    skin.reset()
+    first = codes()
+    assert first["a"] != first["b"] != first["c"]
+    skin.reset()
+    assert codes() == first
+    skin.reset(seed=1)
+    second = codes()
+    assert all(second[name] != first[other] for name in SITES for other in SITES)
+    single = arm.single("b", cs.Simulator("six_patch_bare"))
+    single.use_readout("teensy")
+    single.reset(seed=1 + 2**32)
+    arm.data.time = 0.1
+    assert single.read().counts.code.tolist() == second["b"]
+    with pytest.raises(cs.ReadOutError, match="seed is -1"):
+        single.reset(seed=-1)
 
 
 def test_a_readout_is_not_shared(tiny_simulator: cs.Simulator) -> None:

@@ -70,17 +70,10 @@ class AttachedSensor(ABC):
             ReadOutError: There is no such chip or file, or the file is wrong.
         """
         self.readout = make_readout(readout, self.simulator)
-        self.restart_readout()
+        self._restart_readout(None)
 
-    def restart_readout(self, seed: int | None = None) -> None:
-        """Switch the chip on anew, at the simulator's time, or at 0 s if that is not told.
-
-        Args:
-            seed: Of its noise from now on; by default random numbers repeat.
-
-        Raises:
-            ReadOutError: The seed is no whole number from 0 on.
-        """
+    def _restart_readout(self, seed: int | None) -> None:
+        """Switch the chip on anew, at the simulator's time, or at 0 s if that is not told."""
         if self.readout is None:
             return
         try:
@@ -140,10 +133,17 @@ class AttachedSensor(ABC):
         """Electrode names in matrix order."""
         return self.simulator.electrode_names
 
-    def reset(self) -> None:
-        """Forget the previous step, as after the simulator was set back; restart the read-out."""
+    def reset(self, seed: int | None = None) -> None:
+        """Forget the previous step, as after the simulator was set back; restart the read-out.
+
+        Args:
+            seed: Of the read-out's noise from now on; by default its random numbers repeat.
+
+        Raises:
+            ReadOutError: The seed is no whole number from 0 on.
+        """
         self.simulator.reset()
-        self.restart_readout()
+        self._restart_readout(seed)
 
 
 class DepthSensor(AttachedSensor):

@@ -9,7 +9,7 @@ from capsense._crew import Crew
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
 from capsense.errors import ReadOutError, SceneError
-from capsense.readout.read_out import ReadOut
+from capsense.readout.read_out import SEED_STRIDE, ReadOut
 from capsense.scene import Pose
 from capsense.simulator import Reading, Simulator
 from capsense.skin import AnyDesign, make_simulators, read_all
@@ -21,7 +21,7 @@ class AttachedSkin:
     Args:
         sensors: Name → sensor; they share one source of their world.
         readout: Name of the chip behind every sensor, the path of a read-out file, or None. Each
-            has noise of its own: their seeds count up, in the order of the sensors.
+            has noise of its own, see :meth:`reset`.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
@@ -40,10 +40,11 @@ class AttachedSkin:
         """The sensors, as ``attach`` makes them."""
         self._source = next(iter(self.sensors.values())).source
         self._crew = Crew(threads)
-        for number, sensor in enumerate(self.sensors.values()):
+        for sensor in self.sensors.values():
             sensor.use_readout(readout)
-            if sensor.readout is not None:
-                sensor.restart_readout(sensor.readout.seed + number)
+        first = next(iter(self.sensors.values())).readout
+        if first is not None:
+            self.reset(first.seed)
 
     def read(self, time: float | None = None) -> dict[str, Reading]:
         """The readings of the simulator's present state, by name.
@@ -86,10 +87,18 @@ class AttachedSkin:
         for sensor in self.sensors.values():
             sensor.catch_up()
 
-    def reset(self) -> None:
-        """Forget the previous step, as after the simulator was set back; restart read-outs."""
-        for sensor in self.sensors.values():
-            sensor.reset()
+    def reset(self, seed: int | None = None) -> None:
+        """Forget the previous step, as after the simulator was set back; restart read-outs.
+
+        Args:
+            seed: Of the first sensor's read-out; those of the others follow at steps of 2³², so
+                that noise is not shared. By default all random numbers repeat.
+
+        Raises:
+            ReadOutError: The seed is no whole number from 0 on.
+        """
+        for number, sensor in enumerate(self.sensors.values()):
+            sensor.reset(None if seed is None else seed + number * SEED_STRIDE)
 
     def __len__(self) -> int:
         return len(self.sensors)

@@ -24,6 +24,9 @@ _BATCH = 4096
 """Samples processed at a time."""
 _AT_ONCE = 20_000_000
 """Samples that a single step may hold: hours of the fastest chip."""
+SEED_STRIDE = 2**32
+"""How far apart the seeds of sensors side by side lie: where seeds count up from run to run, no
+sensor sees in one run what another one saw in the last."""
 
 
 class Reading(Protocol):

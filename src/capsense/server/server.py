@@ -20,7 +20,7 @@ from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ProtocolError, ServerError
 from capsense.readout.config import choose_readout, file_content, parse_readout
-from capsense.readout.read_out import ReadOut
+from capsense.readout.read_out import SEED_STRIDE, ReadOut
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
 from capsense.server.frames import PROTOCOL
@@ -253,7 +253,7 @@ class Server:
         if choice is None:
             return None
         readout = choose_readout(choice, simulator.electrode_names, simulator.step(Scene()))
-        readout.reset(seed=readout.seed + number)
+        readout.reset(seed=readout.seed + number * SEED_STRIDE)
         return readout
 
 
