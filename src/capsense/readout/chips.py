@@ -103,7 +103,8 @@ FDC2214 = Chip(
              "that of the evaluation module: TI E2E forum thread 717275"),
         Fact("reference", "40 MHz", _CONFIRMED, "the external clock that the Zephyr driver's "
              "binding ti,fdc2x1x recommends"),
-        Fact("capacitor", "33 pF", _REMEMBERED, "evaluation module"),
+        Fact("capacitor", "33 pF", _CONFIRMED,
+             "settings of the evaluation module's software: TI E2E forum thread 798656"),
         Fact("switch-over", "50 µs, for settling and multiplexer", _ASSUMED, "settable"),
         Fact("flicker floor", "0.1 fF", _ASSUMED, ""),
     ),
