@@ -216,6 +216,25 @@ def test_reading_shape_and_names(sensor_in: SensorIn, tiny_simulator: cs.Simulat
     assert reading.capacitance == pytest.approx(sensor.baseline + reading.delta, abs=0)
 
 
+# -- what sees depth images --------------------------------------------------------------------
+
+
+def test_a_camera_inside_a_body(image_way: Way, image_in: SensorIn) -> None:
+    """As documented: rays tell where they leave it, and PyBullet draws nothing of it."""
+    block = Thing("block", cs.Box((0.06, 0.05, 0.04)), cs.Pose())
+    sensor = image_in([block], cs.Pose())
+    frame = sensor.frame()
+    if image_way.package == "pybullet":
+        assert not frame.valid.any()
+    else:
+        assert frame.points()[:, 2] == pytest.approx(np.full(frame.valid.sum(), 0.02), abs=1e-6)
+        assert frame.valid.mean() == pytest.approx(0.30, abs=0.02)
+    assert np.isfinite(sensor.read().delta).all()
+
+
+# -- what is refused ---------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
