@@ -126,7 +126,7 @@ def heat_map(names: Sequence[str], delta: Array) -> str:
     return (
         '<div style="padding:0 0.6em 0.6em"><div style="font-size:13px;text-align:center">'
         "ΔC, Maxwell matrix [fF]</div>"
-        f'<table style="{style}"><tr>{head}</tr>{"".join(rows)}</table></div>'
+        f'<table class="matrix" style="{style}"><tr>{head}</tr>{"".join(rows)}</table></div>'
     )
 
 

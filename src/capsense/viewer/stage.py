@@ -99,7 +99,7 @@ class Stage:
         """
         shown, colours = paint(plane.sample(potential))
         self._scene.add_point_cloud(
-            "/potential", plane.points[shown], colours, point_size=plane.pitch,
+            "/potential", plane.points[shown], colours, point_size=0.6 * plane.pitch,
             point_shape="square", point_shading="flat",
         )  # fmt: skip
 
@@ -142,8 +142,8 @@ class Stage:
             return self._dots(name, body.shape, colour)
         mesh = body.shape.to_trimesh()
         return self._scene.add_mesh_simple(
-            name, mesh.vertices, mesh.faces, color=colour, opacity=0.4, flat_shading=body.shape.kind in _FACETED, cast_shadow=False,
-            receive_shadow=False,
+            name, mesh.vertices, mesh.faces, color=colour, opacity=0.4, cast_shadow=False,
+            flat_shading=body.shape.kind in _FACETED, receive_shadow=False,
         )  # fmt: skip
 
     def _dots(self, name: str, layers: Layers, colour: Colour) -> Any:
@@ -154,6 +154,6 @@ class Stage:
         front = layers.fields[slot, row, column, 0]
         points = np.column_stack([x + column * width, y + row * height, front])
         return self._scene.add_point_cloud(
-            name, points, colour, point_size=0.5 * min(width, height), point_shape="circle",
+            name, points, colour, point_size=0.2 * min(width, height), point_shape="circle",
             point_shading="flat",
         )  # fmt: skip

@@ -95,6 +95,8 @@ class Watched:
 
         try:
             return Client(self._url, token=self._token, name="capsense view")
+        except ProtocolError:
+            raise
         except (OSError, ValueError, WebSocketException) as error:
             raise ServerError(
                 f"there is no server to watch at {self._url}: {error}; start one with: capsense "

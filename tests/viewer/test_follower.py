@@ -1,0 +1,138 @@
+"""The follower: live samples are kept, held, and looked at again."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+import capsense as cs
+from capsense.errors import ProtocolError
+from capsense.recording.session import reading_of
+from capsense.scenario.channels import Excitation, channels_of
+from capsense.viewer import follower
+from capsense.viewer.follower import Follower
+from capsense.viewer.source import Shot
+
+
+class Queued:
+    """A stream of what tests put in; sample k has k + 1 farads in every entry."""
+
+    def __init__(self) -> None:
+        self.title, self.design = "queued", cs.load_design("patch")
+        self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
+        self.empty = self.reading(-1)
+        self.lattice = object()
+        self.items: queue.Queue[Shot | ProtocolError] = queue.Queue()
+        self.count = 0
+        self.closed = False
+
+    def reading(self, k: int) -> cs.Reading:
+        n = len(self.design.electrodes)
+        return reading_of(
+            self.design, np.full((n, n), k + 1.0), np.full((n, n), k + 1.0), np.zeros(n)
+        )
+
+    def put(self, count: int = 1) -> None:
+        for k in range(self.count, self.count + count):
+            self.items.put(Shot(k, 0.1 * k, cs.Scene(), self.reading(k), None))
+        self.count += count
+
+    def next(self, timeout: float) -> Shot | None:
+        try:
+            item = self.items.get(timeout=timeout)
+        except queue.Empty:
+            return None
+        if isinstance(item, ProtocolError):
+            raise item
+        return item
+
+    def potentials(self, shot: Shot) -> np.ndarray:
+        return np.full((3, 2), float(shot.index))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def until(condition: Callable[[], bool]) -> None:
+    limit = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < limit
+        time.sleep(1e-3)
+
+
+@pytest.fixture
+def followed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Queued, Follower]]:
+    monkeypatch.setattr(follower, "KEPT", 10)
+    stream = Queued()
+    player = Follower(stream)  # type: ignore[arg-type]
+    yield stream, player
+    player.stop()
+    assert stream.closed
+    assert not any(t.name == "capsense follower" for t in threading.enumerate())
+
+
+def test_follows(followed: tuple[Queued, Follower]) -> None:
+    """The newest is shown, and the ones before make charts."""
+    stream, player = followed
+    assert (player.newest, player.span, player.playing) == (None, (0, 0), True)
+    stream.put(6)
+    until(lambda: player.span == (0, 5))
+    assert player.newest.index == 5
+    times, changes = player.history(5)
+    np.testing.assert_allclose(times, 0.1 * np.arange(6))
+    np.testing.assert_array_equal(changes[:, -1], np.arange(1.0, 7.0))
+
+
+def test_holds_and_looks_back(followed: tuple[Queued, Follower]) -> None:
+    """While it is held, samples come in unseen; steps go through what is kept."""
+    stream, player = followed
+    stream.put(4)
+    until(lambda: player.span == (0, 3))
+    player.pause()
+    stream.put(3)
+    until(lambda: player.span == (0, 6))
+    assert (player.newest.index, player.playing) == (3, False)
+    player.step(-2)
+    assert player.newest.index == 1
+    until(lambda: player.with_field.index == 1)
+    player.step(1)
+    assert player.newest.index == 2
+    player.go(1000)
+    assert player.newest.index == 6
+    player.go(-1)
+    assert player.newest.index == 0
+    player.play()
+    assert player.newest.index == 6
+
+
+def test_forgets_the_oldest(followed: tuple[Queued, Follower]) -> None:
+    """At least ten of many are kept; one that is held and forgotten gives way to the oldest."""
+    stream, player = followed
+    stream.put(20)
+    until(lambda: player.span == (0, 19))
+    player.go(2)
+    stream.put(5)
+    until(lambda: player.span == (10, 24))
+    assert player.newest.index == 10
+    times, changes = player.history(12)
+    np.testing.assert_allclose(times, [1.0, 1.1, 1.2])
+    np.testing.assert_array_equal(changes[:, 0], [11, 12, 13])
+
+
+def test_goes_on_after_a_failure(
+    followed: tuple[Queued, Follower], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What went wrong is told until something comes again."""
+    monkeypatch.setattr(follower, "RETRY", 0.05)
+    stream, player = followed
+    stream.put(2)
+    stream.items.put(ProtocolError("the client has left"))
+    until(lambda: player.failure is not None)
+    assert player.newest.index == 1
+    stream.put(1)
+    until(lambda: player.failure is None and player.newest.index == 2)
