@@ -81,7 +81,8 @@ class Stage:
         """Put the bodies where they stand; those of other shapes are made anew."""
         bodies = list(scene)
         same = len(bodies) == len(self._bodies) and all(
-            new.shape is old.shape for new, (old, _) in zip(bodies, self._bodies, strict=True)
+            new.shape is old.shape and new.material == old.material
+            for new, (old, _) in zip(bodies, self._bodies, strict=True)
         )
         if not same:
             for _, handle in self._bodies:
