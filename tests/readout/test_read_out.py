@@ -187,6 +187,11 @@ def test_start_shifts_everything():
     matrices = moving(times, np.random.default_rng(1))
     now, later = plain()(times, matrices), plain()(times + 3600.0, matrices)
     assert later.time - 3600.0 == pytest.approx(now.time, abs=1e-9)
+    readout = plain()
+    first = readout.due(0.2)
+    readout.reset(start=3600.0)
+    assert readout.due(3600.2) - 3600.0 == pytest.approx(first, abs=1e-9)
+    assert len(readout.due(3600.0)) == 0
     # Instants relative to the start are rounded differently, by 1e-13 s or so.
     assert np.abs(later.capacitance - now.capacitance).max() < 1e-20
 
@@ -311,9 +316,12 @@ def test_leaps_are_refused():
     matrix = random_maxwell(np.random.default_rng(0), 3)
     for leap in (lambda: readout.sample(1.7e9, matrix), lambda: readout.due(1.7e9),
                  lambda: readout([0.0, 1.7e9], [matrix, matrix])):  # fmt: skip
-        with pytest.raises(ReadOutError, match=r"begin there: reset\(start=…\)"):
+        with pytest.raises(ReadOutError, match=r"1.7e\+09 s is .*begin there: reset\(start=…\)"):
             leap()
     readout.reset(start=1.7e9)
+    with pytest.raises(ReadOutError, match=r"1.8e\+09 s is more than"):
+        readout.due(1.8e9)
+    assert len(readout.due(1.7e9 + 1)) > 400
     readout.sample(1.7e9, matrix)
     done = len(readout.sample(1.7e9 + 1, matrix))
     assert done == readout.schedule.samples_until(1 - 1e-3)

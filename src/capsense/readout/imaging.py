@@ -13,7 +13,8 @@ fewer pairs than voxels: what an image shows is where something is, not what.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -188,9 +189,8 @@ def tikhonov(matrix: ArrayLike, strength: float = 1e-3, *, depth_weight: float =
 
 
 def landweber(
-    matrix: ArrayLike, change: ArrayLike, iterations: int = 50, *, low: float = 0.0,
-    high: float = math.inf,
-) -> Array:  # fmt: skip
+    matrix: ArrayLike, iterations: int = 50, *, low: float = 0.0, high: float = math.inf
+) -> Callable[[ArrayLike], Array]:
     """Projected Landweber iteration: ``g ← clip(g + α Jᵀ (d − J g), low, high)``.
 
     α is 1/λ_max(J Jᵀ), below the 2/λ_max that converges. The projection onto what matter can be
@@ -198,30 +198,37 @@ def landweber(
 
     Args:
         matrix: J, shape (pairs, voxels); better with rows scaled alike.
-        change: d, changes of capacitance [F], shape (pairs,) or (n, pairs).
         iterations: Number of steps.
         low: Least change of relative permittivity; 0 keeps images positive.
         high: Largest change.
 
     Returns:
-        Images, changes of relative permittivity, shape (voxels,) or (n, voxels).
+        A function that takes d, changes of capacitance [F], shape (pairs,) or (n, pairs), to
+        images, changes of relative permittivity, shape (voxels,) or (n, voxels). It raises
+        :class:`ReadOutError` if the shape does not fit.
 
     Raises:
-        ReadOutError: Shapes do not fit, or bounds or iterations are out of range.
+        ReadOutError: J is no matrix or zero, or bounds or iterations are out of range.
     """
     j = _checked(matrix)
-    d = finite("change", change)
-    if d.shape[-1:] != (len(j),):
-        raise ReadOutError(f"change has shape {d.shape}; give {len(j)} numbers an image")
     require_whole("Landweber", "iterations", iterations, 1)
     if not as_number(low) < as_number(high):
         raise ReadOutError(f"low = {low!r}, high = {high!r}; give numbers, low below high")
     largest = float(np.linalg.eigvalsh(j @ j.T)[-1])
     if largest <= 0:
         raise ReadOutError("the sensitivity matrix is zero; check the potentials")
+    return partial(_landweber, j, 1.0 / largest, iterations, low, high)
+
+
+def _landweber(
+    j: Array, step: float, iterations: int, low: float, high: float, change: ArrayLike
+) -> Array:
+    d = finite("change", change)
+    if d.shape[-1:] != (len(j),):
+        raise ReadOutError(f"change has shape {d.shape}; give {len(j)} numbers an image")
     image = np.clip(np.zeros((*d.shape[:-1], j.shape[1])), low, high)
     for _ in range(iterations):
-        image = np.clip(image + (d - image @ j.T) @ j / largest, low, high)
+        image = np.clip(image + step * ((d - image @ j.T) @ j), low, high)
     return image
 
 
