@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import shutil
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,7 +15,7 @@ from PIL import Image
 pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
 pytest.importorskip("playwright", reason="needs playwright: pip install playwright")
 
-from playwright.sync_api import sync_playwright
+from headless_browser import BROWSERS, browser_page, browser_path
 
 import capsense as cs
 from capsense.scenario import Scenario, parse_scenario
@@ -25,11 +24,6 @@ from capsense.viewer.player import Player
 from capsense.viewer.source import ScenarioSource
 from capsense.viewer.view import View
 
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")  # fmt: skip
-PATIENCE = 60_000.0
-"""Longest wait for the page [ms]; a software renderer is slow."""
 SCENARIO = {
     "name": "a ball <goes> by",
     "design": "patch",
@@ -66,22 +60,14 @@ def shown(scenario: Scenario) -> Iterator[tuple[Player, View]]:
 
 @pytest.fixture(scope="module")
 def page(shown: tuple[Player, View]) -> Iterator[Any]:
-    """The page in a browser that has loaded it; ``page.asked`` are all addresses it asked for."""
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
+    """The page in a browser that has loaded it."""
+    if browser_path() is None:
         pytest.skip(f"needs a browser, one of: {', '.join(BROWSERS)}")
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=path, args=SOFTWARE)
-        page = browser.new_page(viewport={"width": 1000, "height": 700})
-        page.set_default_timeout(PATIENCE)
-        page.asked = []
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.on("websocket", lambda opened: page.asked.append(opened.url))
+    with browser_page(1000, 700) as page:
         page.goto(shown[1].url)
         page.get_by_text("Maxwell matrix").wait_for()
         page.get_by_text("sample 0 of").wait_for()
         yield page
-        browser.close()
 
 
 def sample(page: Any) -> int:
