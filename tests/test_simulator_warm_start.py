@@ -8,6 +8,7 @@ from field_cases import bar
 from random_scenes import random_body, random_scene
 
 import capsense as cs
+from capsense.errors import SolveError
 
 FACTOR = 10.0
 """Each of the two solutions is within ``stats.tolerance`` of the exact one by an *estimate*; the
@@ -119,3 +120,23 @@ def test_readings_are_independent_of_each_other(simulators):
     sim.step(cs.Scene([bar(0.05)]))
     np.testing.assert_array_equal(reading.delta, kept[0])
     np.testing.assert_array_equal(reading.capacitance, kept[1])
+
+
+def test_what_is_not_finite_does_not_reach_the_next_step(simulators, monkeypatch):
+    """A step that goes wrong is refused, and the one after it starts from rest."""
+    sim = simulators("six_patch_bare")
+    scene = cs.Scene([bar(0.01)])
+    expected = sim.step(scene).delta
+    solver = sim._solver
+
+    def spoil(scene: cs.Scene, *rest: object) -> None:
+        prepare(scene, *rest)
+        for block in solver._blocks:
+            block.u[:], block.p[:], block.ap[:] = np.nan, np.nan, np.nan
+
+    prepare = solver._prepare
+    monkeypatch.setattr(solver, "_prepare", spoil)
+    with pytest.raises(SolveError, match="not finite"):
+        sim.step(cs.Scene([bar(0.02)]))
+    monkeypatch.undo()
+    np.testing.assert_array_equal(sim.step(scene).delta, expected)

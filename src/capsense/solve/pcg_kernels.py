@@ -193,6 +193,18 @@ def backward(weight, inverse, storeys, ceiling, parent, share, y, p, beta):
 
 
 @njit(cache=True, nogil=True)
+def _flow_in(wx, wy, wz, diagonal, sx, sy, p, a, below, here, above):
+    """Minus the operator times p at node a, given p below, at and above it."""
+    v = madd(wx[a - sx], load(p, a - sx), splat(np.float32(0.0)))
+    v = madd(wx[a], load(p, a + sx), v)
+    v = madd(wy[a - sy], load(p, a - sy), v)
+    v = madd(wy[a], load(p, a + sy), v)
+    v = madd(wz[a - 1], below, v)
+    v = madd(wz[a], above, v)
+    return madd(-diagonal[a], here, v)
+
+
+@njit(cache=True, nogil=True)
 def apply_operator(weight, diagonal, active, storeys, p, ap, pap):
     """Write the operator times p, zero at nodes that are off, and p · A p per lane.
 
@@ -212,13 +224,7 @@ def apply_operator(weight, diagonal, active, storeys, p, ap, pap):
                 below, here = load(p, start), load(p, start + 1)
                 for a in range(start + 1, start + nz - 1):
                     above = load(p, a + 1)
-                    v = madd(wx[a - sx], load(p, a - sx), zero)
-                    v = madd(wx[a], load(p, a + sx), v)
-                    v = madd(wy[a - sy], load(p, a - sy), v)
-                    v = madd(wy[a], load(p, a + sy), v)
-                    v = madd(wz[a - 1], below, v)
-                    v = madd(wz[a], above, v)
-                    v = madd(-diagonal[a], here, v)
+                    v = _flow_in(wx, wy, wz, diagonal, sx, sy, p, a, below, here, above)
                     v = madd(-active[a], v, zero)
                     store(ap, a, v)
                     total = vmadd(here, v, total)
@@ -228,19 +234,28 @@ def apply_operator(weight, diagonal, active, storeys, p, ap, pap):
 
 
 @njit(cache=True, nogil=True)
-def start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r, p, ap, pap):
-    """Clear the solution where nodes are off, and set r ← rhs − A u and p ← 0."""
+def start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r):
+    """Clear the solution where nodes are off, and set r ← rhs − A u."""
+    wx, wy, wz = weight[0], weight[1], weight[2]
     zero = splat(np.float32(0.0))
     for a in range(u.shape[0]):
         if active[a] == 0.0:
             store(u, a, zero)
     lift(ceiling, parent, share, 0, ceiling.shape[0], u)
     lower(ceiling, parent, 0, ceiling.shape[0], u)
-    apply_operator(weight, diagonal, active, storeys, u, ap, pap)
-    for a in range(u.shape[0]):
-        on = active[a]
-        store(r, a, madd(on, load(rhs, a), madd(-on, load(ap, a), zero)))
-        store(p, a, zero)
+    for s in range(storeys.shape[0]):
+        first, nx, ny, nz = storeys[s]
+        sx, sy = ny * nz, nz
+        for i in range(1, nx - 1):
+            for j in range(1, ny - 1):
+                start = first + i * sx + j * sy
+                below, here = load(u, start), load(u, start + 1)
+                for a in range(start + 1, start + nz - 1):
+                    above = load(u, a + 1)
+                    v = _flow_in(wx, wy, wz, diagonal, sx, sy, u, a, below, here, above)
+                    v = madd(active[a], load(rhs, a), madd(active[a], v, zero))
+                    store(r, a, v)
+                    below, here = here, above
     for j in range(ceiling.shape[0]):
         store(r, ceiling[j], zero)
 
@@ -274,7 +289,7 @@ def solve(
     beta, alpha = np.zeros((1, LANES), np.float32), np.zeros((2, LANES), np.float32)
     rz, pap, old = np.empty(LANES), np.empty(LANES), np.ones(LANES)
     previous = np.full(LANES, np.inf)
-    start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r, p, ap, pap)
+    start(weight, diagonal, active, storeys, ceiling, parent, share, rhs, u, r)
     iteration = 0
     while iteration < max_iterations:
         forward(weight, inverse, storeys, ceiling, parent, share, u, r, p, ap, alpha, z, rz)

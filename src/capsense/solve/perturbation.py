@@ -87,7 +87,8 @@ class PerturbationSolver:
     def reset(self) -> None:
         """Forget the last solution."""
         for block in self._blocks:
-            block.u[:] = 0.0
+            for values in (block.u, block.r, block.p, block.ap):
+                values[:] = 0.0
         self._rested = True
         self._active[:] = 0.0
 
@@ -111,6 +112,7 @@ class PerturbationSolver:
         conductors.add_couplings(energy, self._found.couples[:n_couple], lanes)
         delta = _reduce(energy, n_terminals, grounds)
         if not np.isfinite(delta).all():
+            self.reset()  # nothing of it must reach the next step
             raise SolveError("a step gave a capacitance that is not finite")
         if iterations >= self.max_iterations and left > goal:
             raise SolveError(
