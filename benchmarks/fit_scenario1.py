@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from capsense.reproduce.metrics import cross_correlation, rmse
+from capsense.reproduce.scenario1 import ZIGZAG, ZIGZAG_SAMPLES
 from capsense.reproduce.scenario1_fit import (
     Fit,
     Grid,
@@ -29,6 +30,7 @@ from capsense.reproduce.scenario1_signal import matrices, mutual, normalised
 from capsense.simulator import Simulator
 
 PANELS = ("stripe", "patch")
+DRAWS = 200
 
 
 def report(stage: str, fraction: float) -> None:
@@ -79,7 +81,32 @@ def all_pairs(
     return dict(sorted(found.items(), key=lambda item: item[1][0].cost))
 
 
-def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]) -> None:
+def with_teeth(setup: Setup, width: float) -> Setup:
+    """The same with the zig-zag's teeth wider by a factor."""
+    start, *teeth = setup.trajectories[ZIGZAG]
+    wider = (start, *((width * x, z) for x, z in teeth))
+    return replace(setup, trajectories={**setup.trajectories, ZIGZAG: wider})
+
+
+def print_zig_zag(result: Fit, tables: dict[str, Table]) -> None:
+    """How far the zig-zag's curves move with what is known badly."""
+    setup = result.setup
+    drawn = result.drawn(DRAWS)
+    others = {f"{DRAWS} draws of the fitted figures": drawn} | {
+        f"teeth {width:g} times as wide": [with_teeth(setup, width)] for width in (0.5, 2.0)
+    }
+    print("\nzig-zag: rms change; least zero-mean correlation; rms change of the lowest reading")
+    for name, table in tables.items():
+        curve = predicted(setup, name, table, ZIGZAG, ZIGZAG_SAMPLES)
+        for what, setups in others.items():
+            moved = [predicted(other, name, table, ZIGZAG, ZIGZAG_SAMPLES) for other in setups]
+            change = np.sqrt(np.mean([rmse(one, curve) ** 2 for one in moved]))
+            least = min(cross_correlation(one, curve) for one in moved)
+            low = np.sqrt(np.mean([(one.min() - curve.min()) ** 2 for one in moved]))
+            print(f"{name}, {what}: {change:.4f}, {least:.2f}, {low:.4f} of {curve.min():.4f}")
+
+
+def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]) -> Fit:
     """The figures, and each board's curve by the simulation itself."""
     result = fit(setup, tables, report=report)
     print(f"cost {result.cost:.6f}, correlation of successive residuals {result.memory:.3f}\n")
@@ -102,11 +129,13 @@ def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]
             f"table is within {apart:.4f} rms of the simulation; noise of the measurement "
             f"{noise:.2g} F"
         )
+    return result
 
 
 def main() -> None:
     """Tabulate, fit, print."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--zig-zag", action="store_true", help="how well the zig-zag is known")
     parser.add_argument("--held-out", action="store_true", help="foretell each panel by the other")
     parser.add_argument("--pairs", action="store_true", help="try every choice of pairs")
     parser.add_argument("--pours", action="store_true", help="try all pairs with floating pours")
@@ -115,7 +144,9 @@ def main() -> None:
     sims = simulators(setup)
     grids = {name: tabulate(sim, setup) for name, sim in sims.items()}
     tables = tables_of(setup, grids)
-    print_fit(setup, sims, tables)
+    result = print_fit(setup, sims, tables)
+    if args.zig_zag:
+        print_zig_zag(result, tables)
     if args.held_out:
         print("\nheld out: zero-mean correlation, rms error")
         for name, correlation, error in held_out(setup, tables):

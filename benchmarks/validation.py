@@ -2,7 +2,8 @@
 
 Writes ``docs/validation.md``. Analytic cases and converged references are computed here; the
 paper's and the hardware's part come from ``capsense reproduce all``, which is run first and only
-computes what it has not yet; the peers' from the results that ``benchmarks/peers.py`` left.
+computes what it has not yet; the peers' and the boards' from what their benchmarks left in
+``out/``.
 """
 
 from __future__ import annotations
@@ -32,14 +33,18 @@ from field_cases import (  # noqa: E402
     patches,
     rectangle,
 )
+from fit_scenario1 import held_out, simulators, tables_of  # noqa: E402
 from machine import describe_machine  # noqa: E402
 from peers_report import rows as peer_rows  # noqa: E402
 
 import capsense as cs  # noqa: E402
 from capsense.constants import EPS0  # noqa: E402
 from capsense.reproduce.registry import STUDIES  # noqa: E402
+from capsense.reproduce.scenario1_fit import tabulate  # noqa: E402
+from capsense.reproduce.scenario1_setup import load_setup  # noqa: E402
 
 COMMAND = "python benchmarks/validation.py"
+BOARDS = "python benchmarks/boards.py stripe patch | tee out/boards.txt"
 MADELUNG = 1.7475646
 """Of rock salt: what the images of a charge in the middle of a grounded cube amount to."""
 Cells = Sequence[object]
@@ -167,6 +172,13 @@ def random_scenes() -> str:
     return printed.strip().splitlines()[-1].removeprefix("  all: ")
 
 
+def boards(path: Path) -> str:
+    """What ``benchmarks/boards.py`` printed."""
+    if not path.exists():
+        return f"Not measured in this edition: `{BOARDS}`; half an hour."
+    return f"`{BOARDS}`:\n\n```\n{path.read_text(encoding='utf-8').strip()}\n```"
+
+
 def machine() -> str:
     """What the page was made on, in a line."""
     found = describe_machine(("capsense", "numpy", "scipy", "numba", "mujoco", "pybullet"))
@@ -191,6 +203,17 @@ def peers(path: Path) -> str:
                           f"{row['median_ms']:.2f}", f"{100 * row['worst']:.1f} %"))  # fmt: skip
     head = ("mesh", "method", "tetrahedra", "step, ms (median)", "largest error of ΔC's diagonal")
     return table(head, lines)
+
+
+def foretold() -> str:
+    """Scenario 1's panels, each with the shared figures of a fit to the other one."""
+    setup = load_setup()
+    grids = {name: tabulate(sim, setup) for name, sim in simulators(setup).items()}
+    lines = [
+        (name, f"{correlation:.4f}", f"{error:.4f}")
+        for name, correlation, error in held_out(setup, tables_of(setup, grids))
+    ]
+    return table(("panel that is held out", "zero-mean correlation", "rms error"), lines)
 
 
 def studies(folder: Path) -> str:
@@ -222,7 +245,8 @@ What CapSense was measured against, and what it was not. The page is written by
 $ {command}
 ```
 
-which runs what is named beside each figure, but for the peers. This edition: {machine}.
+which runs what is named beside each figure, but for the peers and the boards. This edition:
+{machine}.
 
 ## Analytic cases
 
@@ -245,6 +269,13 @@ case's largest change. Numbers in the names are gaps in millimetres.
 Over 40 random scenes of limbs, balls and tilted boxes 5 to 80 mm away, against a lattice of seven
 times as many nodes (`python benchmarks/random_scenes.py`): {random}.
 
+### Boards with copper pours
+
+A grounded bar over two boards of scenario 1, against boundary elements of board and bar together:
+the largest error of ΔC's diagonal, and of any of its mutual capacitances as a part of itself,
+however small.
+{boards}
+
 ## Peers
 
 A bar that moves over `six_patch_bare`, one core, `python benchmarks/peers.py`:
@@ -255,14 +286,23 @@ A bar that moves over `six_patch_bare`, one core, `python benchmarks/peers.py`:
 
 {studies}
 
+### Scenario 1, foretold
+
+What both boards share fitted to one panel of hardware, the other panel foretold; only the latter's
+sample rate, and the stripe panel's level, are fitted to it. `python benchmarks/fit_scenario1.py
+--held-out`
+
+{foretold}
+
 ## What is not validated
 
 - **Self-capacitance along limbs.** No measurements are public: [scenario 2](scenario2.md) compares
   simulations with each other, and the [limb approach](limb_approach.md) compares shapes of curves
   with fits that were published, of a sensor whose size is not.
-- **Scenario 1 beyond the two panels that were fitted.** Its ten free figures were fitted to the
-  same two panels that the table above holds it against; hardware curves of the other trajectories
-  and of the meander board are not public.
+- **Scenario 1 beyond two panels.** Its ten free figures were fitted to the same two panels that it
+  is held against. With one panel held out, only the stripes foretell the other; the patches alone
+  leave distance and stray capacitance open. Hardware curves of the other trajectories and of the
+  meander board are not public.
 - **Absolute capacitances of the paper's boards.** Their dimensions are read from photographs, good
   to ±5 %; published curves are normalised.
 - **Materials with loss.** A material conducts or it does not. Wet cloth and thin skin, whose
@@ -285,6 +325,7 @@ def main() -> None:
     parser.add_argument("--reproduced", type=Path, default=ROOT / "out" / "reproduced")
     parser.add_argument("--as-is", action="store_true", help="run no study, take what is there")
     parser.add_argument("--peers", type=Path, default=ROOT / "out" / "peers" / "peers.json")
+    parser.add_argument("--boards", type=Path, default=ROOT / "out" / "boards.txt")
     args = parser.parse_args()
     run = [sys.executable, "-m", "capsense", "reproduce", "all", "-o", str(args.reproduced)]
     code = 0 if args.as_is else subprocess.run(run, check=False).returncode
@@ -292,7 +333,8 @@ def main() -> None:
         raise SystemExit(f"capsense reproduce all failed with {code}")
     page = PAGE.format(
         command=COMMAND, machine=machine(), analytic=analytic(), references=references(),
-        random=random_scenes(), peers=peers(args.peers), studies=studies(args.reproduced),
+        random=random_scenes(), boards=boards(args.boards), peers=peers(args.peers),
+        studies=studies(args.reproduced), foretold=foretold(),
     )  # fmt: skip
     args.output.write_text(page, encoding="utf-8")
     print(f"wrote {args.output}")

@@ -46,6 +46,7 @@ def test_references(validation: ModuleType) -> None:
 
 def test_what_was_not_run_is_said(validation: ModuleType, tmp_path: Path) -> None:
     assert "not measured" in validation.peers(tmp_path / "peers.json")
+    assert "Not measured" in validation.boards(tmp_path / "boards.txt")
     found = validation.studies(tmp_path)
     for name in STUDIES:
         assert f"Not run in this edition: `capsense reproduce {name}`" in found

@@ -111,6 +111,9 @@ def test_stored_figures_are_those_of_the_fit() -> None:
         apart = abs(found.setup.value(key) - SETUP.value(key))
         assert apart < uncertainty, key
         assert found.setup.uncertainty[key] == pytest.approx(uncertainty, rel=0.3)
+    drawn = found.drawn(400)
+    for key, uncertainty in found.setup.uncertainty.items():
+        assert np.std([one.value(key) for one in drawn]) == pytest.approx(uncertainty, rel=0.15)
     for name, table in tables.items():
         measured = load_panel(SETUP.boards[name].panel).measured
         assert np.abs(predicted(found.setup, name, table) - measured).mean() < 0.005

@@ -81,11 +81,13 @@ def tabulate(sim: Simulator, setup: Setup, coarser: float = 1.0) -> Grid:
     return Grid(sim.electrode_names, sim.baseline, x, gaps, stacked, setup.size[2])
 
 
-def predicted(setup: Setup, name: str, table: Table) -> Array:
-    """The panel's curve by the table, without rounding and noise, shape (250,)."""
+def predicted(
+    setup: Setup, name: str, table: Table, trajectory: str = "T2", samples: int = PANEL_SAMPLES
+) -> Array:
+    """A curve at the panels' speed by the table, without rounding and noise, shape (samples,)."""
     board = setup.boards[name]
-    times = np.arange(PANEL_SAMPLES) / board.sample_rate
-    poses = setup.poses("T2", setup.panel_speed, times)
+    times = np.arange(samples) / board.sample_rate
+    poses = setup.poses(trajectory, setup.panel_speed, times)
     place = np.array([pose.position for pose in poses])
     share = table.empty / (table.empty + setup.stray)
     return board.level * (1 + share * table.change(place[:, 0], place[:, 2]))
@@ -101,6 +103,17 @@ class Fit:
     """Half the sum of squared differences over both panels."""
     memory: float
     """Correlation of successive residuals, the larger of the two panels'."""
+    keys: tuple[str, ...]
+    """The figures that were fitted."""
+    covariance: Array
+    """Of these figures, in their units, shape (len(keys), len(keys))."""
+
+    def drawn(self, count: int, seed: int = 0) -> list[Setup]:
+        """Set-ups whose fitted figures are drawn at random from their covariance."""
+        random = np.random.default_rng(seed)
+        values = [self.setup.value(key) for key in self.keys]
+        draws = random.multivariate_normal(values, self.covariance, count, method="cholesky")
+        return [self.setup.changed(dict(zip(self.keys, draw, strict=True))) for draw in draws]
 
 
 def fit(
@@ -147,11 +160,12 @@ def fit(
     parts = np.split(best.fun, len(tables))
     memory = max(float(np.corrcoef(part[1:], part[:-1])[0, 1]) for part in parts)
     variance = 2 * best.cost / (len(best.fun) - len(keys)) * (1 + memory) / (1 - memory)
-    deviation = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)) * variance) * scale
+    covariance = np.linalg.inv(best.jac.T @ best.jac) * variance * np.outer(scale, scale)
+    deviation = np.sqrt(np.diag(covariance))
     values = dict(zip(keys, best.x * scale, strict=True))
     uncertainty = dict(setup.uncertainty) | dict(zip(keys, deviation.tolist(), strict=True))
     fitted = replace(setup.changed(values), uncertainty=uncertainty)
-    return Fit(fitted, float(best.cost), memory)
+    return Fit(fitted, float(best.cost), memory, tuple(keys), covariance)
 
 
 def fit_without(setup: Setup, tables: Mapping[str, Table], name: str) -> Setup:
