@@ -280,13 +280,17 @@ def test_smplx_with_a_stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     class Model:
         faces = open_box()[1]
 
-        def __call__(self, return_verts: bool, betas: Tensor) -> Any:
+        def forward(self, betas: Any = None, return_verts: bool = True, **_: Any) -> Any:
             assert return_verts
-            assert betas.array.shape == (1, 10)
+            if betas.array.shape != (1, 10):
+                raise RuntimeError("einsum(): subscript l")
             return types.SimpleNamespace(vertices=Tensor(vertices[None].astype(np.float32)))
+
+        __call__ = forward
 
     def create(path: str, **options: Any) -> Model:
         asked.update(options, path=path)
+        assert options["gender"] != "male", "Path SMPLX_MALE.npz does not exist!"
         return Model()
 
     monkeypatch.setitem(sys.modules, "smplx", types.SimpleNamespace(create=create))
@@ -296,7 +300,11 @@ def test_smplx_with_a_stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     assert shape.volume == pytest.approx(0.12, rel=1e-5)
     with pytest.raises(cs.SceneError, match="betas holds a number"):
         load_smplx(tmp_path, betas=[math.nan] * 10)
-    with pytest.raises(cs.SceneError, match=r"refuses \['bets'\]"):
+    with pytest.raises(cs.SceneError, match="has no parameter 'bets'; did you mean 'betas'"):
         load_smplx(tmp_path, bets=[0.0] * 10)
+    with pytest.raises(cs.SceneError, match=r"refuses \['betas'\]: einsum"):
+        load_smplx(tmp_path, betas=[0.0] * 3)
+    with pytest.raises(cs.SceneError, match=r"holds no male smplx model: .*does not exist"):
+        load_smplx(tmp_path, gender="male")
     with pytest.raises(cs.SceneError, match="there are no model files"):
         load_smplx(tmp_path / "gone")

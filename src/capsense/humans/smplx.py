@@ -5,12 +5,14 @@ The files are licensed by their makers and are not part of CapSense: see smpl-x.
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._validate import suggest
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.scene import TriMesh
 
@@ -40,7 +42,8 @@ def load_smplx(
 
     Raises:
         MissingDependencyError: ``smplx`` is not installed.
-        SceneError: The model files are not there, or a parameter does not fit the model.
+        SceneError: The model files are not there, or the model has no such parameter, or one of
+            another size.
     """
     try:
         import smplx
@@ -53,9 +56,18 @@ def load_smplx(
     path = Path(model_path)
     if not path.exists():
         raise SceneError(f"model_path is {path}; there are no model files; give their folder")
-    model = smplx.create(str(path), model_type=model_type, gender=gender)
+    try:
+        model = smplx.create(str(path), model_type=model_type, gender=gender)
+    except (AssertionError, OSError, ValueError, KeyError) as error:
+        raise SceneError(f"{path} holds no {gender} {model_type} model: {error}") from None
+    known = inspect.signature(model.forward).parameters.values()
+    names = [p.name for p in known if p.default is None]  # others are switches, or **kwargs
     tensors: dict[str, Any] = {}
     for name, value in parameters.items():
+        if name not in names:
+            raise SceneError(
+                f"the {model_type} model has no parameter {name!r}; {suggest(name, names)}"
+            )
         array = np.asarray(value, dtype=np.float32)
         if not np.isfinite(array).all():
             raise SceneError(f"{name} holds a number that is not finite")
