@@ -118,6 +118,16 @@ def test_dac_jump_of_the_fdc1004():
     assert jump == near(-1.38e-12, rel=0.01)
 
 
+def test_offset_dac_as_the_host_sets_it():
+    """Analytic: codes count from what the DAC subtracts; by default, the nearest step does."""
+    level = 5e-12
+    for start, offset in ((None, 6.25e-12), (0, 0.0), (1, 3.125e-12)):
+        readout = ReadOut.preset("fdc1004", NAMES[:1], noise=False, capdac=start)
+        counts = readout([0.0, 0.1], np.full((2, 1), level))
+        assert counts.code[0] == round((level - offset) * 2**19 / 1e-12)
+        assert counts.capacitance[0] == pytest.approx(level, abs=1e-18)
+
+
 def test_saturation_reaches_the_flags():
     """Each chip's range, with its CAPDAC where the host left it."""
     for name, limit in (("ad7147", 8e-12), ("ad7746", 4.096e-12), ("ad7747", 8.192e-12)):
@@ -227,6 +237,8 @@ def test_noise_of_ones_own():
         (("fdc1004", {"gain_per_percent": 1e-3}), "does nothing without a humidity"),
         (("fdc1004", {"period": 0.01}), "a period of 0.01 s is too short"),
         (("fdc1004", {"latency": "long"}), "latency is 'long'"),
+        (("fdc1004", {"capdac": 32}), "is 32; give a whole number from 0 to 31"),
+        (("fdc2214", {"capdac": 0}), "capdac is 0, but the fdc2214 has no offset DAC"),
         (("fdc1004", {"white": -1e-15}), "rms is -1e-15"),
         (("fdc1004", {"rate": "400"}), "no rate of '400' conversions per second"),
         (("fdc1004", {"flicker": "low"}), "floor is 'low'"),

@@ -25,6 +25,7 @@ chip = "fdc1004"
 rate = 400
 period = 0.02
 latency = 0.003
+capdac = 2
 seed = 7
 
 [[channel]]
@@ -78,6 +79,8 @@ def test_everything_is_taken_over():
     plan = readout.schedule
     assert (plan.conversion, plan.period) == (near(2.5e-3, rel=1e-12), near(0.02, rel=1e-12))
     assert plan.latency == 0.003
+    assert readout.dac is not None
+    assert readout.dac.start == 2
     assert readout.wiring.trace == [1e-12, 2e-12]
     assert readout.wiring.coupling == 3e-14
     sensor, climate, walk, flicker, mains, white = readout.stages
@@ -189,6 +192,8 @@ def test_a_tank_or_front_end_of_ones_own():
         ),
         ('chip = "sdr"\n[front_end]\ngain = 1e-6', "my.toml: front_end: the codes run from 0 to 0"),
         ('chip = "fdc1004"\nperiod = 0.01', "a period of 0.01 s is too short"),
+        ('chip = "fdc1004"\ncapdac = 32', "my.toml: .*give a whole number from 0 to 31"),
+        ('chip = "fdc1004"\ncapdac = "auto"', "capdac = 'auto' must be an integer"),
         ('chip = "fdc1004"\nlatency = -1', "latency = -1 must be from 0"),
         ('chip = "fdc1004"\n[climate]\ntemperature = [[1, 2], [1, 3]]', "times must rise"),
         ('chip = "fdc1004"\n[detector]\ntouch = 5\nrelease = 9', "release = 9 must be from"),

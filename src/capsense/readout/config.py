@@ -21,8 +21,8 @@ from capsense.readout.read_out import Reading, ReadOut
 from capsense.readout.wiring import Wiring
 
 TOP_KEYS = (
-    "chip", "rate", "period", "latency", "seed", "random", "expected", "mode", "pairs", "rest",
-    "channel", "tank", "front_end", "wiring", "noise", "climate", "detector", "calibration",
+    "chip", "rate", "period", "latency", "seed", "random", "expected", "capdac", "mode", "pairs",
+    "rest", "channel", "tank", "front_end", "wiring", "noise", "climate", "detector", "calibration",
 )  # fmt: skip
 
 
@@ -104,6 +104,8 @@ def parse_readout(
     if "period" in top:
         options["period"] = top.number("period", 1e-6, 1e6, unit="s")
     options["latency"] = top.number("latency", 0.0, 1e3, 0.0, unit="s")
+    if "capdac" in top:
+        options["capdac"] = top.integer("capdac", 0, 10**6)
     options["seed"] = top.integer("seed", 0, 2**63 - 1, 0)
     options["noise"] = top.boolean("random", True)
     if "tank" in top or "front_end" in top:

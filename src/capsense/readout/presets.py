@@ -15,7 +15,7 @@ from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, sel
 from capsense.readout.checks import Array, require
 from capsense.readout.chip import Chip
 from capsense.readout.chips import CHIPS, MPR121_CURRENTS, MPR121_SUPPLY, MPR121_TIMES
-from capsense.readout.converter import Law, ReciprocalLaw, ShuntLaw
+from capsense.readout.converter import CapDac, Law, ReciprocalLaw, ShuntLaw
 from capsense.readout.detector import Detector
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.read_out import ReadOut
@@ -69,6 +69,8 @@ class Options:
     wiring: Wiring | None = None
     expected: float | None = None
     """Capacitance that a chip which adapts to it is set up for [F]."""
+    capdac: int | None = None
+    """Offset DAC at the start; by default the step nearest to each channel's first sample."""
     law: Law | None = None
     """The converter's law, instead of the chip's: another tank, another front end."""
     stages: Sequence[Stage] = ()
@@ -130,7 +132,7 @@ def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None =
         electrodes,
         dataclasses.replace(plan, idle=idle, latency=chosen.latency),
         law_of(part, chosen, len(patterns)),
-        dac=part.dac,
+        dac=_dac_of(part, chosen.capdac),
         wiring=chosen.wiring,
         stages=(*chosen.stages, *_stages(part, rate.rms, chosen)),
         detector=chosen.detector or part.detector,
@@ -184,6 +186,17 @@ def law_of(chip: Chip, options: Options, channels: int) -> Law:
         require("read-out", "expected", expected, 0.0, "F", open_=True)
         return charge_for(expected)
     return law
+
+
+def _dac_of(chip: Chip, start: int | None) -> CapDac | None:
+    """The chip's offset DAC, as it is set at the start."""
+    if start is None:
+        return chip.dac
+    if chip.dac is None:
+        raise ReadOutError(
+            f"capdac is {start!r}, but the {chip.name} has no offset DAC; leave it out"
+        )
+    return dataclasses.replace(chip.dac, start=start)
 
 
 def expected_of(empty: Array) -> float:
