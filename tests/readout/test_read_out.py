@@ -272,6 +272,10 @@ def test_counts_by_channel_and_in_rows():
     assert counts.of("B").channel.tolist() == [1] * len(counts.of("B"))
     stamps, rows = counts.table()
     assert rows.shape == (len(counts) // 3, 3)
+    _, codes = counts.table("code")
+    assert codes.dtype == np.int64
+    assert (codes == np.rint(rows / 1e-21)).all()
+    assert not counts.table("flags")[1].any()
     for k, name in enumerate(NAMES):
         assert (rows[:, k] == counts.of(name).capacitance[: len(rows)]).all()
         assert (stamps[:, k] == counts.of(name).time[: len(rows)]).all()
@@ -281,6 +285,8 @@ def test_counts_by_channel_and_in_rows():
         counts.of("D")
     with pytest.raises(ReadOutError, match="not whole cycles"):
         counts[counts.channel != 1].table()
+    with pytest.raises(ReadOutError, match="no 'touched'; valid are code, capacitance, flags"):
+        counts.table("touched")
     with pytest.raises(ReadOutError, match="no counts to join"):
         join([])
 

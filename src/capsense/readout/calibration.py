@@ -198,7 +198,8 @@ def calibrate(
     is: with flicker they come out several times too small, that of the drift most. With the floor
     of the sensor's Allan plot, taken at rest, uncertainties hold for white noise and flicker
     together, ``A (s² + Σ) Aᵀ`` with A = (XᵀX)⁻¹Xᵀ, Σ being the covariance of
-    :class:`~capsense.readout.noise.Flicker` at the samples' times.
+    :class:`~capsense.readout.noise.Flicker` at the samples' times. Leave out samples that were out
+    of the converter's range.
 
     Args:
         true: Capacitances that the simulator gives at the poses and times of the recording [F],

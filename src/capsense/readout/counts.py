@@ -12,6 +12,9 @@ from capsense._validate import suggest
 from capsense.errors import ReadOutError
 from capsense.readout.checks import Array, Ints
 
+COLUMNS = ("time", "channel", "code", "capacitance", "flags", "baseline", "touched")
+"""What is known of each conversion, in the order of the fields of :class:`Counts`."""
+
 
 @dataclass(frozen=True, eq=False)
 class Counts:
@@ -72,29 +75,34 @@ class Counts:
             for k, c in zip(self.channel.tolist(), self.capacitance, strict=True)
         }
 
-    def table(self) -> tuple[Array, Array]:
+    def table(self, what: str = "capacitance") -> tuple[Array, NDArray]:
         """Whole cycles side by side.
 
+        Args:
+            what: What stands in the cells: ``"capacitance"`` [F], ``"code"``, ``"flags"``,
+                ``"baseline"`` or ``"touched"``.
+
         Returns:
-            Time stamps [s] and capacitances [F], both of shape (cycles, K), columns in the order
-            of the channels; an unfinished last cycle is left out. The conversions must start
-            with a cycle, as those of a whole recording do.
+            Time stamps [s] and cells, both of shape (cycles, K), columns in the order of the
+            channels; an unfinished last cycle is left out. The conversions must start with a
+            cycle, as those of a whole recording do.
 
         Raises:
-            ReadOutError: The conversions do not start with a cycle or leave some out.
+            ReadOutError: The conversions do not start with a cycle or leave some out, or they do
+                not hold ``what``.
         """
+        kinds = [name for name in COLUMNS[2:] if getattr(self, name) is not None]
+        if what not in kinds:
+            raise ReadOutError(f"the conversions hold no {what!r}; {suggest(str(what), kinds)}")
         k = len(self.channel_names)
-        cycles = len(self) // k
-        whole = slice(0, cycles * k)
-        order = np.argsort(self.channel[whole].reshape(cycles, k), axis=1)
-        ranked = np.take_along_axis(self.channel[whole].reshape(cycles, k), order, axis=1)
-        if (ranked != np.arange(k)).any():
-            raise ReadOutError("the conversions are not whole cycles; use of(name) instead")
-        shape = (cycles, k)
-        return (
-            np.take_along_axis(self.time[whole].reshape(shape), order, axis=1),
-            np.take_along_axis(self.capacitance[whole].reshape(shape), order, axis=1),
+        shape = (len(self) // k, k)
+        time, channel, cells = (
+            getattr(self, name)[: shape[0] * k].reshape(shape) for name in ("time", "channel", what)
         )
+        order = np.argsort(channel, axis=1)
+        if (np.take_along_axis(channel, order, axis=1) != np.arange(k)).any():
+            raise ReadOutError("the conversions are not whole cycles; use of(name) instead")
+        return np.take_along_axis(time, order, axis=1), np.take_along_axis(cells, order, axis=1)
 
 
 def join(parts: Sequence[Counts]) -> Counts:
@@ -110,5 +118,4 @@ def join(parts: Sequence[Counts]) -> Counts:
         columns = [getattr(p, name) for p in parts]
         return None if columns[0] is None else np.concatenate(columns)
 
-    names = ("time", "channel", "code", "capacitance", "flags", "baseline", "touched")
-    return Counts(parts[0].channel_names, *(column(n) for n in names))  # type: ignore[arg-type]
+    return Counts(parts[0].channel_names, *(column(n) for n in COLUMNS))  # type: ignore[arg-type]
