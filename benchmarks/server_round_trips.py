@@ -5,6 +5,7 @@ process of its own, and waits for each reading. Times are of this machine, as fo
 says its step took is taken from each round trip, and the rest is what the protocol costs. What the
 processor spent on the server is little changed by other programs, and bounds what it can do on a
 machine of its own. With ``mcs`` and ``mono`` there, the Unity package is measured as well.
+``--runs`` measures all in turn, several times.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -99,31 +101,59 @@ def unity_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(figures["round_trip_s"]), np.array(figures["solve_s"])
 
 
+def two_clients(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same by two clients at once, each with a sensor of its own."""
+    with ThreadPoolExecutor(2) as pool:
+        taken, solve = zip(*pool.map(python_client, [url, url], [count, count]), strict=True)
+    return np.concatenate(taken), np.concatenate(solve)
+
+
+CLIENTS = {
+    "Python": (python_client, 1),
+    "Python, streaming": (python_stream, 1),
+    "Python, two at once": (two_clients, 2),
+    "Unity package, mono": (unity_client, 1),
+}
+COLUMNS = ("a second", "median", "p95", "p99", "solve", "protocol", "server")
+
+
+def figures(name: str, design: str, count: int) -> list[float]:
+    """One number for each of the columns; times in milliseconds."""
+    measure, clients = CLIENTS[name]
+    with server(design) as (url, process):
+        measure(url, 50)
+        before = processor_time(process)
+        taken, solve = measure(url, count)
+        spent = (processor_time(process) - before) / (count * clients)
+    times = (*np.percentile(taken, [50, 95, 99]), np.median(solve), np.median(taken - solve), spent)
+    return [clients / taken.mean(), *(1e3 * np.array(times))]
+
+
 def main() -> None:
     """Print a row for each client."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=2000, help="round trips of each client")
+    parser.add_argument("--runs", type=int, default=1, help="of each; figures are their medians")
     parser.add_argument("--design", default="six_patch")
     args = parser.parse_args()
-    clients = {"Python": python_client, "Python, streaming": python_stream}
-    if shutil.which("mcs") and shutil.which("mono"):
-        clients["Unity package, mono"] = unity_client
+    names = [*CLIENTS]
+    if not (shutil.which("mcs") and shutil.which("mono")):
+        names.remove("Unity package, mono")
+    runs: dict[str, list[list[float]]] = {name: [] for name in names}
+    loads = []
+    for _ in range(args.runs):
+        for name in names:
+            runs[name].append(figures(name, args.design, args.count))
+            loads.append(os.getloadavg()[0])
     print(
-        f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.2f}, "
-        f"Python {platform.python_version()}, {args.design}, {args.count} round trips"
+        f"{platform.machine()}, {os.cpu_count()} cores, load {min(loads):.1f} to {max(loads):.1f}, "
+        f"Python {platform.python_version()}, {args.design}, {args.count} round trips, "
+        f"median of {args.runs} runs"
     )
-    columns = ("a second", "median", "p95", "p99", "solve", "protocol", "server")
-    print(f"{'client':20}" + "".join(f"{c:>10}" for c in columns))
-    for name, measure in clients.items():
-        with server(args.design) as (url, process):
-            measure(url, 50)
-            before = processor_time(process)
-            taken, solve = measure(url, args.count)
-            spent = 1e3 * (processor_time(process) - before) / args.count
-        p50, p95, p99 = 1e3 * np.percentile(taken, [50, 95, 99])
-        step, rest = 1e3 * np.median(solve), 1e3 * np.median(taken - solve)
-        figures = "".join(f"{v:10.2f}" for v in (p50, p95, p99, step, rest, spent))
-        print(f"{name:20}{1 / taken.mean():10.0f}{figures}")
+    print(f"{'client':20}" + "".join(f"{c:>10}" for c in COLUMNS))
+    for name in names:
+        rate, *times = np.median(runs[name], axis=0)
+        print(f"{name:20}{rate:10.0f}" + "".join(f"{v:10.2f}" for v in times))
     print(
         "ms by the clock; solve and protocol are medians. server: processor's time of a round trip"
     )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -22,6 +24,7 @@ pytest.importorskip("websockets", reason='needs websockets: pip install "capsens
 from raw_websocket import HELLO, raw_websocket
 
 from capsense.cli.main import main
+from capsense.cli.serve import JsonLines
 from capsense.errors import ProtocolError
 from capsense.server.client import Client
 
@@ -74,6 +77,27 @@ def test_a_second_signal_stops_at_once(number: signal.Signals, code: int) -> Non
         process.send_signal(number)
         assert process.wait(10) == code
         assert '"stopped"' not in process.stderr.read()
+
+
+def test_whatever_is_logged_is_one_line() -> None:
+    """Text from clients cannot forge a line, and a traceback is a field."""
+    fields = {"name": 'x"}\n{"event": "forged\u2028'}
+    try:
+        raise RuntimeError("two\nlines")
+    except RuntimeError:
+        record = logging.LogRecord(
+            "capsense.server", logging.ERROR, __file__, 1, "internal error", (), sys.exc_info()
+        )
+    record.fields = fields
+    text = JsonLines().format(record)
+    assert text.isascii()
+    assert len(text.splitlines()) == 1
+    entry = json.loads(text)
+    assert (entry["event"], entry["level"], entry["name"]) == (
+        "internal error", "error", fields["name"],
+    )  # fmt: skip
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", entry["time"])
+    assert entry["exception"].startswith("Traceback")
 
 
 def test_quiet() -> None:

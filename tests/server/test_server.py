@@ -39,6 +39,16 @@ def test_readings_are_the_simulators(served: RunningServer, dome: np.ndarray) ->
             assert not len(there.conversions)
 
 
+def test_welcome(served: RunningServer) -> None:
+    """What a server tells of itself."""
+    with served.client() as client:
+        assert client.welcome == {
+            "type": "welcome", "protocol": 1, "server": f"capsense {cs.__version__}",
+            "designs": ["six_patch", "patch"],
+            "limits": {"sensors": 8, "pixels": 65536, "bodies": 64, "message": 40 + 8 * 65536},
+        }  # fmt: skip
+
+
 def test_permittivities_and_cameras(served: RunningServer, dome: np.ndarray) -> None:
     """Codes, numbers, thickness, grounding and camera arrive."""
     codes = np.where(np.arange(32) < 16, 4, 255).astype(np.uint8) * np.ones((32, 1), np.uint8)
