@@ -261,9 +261,14 @@ def test_readings_of_a_simulator():
     assert readout.channel_values(np.array(expected)).tolist() == expected
     readout.sample(0.0, reading)
     assert readout.sample(1.0, reading).capacitance[:3] == near(expected, rel=1e-8)
+    assert readout([0.0, 1.0], [reading, reading]).capacitance[:3] == near(expected, rel=1e-8)
     other = Reading(matrix, np.diag(matrix), ("A", "C", "B"))
     with pytest.raises(ReadOutError, match="make it with the simulator's electrode_names"):
         readout.sample(2.0, other)
+    with pytest.raises(ReadOutError, match="make it with the simulator's electrode_names"):
+        readout([0.0, 1.0], [reading, other])
+    with pytest.raises(ReadOutError, match=r"1 times for capacitances of shape \(2, 3\)"):
+        readout([0.0], [reading, reading])
 
 
 def test_counts_by_channel_and_in_rows():

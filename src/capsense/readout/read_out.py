@@ -165,8 +165,8 @@ class ReadOut:
         """Capacitance of each channel before anything distorts it [F].
 
         Args:
-            capacitance: A reading; or Maxwell matrices [F], shape (M, M) or (n, M, M); or the
-                channels themselves [F], shape (K,).
+            capacitance: A reading; or Maxwell matrices [F], shape (M, M) or (n, M, M), shields
+                held at ground; or the channels themselves [F], shape (K,).
 
         Returns:
             Shape (K,), or (n, K).
@@ -174,8 +174,7 @@ class ReadOut:
         Raises:
             ReadOutError: The shape does not fit, or a number is not finite.
         """
-        # Looked up by name: a check against the protocol takes longer than all the rest.
-        if hasattr(capacitance, "self_capacitance"):
+        if _is_reading(capacitance):
             reading = cast("Reading", capacitance)
             if reading.electrode_names != self.bank.electrodes:
                 raise ReadOutError(
@@ -231,12 +230,13 @@ class ReadOut:
             self._take(now, before, values)
         return self._report(now)
 
-    def __call__(self, times: ArrayLike, capacitance: ArrayLike) -> Counts:
+    def __call__(self, times: ArrayLike, capacitance: Sequence[Reading] | ArrayLike) -> Counts:
         """Read a whole recording, from its first time on; resets before and after.
 
         Args:
             times: [s], rising, shape (n,).
-            capacitance: Maxwell matrices [F], shape (n, M, M), or channels [F], shape (n, K).
+            capacitance: Readings, n of them; or Maxwell matrices [F], shape (n, M, M), which say
+                nothing of driven shields; or channels [F], shape (n, K).
 
         Returns:
             All conversions finished by the last time: the same, to the last bit, as sampling one
@@ -248,6 +248,8 @@ class ReadOut:
         t = real("times", times)
         if t.ndim != 1 or not len(t) or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
             raise ReadOutError("times must be finite numbers that rise, of shape (n,)")
+        if isinstance(capacitance, Sequence) and any(map(_is_reading, capacitance)):
+            capacitance = np.array([self.channel_values(c) for c in capacitance])
         array = real("capacitance", capacitance)
         if array.ndim not in (2, 3) or len(array) != len(t):
             raise ReadOutError(
@@ -352,3 +354,8 @@ class ReadOut:
         )
         if self._detect is not None and counts.baseline is not None and counts.touched is not None:
             counts.baseline[:], counts.touched[:] = self._detect(counts.channel, counts.code)
+
+
+def _is_reading(capacitance: object) -> bool:
+    # By name: a check against the protocol takes longer than all the rest of a step.
+    return hasattr(capacitance, "self_capacitance")
