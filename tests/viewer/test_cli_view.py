@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import socket
@@ -78,16 +79,24 @@ def test_open_to_others_is_warned_of(scenario: Path) -> None:
 def test_watches_a_server() -> None:
     """It waits for a client, and shows its sensor."""
     pytest.importorskip("websockets", reason='needs websockets: pip install "capsense[serve]"')
-    from running_server import RunningServer
+    from capsense.server.client import Client
 
-    with RunningServer("patch", watch=True) as server, server.client() as client:
-        client.open()
-        with viewing("--connect", server.url, "-q") as (process, url):
-            assert url.startswith("http://127.0.0.1:")
-            process.send_signal(signal.SIGINT)
-            assert process.communicate(timeout=20) == ("", "")
-        assert process.returncode == 0
-        assert server.logged("watches")[0]["sensor"] == 0
+    serve = [sys.executable, "-m", "capsense", "serve", "--design", "patch", "--port", "0"]
+    with subprocess.Popen([*serve, "--watch"], stderr=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stderr is not None
+            address = json.loads(server.stderr.readline())["url"]
+            with Client(address) as client:
+                client.open()
+                with viewing("--connect", address, "-q") as (process, url):
+                    assert url.startswith("http://127.0.0.1:")
+                    process.send_signal(signal.SIGINT)
+                    assert process.communicate(timeout=20) == ("", "")
+                assert process.returncode == 0
+        finally:
+            server.terminate()
+        events = [json.loads(line)["event"] for line in server.stderr]
+    assert "watches" in events
 
 
 @pytest.mark.parametrize(

@@ -2,73 +2,23 @@
 
 from __future__ import annotations
 
-import queue
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from view_sources import Queued, until
 
-import capsense as cs
 from capsense.errors import ProtocolError
-from capsense.recording.session import reading_of
-from capsense.scenario.channels import Excitation, channels_of
 from capsense.viewer import follower
 from capsense.viewer.follower import Follower
-from capsense.viewer.source import Shot
-
-
-class Queued:
-    """A stream of what tests put in; sample k has k + 1 farads in every entry."""
-
-    def __init__(self) -> None:
-        self.title, self.design = "queued", cs.load_design("patch")
-        self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
-        self.empty = self.reading(-1)
-        self.lattice = object()
-        self.items: queue.Queue[Shot | ProtocolError] = queue.Queue()
-        self.count = 0
-        self.closed = False
-
-    def reading(self, k: int) -> cs.Reading:
-        n = len(self.design.electrodes)
-        return reading_of(
-            self.design, np.full((n, n), k + 1.0), np.full((n, n), k + 1.0), np.zeros(n)
-        )
-
-    def put(self, count: int = 1) -> None:
-        for k in range(self.count, self.count + count):
-            self.items.put(Shot(k, 0.1 * k, cs.Scene(), self.reading(k), None))
-        self.count += count
-
-    def next(self, timeout: float) -> Shot | None:
-        try:
-            item = self.items.get(timeout=timeout)
-        except queue.Empty:
-            return None
-        if isinstance(item, ProtocolError):
-            raise item
-        return item
-
-    def potentials(self, shot: Shot) -> np.ndarray:
-        return np.full((3, 2), float(shot.index))
-
-    def close(self) -> None:
-        self.closed = True
-
-
-def until(condition: Callable[[], bool]) -> None:
-    limit = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(1e-3)
 
 
 @pytest.fixture
 def followed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Queued, Follower]]:
     monkeypatch.setattr(follower, "KEPT", 10)
     stream = Queued()
+    stream.lattice = object()  # potentials are given
     player = Follower(stream)  # type: ignore[arg-type]
     yield stream, player
     player.stop()

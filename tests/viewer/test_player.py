@@ -9,45 +9,9 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from view_sources import Counting, until
 
-import capsense as cs
-from capsense.errors import SolveError
-from capsense.recording.session import reading_of
-from capsense.scenario.channels import Excitation, channels_of
 from capsense.viewer.player import Player
-from capsense.viewer.source import Shot
-
-WAIT = 10.0
-
-
-class Counting:
-    """A source of ``count`` samples; sample k has k + 1 farads in every entry."""
-
-    def __init__(self, count: int = 20, period: float = 1e-3) -> None:
-        self.title, self.design = "counting", cs.load_design("patch")
-        self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
-        self.times = period * np.arange(count)
-        self.empty = self.reading(-1)
-        self.lattice = None
-        self.asked: list[tuple[int, bool]] = []
-        self.broken: set[int] = set()
-        self.closed = False
-
-    def reading(self, k: int) -> cs.Reading:
-        n = len(self.design.electrodes)
-        return reading_of(
-            self.design, np.full((n, n), k + 1.0), np.full((n, n), k + 1.0), np.zeros(n)
-        )
-
-    def shot(self, index: int, *, field: bool) -> Shot:
-        self.asked.append((index, field))
-        if index in self.broken:
-            raise SolveError(f"sample {index} was not solved")
-        potentials = np.full((3, 2), float(index)) if field else None
-        return Shot(index, float(self.times[index]), cs.Scene(), self.reading(index), potentials)
-
-    def close(self) -> None:
-        self.closed = True
 
 
 @contextmanager
@@ -60,13 +24,6 @@ def playing(source: Counting, **options: float) -> Iterator[Player]:
         player.stop()
         assert source.closed
         assert not any(t.name == "capsense player" for t in threading.enumerate())
-
-
-def until(condition: Callable[[], bool]) -> None:
-    limit = time.monotonic() + WAIT
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(1e-3)
 
 
 def shows(player: Player, index: int) -> Callable[[], bool]:

@@ -186,7 +186,7 @@ class TestWatched:
 
         with pytest.raises(ServerError, match=r"no server to watch at ws://127\.0\.0\.1:9"):
             Watched("ws://127.0.0.1:9")
-        with pytest.raises(ServerError, match="no server to watch at elsewhere"):
+        with pytest.raises(ProtocolError, match="elsewhere is no server"):
             Watched("elsewhere")
         with RunningServer("patch") as server, pytest.raises(ProtocolError, match="--watch"):
             Watched(server.url)

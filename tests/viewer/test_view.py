@@ -12,9 +12,11 @@ import pytest
 pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
 
 from recorded_scenes import SLAB, bodies, frame_at, scene_at
+from view_sources import Queued, until
 
 import capsense as cs
-from capsense.errors import ServerError
+from capsense.errors import ProtocolError, ServerError
+from capsense.viewer.follower import Follower
 from capsense.viewer.plane import Plane, region
 from capsense.viewer.stage import LOUD, QUIET, Stage
 from capsense.viewer.view import View, check_address
@@ -113,6 +115,34 @@ def test_plane(server: Any) -> None:
     stage.hide_plane()
     assert "/potential" not in server.scene._handle_from_node_name
     stage.hide_plane()
+
+
+def test_live_controls() -> None:
+    """Hold and follow; the slider spans what is kept; what is wrong is said, as text."""
+    stream = Queued()
+    player = Follower(stream)  # type: ignore[arg-type]
+    view = View(player, port=0)
+    try:
+        view.refresh()
+        stream.put(7)
+        until(lambda: player.span == (0, 6))
+        view.refresh()
+        controls = view._time
+        assert (controls._play.label, controls._slider.max, controls._slider.value) == (
+            "Hold",
+            6,
+            6,
+        )
+        assert "sample 6 of 6" in view._status.content
+        player.go(2)
+        view.refresh()
+        assert (controls._play.label, controls._slider.value) == ("Follow", 2)
+        player.failure = ProtocolError("<b>gone</b>")
+        view.refresh()
+        assert "&lt;b&gt;gone" in view._status.content
+    finally:
+        view.stop()
+        player.stop()
 
 
 def test_address_that_is_taken() -> None:

@@ -151,8 +151,7 @@ def status(player: Playback, shot: Shot, largest: float) -> str:
         f"<b>{html.escape(player.source.title)}</b>",
         f"t = {shot.time:.3f} s, sample {shot.index} of {last}",
         f"step {1e3 * stats.wall_time:.1f} ms, {stats.iterations} "
-        f"iteration{'' if stats.iterations == 1 else 's'}, error {1e18 * stats.error_estimate:.2g} "
-        "aF",
+        f"iteration{'' if stats.iterations == 1 else 's'}",
         'electrodes: <span style="background:linear-gradient(90deg,rgb(214,219,222),'
         'rgb(213,94,0));padding:0 2.5em;border-radius:2px">&nbsp;</span> '
         f"0 to {1e15 * largest:.3g} fF",

@@ -91,13 +91,9 @@ class Watched:
         self._client = None
 
     def _connect(self) -> Client:
-        from websockets.exceptions import WebSocketException
-
         try:
             return Client(self._url, token=self._token, name="capsense view")
-        except ProtocolError:
-            raise
-        except (OSError, ValueError, WebSocketException) as error:
+        except OSError as error:
             raise ServerError(
                 f"there is no server to watch at {self._url}: {error}; start one with: capsense "
                 "serve --design NAME --watch"

@@ -1,0 +1,88 @@
+"""Made-up sources of a view, and patience."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+import capsense as cs
+from capsense.errors import ProtocolError, SolveError
+from capsense.recording.session import reading_of
+from capsense.scenario.channels import Excitation, channels_of
+from capsense.viewer.source import Shot
+
+WAIT = 10.0
+"""Longest wait for anything [s]."""
+
+
+class Stated:
+    """What sources have in common; sample k has k + 1 farads in every entry."""
+
+    def __init__(self, title: str) -> None:
+        self.title, self.design = title, cs.load_design("patch")
+        self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
+        self.empty = self.reading(-1)
+        self.lattice = None
+        self.closed = False
+
+    def reading(self, k: int) -> cs.Reading:
+        n = len(self.design.electrodes)
+        return reading_of(
+            self.design, np.full((n, n), k + 1.0), np.full((n, n), k + 1.0), np.zeros(n)
+        )
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Counting(Stated):
+    """A source of ``count`` samples."""
+
+    def __init__(self, count: int = 20, period: float = 1e-3) -> None:
+        super().__init__("counting")
+        self.times = period * np.arange(count)
+        self.asked: list[tuple[int, bool]] = []
+        self.broken: set[int] = set()
+
+    def shot(self, index: int, *, field: bool) -> Shot:
+        self.asked.append((index, field))
+        if index in self.broken:
+            raise SolveError(f"sample {index} was not solved")
+        potentials = np.full((3, 2), float(index)) if field else None
+        return Shot(index, float(self.times[index]), cs.Scene(), self.reading(index), potentials)
+
+
+class Queued(Stated):
+    """A stream of what tests put in."""
+
+    def __init__(self) -> None:
+        super().__init__("queued")
+        self.items: queue.Queue[Shot | ProtocolError] = queue.Queue()
+        self.count = 0
+
+    def put(self, count: int = 1) -> None:
+        for k in range(self.count, self.count + count):
+            self.items.put(Shot(k, 0.1 * k, cs.Scene(), self.reading(k), None))
+        self.count += count
+
+    def next(self, timeout: float) -> Shot | None:
+        try:
+            item = self.items.get(timeout=timeout)
+        except queue.Empty:
+            return None
+        if isinstance(item, ProtocolError):
+            raise item
+        return item
+
+    def potentials(self, shot: Shot) -> np.ndarray:
+        return np.full((3, 2), float(shot.index))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    limit = time.monotonic() + WAIT
+    while not condition():
+        assert time.monotonic() < limit
+        time.sleep(1e-3)
