@@ -26,6 +26,10 @@ TOP_KEYS = (
 )  # fmt: skip
 
 
+Limits = Mapping[str, tuple[float, float, str]]
+"""Key → least and largest number, and their unit."""
+
+
 class Table(_validate.Table):
     """One table of a read-out file; whatever is wrong raises :class:`ReadOutError`."""
 
@@ -97,13 +101,11 @@ def parse_readout(
     top.only(TOP_KEYS)
     chip = chip_of(top.choice("chip", tuple(CHIPS)))
     options: dict[str, Any] = {"patterns": _patterns(top, chip.mode, electrodes)}
-    if "rate" in top:
-        options["rate"] = top.number("rate", 1e-3, 1e7, unit="Hz")
-    if "expected" in top:
-        options["expected"] = top.number("expected", 1e-15, 1e-6, unit="F")
-    if "period" in top:
-        options["period"] = top.number("period", 1e-6, 1e6, unit="s")
-    options["latency"] = top.number("latency", 0.0, 1e3, 0.0, unit="s")
+    limits = {
+        "rate": (1e-3, 1e7, "Hz"), "period": (1e-6, 1e6, "s"), "latency": (0.0, 1e3, "s"),
+        "expected": (1e-15, 1e-6, "F"),
+    }  # fmt: skip
+    options.update(_given(top, limits))
     if "capdac" in top:
         options["capdac"] = top.integer("capdac", 0, 10**6)
     options["seed"] = top.integer("seed", 0, 2**63 - 1, 0)
@@ -121,6 +123,15 @@ def parse_readout(
         return build(chip, electrodes, Options.of(options))
     except ReadOutError as error:
         raise top.error(str(error)) from None
+
+
+def _given(table: Table, limits: Limits) -> dict[str, float]:
+    """Numbers of the keys that a table holds, within their limits."""
+    return {
+        key: table.number(key, low, high, unit=unit)
+        for key, (low, high, unit) in limits.items()
+        if key in table
+    }
 
 
 def _law(top: Table, chip: Chip) -> Law:
@@ -147,15 +158,10 @@ def _law(top: Table, chip: Chip) -> Law:
         "parasitic": (0.0, 1e-6, "F"),
     }  # fmt: skip
     table.only((*limits, "full_scale", "bits"))
-    figures = {
-        key: table.number(key, low, high, unit=unit)
-        for key, (low, high, unit) in limits.items()
-        if key in table
-    }
     full_scale = table.number("full_scale", 1e-9, 1e6, law.full_scale, "V")
     bits = table.integer("bits", 2, 32, law.bits)
     try:
-        return ShuntLaw(replace(law.front_end, **figures), full_scale, bits)
+        return ShuntLaw(replace(law.front_end, **_given(table, limits)), full_scale, bits)
     except ReadOutError as error:
         raise table.error(str(error)) from None
 
@@ -248,24 +254,16 @@ def _noise(table: Table) -> dict[str, Any]:
         "mains": (0.0, 1e-9, "F"), "mains_frequency": (1.0, 1e3, "Hz"),
     }  # fmt: skip
     table.only(limits)
-    return {
-        key: table.number(key, low, high, unit=unit)
-        for key, (low, high, unit) in limits.items()
-        if key in table
-    }
+    return _given(table, limits)
 
 
 def _climate(table: Table) -> dict[str, Any]:
     coefficients = {
-        "offset_per_kelvin": (1e-9, "F/K"), "gain_per_kelvin": (1.0, "1/K"),
-        "offset_per_percent": (1e-9, "F"), "gain_per_percent": (1.0, ""),
+        "offset_per_kelvin": (-1e-9, 1e-9, "F/K"), "gain_per_kelvin": (-1.0, 1.0, "1/K"),
+        "offset_per_percent": (-1e-9, 1e-9, "F"), "gain_per_percent": (-1.0, 1.0, ""),
     }  # fmt: skip
     table.only(("temperature", "humidity", *coefficients))
-    out: dict[str, Any] = {
-        key: table.number(key, -limit, limit, unit=unit)
-        for key, (limit, unit) in coefficients.items()
-        if key in table
-    }
+    out: dict[str, Any] = _given(table, coefficients)
     for key in ("temperature", "humidity"):
         value = table.data.get(key)
         if isinstance(value, list):
