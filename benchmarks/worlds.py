@@ -42,11 +42,18 @@ GAPS = (0.010, 0.020, 0.050)
 # -- how often -----------------------------------------------------------------------------------
 
 
-def ride(depth: bool, rate: float, pixels: int = 64) -> tuple[Times, Array, list[int]]:
+def ride(
+    depth: bool, rate: float, pixels: int = 64, back: str | float = "fill"
+) -> tuple[Times, Array, list[int]]:
     """The forearm example: times of its readings, the diagonals read [F], iterations."""
     mujoco_forearm.PIXELS = pixels
     way = mujoco_forearm.Ride(depth)
     model, data, sensor = way.model, way.data, way.sensor
+    if back != "fill":
+        sensor = cs.mujoco.attach(
+            model, data, "wrist_pad", "six_patch", world="depth", default_material="human",
+            default_grounding=100e-12, back=back,
+        )  # fmt: skip
     no_sensors = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     times, found, iterations = Times(), [], []
 
@@ -84,14 +91,22 @@ def rates() -> None:
 
 def same_ride() -> None:
     """Print how far the depth camera's ride is from that on geometry."""
-    print("\nthe same ride seen by the depth camera: rms difference of an electrode's change, % of")
-    print("its largest; over the fingers (first 1.4 s) and over hand and forearm")
-    expected = ride(False, RATE)[1]
-    fingers = np.arange(len(expected)) < 1.4 * RATE
-    for pixels in (64, 128, 256):
-        off = (ride(True, RATE, pixels)[1] - expected) / expected.max(axis=0)
-        rms = [100 * np.sqrt(np.mean(off[k] ** 2)) for k in (fingers, ~fingers)]
-        print(f"  {pixels} x {pixels}: {rms[0]:.2f}, {rms[1]:.2f}")
+    print(
+        "\nthe same ride seen by the depth camera, over the fingers (first 1.4 s) and over hand and"
+    )
+    print("forearm: rms difference of an electrode's change, % of its largest in the ride; largest")
+    print("difference, % of the largest change at that time")
+    exact = ride(False, RATE)[1]
+    fingers = np.arange(len(exact)) < 1.4 * RATE
+    for pixels, back in ((64, "fill"), (128, "fill"), (64, 0.016), (128, 0.016)):
+        off = ride(True, RATE, pixels, back)[1] - exact
+        now = np.abs(off).max(axis=1) / exact.max(axis=1)
+        for name, part in (("fingers", fingers), ("hand and forearm", ~fingers)):
+            rms = np.sqrt(np.mean((off / exact.max(axis=0))[part] ** 2))
+            print(
+                f"  {pixels} x {pixels}, back {back}, {name}: {100 * rms:.2f}; "
+                f"{100 * now[part].max():.1f}"
+            )
 
 
 # -- how well ------------------------------------------------------------------------------------
@@ -169,6 +184,44 @@ def cameras() -> None:
             print(f"  {name:20s} {1e3 * gap:3.0f} mm   {figures}", flush=True)
 
 
+def round_shapes() -> None:
+    """Print how far TinyRenderer's round shapes are from what they stand for, 10 mm away."""
+    print(
+        "\nround shapes as TinyRenderer draws them: depth against the exact one [mm], from and to;"
+    )
+    print("error of the electrodes' changes, %, from and to")
+    n, size, gap = 256, 0.25, 0.010
+    x, y = np.meshgrid(*2 * ((np.arange(n) + 0.5) / n * size - size / 2,))
+    kinds = {
+        "ball": (cs.Sphere(0.04), p.GEOM_SPHERE),
+        "capsule": (cs.Capsule(0.045, 0.2), p.GEOM_CAPSULE),
+        "cylinder": (cs.Cylinder(0.045, 0.2), p.GEOM_CYLINDER),
+    }
+    for name, (shape, kind) in kinds.items():
+        pose = cs.Pose.from_euler((0.0, 0.0, gap + shape.radius), (np.pi / 2, 0.0, 0.0))
+        client = p.connect(p.DIRECT)
+        pad = p.createMultiBody(0, -1, physicsClientId=client)
+        visual = p.createVisualShape(kind, radius=shape.radius, length=0.2, physicsClientId=client)
+        p.createMultiBody(0, -1, visual, pose.position, pose.quaternion, physicsClientId=client)
+        sensor = cs.pybullet.attach(
+            client, pad, design=_sim(), world="depth", resolution=n, size=size,
+            back=2 * shape.radius,
+        )  # fmt: skip
+        frame = sensor.frame()
+        out = np.hypot(x, y) if name == "ball" else np.where(np.abs(y) < 0.09, np.abs(x), np.inf)
+        exact = gap + shape.radius - np.sqrt(np.maximum(shape.radius**2 - out**2, 0.0))
+        on = frame.valid.reshape(n, n) & (out < 0.8 * shape.radius)
+        off = 1e3 * (frame.depth.reshape(n, n) - exact)[on]
+        found = np.diag(sensor.read().delta)
+        expected = np.diag(_sim().step(cs.Scene([cs.Body(shape, pose)])).delta)
+        change = 100 * (found / expected - 1)
+        print(
+            f"  {name:8s} {off.min():+.1f}, {off.max():+.1f} mm; {change.min():+.0f}, "
+            f"{change.max():+.0f} %"
+        )
+        p.disconnect(physicsClientId=client)
+
+
 def simulators() -> None:
     """Print how far the readings of one arm in MuJoCo and in PyBullet are apart."""
     limb, sim, rng, apart = arm(), _sim(), np.random.default_rng(1), []
@@ -232,18 +285,19 @@ def _text(values: Any) -> str:
     return " ".join(repr(float(v)) for v in np.ravel(values))
 
 
+PARTS = {part.__name__: part for part in (rates, same_ride, cameras, round_shapes, simulators)}
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("parts", nargs="*", help="rates, same_ride, cameras, simulators; all")
-    parts = parser.parse_args().parts or ["rates", "same_ride", "cameras", "simulators"]
+    parser.add_argument("parts", nargs="*", help=", ".join(PARTS) + "; by default all")
+    parts = parser.parse_args().parts or list(PARTS)
     on_one_core()
     machine = describe_machine(("mujoco", "pybullet", "numpy", "numba"))
     print(f"{machine['processor']}, load {machine['load']:.1f}, {machine['versions']}")
     for part in parts:
-        {"rates": rates, "same_ride": same_ride, "cameras": cameras, "simulators": simulators}[
-            part
-        ]()
+        PARTS[part]()
 
 
 if __name__ == "__main__":

@@ -59,11 +59,10 @@ def bent(angle: float) -> cs.Design:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("degrees", [30.0, 50.0])
-def test_turning_sensor_and_scene_about_the_forearm(degrees: float, simulators: Simulators) -> None:
+def test_turning_sensor_and_scene_about_the_forearm(simulators: Simulators) -> None:
     """Measured: 2.5 % at most; empty, 0.01 %. The box around stands where it was."""
     readings, empty = [], []
-    for angle in (0.0, math.radians(degrees)):
+    for angle in (0.0, math.radians(30.0)):
         sim = simulators(bent(angle))
         empty.append(sim.baseline[0, 0])
         for gap in (0.005, 0.02, 0.05):
