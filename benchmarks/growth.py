@@ -31,7 +31,7 @@ from capsense.field.background import BuildSettings
 from capsense.field.planes import LatticeSettings
 
 DESIGN = "six_patch"
-REFINEMENTS = (0.4, 0.6, 1.0, 1.5, 2.25)
+REFINEMENTS = (0.33, 0.6, 1.0, 1.5, 2.25)
 """Lattices, as multiples of the default's nodes along an axis; about 10,000 to 1,000,000."""
 LANES, SINGLE = 8, 4
 """Right-hand sides that go together, and bytes of a number."""
@@ -39,7 +39,7 @@ ITERATION = (13, 13)
 """Passes over vectors of all lanes, and over numbers one a node, in an iteration: forward sweep
 (reads u, p, r, A p and four coefficients, writes u, r, z), backward sweep (reads and writes z and
 p, four coefficients), operator (reads p and five coefficients, writes A p)."""
-AROUND = (20, 26)
+AROUND = (17, 25)
 """The same for what a step does once: weights copied, factors, loads, start, end, energies."""
 
 
