@@ -185,7 +185,7 @@ def test_a_tank_or_front_end_of_ones_own():
         ('chip = "fdc1004"\n[noise]\nwhite = 1', "white = 1 must be from 0 to 1e-09 F"),
         ('chip = "fdc1004"\n[tank]\nreference = 4e7', "has no tank; it goes with chip = fdc2214"),
         ('chip = "fdc2214"\n[front_end]\ngain = 2', "no front_end; it goes with chip = sdr"),
-        ('chip = "fdc2214"\n[tank]\nreference = 40', "tank: reference = 40 must be from 1000"),
+        ('chip = "fdc2214"\n[tank]\nreference = 40', "tank: reference = 40 must be from 100000"),
         (
             'chip = "sdr"\n[front_end]\ngane = 2',
             "front_end: unknown key 'gane'; did you mean 'gain",

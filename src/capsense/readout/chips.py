@@ -90,6 +90,8 @@ FDC2214 = Chip(
     facts=(
         Fact("law", "DATA = 2^28 f_sensor/f_ref, with f_sensor of an LC tank", _CONFIRMED,
              _FDC2214 + "7.1 Overview and 7.3; the makers' answer in TI E2E forum thread 1543147"),
+        Fact("range", "10 kHz to 10 MHz, and below a quarter of the reference", _CONFIRMED,
+             _FDC2214 + "1 Features; table of clock settings in 7.3.1"),
         Fact("conversion", "the window is averaged over, in frequency", _CONFIRMED,
              "TI E2E forum thread 1543147"),
         Fact("output rate", "up to 4.08 kS/s, which the bus limits", _CONFIRMED,

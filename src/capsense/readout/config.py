@@ -148,7 +148,7 @@ def _law(top: Table, chip: Chip) -> Law:
             law,
             inductance=table.number("inductance", 1e-9, 1.0, law.inductance, "H"),
             fixed=table.number("capacitance", 1e-15, 1e-3, law.fixed, "F"),
-            reference=table.number("reference", 1e3, 1e9, law.reference, "Hz"),
+            reference=table.number("reference", 1e5, 1e9, law.reference, "Hz"),
         )
     assert isinstance(law, ShuntLaw)
     table = Table(top.data["front_end"], top.source, "front_end")

@@ -136,12 +136,21 @@ class ResonanceLaw:
     reference: float
     """f_ref [Hz]."""
     bits: int = 28
-    low: int = 1
+    slowest: float = 10e3
+    """Least frequency that is counted [Hz]."""
     rising = False
 
     def __post_init__(self) -> None:
-        for name, unit in (("inductance", "H"), ("fixed", "F"), ("reference", "Hz")):
+        for name, unit in (
+            ("inductance", "H"), ("fixed", "F"), ("reference", "Hz"), ("slowest", "Hz"),
+        ):  # fmt: skip
             require("resonance law", name, getattr(self, name), 0.0, unit, open_=True)
+        _require_codes(self.low, self.high)
+
+    @property
+    def low(self) -> int:
+        """Smallest code: that of the least frequency."""
+        return math.ceil(self.slowest / self.reference * 2**self.bits)
 
     @property
     def high(self) -> int:
