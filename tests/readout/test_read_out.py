@@ -356,6 +356,34 @@ def test_parts_that_do_not_fit_are_refused(options, words):
         plain(**options)
 
 
+def test_stages_are_applied_in_their_order():
+    """Analytic: gain and offset, either way round; a stage and a law of one's own take part."""
+
+    class Doubled:
+        def start(self, context):
+            return lambda channel, time, value: 2 * value
+
+    class Square:
+        """Code = (C/fF)²."""
+
+        low, high, rising = 0, 10**9, True
+
+        def level(self, capacitance):
+            return (capacitance / 1e-15) ** 2
+
+        def capacitance(self, code):
+            return 1e-15 * np.sqrt(code)
+
+    shift = LinearSensor(1.0, 3e-13, 0.0, 0.0)
+    for stages, expected in (((Doubled(), shift), 2300), ((shift, Doubled()), 2600)):
+        readout = ReadOut(
+            self_patterns(NAMES), NAMES, Schedule.simultaneous(3, 0.1), Square(), stages=stages
+        )
+        counts = readout([0.0, 1.0], np.full((2, 3), 1e-12))
+        assert (counts.code == expected**2).all()
+        assert counts.capacitance == near(np.full(len(counts), expected * 1e-15), rel=1e-12)
+
+
 def test_a_stage_that_fails_is_noticed():
     """NaN is never turned into a code."""
 
