@@ -72,9 +72,10 @@ FDC1004 = Chip(
              _FDC1004 + "1 Features; 6.3.2 The CAPDAC"),
         Fact("CAPDAC jump", "−1.4 pF from code 7 to 8, on one specimen; laid on bits 2 and 3",
              _CONFIRMED, "TI E2E forum thread 1178477, table of readings"),
-        Fact("temperature drift", "gain −37.5 ppm/K; offset 46 fF from −40 to 125 °C, taken as "
-             "even: 0.28 fF/K", _CONFIRMED, _FDC1004 + "5.5 Electrical Characteristics, as quoted "
-             "in TI E2E forum thread 1054072"),
+        Fact("gain drift", "−37.5 ppm/K", _CONFIRMED, _FDC1004 + "5.5 Electrical Characteristics, "
+             "as quoted in TI E2E forum thread 1054072"),
+        Fact("offset drift", "0.28 fF/K: 46 fF from −40 to 125 °C, taken as even", _COMPUTED,
+             "as for the gain drift"),
         Fact("shields", "two, up to 400 pF each", _CONFIRMED, _FDC1004 + "1 Features"),
         Fact("excitation", "25 kHz", _REMEMBERED, _FDC1004 + "5.5 Electrical Characteristics"),
         Fact("flicker floor", "0.15 fF", _ASSUMED, ""),
