@@ -138,6 +138,23 @@ def test_planes(normal: Any, client: int, attach: Callable[..., Any]) -> None:
     assert np.array_equal(inside < 0, side < 0)
 
 
+def test_a_drawn_floor_is_its_collision_shape(client: int, attach: Callable[..., Any]) -> None:
+    """Differential: a flat visual mesh, such as plane.urdf has, has no inside of its own."""
+    import pybullet_data
+
+    floor = f"{pybullet_data.getDataPath()}/plane.urdf"
+    body = p.loadURDF(floor, (0, 0, 0.03), (1, 0, 0, 0), physicsClientId=client)
+    readings = [attach(shapes=s, exclude=["pad"]).read().delta for s in ("visual", "collision")]
+    assert readings[0][0, 0] > 1e-15
+    assert np.array_equal(*readings)
+    p.removeBody(body, physicsClientId=client)
+    file = f"{pybullet_data.getDataPath()}/plane.obj"
+    drawn = p.createVisualShape(p.GEOM_MESH, fileName=file, physicsClientId=client)
+    p.createMultiBody(0, -1, drawn, physicsClientId=client)
+    with pytest.raises(cs.SceneError, match=r"flat visual mesh, .*no collision shape; leave it"):
+        attach(shapes="visual")
+
+
 def test_meshes_without_a_file(client: int, attach: Callable[..., Any]) -> None:
     """Corners given in code make a hull; a concave surface is refused by name."""
     corners = [[0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02]]

@@ -63,6 +63,13 @@ def load_triangles(path: str | Path, scale: ArrayLike, label: str) -> tuple[Arra
     return np.asarray(mesh.vertices) * np.asarray(scale, dtype=float), np.asarray(mesh.faces)
 
 
+def is_flat(vertices: ArrayLike) -> bool:
+    """Whether points, shape (n, 3), lie in a plane to within a millionth of their extent."""
+    v = np.asarray(vertices, dtype=float)
+    spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)
+    return len(spread) < 3 or bool(spread[2] <= 1e-6 * spread[0])
+
+
 def height_field(heights: ArrayLike, size: ArrayLike, base: float) -> tuple[Array, Array]:
     """A closed surface around a terrain: its top, side walls and a flat bottom.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from capsense.adapters.attached import WorldSource
 from capsense.adapters.meshes import (
+    is_flat,
     joined_hulls,
     load_triangles,
     round_cylinder,
@@ -221,15 +222,23 @@ class WorldReader:
             raise _refuse(link, "is a height field, of which PyBullet tells nothing but its bounds")
         if self.shapes == "visual":
             to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
+            flat = False
             for entry in drawn:
-                yield self._visual(link, entry), to_mass @ Pose(entry[5], entry[6])
-            return
+                shape = self._visual(link, entry)
+                flat = flat or shape is None
+                if shape is not None:
+                    yield shape, to_mass @ Pose(entry[5], entry[6])
+            if not flat:
+                return
         # entries 0 and 1 are sound in the first record of a link only
         data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
+        if self.shapes == "visual" and not data:
+            raise _refuse(link, "has a flat visual mesh, without an inside, and no collision shape")
         for number, entry in enumerate(data):
             yield self._collision(link, number, entry)
 
-    def _visual(self, link: Link, entry: Any) -> Shape:
+    def _visual(self, link: Link, entry: Any) -> Shape | None:
+        """A visual shape; None for a flat mesh, such as that of a drawn floor."""
         import pybullet as p
 
         kind, sizes, file = entry[2:5]
@@ -244,6 +253,8 @@ class WorldReader:
         if key not in self._meshes:
             label = link.names[-1]
             vertices, faces = load_triangles(file.decode(), sizes, label)
+            if is_flat(vertices):
+                return None
             self._meshes[key] = solid_mesh(vertices, faces, label, hull=hull)
         return self._meshes[key]
 
