@@ -161,6 +161,8 @@ def test_groups_select_geoms(tiny_simulator: cs.Simulator) -> None:
     world = "".join(f'<geom name="g{g}" size=".01" pos="0 0 .04" group="{g}"/>' for g in range(4))
     scene = sensor_in(world, tiny_simulator, groups=(1, 3)).scene()
     assert [b.name for b in scene] == ["world/g1", "world/g3"]
+    with pytest.raises(cs.SceneError, match=r"nothing is in group 5; there are geoms in \[0, 1"):
+        sensor_in(world, tiny_simulator, groups=(1, 5))
 
 
 def test_a_site_of_the_world_keeps_the_world(tiny_simulator: cs.Simulator) -> None:

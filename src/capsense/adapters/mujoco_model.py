@@ -209,7 +209,8 @@ class ModelSource(WorldSource):
         groups: See only geoms of these groups; all where None.
 
     Raises:
-        SceneError: A pattern fits nothing, or one of the model's own texts is wrong.
+        SceneError: A pattern fits nothing, a group is empty, or one of the model's own texts is
+            wrong.
     """
 
     def __init__(
@@ -222,9 +223,14 @@ class ModelSource(WorldSource):
         self.model = model
         self.data = data
         self._rules = rules
-        chosen = None if groups is None else {int(g) for g in groups}
+        there = {int(g) for g in (*model.geom_group, *model.flex_group)}
+        for group in () if groups is None else groups:
+            if group not in there:
+                raise SceneError(
+                    f"groups: nothing is in group {group!r}; there are geoms in {sorted(there)}"
+                )
         self._geoms = [
-            i for i in range(model.ngeom) if chosen is None or int(model.geom_group[i]) in chosen
+            i for i in range(model.ngeom) if groups is None or int(model.geom_group[i]) in groups
         ]
         super().__init__()
 
