@@ -109,11 +109,18 @@ def draw(curves: dict[str, np.ndarray], folder: Path) -> None:
     x = np.linspace(-150, 150, STEPS)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8))
     for title, style in (("arm in a sleeve", "-"), ("bare arm", ":"), ("sleeve alone", "--")):
+        left.plot([], [], style, color="0.3", label=title)
         for k in range(3):
-            label = title if k == 0 else None
-            left.plot(x, curves[title][:, k] * 1e15, style, color=f"C{k}", label=label)
-    left.set(xlabel="arm's position, mm", ylabel="change of E1, E2, E3, fF")
-    left.set_ylim(top=1.4 * curves["arm in a sleeve"].max() * 1e15)
+            left.plot(x, curves[title][:, k] * 1e15, style, color=f"C{k}")
+    covered = curves["arm in a sleeve"] * 1e15
+    for k in range(3):
+        top = int(covered[:, k].argmax())
+        left.annotate(
+            f"E{k + 1}", (x[top], covered[top, k]), xytext=(0, 4), textcoords="offset points",
+            ha="center", color=f"C{k}",
+        )  # fmt: skip
+    left.set(xlabel="arm's position, mm", ylabel="change of capacitance, fF")
+    left.set_ylim(top=1.6 * covered.max())
     left.legend(loc="upper left")
     left.grid(alpha=0.3)
     middle = STEPS // 2
