@@ -51,6 +51,18 @@ BODY = np.dtype(
 """A body of a scene as the scan sees it: shape and pose, the index of a conductor (−1: dielectric),
 and where the grid of a mesh or of layers begins among those of all."""
 
+PART = np.dtype(
+    [
+        ("begin", np.float64),
+        ("weight", np.float64),
+        ("aside", np.float64),
+        ("low", np.float64, (2,)),
+        ("high", np.float64, (2,)),
+    ]
+)
+"""What a body takes of a column: the part ``[begin, begin + weight]`` of its cross-section, how far
+from the column's line it lies [m], and from where to where along both axes across [m]."""
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def pierce(axis, op, oq, low, high, body, grids, out):
@@ -155,23 +167,24 @@ def _holds_cross(axis, p, q, t, pl, ph, ql, qh, sq, body):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, out):
-    """Weight of a body in a column at t around (sp, sq), and the middle of what it covers.
+def _cover(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, out, part):
+    """Fill in what a body takes of a column at t around (sp, sq), its place in it apart.
 
-    The share of the column's cross-section that it covers, steepened. Of a rod or a speck in the
-    column it counts how much of its own width the column holds. Last comes how far the covered
-    part lies aside of the column's line [m].
+    Its weight is the share of the column's cross-section that it covers, steepened. Of a rod or a
+    speck in the column it counts how much of its own width the column holds.
     """
     least = slenderness(body.kind, body.params)
     if (least >= ph - pl or least >= qh - ql) and _holds_cross(axis, p, q, t, pl, ph, ql, qh, sq,
                                                               body):  # fmt: skip
-        return 1.0, 0.5 * (pl + ph), 0.5 * (ql + qh), 0.0
+        part.low[0], part.high[0], part.low[1], part.high[1] = pl, ph, ql, qh
+        part.weight, part.aside = 1.0, 0.0
+        return
     a, b, across_p = _chord(axis, p, t, sp, sq, pl, ph, body, grids, out)
-    sp = 0.5 * (a + b)
+    part.low[0], part.high[0] = a, b
     share = part_covered(pl, op, ph, a, b, max(across_p, least))
     aside_p = max(a - op, max(op - b, 0.0))
-    a, b, across_q = _chord(axis, q, t, sq, sp, ql, qh, body, grids, out)
-    sq = 0.5 * (a + b)
+    a, b, across_q = _chord(axis, q, t, sq, 0.5 * (a + b), ql, qh, body, grids, out)
+    part.low[1], part.high[1] = a, b
     share *= part_covered(ql, oq, qh, a, b, max(across_q, least))
     aside_q = max(a - oq, max(oq - b, 0.0))
     share = 0.5 + RAMP * (share - 0.5)
@@ -179,7 +192,31 @@ def _covered_share(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, o
         share = 1.0
     if least < ph - pl and least < qh - ql:
         share *= thin_factor(ph - pl, qh - ql, max(across_p, least), max(across_q, least))
-    return share, sp, sq, math.hypot(aside_p, aside_q)
+    part.weight, part.aside = share, math.hypot(aside_p, aside_q)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nested(part, other):
+    """How much of the smaller of two parts lies within the other: 0 beside, 1 inside."""
+    share = 1.0
+    for k in range(2):
+        narrow = min(part.high[k] - part.low[k], other.high[k] - other.low[k])
+        common = min(part.high[k], other.high[k]) - max(part.low[k], other.low[k])
+        share *= min(max(common, 0.0) / narrow, 1.0) if narrow > 0.0 else 1.0
+    return share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _place_beside(m, near, bodies, parts):
+    """Where what conductor ``near[m]`` takes of a column begins: after what it lies beside of."""
+    part = parts[near[m]]
+    begin = 0.0
+    if part.weight < 1.0:
+        for k in range(m):
+            other = parts[near[k]]
+            if bodies[near[k]].conductor >= 0 and 0.0 < other.weight < 1.0:
+                begin = max(begin, other.begin + (1.0 - nested(part, other)) * other.weight)
+    part.begin = min(begin, 1.0 - part.weight)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -218,26 +255,27 @@ def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, grids, t0, t1,
-                      who, cover, aside, out):  # fmt: skip
-    """Stretches of a lattice line's column inside bodies, and the weight of each.
+                      who, parts, out):  # fmt: skip
+    """Stretches of a lattice line's column inside bodies, and what of the column they take.
 
     The column of a line reaches about half-way to its neighbours, [pl, ph] x [ql, qh]. A
     conductor's stretch is taken at the middle of what it covers of the column, and weighted by the
     share it covers, so that an edge that moves across a line makes it enter gradually. Dielectrics
-    are met on the line itself. ``aside`` tells, for each body, how far what it covers lies from
-    the line [m]. Returns the number of stretches, or −1 if they do not fit.
+    are met on the line itself. Fills in ``parts``, for each body. Returns the number of stretches,
+    or −1 if they do not fit.
     """
     n = 0
     for m in range(n_near):
-        body = bodies[near[m]]
+        body, part = bodies[near[m]], parts[near[m]]
         bounds = body.bounds
+        part.begin, part.weight, part.aside = 0.0, 0.0, 0.0
         if ph < bounds[0, p] or pl > bounds[1, p] or qh < bounds[0, q] or ql > bounds[1, q]:
             continue
         sp, sq = op, oq
         count = pierce(axis, sp, sq, -math.inf, math.inf, body, grids, out)
-        share = 1.0
-        aside[near[m]] = 0.0
-        if body.conductor >= 0:
+        if body.conductor < 0:
+            part.weight = 1.0
+        else:
             centred = count > 0
             if not centred:
                 if _barely_covers(pl, op, ph, ql, oq, qh, p, q, body):
@@ -249,21 +287,25 @@ def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, 
             for k in range(1, count):
                 if out[k, 1] - out[k, 0] > b - a:
                     a, b = out[k, 0], out[k, 1]
-            share, sp, sq, aside[near[m]] = _covered_share(
-                axis, p, q, 0.5 * (a + b), op, oq, sp, sq, pl, ph, ql, qh, body, grids, out
+            _cover(
+                axis, p, q, 0.5 * (a + b), op, oq, sp, sq, pl, ph, ql, qh, body, grids, out, part
             )
-            if share <= 0.0:
+            if part.weight <= 0.0:
                 continue
-            if share == 1.0 and centred and count == 1:
+            _place_beside(m, near, bodies, parts)
+            if part.weight == 1.0 and centred and count == 1:
                 out[0, 0], out[0, 1] = a, b
             else:
-                if share == 1.0 and centred:
-                    sp, sq = op, oq
+                if part.weight < 1.0 or not centred:
+                    sp = 0.5 * (part.low[0] + part.high[0])
+                    sq = 0.5 * (part.low[1] + part.high[1])
                 count = pierce(axis, sp, sq, -math.inf, math.inf, body, grids, out)
+                if count == 0:
+                    part.weight = 0.0
         for k in range(count):
             if out[k, 1] > out[k, 0]:
                 if n == MAX_STRETCHES:
                     return -1
-                t0[n], t1[n], who[n], cover[n] = out[k, 0], out[k, 1], near[m], share
+                t0[n], t1[n], who[n] = out[k, 0], out[k, 1], near[m]
                 n += 1
     return n

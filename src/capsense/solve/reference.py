@@ -6,8 +6,8 @@ The kernels are tested against it.
 
 **Columns.** A lattice line stands for the column half-way to its neighbours. A conductor weighs in
 with the share of the column that it covers, steepened by ``RAMP``, and is met at the middle of the
-part that it covers; dielectrics are met on the line itself. A line that several bodies cover to
-different shares is a bundle of lines, each with its part of every link's weight.
+part that it covers; dielectrics are met on the line itself. A line of which several bodies cover
+different parts is a bundle of lines, each with its part of every link's weight: see ``layers``.
 
 **Links.** A link of weight w runs from a node to the next along an axis; where a sheet of the
 design cuts it, two half-links run from the nodes to the sheet. Between its ends a scene lays
@@ -51,7 +51,7 @@ from capsense.field.background import BackgroundField
 from capsense.field.lattice import FREE, Storey
 from capsense.scene import Body, Scene
 from capsense.solve.perturbation import CONTACT
-from capsense.solve.reference_columns import Column, met, pierce
+from capsense.solve.reference_columns import Column, Part, layers, met, pierce
 from capsense.solve.trace_kernels import _LEAST, _SNAP
 
 Array = NDArray[np.float64]
@@ -92,6 +92,10 @@ class _Stretch:
     body: int
     aside: float = 0.0
     """How far what the body covers of the line's column lies from the line [m]."""
+
+
+def _stretches(part: Part) -> list[_Stretch]:
+    return [_Stretch(a, b, part.body, part.aside) for a, b in part.stretches]
 
 
 @dataclass(frozen=True)
@@ -184,18 +188,13 @@ class _Problem:
         for i in range(1, len(storey.axes[p]) - 1):
             for j in range(1, len(storey.axes[q]) - 1):
                 column = Column.around(storey, axis, i, j)
-                found = [
-                    (cover, _Stretch(a, b, body, aside))
+                parts = [
+                    met(self.scene[body], body, self.packed, body in self.same, column)
                     for body in here
-                    for cover, a, b, aside in met(
-                        self.scene[body], body, self.packed, body in self.same, column
-                    )
                 ]
-                levels = sorted({cover for cover, _ in found})
-                steps = np.diff([0.0, *levels])
                 bundle = [
-                    (share, self._disjoint([s for cover, s in found if cover >= level]))
-                    for share, level in zip(steps, levels, strict=True)
+                    (share, self._disjoint([s for part in filled for s in _stretches(part)]))
+                    for share, filled in layers([part for part in parts if part.stretches])
                 ]
                 if bundle:
                     yield _Line(axis, grid[i, j], c, smooth), bundle

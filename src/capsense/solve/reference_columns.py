@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,31 +62,46 @@ class Column:
         return out
 
 
-def met(
-    body: Body, number: int, packed: PackedScene, conducts: bool, column: Column
-) -> list[tuple[float, float, float, float]]:
-    """A body's stretches in a column: weight, start, end, and how far aside they lie."""
+@dataclass
+class Part:
+    """What a body takes of a column."""
+
+    body: int
+    stretches: list[tuple[float, float]]
+    """Where it is met: coordinates [m] along the column."""
+    weight: float = 1.0
+    """How much of the column's cross-section it fills."""
+    aside: float = 0.0
+    """How far what it covers lies from the column's line [m]."""
+    across: list[tuple[float, float]] = field(default_factory=list)
+    """From where to where it covers the column, along both axes across [m]."""
+    begin: float = 0.0
+    """It takes ``[begin, begin + weight]`` of the cross-section's weight."""
+
+
+def met(body: Body, number: int, packed: PackedScene, conducts: bool, column: Column) -> Part:
+    """What a body takes of a column, of no stretches where they do not meet."""
     axis = column.axis
     low, high = packed.bounds[number]
     if any(end < low[a] or start > high[a] for a, (start, end) in column.bounds.items()):
-        return []
+        return Part(number, [])
     middle = column.at(*column.middle)
-    if not conducts:
-        return [(1.0, a, b, 0.0) for a, b in pierce(body, middle[None], axis)[0]]
     hit = pierce(body, middle[None], axis)[0]
+    if not conducts:
+        return Part(number, hit)
     centred, point = bool(hit), middle.copy()
     if not centred:
         trials = np.array([column.at(*uv) for uv in column.trials(packed, number)])
         hits = pierce(body, trials, axis)
         first = next((k for k, found in enumerate(hits) if found), None)
         if first is None:
-            return []
+            return Part(number, [])
         hit, point = hits[first], trials[first].copy()
     a, b = max(hit, key=lambda ab: ab[1] - ab[0])
     point[axis] = 0.5 * (a + b)
     kind, params = body.shape.kind, packed.params[number]
     slender = float(slenderness(kind, params))
-    share, widths, extents, off = 1.0, [], [], []
+    share, widths, extents, off, across = 1.0, [], [], [], []
     for along, node in zip(column.across, column.middle, strict=True):
         low, high = column.bounds[along]
         chords = [
@@ -100,16 +116,55 @@ def met(
         share *= part_covered(low, node, high, *inside, extents[-1])
         point[along] = 0.5 * (inside[0] + inside[1])
         off.append(max(inside[0] - node, node - inside[1], 0.0))
+        across.append(inside)
     weight = 0.5 + RAMP * (share - 0.5)
     weight = 1.0 if weight > WHOLE else weight
     if slender < min(widths):
         weight *= thin_factor(*widths, *extents)
     if weight <= 0.0:
-        return []
+        return Part(number, [])
     if weight == 1.0 and centred:
         point = middle
-    aside = math.hypot(*off)
-    return [(weight, a, b, aside) for a, b in pierce(body, point[None], axis)[0]]
+    stretches = pierce(body, point[None], axis)[0]
+    return Part(number, stretches, weight, math.hypot(*off), across)
+
+
+def layers(parts: list[Part]) -> list[tuple[float, list[Part]]]:
+    """Layers of a column's cross-section, each with its share and the parts that fill it.
+
+    Bodies that lie beside each other in the column fill one layer after the other, those of which
+    one lies within the other the same. Dielectrics fill all of it.
+    """
+    for k, part in enumerate(parts):
+        for other in parts[:k]:
+            if other.across and part.weight < 1.0 and other.weight < 1.0:
+                begin = other.begin + (1.0 - _nested(part, other)) * other.weight
+                part.begin = max(part.begin, begin)
+        part.begin = min(part.begin, 1.0 - part.weight)
+    edges = [0.0]
+    for edge in sorted({e for part in parts for e in (part.begin, part.begin + part.weight)}):
+        if edge > edges[-1] + 1e-9:
+            edges.append(edge)
+    return [
+        (upper - lower, filled)
+        for lower, upper in pairwise(edges)
+        if (
+            filled := [
+                part
+                for part in parts
+                if part.begin <= lower + 1e-9 and part.begin + part.weight >= upper - 1e-9
+            ]
+        )
+    ]
+
+
+def _nested(part: Part, other: Part) -> float:
+    """How much of the smaller of two parts lies within the other: 0 beside, 1 inside."""
+    share = 1.0
+    for (a, b), (c, d) in zip(part.across, other.across, strict=True):
+        narrow = min(b - a, d - c)
+        share *= min(max(min(b, d) - max(a, c), 0.0) / narrow, 1.0) if narrow > 0.0 else 1.0
+    return share
 
 
 def pierce(body: Body, points: Array, axis: int) -> list[list[tuple[float, float]]]:

@@ -14,7 +14,12 @@ import math
 import numpy as np
 from numba import njit
 
-from capsense.solve.column_kernels import MAX_STRETCHES, MESH_STRETCHES, covered_stretches
+from capsense.solve.column_kernels import (
+    MAX_STRETCHES,
+    MESH_STRETCHES,
+    PART,
+    covered_stretches,
+)
 from capsense.solve.finding_kernels import (
     add_energy,
     add_tie,
@@ -28,6 +33,8 @@ _SNAP = 1e-6
 """Fraction of a link within which a surface counts as lying on a node."""
 _LEAST = 1e-3
 """Smallest fraction of a link between a free node and a conductor."""
+_THIN = 1e-9
+"""Layers of a column thinner than this part of it are none."""
 FULL, CROWDED, SHORT = 0, 1, 2
 """Outcomes of a scan: whole; more stretches on a line than fit; more findings than fit."""
 
@@ -136,14 +143,13 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
     lowest, highest = storey.lowest[axis], storey.highest[axis]
     t0, t1 = np.empty(MAX_STRETCHES), np.empty(MAX_STRETCHES)
     who = np.empty(MAX_STRETCHES, np.int64)
-    cover = np.empty(MAX_STRETCHES)
     u0, u1 = np.empty(MAX_STRETCHES), np.empty(MAX_STRETCHES)
     uwho = np.empty(MAX_STRETCHES, np.int64)
     r0, r1 = np.empty(2 * MAX_STRETCHES), np.empty(2 * MAX_STRETCHES)
     rwho = np.empty(2 * MAX_STRETCHES, np.int64)
     ends = np.empty(2 * MAX_STRETCHES)
     scratch = np.empty((MESH_STRETCHES, 2))
-    near, aside = np.empty(bodies.shape[0], np.int64), np.empty(bodies.shape[0])
+    near, parts = np.empty(bodies.shape[0], np.int64), np.empty(bodies.shape[0], PART)
     for ip in range(1, cp.shape[0] - 1):
         n_near = 0
         for m in range(bodies.shape[0]):
@@ -159,37 +165,50 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
         for iq in range(1, cq.shape[0] - 1):
             total = covered_stretches(
                 axis, p, q, cp[ip], cq[iq], fp[ip - 1], fp[ip], fq[iq - 1], fq[iq], bodies, near,
-                n_near, grids, t0, t1, who, cover, aside, scratch,
+                n_near, grids, t0, t1, who, parts, scratch,
             )  # fmt: skip
             if total == 0:
                 continue
             if total < 0:
                 return CROWDED
-            # bodies that fill different shares of the column are met layer by layer
-            level = 0.0
-            for k in range(total):
-                level = max(level, cover[k])
-            while level > 0.0:
-                below = 0.0
+            # where bodies fill different parts of the column, it is met layer by layer
+            lower = 0.0
+            while True:
+                upper = _next_edge(lower, total, who, parts)
+                if upper == math.inf:
+                    break
                 n = 0
                 for k in range(total):
-                    if cover[k] >= level:
+                    part = parts[who[k]]
+                    if part.begin <= lower + _THIN and part.begin + part.weight >= upper - _THIN:
                         u0[n], u1[n], uwho[n] = t0[k], t1[k], who[k]
                         n += 1
-                    else:
-                        below = max(below, cover[k])
                 n = _resolve(n, u0, u1, uwho, bodies, r0, r1, rwho, ends, joined)
                 line = storey.first + ip * sp + iq * sq
-                if not _lay_line(axis, line, stride, c, lowest, highest, level - below, n, r0, r1,
-                                 rwho, aside, nodes, links, cuts, bodies, contact, weight, extra,
-                                 inside, ties, energies, couples, counts):  # fmt: skip
+                if n > 0 and not _lay_line(
+                    axis, line, stride, c, lowest, highest, upper - lower, n, r0, r1, rwho, parts,
+                    nodes, links, cuts, bodies, contact, weight, extra, inside, ties, energies,
+                    couples, counts,
+                ):  # fmt: skip
                     return SHORT
-                level = below
+                lower = upper
     return FULL
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _next_edge(lower, total, who, parts):
+    """Where the next layer of a column ends, above ``lower``; infinite above the last."""
+    out = math.inf
+    for k in range(total):
+        part = parts[who[k]]
+        for edge in (part.begin, part.begin + part.weight):
+            if lower + _THIN < edge < out:
+                out = edge
+    return out
+
+
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, aside, nodes, links,
+def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, parts, nodes, links,
               cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
     """Lay ``n`` disjoint stretches over the links of a line; False: the findings do not fit."""
@@ -214,14 +233,14 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, as
                 return False
             for part in range(1 if link.cut < 0 else 2):
                 _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1,
-                          rwho, aside, nodes, cuts, bodies, contact, weight, extra, inside, ties,
+                          rwho, parts, nodes, cuts, bodies, contact, weight, extra, inside, ties,
                           energies, couples, counts)  # fmt: skip
         m += 1
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, aside,
+def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, parts,
               nodes, cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
     """Change a link, or one part of a cut link, by the stretches on it from number ``seg`` on."""
@@ -256,7 +275,7 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
             if s0 > pos:
                 resist += (s0 - pos) / length
             if who >= 0:
-                off_line = max(off_line, aside[rwho[k]])
+                off_line = max(off_line, parts[rwho[k]].aside)
                 if first_c < 0:
                     first_r, first_t, first_c = resist, s0, who
                     first_deep = r0[k] < pa - _SNAP * length
