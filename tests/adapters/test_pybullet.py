@@ -235,6 +235,8 @@ def test_wrong_calls_are_refused(
         ({"client": "direct"}, "client is 'direct'"),
         ({"shapes": "drawn"}, "shapes is 'drawn'; choose"),
         ({"pose_in_link": (0, 0, 0)}, "pose_in_link is"),
+        ({"resolution": 128}, 'resolution goes with world="depth"'),
+        ({"size": 0.2}, 'size goes with world="depth"'),
     ):
         call = {"client": client, "body": sensor.body, "design": tiny_simulator, **options}
         with pytest.raises(cs.SceneError, match=message):

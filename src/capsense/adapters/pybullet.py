@@ -96,7 +96,7 @@ def attach(
             Geometry only.
         sheet_thickness: Thickness [m] of soft bodies that are open surfaces, such as cloth.
         size: Width and height of the image [m]; by default the width of the domain. Depth only.
-        resolution: Pixels along each side of the image.
+        resolution: Pixels along each side of the image. Depth only.
         back: Where what is drawn ends: ``"fill"``, at the end of the domain, or after an assumed
             thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
         readout: A read-out whose counts readings are to hold, a chip's name, or a file's; see
@@ -114,7 +114,8 @@ def attach(
     only_geometry = {
         "grounding": grounding, "hull": hull, 'shapes="visual"': shapes == "visual",
     }  # fmt: skip
-    check_world(world, only_geometry, {"size": size, "back": back != "fill"})
+    only_depth = {"size": size, "resolution": resolution != 64, "back": back != "fill"}
+    check_world(world, only_geometry, only_depth)
     if not isinstance(pose_in_link, Pose):
         raise SceneError(f"pose_in_link is {pose_in_link!r}; give a Pose(position, quaternion)")
     rules = Rules(
