@@ -117,6 +117,7 @@ def measure(makers: Makers, budget: float) -> list[dict[str, Any]]:
             method = make()
         except ImportError as error:
             rows.append({"label": label, "missing": str(error)})
+            print(f"  {label}: left out, {error}", flush=True)
             continue
         prepared = time.perf_counter() - start
         method.step(*timed_place(0))
@@ -180,10 +181,7 @@ def main() -> None:
                 sys.exit(f"there is no group {name!r}; known: {', '.join(known)}")
         results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
         for name in wanted:
-            print(
-                f"{name}: {HEADINGS} {GAPS} mm",
-                flush=True,
-            )
+            print(f"{name}: {HEADINGS} {GAPS} mm", flush=True)
             load = os.getloadavg()[0]
             rows = measure(known[name](), 1.0 if args.quick else BUDGET)
             results[name] = {**describe_machine(PACKAGES), "load": load, "results": rows}
