@@ -53,9 +53,13 @@ def processor_time(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def python_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+def domes() -> list[np.ndarray]:
+    """The frames."""
+    return [moving_depth(k).depth[0].astype(np.float32) for k in range(500)]
+
+
+def round_trips(url: str, count: int, frames: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Round trips and steps [s], shape (n,)."""
-    frames = [moving_depth(k).depth[0].astype(np.float32) for k in range(500)]
     taken, solve = np.empty(count), np.empty(count)
     with Client(url) as client:
         sensor = client.open()
@@ -67,9 +71,19 @@ def python_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     return taken[first:], solve[first:]
 
 
+def python_client(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Round trips and steps [s], shape (n,)."""
+    return round_trips(url, count, domes())
+
+
+def nothing_in_view(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same with frames that leave nothing to solve."""
+    return round_trips(url, count, [np.zeros((64, 64), np.float32)])
+
+
 def python_stream(url: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Times between readings, and steps [s], shape (n,); the next frame is sent meanwhile."""
-    frames = [moving_depth(k).depth[0].astype(np.float32) for k in range(500)]
+    frames = domes()
     came, solve = np.empty(count), np.empty(count)
     with Client(url) as client:
         sensor = client.open()
@@ -113,6 +127,7 @@ CLIENTS = {
     "Python, streaming": (python_stream, 1),
     "Python, two at once": (two_clients, 2),
     "Unity package, mono": (unity_client, 1),
+    "Python, empty frames": (nothing_in_view, 1),
 }
 COLUMNS = ("a second", "median", "p95", "p99", "solve", "protocol", "server")
 
