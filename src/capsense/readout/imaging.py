@@ -137,75 +137,79 @@ def _four_edges(product: Array, axis: int) -> Array:
 
 
 def back_projection(matrix: ArrayLike) -> Array:
-    """Linear back-projection: the image is R d with R = Jᵀ, rows and columns scaled.
+    """Linear back-projection: R = Jᵀ, each voxel's row divided by its length; one product a frame.
 
-    Each pair first counts relative to its largest sensitivity; each voxel is then divided by the
-    sum of the sensitivities that reach it. One matrix product a frame; blurred, without a scale.
-
-    Args:
-        matrix: J, shape (pairs, voxels).
-
-    Returns:
-        R, shape (voxels, pairs).
-    """
-    j = _checked(matrix)
-    rows = np.abs(j).max(axis=1)
-    scaled = j / np.where(rows > 0, rows, 1.0)[:, None]
-    reach = np.abs(scaled).sum(axis=0)
-    inverse = scaled / np.where(reach > 0, reach, 1.0)
-    return (inverse / np.where(rows > 0, rows, 1.0)[:, None]).T
-
-
-def tikhonov(matrix: ArrayLike, strength: float = 1e-3, *, depth_weight: float = 0.5) -> Array:
-    """Tikhonov regularisation: R = W Jᵀ (J W Jᵀ + λ I)⁻¹, one matrix product a frame.
-
-    The image minimises ``|J g − d|² + λ gᵀ W⁻¹ g``. W weighs voxels by a power of their
-    sensitivity, against the pull of images towards the electrodes.
+    A voxel is as bright as the change looks like its own signal. What a single voxel changes is
+    therefore brightest in that voxel (Cauchy–Schwarz); everything else is blurred.
 
     Args:
         matrix: J, shape (pairs, voxels).
-        strength: λ as a share of the largest eigenvalue of J W Jᵀ, above zero.
-        depth_weight: 0 for W = I, 1 for voxels that are all equally sensitive after weighting.
 
     Returns:
         R, shape (voxels, pairs).
 
     Raises:
-        ReadOutError: ``strength`` is not above zero, or ``depth_weight`` not from 0 to 1.
+        ReadOutError: J is no matrix, or a number is not finite.
+    """
+    return _unit_columns(_checked(matrix)).T
+
+
+def tikhonov(matrix: ArrayLike, strength: float = 1e-2, *, standardised: bool = True) -> Array:
+    """Tikhonov regularisation: R = Jᵀ (J Jᵀ + λ I)⁻¹, one matrix product a frame.
+
+    The image minimises ``|J g − d|² + λ |g|²``; it is drawn towards the electrodes, where little
+    explains much. Standardised, each voxel is divided by √(R J)_vv, what its own signal would make
+    of it, and what a single voxel changes is brightest in that voxel (Pascual-Marqui 2002).
+
+    Args:
+        matrix: J, shape (pairs, voxels).
+        strength: λ as a share of the largest eigenvalue of J Jᵀ, above zero. The more noise, the
+            more.
+        standardised: Whether to show where something is; otherwise the minimiser itself.
+
+    Returns:
+        R, shape (voxels, pairs).
+
+    Raises:
+        ReadOutError: ``strength`` is not above zero, J is no matrix or zero, or a number is not
+            finite.
     """
     j = _checked(matrix)
     require("Tikhonov", "strength", strength, 0.0, "", open_=True)
-    if not 0 <= as_number(depth_weight) <= 1:
-        raise ReadOutError(f"depth_weight is {depth_weight!r}; give a number from 0 to 1")
-    power = (j**2).sum(axis=0)
-    floor = 1e-12 * power.max(initial=0.0)
-    weight = np.maximum(power, floor) ** -depth_weight if floor > 0 else np.ones(j.shape[1])
-    weighted = weight[:, None] * j.T
-    normal = j @ weighted
-    largest = float(np.linalg.eigvalsh(normal)[-1])
-    if largest <= 0:
-        raise ReadOutError("the sensitivity matrix is zero; check the potentials")
-    return np.linalg.solve(normal + strength * largest * np.eye(len(j)), weighted.T).T
+    normal = j @ j.T
+    loaded = normal + strength * _largest(normal) * np.eye(len(j))
+    inverse = np.asarray(np.linalg.solve(loaded, j).T, dtype=float)
+    if not standardised:
+        return inverse
+    own = np.sqrt(np.maximum((inverse * j.T).sum(axis=1), 0.0))
+    return np.asarray(inverse / np.where(own > 0, own, 1.0)[:, None], dtype=float)
 
 
 def landweber(
-    matrix: ArrayLike, iterations: int = 50, *, low: float = 0.0, high: float = math.inf
+    matrix: ArrayLike,
+    iterations: int = 200,
+    *,
+    low: float = 0.0,
+    high: float = math.inf,
+    unit_voxels: bool = False,
 ) -> Callable[[ArrayLike], Array]:
     """Projected Landweber iteration: ``g ← clip(g + α Jᵀ (d − J g), low, high)``.
 
     α is 1/λ_max(J Jᵀ), below the 2/λ_max that converges. The projection onto what matter can be
-    (no permittivity below vacuum's) sharpens images well beyond a linear method's.
+    (no permittivity below vacuum's) keeps images from ringing.
 
     Args:
-        matrix: J, shape (pairs, voxels); better with rows scaled alike.
+        matrix: J, shape (pairs, voxels).
         iterations: Number of steps.
         low: Least change of relative permittivity; 0 keeps images positive.
         high: Largest change.
+        unit_voxels: Whether images and bounds count each voxel by the signal that it gives [F], not
+            by its permittivity: fairer to what is far away.
 
     Returns:
         A function that takes d, changes of capacitance [F], shape (pairs,) or (n, pairs), to
-        images, changes of relative permittivity, shape (voxels,) or (n, voxels). It raises
-        :class:`ReadOutError` if the shape does not fit.
+        images, shape (voxels,) or (n, voxels). It raises :class:`ReadOutError` if the shape does
+        not fit.
 
     Raises:
         ReadOutError: J is no matrix or zero, or bounds or iterations are out of range.
@@ -214,10 +218,8 @@ def landweber(
     require_whole("Landweber", "iterations", iterations, 1)
     if not as_number(low) < as_number(high):
         raise ReadOutError(f"low = {low!r}, high = {high!r}; give numbers, low below high")
-    largest = float(np.linalg.eigvalsh(j @ j.T)[-1])
-    if largest <= 0:
-        raise ReadOutError("the sensitivity matrix is zero; check the potentials")
-    return partial(_landweber, j, 1.0 / largest, iterations, low, high)
+    j = _unit_columns(j) if unit_voxels else j
+    return partial(_landweber, j, 1.0 / _largest(j @ j.T), iterations, low, high)
 
 
 def _landweber(
@@ -237,3 +239,17 @@ def _checked(matrix: ArrayLike) -> Array:
     if j.ndim != 2 or not j.size:
         raise ReadOutError(f"J has shape {j.shape}; give it as (pairs, voxels)")
     return j
+
+
+def _unit_columns(j: Array) -> Array:
+    """Columns divided by their lengths; those that are zero stay so."""
+    length = np.linalg.norm(j, axis=0)
+    return np.asarray(j / np.where(length > 0, length, 1.0), dtype=float)
+
+
+def _largest(normal: Array) -> float:
+    """Largest eigenvalue of J Jᵀ."""
+    largest = float(np.linalg.eigvalsh(normal)[-1])
+    if largest <= 0:
+        raise ReadOutError("the sensitivity matrix is zero; check the potentials")
+    return largest
