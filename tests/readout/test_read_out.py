@@ -196,6 +196,15 @@ def test_start_shifts_everything():
     assert np.abs(later.capacitance - now.capacitance).max() < 1e-20
 
 
+def test_stages_know_the_time_of_the_recording():
+    """Analytic: drift against the clock of the recording, and not since its start."""
+    profile = Profile.of([(3600.0, 25.0), (3610.0, 35.0)], "temperature")
+    stages = (LinearSensor(1.0, 0.0, 1e-15, 3600.0), ClimateDrift(1e-14, temperature=profile))
+    counts = plain(stages=stages)([3600.0, 3605.0], np.full((2, 3), 1e-12))
+    since = counts.time - 1e-3 - 3600.0
+    assert np.abs(counts.capacitance - 1e-12 - 1.1e-14 * since).max() < 1e-20
+
+
 def test_latency_only_delays():
     """Analytic: the same conversions, as much later, and none before its time."""
     times = np.arange(40) * 0.013
