@@ -26,7 +26,7 @@ from capsense.field.lattice import Lattice, LatticeSettings, build_lattice
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 4
+NUMERICS = 5
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 

@@ -20,7 +20,7 @@ _LOWEST, _HIGHEST = -0.8, 4.0
 """Bounds on the relative change of a weight; weights stay positive."""
 _TOTALS = 100.0
 """Weight of energies and charges against the residuals of nodes."""
-_UNRESOLVED = 0.5
+_UNRESOLVED = 1.0
 """Relative error of an energy or a charge beyond which a lattice counts as too coarse."""
 
 
