@@ -58,9 +58,21 @@ def likeness(setup: Setup, name: str, table: Table) -> tuple[float, float]:
     return cross_correlation(curve, measured), rmse(curve, measured)
 
 
-def held_out(setup: Setup, tables: dict[str, Table]) -> list[tuple[str, float, float]]:
-    """For each board: its name, and correlation and rms error if its panel is held out."""
-    return [(n, *likeness(fit_without(setup, tables, n), n, tables[n])) for n in PANELS]
+def held_out(setup: Setup, tables: dict[str, Table]) -> dict[str, Setup]:
+    """For each board the set-up that is fitted with its panel held out."""
+    return {name: fit_without(setup, tables, name) for name in PANELS}
+
+
+def print_held_out(setup: Setup, tables: dict[str, Table]) -> None:
+    """What one panel alone tells, and how it foretells the other."""
+    found = held_out(setup, tables)
+    for name, other in found.items():
+        print(f"\n{name} held out")
+        for key in (key for key in setup.uncertainty if "." not in key):
+            print(f"{key} = {other.value(key):.4g}    # ± {other.uncertainty[key]:.2g}")
+        for board, table in tables.items():
+            correlation, error = likeness(other, board, table)
+            print(f"{board}: correlation {correlation:.4f}, rms error {error:.4f}")
 
 
 def all_pairs(
@@ -116,7 +128,7 @@ def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]
     for name, sim in sims.items():
         board, panel = result.setup.boards[name], load_panel(setup.boards[name].panel)
         times = np.arange(PANEL_SAMPLES) / board.sample_rate
-        poses = result.setup.poses("T2", setup.panel_speed, times)
+        poses = result.setup.poses(name, "T2", setup.panel_speed, times)
         values = mutual(matrices(sim, setup, poses), sim.electrode_names, board.pair)
         curve = normalised(result.setup, board, values, tables[name].empty, noise=False)
         apart = rmse(curve, predicted(result.setup, name, tables[name]))
@@ -148,9 +160,7 @@ def main() -> None:
     if args.zig_zag:
         print_zig_zag(result, tables)
     if args.held_out:
-        print("\nheld out: zero-mean correlation, rms error")
-        for name, correlation, error in held_out(setup, tables):
-            print(f"{name}: {correlation:.4f}, {error:.4f}")
+        print_held_out(setup, tables)
     if args.pairs:
         print("\nrms error by pair: stripe, patch")
         for pairs, (_, errors) in all_pairs(setup, grids).items():

@@ -80,7 +80,7 @@ def cases_of(setup: Setup, *, reduced: bool) -> list[Case]:
                 on_panel = shown is not None and speed == setup.panel_speed
                 if reduced and not (on_panel and board.panel):
                     continue
-                time = setup.rest + setup.path(trajectory, speed).duration
+                time = setup.rest + setup.path(board.design, trajectory, speed).duration
                 once = math.ceil(time * board.sample_rate) + 1
                 samples = shown if on_panel and shown is not None else once
                 out.append(Case(board, trajectory, speed, samples))
@@ -95,7 +95,7 @@ def _simulator(board: Board, pour: str, frequency: float) -> Simulator:
 def curve_of(setup: Setup, case: Case, store: Store) -> Curve:
     """Simulate a case, or take its capacitances from the store, and read them."""
     board = case.board
-    poses = setup.poses(case.trajectory, case.speed, case.times)
+    poses = setup.poses(board.design, case.trajectory, case.speed, case.times)
 
     def compute() -> dict[str, Array]:
         sim = _simulator(board, setup.pour, setup.frequency)
@@ -228,17 +228,18 @@ def _curve(curve: Curve) -> Table:
 
 
 NOTES = (
-    "**What was fitted.** Ten figures, listed under *fitted*, to 500 samples: the measured curves "
-    "of the stripe and the patch panel. All but the sample rates and the stripe panel's level are "
-    "shared by both boards. The electrode pairs are those of all 36 choices that fit best. No "
-    "curve is scaled: what both boards see less than their electrodes' coupling alone would "
-    "give is one stray capacitance between leads, the same for both.",
+    "**What was fitted.** Eleven figures, listed under *fitted*, to 500 samples: the measured "
+    "curves of the stripe and the patch panel. The triangle's depth and the sample rate are a "
+    "board's own, and so is the level of the stripe panel; all others are shared. The electrode "
+    "pairs are the ones of 36 choices that need the depths to differ least; nine others fit a "
+    "little closer. No curve is scaled: what both boards see less than their electrodes' coupling "
+    "alone would give is one stray capacitance between leads, the same for both.",
     "**What this shows.** That the geometry read off the paper's pictures, and a physical model "
     "with few free figures, follow the hardware closer than the paper's simulation does. It is a "
     "fit to these very panels, not a blind prediction.",
     "**What it does not show.** T1, T3 and T4 are predictions, compared with nothing here; their "
     "corners are read from a sketch without dimensions. Fig. 9 does not say its speed; at "
-    "another one, sample rates and the rest scale with it. What is left between curve and hardware "
-    "lasts several samples, so it is the model's: the weak dips beside the strong ones are too "
-    "shallow for the stripes and too deep for the patches.",
+    "another one, sample rates and the rest scale with it. That both recordings had in common "
+    "what is shared here is an assumption: either panel alone is fitted down to its noise, with "
+    "other figures.",
 )

@@ -87,7 +87,7 @@ def predicted(
     """A curve at the panels' speed by the table, without rounding and noise, shape (samples,)."""
     board = setup.boards[name]
     times = np.arange(samples) / board.sample_rate
-    poses = setup.poses(trajectory, setup.panel_speed, times)
+    poses = setup.poses(name, trajectory, setup.panel_speed, times)
     place = np.array([pose.position for pose in poses])
     share = table.empty / (table.empty + setup.stray)
     return board.level * (1 + share * table.change(place[:, 0], place[:, 2]))
@@ -172,7 +172,7 @@ def fit_without(setup: Setup, tables: Mapping[str, Table], name: str) -> Setup:
     """Fit with a board's panel held out, but for what belongs to that panel alone.
 
     What both boards share is fitted to the other panels; then the held-out board's own figures,
-    its sample rate and the stripe panel's level, to its panel.
+    the triangle's depth, its sample rate and the stripe panel's level, to its panel.
 
     Args:
         setup: Where to begin.

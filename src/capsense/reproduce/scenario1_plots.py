@@ -43,10 +43,10 @@ def plot_trajectories(
     figure = Figure(figsize=(3.0 * len(ways) + 0.6, 1.2 + 2.0 * len(boards)), layout="constrained")
     axes = figure.subplots(
         len(boards) + 1, len(ways), squeeze=False, sharey="row",
-        height_ratios=[0.55] + [1.0] * len(boards),
+        height_ratios=[0.7] + [1.0] * len(boards),
     )  # fmt: skip
     for column, way in enumerate(ways):
-        _draw_way(axes[0, column], setup, way)
+        _draw_way(axes[0, column], setup, boards, way)
         for row, board in enumerate(boards, start=1):
             ax = axes[row, column]
             ax.plot(*curves[board, way], color=OURS, lw=1.0)
@@ -54,22 +54,28 @@ def plot_trajectories(
             if column == 0:
                 ax.set_ylabel(f"{board}: C / C empty")
         axes[-1, column].set_xlabel("time [s]")
+    axes[0, -1].legend(frameon=False, fontsize=8, loc="upper left", handlelength=1.2)
     return figure
 
 
-def _draw_way(ax: Axes, setup: Setup, way: str) -> None:
-    """The middle of the bar's lower face, and the board, to scale."""
-    poses = setup.path(way, 1.0).waypoints
-    points = 1e3 * np.array([pose.position for pose in (*poses, poses[0])])
-    height = points[:, 2] - 5e2 * setup.size[2]
-    ax.plot(points[:, 0], height, color=OURS, lw=1.0, marker="o", ms=2.5)
+def _draw_way(ax: Axes, setup: Setup, boards: list[str], way: str) -> None:
+    """The middle of the bar's lower face on each distinct way, and the board, to scale."""
+    by_depth: dict[float, list[str]] = {}
+    for name in boards:
+        by_depth.setdefault(setup.boards[name].depth, []).append(name)
+    for names, colour in zip(by_depth.values(), (OURS, PAPER, MEASURED), strict=False):
+        poses = setup.path(names[0], way, 1.0).waypoints
+        points = 1e3 * np.array([pose.position for pose in (*poses, poses[0])])
+        height = points[:, 2] - 5e2 * setup.size[2]
+        label = ", ".join(names)
+        ax.plot(points[:, 0], height, color=colour, lw=1.0, marker="o", ms=2.5, label=label)
     half = 5e2 * setup.size[0]
     x, z = points[0, 0], height[0]
     ax.plot([x - half, x + half], [z, z], color=FAINT, lw=3, solid_capstyle="butt")
     ax.plot([-32.5, 32.5], [0, 0], color=MEASURED, lw=3, solid_capstyle="butt")
     ax.set_title(f"{way} [mm]", fontsize=10)
     ax.set_xlim(-265, 265)
-    ax.set_ylim(-8, 125)
+    ax.set_ylim(-8, 165)
     ax.set_aspect("equal")
     _bare(ax)
 

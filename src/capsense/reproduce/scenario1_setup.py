@@ -32,6 +32,8 @@ class Board:
     design: str
     pair: tuple[str, str]
     """Transmitter and receiver."""
+    depth: float
+    """How far the triangle in front of it goes away from the line across it [m]."""
     sample_rate: float
     """[Hz]"""
     level: float
@@ -65,7 +67,6 @@ class Setup:
     size: tuple[float, float, float]
     material: str
     half_line: float
-    depth: float
     gap: float
     tilt: float
     offset: float
@@ -98,25 +99,27 @@ class Setup:
                 top[name] = float(value)
         return dataclasses.replace(self, boards=boards, **top)
 
-    def path(self, trajectory: str, speed: float) -> Trajectory:
+    def path(self, board: str, trajectory: str, speed: float) -> Trajectory:
         """The way of the bar's centre in the sensor frame, without the rest at its start.
 
         Args:
+            board: Name of the board.
             trajectory: Name, ``"T1"`` to ``"T4"``.
             speed: [m/s]
         """
         angle = -math.radians(self.tilt)  # a positive tilt lifts the bar at positive x
         middle = (self.offset, 0.0, self.gap + 0.5 * self.size[2])
         corners = [
-            (x * self.half_line, 0.0, z * self.depth) for x, z in self.trajectories[trajectory]
+            (x * self.half_line, 0.0, z * self.boards[board].depth)
+            for x, z in self.trajectories[trajectory]
         ]
         points = Pose.from_euler(middle, (0.0, angle, 0.0)).apply(np.array(corners))
         poses = tuple(Pose(point) for point in points)
         return Trajectory(poses, (speed,) * len(poses), closed=True)
 
-    def poses(self, trajectory: str, speed: float, times: ArrayLike) -> list[Pose]:
+    def poses(self, board: str, trajectory: str, speed: float, times: ArrayLike) -> list[Pose]:
         """Poses of the bar at times [s] since the start of a recording."""
-        path = self.path(trajectory, speed)
+        path = self.path(board, trajectory, speed)
         return [path.pose_at(t - self.rest) for t in np.asarray(times, dtype=float).tolist()]
 
 
@@ -131,7 +134,7 @@ def load_setup() -> Setup:
 
 _TOP = ("speeds", "panel_speed", "frequency", "pour", "bar", "path", "trajectories", "front_end",
         "board", "uncertainty")  # fmt: skip
-_PATH = {"half_line": 1.0, "depth": 1.0, "gap": 1.0, "tilt": 45.0, "offset": 1.0, "rest": 1e3}
+_PATH = {"half_line": 1.0, "gap": 1.0, "tilt": 45.0, "offset": 1.0, "rest": 1e3}
 _FRONT_END = {"stray": 1e-9, "shunt": 1e9, "full_scale": 1e3, "conversion": 10.0, "noise": 1e-9}
 
 
@@ -182,6 +185,7 @@ def _board(table: Table) -> Board:
     return Board(
         table.string("design"),
         (str(pair[0]), str(pair[1])),
+        table.number("depth", 1e-3, 1.0, unit="m"),
         table.number("sample_rate", 1e-3, 1e6, unit="Hz"),
         table.number("level", 0.0, 10.0),
         table.number("gain", 1e-6, 1e9),
