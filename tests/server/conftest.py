@@ -10,6 +10,9 @@ import pytest
 pytest.importorskip("websockets", reason='needs websockets: pip install "capsense[serve]"')
 
 from running_server import RunningServer
+from stopped_clock import StoppedClock
+
+from capsense.server import allowance
 
 
 @pytest.fixture(scope="session")
@@ -25,3 +28,11 @@ def dome() -> np.ndarray:
     u, v = np.meshgrid(np.linspace(-1, 1, 32), np.linspace(-1, 1, 32))
     squared = (u - 0.3) ** 2 + (v + 0.2) ** 2
     return np.where(squared < 0.25, 0.05 + 0.1 * squared, 0).astype(np.float32)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> StoppedClock:
+    """What allowances look at."""
+    clock = StoppedClock()
+    monkeypatch.setattr(allowance, "time", clock)
+    return clock

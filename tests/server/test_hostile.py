@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from capsense.server.client import Client
 from capsense.server.frames import HEADER, pack_depth
 from capsense.server.options import Limits
 from capsense.server.sensor import ServedSensor
+from capsense.server.session import ALL_ALLOWANCES, ALLOWANCE, AT_ONCE, MISTAKE
 
 
 @contextmanager
@@ -140,36 +141,48 @@ def test_oversized_message(served: RunningServer, witness: None) -> None:
         assert closed(connection)[0] == 1009
 
 
-def test_flood_of_errors_is_slowed(served: RunningServer, witness: None, dome: np.ndarray) -> None:
-    """Whoever sends rubbish without end is read slowly; another's frames are not."""
-    with raw(served, HELLO) as flood, served.client(timeout=5) as client:
+@pytest.mark.parametrize("floods", [1, 5])
+def test_floods_of_errors_are_slowed(
+    served: RunningServer, witness: None, dome: np.ndarray, floods: int
+) -> None:
+    """Whoever sends rubbish is read slowly, the slower the more do so; another's frames are not."""
+    answers = [0] * floods
+    stop = threading.Event()
+
+    def send(connection: ClientConnection) -> None:
+        with suppress(ConnectionClosed):
+            while not stop.is_set():
+                connection.send("rubbish")
+
+    def receive(connection: ClientConnection, number: int) -> None:
+        with suppress(ConnectionClosed):
+            while not stop.is_set():
+                connection.recv(5)
+                answers[number] += 1
+
+    with ExitStack() as stack:
+        client = stack.enter_context(served.client(timeout=5))
         sensor = client.open()
-        stop = threading.Event()
-
-        def send() -> None:
-            with suppress(ConnectionClosed):
-                while not stop.is_set():
-                    flood.send("rubbish")
-
-        def receive() -> None:
-            with suppress(ConnectionClosed):
-                while not stop.is_set():
-                    flood.recv(5)
-                    answers.append(time.monotonic())
-
-        answers: list[float] = []
+        hostile = [stack.enter_context(raw(served, HELLO)) for _ in range(floods)]
         start = time.monotonic()
-        threads = [threading.Thread(target=f, daemon=True) for f in (send, receive)]
+        threads = [threading.Thread(target=send, args=(c,), daemon=True) for c in hostile]
+        threads += [
+            threading.Thread(target=receive, args=(c, n), daemon=True)
+            for n, c in enumerate(hostile)
+        ]
         for thread in threads:
             thread.start()
         steps = 0
-        while time.monotonic() < start + 2.0:
+        while time.monotonic() < start + 1.5:
             sensor.step(dome)
             steps += 1
         stop.set()
-        assert len(answers) <= 50 + 2.5 * 50  # an allowance at once, then 50 a second
+        rate = min(ALLOWANCE, ALL_ALLOWANCES / (floods + 2))  # two of them behave
+        most = 1 + (AT_ONCE + rate * (time.monotonic() - start)) / MISTAKE
+        assert max(answers) <= most
         assert steps >= 3
-        flood.socket.shutdown(socket.SHUT_RDWR)
+        for connection in hostile:
+            connection.socket.shutdown(socket.SHUT_RDWR)
         for thread in threads:
             thread.join(5)
 

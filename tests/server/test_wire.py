@@ -22,7 +22,11 @@ from raw_websocket import (
     raw_websocket,
 )
 from running_server import RunningServer
+from stopped_clock import StoppedClock
 
+from capsense.errors import ProtocolError
+from capsense.server import connection
+from capsense.server.connection import Door, GatedConnection
 from capsense.server.frames import HEADER, pack_depth
 
 
@@ -132,3 +136,50 @@ def test_only_one_address(served: RunningServer) -> None:
     assert served.url.startswith("ws://127.0.0.1:")
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.2", served.port), timeout=2)
+
+
+def test_newcomers_are_let_in_slowly(
+    clock: StoppedClock, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beyond so many in a second, they are closed; those before stay, later ones come in."""
+    monkeypatch.setattr(connection, "ARRIVALS", 3)
+    with RunningServer() as server, server.client() as client:
+        sensor = client.open()
+        server.client().close()
+        server.client().close()
+        for _ in range(5):
+            with pytest.raises((OSError, ProtocolError)):
+                server.client()
+        assert sensor.step(dome).sequence == 0
+        clock.now += 0.4
+        server.client().close()
+
+
+def test_who_is_turned_away_keeps_nobody_out(clock: StoppedClock) -> None:
+    """However many come meanwhile, every hundredth of a second one more is let in."""
+    door = Door(10**6)
+    assert [door.admits() for _ in range(1000)] == [True] * 100 + [False] * 900
+    clock.now += 0.0101
+    assert [door.admits() for _ in range(1000)] == [True] + [False] * 999
+    door.open = door.most + 1
+    clock.now += 100
+    assert not door.admits()
+
+
+def test_reads_a_little_at_a_time(
+    served: RunningServer, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A large frame comes in pieces, between which it is the others' turn."""
+    sizes: list[int] = []
+    update = GatedConnection.buffer_updated
+
+    def watch(self: GatedConnection, nbytes: int) -> None:
+        sizes.append(nbytes)
+        update(self, nbytes)
+
+    monkeypatch.setattr(GatedConnection, "buffer_updated", watch)
+    with served.client() as client:
+        large = np.kron(dome, np.ones((8, 8), np.float32))
+        assert client.open().step(large).sequence == 0
+    assert sum(sizes) > large.nbytes
+    assert max(sizes) <= 16384

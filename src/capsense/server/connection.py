@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import Frame, Opcode
+
+from capsense.server.allowance import Allowance
 
 POLICY, TRY_LATER = 1008, 1013
 """Codes with which connections are closed on errors, and when there are too many."""
@@ -21,6 +22,8 @@ SEND_BUFFER = 262144
 """What the system may hold for a client that does not receive [bytes]."""
 SMALL = 1024
 """Size [bytes] from which on a fragment of a message counts as content."""
+ARRIVALS = 100.0
+"""Connections that a server takes at once, and again every second; others are closed."""
 IDLE_FRAMES = 100.0
 """Pings, pongs and small fragments that a client may send at once, and again every second."""
 
@@ -32,6 +35,16 @@ class Door:
     most: int
     """More are closed at once."""
     open: int = 0
+    arrivals: Allowance = field(default_factory=lambda: Allowance(ARRIVALS, ARRIVALS))
+
+    def admits(self) -> bool:
+        """Whether the connection that was just made may stay."""
+        if self.open > self.most:
+            return False
+        if self.arrivals.spend(1) < 0:
+            self.arrivals.spend(-1)  # those that are turned away keep nobody out
+            return False
+        return True
 
 
 class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
@@ -47,7 +60,7 @@ class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
         """Whether it was cut off."""
         self._door = door
         self._buffer = bytearray(READ_SIZE)
-        self._idle_frames, self._counted = IDLE_FRAMES, time.monotonic()
+        self._idle_frames = Allowance(IDLE_FRAMES, IDLE_FRAMES)
 
     # -- called by asyncio ------------------------------------------------------------------------
 
@@ -57,7 +70,7 @@ class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
         raw = transport.get_extra_info("socket")
         if raw is not None:
             raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        if self._door.open > self._door.most:
+        if not self._door.admits():
             cast(asyncio.Transport, transport).abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -75,7 +88,7 @@ class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
     def process_event(self, event: Any) -> None:
         if self.flooded:
             return
-        if isinstance(event, Frame) and _idle(event) and not self._may_idle():
+        if isinstance(event, Frame) and _idle(event) and self._idle_frames.spend(1) < 0:
             self.flooded = True
             self.protocol.fail(POLICY, FLOOD)
             for data in filter(None, self.protocol.data_to_send()):
@@ -83,13 +96,6 @@ class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
             self.transport.close()
             return
         super().process_event(event)
-
-    def _may_idle(self) -> bool:
-        now = time.monotonic()
-        regained = (now - self._counted) * IDLE_FRAMES
-        self._idle_frames = min(IDLE_FRAMES, self._idle_frames + regained) - 1
-        self._counted = now
-        return self._idle_frames >= 0
 
 
 def _idle(frame: Frame) -> bool:

@@ -92,6 +92,11 @@ class Server:
         self._pool = ThreadPoolExecutor(2 * options.limits.connections, "capsense")
 
     @property
+    def clients(self) -> int:
+        """How many are connected."""
+        return len(self._sessions)
+
+    @property
     def design_names(self) -> tuple[str, ...]:
         """Names of the designs, the default first."""
         return tuple(self._templates)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -13,6 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from capsense.errors import CapSenseError, ProtocolError
 from capsense.recording.design_json import design_to_json
 from capsense.server import messages
+from capsense.server.allowance import Allowance
 from capsense.server.connection import POLICY
 from capsense.server.frames import PROTOCOL, unpack_depth
 from capsense.server.options import Options
@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
 T = TypeVar("T")
-ALLOWANCE = 5000.0
-"""Work that a client may cause a second without being slowed, in units of a small message."""
+ALLOWANCE, ALL_ALLOWANCES = 5000.0, 10000.0
+"""Work that a client, and that all of them, may cause a second without being slowed, in units of a
+small message, which takes the event loop some 50 µs."""
+AT_ONCE, AT_FIRST = 1000.0, 100.0
+"""Work that a client may cause at once, after a rest and at the start."""
 BINARY_UNIT, TEXT_UNIT = 16384, 512
 """Bytes that count as much as a message: JSON takes longer to read than pixels."""
-OPENING, MISTAKE = 500.0, 100.0
+OPENING, MISTAKE = 250.0, 100.0
 """What it takes to open a sensor, and to answer an error."""
 
 
@@ -35,6 +38,9 @@ class Hall(Protocol):
 
     options: Options
     version: str
+
+    @property
+    def clients(self) -> int: ...
 
     @property
     def design_names(self) -> tuple[str, ...]: ...
@@ -75,7 +81,7 @@ class Session:
         self._solver: asyncio.Task[None] | None = None
         self._watched: ServedSensor | None = None
         self._to_show: tuple[str | bytes, ...] = ()
-        self._allowance, self._counted = ALLOWANCE, time.monotonic()
+        self._allowance = Allowance(AT_ONCE, ALLOWANCE, AT_FIRST)
         self._handlers: dict[str, Callable[[messages.Table], Any]] = {
             "open": self._open, "close": self._close, "reset": self._reset,
             "scene": self._scene, "poses": self._poses, "watch": self._watch,
@@ -158,12 +164,10 @@ class Session:
 
     async def _pace(self, cost: float) -> None:
         """Charge some work; wait while the client has caused more than its allowance."""
-        now = time.monotonic()
-        regained = (now - self._counted) * ALLOWANCE
-        self._allowance = min(ALLOWANCE, self._allowance + regained) - cost
-        self._counted = now
-        if self._allowance < 0:
-            await asyncio.sleep(-self._allowance / ALLOWANCE)
+        self._allowance.rate = min(ALLOWANCE, ALL_ALLOWANCES / self._hall.clients)
+        left = self._allowance.spend(cost)
+        if left < 0:
+            await asyncio.sleep(-left / self._allowance.rate)
 
     async def _handle(self, message: str | bytes) -> None:
         """Act on one message; whatever is wrong with it is answered."""
