@@ -132,7 +132,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     """Carry the study out; see :class:`capsense.reproduce.study.Study`."""
     store = Store(folder)
     todo: list[tuple[float, Method, int]] = [
-        (r, "perturbation", 30 if reduced else 150) for r in (REDUCED if reduced else REFINEMENTS)
+        (r, "perturbation", 30 if reduced else 600) for r in (REDUCED if reduced else REFINEMENTS)
     ]
     if not reduced:
         todo += [(r, "masked", 25) for r in REFINEMENTS]
