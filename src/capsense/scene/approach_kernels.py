@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from capsense._jit import kernel
 from capsense.scene.shape import ShapeKind
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ _INNER = 0.999
 _ROUNDS = 4
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def slenderness(kind: int, params: Array) -> float:
     """Middle one of a primitive's three extents [m]: small for rods and specks, not for plates.
 
@@ -36,7 +36,7 @@ def slenderness(kind: int, params: Array) -> float:
     return math.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _pull_in(kind: int, params: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """The point of a primitive nearest to (x, y, z), all in its frame (ellipsoid: radially)."""
     if kind == _BOX:
@@ -58,7 +58,7 @@ def _pull_in(kind: int, params: Array, x: float, y: float, z: float) -> tuple[fl
     return s * x, s * y, middle + s * (z - middle)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def approach(
     kind: int,
     params: Array,

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from capsense._jit import kernel
 from capsense.scene.shape import ShapeKind
 from capsense.scene.shapes import PARALLEL
 
@@ -27,7 +27,7 @@ _PARALLEL = float(PARALLEL)
 _INF = math.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def slab(o: float, d: float, half: float) -> tuple[float, float]:
     """Line against −half <= x <= half, one coordinate."""
     if d == 0.0:
@@ -41,7 +41,7 @@ def slab(o: float, d: float, half: float) -> tuple[float, float]:
     return t1, t0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def ball(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, radius: float
 ) -> tuple[float, float]:
@@ -58,7 +58,7 @@ def ball(
     return middle - half, middle + half
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cylinder(
     ox: float,
     oy: float,
@@ -86,7 +86,7 @@ def cylinder(
     return t0, t1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_interval(
     kind: int,
     params: Array,
@@ -137,7 +137,7 @@ def line_interval(
     return _INF, -_INF
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def contains(kind: int, params: Array, x: float, y: float, z: float) -> bool:
     """Whether a point in a convex primitive's frame lies in it; meshes and layers: never."""
     if kind == _BOX:
@@ -153,7 +153,7 @@ def contains(kind: int, params: Array, x: float, y: float, z: float) -> bool:
     return x * x + y * y + z * z <= params[0] * params[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def body_line_interval(
     kind: int,
     params: Array,
@@ -195,7 +195,7 @@ def body_line_interval(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def grid_value(grid: NDArray[np.float32], x: float, y: float, z: float) -> float:
     """Trilinear interpolation at (x, y, z) in cells; points outside are drawn to the edge."""
     x = min(max(x, 0.0), grid.shape[0] - 1.0)
@@ -216,7 +216,7 @@ def grid_value(grid: NDArray[np.float32], x: float, y: float, z: float) -> float
     return a * (1.0 - x) + c * x
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _crossing(
     grid: NDArray[np.float32],
     px: float,
@@ -260,7 +260,7 @@ def _crossing(
     return s
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def mesh_line_intervals(
     grid: NDArray[np.float32],
     origin: Array,

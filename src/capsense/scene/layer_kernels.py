@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from capsense._jit import kernel
 from capsense.scene.layer_parts import add_stretch, blend, positive, steps_between
 from capsense.scene.layers import BLOCK, HEADER, TABLE
 
@@ -29,7 +29,7 @@ _ALIGNED = 1e-9
 """Slope to rows or columns below which a line counts as parallel to them."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _at(
     values: Array32, base: int, nx: int, u: float, v: float, limit: float
 ) -> tuple[float, float, float]:
@@ -60,7 +60,7 @@ def _at(
     return f, b, m
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _clip(o: float, d: float, low: float, high: float, t0: float, t1: float) -> tuple[float, float]:
     """Part of [t0, t1] in which low <= o + t d <= high."""
     if d == 0.0:
@@ -71,7 +71,7 @@ def _clip(o: float, d: float, low: float, high: float, t0: float, t1: float) -> 
     return max(t0, min(a, b)), min(t1, max(a, b))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _ahead(p: float, u: float, t: float, cell: float) -> tuple[float, float, float]:
     """Next grid line of spacing ``cell`` at or ahead of parameter t: place, time, and spacing."""
     if u == 0.0:
@@ -83,7 +83,7 @@ def _ahead(p: float, u: float, t: float, cell: float) -> tuple[float, float, flo
     return place, (place - p) / u, -cell
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _walk(
     values: Array32, base: int, nx: int, limit: float, i0: float, i1: float, j0: float, j1: float,
     px: float, py: float, oz: float, ux: float, uy: float, dz: float, t0: float, t1: float,
@@ -136,7 +136,7 @@ def _walk(
     return start, end, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _cross_slot(
     values: Array32, table: int, base: int, blocks: int, nx: int, limit: float,
     px: float, py: float, oz: float, ux: float, uy: float, dz: float, begin: float, stop: float,
@@ -194,14 +194,14 @@ def _cross_slot(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mix(values: Array32, a: int, across: int, s: float, limit: float) -> tuple[float, float]:
     """Front and back at fraction ``s`` of the link from the pixel at ``a`` to its neighbour."""
     f = blend(values[a], values[a + across], s, limit)
     return f, blend(values[a + 1], values[a + across + 1], s, limit)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _along_row(
     values: Array32, a: int, step: int, across: int, s: float, limit: float, first: int, last: int,
     z: float, p: float, u: float, start: float, end: float, out: Array, n: int,
@@ -246,14 +246,14 @@ def _along_row(
     return start, end, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_pixels(start: float, end: float, p: float, u: float, out: Array, n: int) -> int:
     """Add a stretch given in pixels of a line at pixel p, of u pixels for each unit of t."""
     a, b = (start - p) / u, (end - p) / u
     return add_stretch(min(a, b), max(a, b), out, n)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _straight_slot(
     values: Array32, table: int, base: int, blocks: int, nx: int, limit: float, axis: int,
     p: float, u: float, v: float, z: float, begin: float, stop: float, out: Array, n: int,
@@ -296,7 +296,7 @@ def _straight_slot(
     return _add_pixels(start, end, p, u, out, n) if end > start else n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def layer_line_intervals(
     values: Array32, shape: Ints, origin: Array, inv_x: float,
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, begin: float, stop: float,
@@ -359,7 +359,7 @@ def layer_line_intervals(
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def layer_level(
     values: Array32, shape: Ints, origin: Array, inv_x: float, x: float, y: float, z: float
 ) -> float:
@@ -382,7 +382,7 @@ def layer_level(
     return best
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def layer_inside(
     values: Array32, shape: Ints, origin: Array, inv_x: float, x: float, y: float, z: float
 ) -> bool:
@@ -390,7 +390,7 @@ def layer_inside(
     return layer_level(values, shape, origin, inv_x, x, y, z) <= 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def layer_intervals_of_lines(
     values: Array32, shape: Ints, origin: Array, inv_x: float, o: Array, d: Array, out: Array
 ) -> None:
@@ -405,7 +405,7 @@ def layer_intervals_of_lines(
             out[i, row, 1] = -math.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def layer_levels(
     values: Array32, shape: Ints, origin: Array, inv_x: float, points: Array, out: Array
 ) -> None:

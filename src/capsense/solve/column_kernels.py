@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from capsense._jit import kernel
 from capsense.scene.approach_kernels import approach, slenderness
 from capsense.scene.kernels import body_line_interval, contains, mesh_line_intervals
 from capsense.scene.layer_kernels import layer_line_intervals
@@ -64,7 +64,7 @@ PART = np.dtype(
 from the column's line it lies [m], and from where to where along both axes across [m]."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pierce(axis, op, oq, low, high, body, grids, out):
     """Stretches of a line along ``axis`` inside one body, at (op, oq) across; return how many.
 
@@ -98,7 +98,7 @@ def pierce(axis, op, oq, low, high, body, grids, out):
     return 1 if out[0, 1] > out[0, 0] else 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _chord(axis, along, t, u, v, low, high, body, grids, out):
     """Part of [low, high] that a body covers around a point on a line along ``along``.
 
@@ -117,7 +117,7 @@ def _chord(axis, along, t, u, v, low, high, body, grids, out):
     return u, u, 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def thin_factor(wide_p, wide_q, across_p, across_q):
     """How much less than a wall a thin conductor inside a column takes from the column's field.
 
@@ -134,7 +134,7 @@ def thin_factor(wide_p, wide_q, across_p, across_q):
     return 1.0 / (1.0 + 2.0 * (wide / (math.pi * max(thin, 1e-9)) - 1.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def part_covered(low, node, high, a, b, extent):
     """Part of a column's side [low, high] that [a, b] covers; an edge at the node covers half.
 
@@ -147,7 +147,7 @@ def part_covered(low, node, high, a, b, extent):
     return at_b - at_a
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _holds_cross(axis, p, q, t, pl, ph, ql, qh, sq, body):
     """Whether a convex body holds [pl, ph] at sq and [ql, qh] at its middle: a short cut."""
     r, c = body.rotation, body.position
@@ -166,7 +166,7 @@ def _holds_cross(axis, p, q, t, pl, ph, ql, qh, sq, body):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _cover(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, out, part):
     """Fill in what a body takes of a column at t around (sp, sq), its place in it apart.
 
@@ -195,7 +195,7 @@ def _cover(axis, p, q, t, op, oq, sp, sq, pl, ph, ql, qh, body, grids, out, part
     part.weight, part.aside = share, math.hypot(aside_p, aside_q)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def nested(part, other):
     """How much of the smaller of two parts lies within the other: 0 beside, 1 inside."""
     share = 1.0
@@ -206,7 +206,7 @@ def nested(part, other):
     return share
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _place_beside(m, near, bodies, parts):
     """Where what conductor ``near[m]`` takes of a column begins: after what it lies beside of."""
     part = parts[near[m]]
@@ -219,7 +219,7 @@ def _place_beside(m, near, bodies, parts):
     part.begin = min(begin, 1.0 - part.weight)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _barely_covers(pl, op, ph, ql, oq, qh, p, q, body):
     """Whether a body's bounding box tells that its weight in a column is zero: a short cut."""
     least, bounds = slenderness(body.kind, body.params), body.bounds
@@ -232,7 +232,7 @@ def _barely_covers(pl, op, ph, ql, oq, qh, p, q, body):
     return 0.5 + RAMP * (share - 0.5) <= 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
     """Look for a body in a column whose line it misses: a place (sp, sq), and stretches there."""
     if body.kind == _MESH or body.kind == _LAYERS:
@@ -253,7 +253,7 @@ def _hit_column(axis, op, oq, pl, ph, ql, qh, body, grids, out):
     return sp, sq, pierce(axis, sp, sq, -math.inf, math.inf, body, grids, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def covered_stretches(axis, p, q, op, oq, pl, ph, ql, qh, bodies, near, n_near, grids, t0, t1,
                       who, parts, out):  # fmt: skip
     """Stretches of a lattice line's column inside bodies, and what of the column they take.

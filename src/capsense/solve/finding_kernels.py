@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from capsense._jit import kernel
 from capsense.constants import EPS0
 
 UNIT = EPS0 * 1e-3
@@ -62,7 +62,7 @@ COUPLE = np.dtype([("a", np.int64), ("b", np.int64), ("weight", np.float64)])
 """Two conductors that face each other on one link."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def room(ties, energies, couples, counts):
     """Whether the buffers hold what one link may add."""
     return (
@@ -72,14 +72,14 @@ def room(ties, energies, couples, counts):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_energy(energies, counts, a, b, end, weight, drives):
     term = energies[counts[1]]
     term.a, term.b, term.end, term.weight, term.drives = a, b, end, weight, drives
     counts[1] += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_tie(ties, counts, extra, node, conductor, point, end, weight):
     """Tie a node (−1: a held end) to a conductor, where the background has a node's potential.
 
@@ -96,7 +96,7 @@ def add_tie(ties, counts, extra, node, conductor, point, end, weight):
     counts[0] += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def value_beside_sheet(tie, na, nb, end, s, shift):
     """Background potential at fraction s of a half-link from na or to nb: linear along it."""
     point, coef = tie.point, tie.coef
@@ -108,7 +108,7 @@ def value_beside_sheet(tie, na, nb, end, s, shift):
     tie.end_coef = at_b if na >= 0 else 1.0 - at_b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def value_on_link(tie, a, b, nodes, c, m, lowest, highest, t, shift):
     """Coefficients of the background potential at t on the link from a to b.
 

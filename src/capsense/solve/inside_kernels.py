@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numba import njit
-
-from capsense.solve.column_kernels import MESH_STRETCHES, pierce
+from capsense._jit import kernel
+from capsense.solve.column_kernels import pierce
 from capsense.solve.finding_kernels import add_energy, add_tie, room
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def place(c, t):
     """How many of the increasing numbers ``c`` lie below t."""
     low, high = 0, c.shape[0]
@@ -24,15 +22,16 @@ def place(c, t):
     return low
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, inside_nodes, before):
+@kernel
+def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, inside_nodes, before,
+                out):  # fmt: skip
     """Mark free nodes inside conductors with the conductor's index, as seen along z.
 
     Clears the first ``before`` marks in ``inside_nodes``; returns how many nodes lie inside now.
+    ``out`` is room for the stretches of one body.
     """
     for i in range(before):
         inside[inside_nodes[i]] = -1
-    out = np.empty((MESH_STRETCHES, 2))
     n = 0
     for s in range(storeys.shape[0]):
         storey = storeys[s]
@@ -69,7 +68,7 @@ def mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside, in
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes, ties,
                   energies, couples, within, counts):  # fmt: skip
     """Turn what conductors leave of the links from nodes inside them into ties.

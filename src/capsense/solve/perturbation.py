@@ -15,7 +15,7 @@ from capsense.field.background import BackgroundField
 from capsense.scene import Scene
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
-from capsense.solve.column_kernels import MAX_STRETCHES
+from capsense.solve.column_kernels import MAX_STRETCHES, PART
 from capsense.solve.conductors import Conductors
 from capsense.solve.finding_kernels import UNIT
 from capsense.solve.packed import Block, Found, PackedLattice, pack_bodies
@@ -77,7 +77,7 @@ class PerturbationSolver:
         self._share = np.zeros(len(la.joints), np.float32)
         self._stamp, self._mark = np.zeros(n, np.int64), 0
         self._inside, self._inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
-        self._counts = np.zeros(4, np.int64)
+        self._counts, self._room = np.zeros(4, np.int64), np.zeros(1, tracing.ROOM)[0]
         self._found = Found(self._mesh, max(4096, n // 4))
         self._pool: list[Block] = []
         self._blocks: list[Block] = []
@@ -153,6 +153,7 @@ class PerturbationSolver:
 
     def _trace(self, scene: Scene, conductors: Conductors) -> tuple[int, int, int]:
         bodies, grids = pack_bodies(scene, conductors)
+        near, parts = np.empty(len(scene), np.int64), np.empty(len(scene), PART)
         mesh = self._mesh
         while True:
             found = self._found
@@ -164,6 +165,7 @@ class PerturbationSolver:
                 mesh.ceiling, mesh.parent, mesh.home, mesh.stored, bodies, grids, CONTACT,
                 conductors.parent, found.weight, found.extra, self._inside, self._inside_nodes,
                 found.ties, found.energies, found.couples, found.within, self._counts,
+                self._room, near, parts,
             )  # fmt: skip
             if status == tracing.FULL:
                 ties, energies, couples, _ = self._counts.tolist()

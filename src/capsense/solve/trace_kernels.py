@@ -12,12 +12,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from capsense._jit import inlined, kernel
 from capsense.solve.column_kernels import (
     MAX_STRETCHES,
     MESH_STRETCHES,
-    PART,
     covered_stretches,
 )
 from capsense.solve.finding_kernels import (
@@ -37,9 +36,17 @@ _THIN = 1e-9
 """Layers of a column thinner than this part of it are none."""
 FULL, CROWDED, SHORT = 0, 1, 2
 """Outcomes of a scan: whole; more stretches on a line than fit; more findings than fit."""
+ROOM = np.dtype(
+    [
+        ("ends", np.float64, (7, 2 * MAX_STRETCHES)),
+        ("bodies", np.int64, (3, 2 * MAX_STRETCHES)),
+        ("stretches", np.float64, (MESH_STRETCHES, 2)),
+    ]
+)
+"""Room for the stretches of one line."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
     """Turn overlapping stretches into disjoint ones, in order; join conductors that touch."""
     if n == 1:
@@ -50,7 +57,7 @@ def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
         cuts[m] = t0[k]
         cuts[m + 1] = t1[k]
         m += 2
-    cuts[:m].sort()
+    _sort(cuts, m)
     out = 0
     for c in range(m - 1):
         a, b = cuts[c], cuts[c + 1]
@@ -81,7 +88,18 @@ def _resolve(n, t0, t1, who, bodies, r0, r1, rwho, cuts, joined):
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
+def _sort(values, n):
+    """Put the first n values in order."""
+    for k in range(1, n):
+        value, at = values[k], k
+        while at > 0 and values[at - 1] > value:
+            values[at] = values[at - 1]
+            at -= 1
+        values[at] = value
+
+
+@kernel
 def _join(joined, a, b):
     while joined[a] != a:
         a = joined[a]
@@ -93,25 +111,26 @@ def _join(joined, a, b):
         joined[a] = b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, stored, bodies, grids,
           contact, joined, weight, extra, inside, inside_nodes, ties, energies, couples, within,
-          counts):  # fmt: skip
+          counts, room, near, parts):  # fmt: skip
     """Scan a scene: change ``weight`` (3, n) and ``extra`` (n,), list ties, energies and couples.
 
     ``stored`` (n, pairs) holds the energies of the links to the next nodes, for each pair of
     terminals; those that lie inside conductors are summed in ``within`` (pairs,) where whole.
     ``joined[c]`` leads from a conductor to one it touches. ``counts`` holds the numbers of ties,
-    energies, couples and nodes inside conductors. Returns ``FULL``, ``CROWDED`` or ``SHORT``.
+    energies, couples and nodes inside conductors. ``room`` (a ``ROOM``), ``near`` and ``parts``
+    (bodies,) are room to work in. Returns ``FULL``, ``CROWDED`` or ``SHORT``.
     """
     counts[:3] = 0
     counts[3] = mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside,
-                            inside_nodes, counts[3])  # fmt: skip
+                            inside_nodes, counts[3], room.stretches)  # fmt: skip
     for s in range(storeys.shape[0]):
         for axis in range(3):
             status = _trace_axis(
                 storeys[s], axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
-                weight, extra, inside, ties, energies, couples, counts,
+                weight, extra, inside, ties, energies, couples, counts, room, near, parts,
             )  # fmt: skip
             if status != FULL:
                 return status
@@ -129,9 +148,10 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, store
     return FULL
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
-                weight, extra, inside, ties, energies, couples, counts):  # fmt: skip
+                weight, extra, inside, ties, energies, couples, counts, room, near,
+                parts):  # fmt: skip
     """Scan the lines of a storey along one axis; lines on the walls carry no unknowns."""
     p, q = 1 if axis == 0 else 0, 1 if axis == 2 else 2
     shape, begin = storey.shape, storey.begin
@@ -141,15 +161,10 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
     cp, fp = axes[begin[p] : begin[p] + shape[p]], faces[begin[p] : begin[p] + shape[p]]
     cq, fq = axes[begin[q] : begin[q] + shape[q]], faces[begin[q] : begin[q] + shape[q]]
     lowest, highest = storey.lowest[axis], storey.highest[axis]
-    t0, t1 = np.empty(MAX_STRETCHES), np.empty(MAX_STRETCHES)
-    who = np.empty(MAX_STRETCHES, np.int64)
-    u0, u1 = np.empty(MAX_STRETCHES), np.empty(MAX_STRETCHES)
-    uwho = np.empty(MAX_STRETCHES, np.int64)
-    r0, r1 = np.empty(2 * MAX_STRETCHES), np.empty(2 * MAX_STRETCHES)
-    rwho = np.empty(2 * MAX_STRETCHES, np.int64)
-    ends = np.empty(2 * MAX_STRETCHES)
-    scratch = np.empty((MESH_STRETCHES, 2))
-    near, parts = np.empty(bodies.shape[0], np.int64), np.empty(bodies.shape[0], PART)
+    t0, t1, u0, u1 = room.ends[0], room.ends[1], room.ends[2], room.ends[3]
+    r0, r1, ends = room.ends[4], room.ends[5], room.ends[6]
+    who, uwho, rwho = room.bodies[0], room.bodies[1], room.bodies[2]
+    scratch = room.stretches
     for ip in range(1, cp.shape[0] - 1):
         n_near = 0
         for m in range(bodies.shape[0]):
@@ -195,7 +210,7 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
     return FULL
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _next_edge(lower, total, who, parts):
     """Where the next layer of a column ends, above ``lower``; infinite above the last."""
     out = math.inf
@@ -207,7 +222,7 @@ def _next_edge(lower, total, who, parts):
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, parts, nodes, links,
               cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
@@ -239,7 +254,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, pa
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, parts,
               nodes, cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
               counts):  # fmt: skip
