@@ -274,8 +274,7 @@ times as many nodes (`python benchmarks/random_scenes.py`): {random}.
 
 A grounded bar over two boards of scenario 1, against boundary elements of board and bar together:
 the largest error of ΔC's diagonal, and of any of its mutual capacitances as a part of itself,
-however small.
-{boards}
+however small. {boards}
 
 ## Peers
 
@@ -289,9 +288,9 @@ A bar that moves over `six_patch_bare`, one core, `python benchmarks/peers.py`:
 
 ### Scenario 1, foretold
 
-What both boards share fitted to one panel of hardware, the other panel foretold; only the latter's
-sample rate, and the stripe panel's level, are fitted to it. `python benchmarks/fit_scenario1.py
---held-out`
+What both boards share is fitted to one panel of hardware and foretells the other; only the latter's
+depth of the triangle and sample rate, and the stripe panel's level, are fitted to it.
+`python benchmarks/fit_scenario1.py --held-out`
 
 {foretold}
 
@@ -300,7 +299,7 @@ sample rate, and the stripe panel's level, are fitted to it. `python benchmarks/
 - **Self-capacitance along limbs.** No measurements are public: [scenario 2](scenario2.md) compares
   simulations with each other, and the [limb approach](limb_approach.md) compares shapes of curves
   with fits that were published, of a sensor whose size is not.
-- **Scenario 1 beyond two panels.** Its ten free figures were fitted to the same two panels that it
+- **Scenario 1 beyond two panels.** Its eleven free figures were fitted to the same two panels that it
   is held against. With one panel held out, only the stripes foretell the other; the patches alone
   leave distance and stray capacitance open. Hardware curves of the other trajectories and of the
   meander board are not public.
