@@ -299,10 +299,10 @@ depth of the triangle and sample rate, and the stripe panel's level, are fitted 
 - **Self-capacitance along limbs.** No measurements are public: [scenario 2](scenario2.md) compares
   simulations with each other, and the [limb approach](limb_approach.md) compares shapes of curves
   with fits that were published, of a sensor whose size is not.
-- **Scenario 1 beyond two panels.** Its eleven free figures were fitted to the same two panels that it
-  is held against. With one panel held out, only the stripes foretell the other; the patches alone
-  leave distance and stray capacitance open. Hardware curves of the other trajectories and of the
-  meander board are not public.
+- **Scenario 1 beyond two panels.** Its eleven free figures were fitted to the same two panels that
+  it is held against. With one panel held out, only the stripes foretell the other; the patches
+  alone leave distance and stray capacitance open. Hardware curves of the other trajectories and of
+  the meander board are not public.
 - **Absolute capacitances of the paper's boards.** Their dimensions are read from photographs, good
   to ±5 %; published curves are normalised.
 - **Materials with loss.** A material conducts or it does not. Wet cloth and thin skin, whose
