@@ -104,7 +104,7 @@ def test_stored_figures_are_those_of_the_fit() -> None:
     """Fitted again on a coarser table, from another gap: within its own error, every figure."""
     tables = {}
     for name in ("stripe", "patch"):
-        grid = tabulate(cs.Simulator(name, frequency=SETUP.frequency), SETUP, coarser=1.6)
+        grid = tabulate(cs.Simulator(name, frequency=SETUP.frequency), SETUP, coarser=2.0)
         tables[name] = grid.table(SETUP.boards[name].pair)
     found = fit(SETUP, tables, starts=(1.3,))
     for key, uncertainty in SETUP.uncertainty.items():
