@@ -18,6 +18,7 @@ from capsense.solve import trace_kernels as tracing
 from capsense.solve.column_kernels import MAX_STRETCHES, PART
 from capsense.solve.conductors import Conductors
 from capsense.solve.finding_kernels import UNIT
+from capsense.solve.matter_kernels import MATTER
 from capsense.solve.packed import Block, Found, PackedLattice, pack_bodies
 
 Array = NDArray[np.float64]
@@ -77,7 +78,9 @@ class PerturbationSolver:
         self._share = np.zeros(len(la.joints), np.float32)
         self._stamp, self._mark = np.zeros(n, np.int64), 0
         self._inside, self._inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
-        self._counts, self._room = np.zeros(4, np.int64), np.zeros(1, tracing.ROOM)[0]
+        self._counts, self._room = np.zeros(5, np.int64), np.zeros(1, tracing.ROOM)[0]
+        self._matter, self._touched = np.zeros((3, n), MATTER), np.empty(3 * n, np.int64)
+        self._matter["series"] = 1.0
         self._found = Found(self._mesh, max(4096, n // 4))
         self._pool: list[Block] = []
         self._blocks: list[Block] = []
@@ -165,10 +168,10 @@ class PerturbationSolver:
                 mesh.ceiling, mesh.parent, mesh.home, mesh.stored, bodies, grids, CONTACT,
                 conductors.parent, found.weight, found.extra, self._inside, self._inside_nodes,
                 found.ties, found.energies, found.couples, found.within, self._counts,
-                self._room, near, parts,
+                self._room, near, parts, self._matter, self._touched,
             )  # fmt: skip
             if status == tracing.FULL:
-                ties, energies, couples, _ = self._counts.tolist()
+                ties, energies, couples, _, _ = self._counts.tolist()
                 return ties, energies, couples
             if status == tracing.CROWDED:
                 raise SceneError(

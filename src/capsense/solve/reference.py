@@ -15,8 +15,9 @@ stretches of dielectric and of conductor. A stretch of length ℓ of the link's 
 resistance ℓ / (L κ), κ being its permittivity over that of the empty domain; so the empty link has
 resistance 1.
 
-- No conductor: the link's weight becomes w / Σ resistance. The change δ = w′ − w drives both ends,
-  ``−δ (φ⁰_a − φ⁰_b)`` at a, and adds ``δ Δφ⁰_i Δφ⁰_j`` to the energy.
+- No conductor: the link's weight becomes w / Σ resistance, or another, where sheets lie along it:
+  see ``mixed_permittivity``. The change δ = w′ − w drives both ends, ``−δ (φ⁰_a − φ⁰_b)`` at a, and
+  adds ``δ Δφ⁰_i Δφ⁰_j`` to the energy.
 - A conductor: the link is taken away (less of it, where the conductor ends beside the line and its
   end comes abreast of a node). From each end a *tie* of weight w / r leads to the first
   conductor met, r being the resistance up to it. A node inside the conductor has none. The tie's
@@ -52,6 +53,7 @@ from capsense.field.lattice import FREE, Storey
 from capsense.scene import Body, Scene
 from capsense.solve.perturbation import CONTACT
 from capsense.solve.reference_columns import Column, Part, layers, met, pierce
+from capsense.solve.reference_matter import Matter, mixed_permittivity, storey_of
 from capsense.solve.trace_kernels import _LEAST, _SNAP
 
 Array = NDArray[np.float64]
@@ -67,6 +69,7 @@ def reference_delta(background: BackgroundField, scene: Scene, frequency: float 
         for line, bundle in problem.lines(axis):
             for share, stretches in bundle:
                 problem.lay(line, stretches, share)
+    problem.mix_matter()
     problem.close_nodes_inside()
     return problem.solve()
 
@@ -122,6 +125,8 @@ class _Problem:
     """Weights [F] of whole links by axis and lower node."""
     diagonal: dict[int, float] = field(default_factory=dict)
     """Weights [F] of ties and half-links by node."""
+    matter: dict[tuple[int, int], Matter | None] = field(default_factory=dict)
+    """What dielectrics fill of whole links; None where these are not of dielectrics alone."""
 
     def __post_init__(self) -> None:
         bg, la = self.background, self.background.lattice
@@ -235,8 +240,6 @@ class _Problem:
             if la.owner[a] != FREE and la.owner[a] == la.owner[b]:
                 continue  # both ends on one sheet: no field between them
             k = self.cut_of.get((axis, a))
-            if k is None and la.weights[axis, a] == 0.0:
-                continue  # the storey below has this link
             if k is None:
                 yield _Link(share * float(la.weights[axis, a]), c[m], c[m + 1], (a, b), (-3, -3))
                 continue
@@ -253,14 +256,56 @@ class _Problem:
         axis = line.axis
         for link in self.links(line, share):
             on = [s for s in stretches if min(s.end, link.ends) > max(s.start, link.starts)]
-            if not on or (min(link.nodes) >= 0 and all(n in self.inside for n in link.nodes)):
+            inside = [n in self.inside for n in link.nodes]
+            if not on or all(inside):
                 continue
-            if any(s.body in self.same for s in on):
+            metal = any(s.body in self.same for s in on)
+            if min(link.nodes) >= 0:
+                if not metal and not any(inside) and share >= 1.0 - 1e-9:
+                    self.matter[axis, link.nodes[0]] = self._matter_on(axis, link, on)
+                    continue
+                self.matter[axis, link.nodes[0]] = None
+                if link.weight == 0.0:
+                    continue  # another storey has this link
+            if metal:
                 self._lay_conductor(line, link, on)
                 continue
             resistance = self._resistance(axis, link, on, link.starts, link.ends)
             if abs(resistance - 1.0) > 1e-9:
                 self._lay_dielectric(axis, link, link.weight / resistance - link.weight)
+
+    def _matter_on(self, axis: int, link: _Link, on: list[_Stretch]) -> Matter:
+        length = link.ends - link.starts
+        out = Matter(self._resistance(axis, link, on, link.starts, link.ends))
+        for s in on:
+            a, b = max(s.start, link.starts), min(s.end, link.ends)
+            eps = self.scene[s.body].material.at(self.frequency).eps_r
+            kappa = eps / self.background.lattice.eps_r[axis, link.nodes[0]]
+            middle = (0.5 * (a + b) - link.starts) / length
+            out.add((b - a) / length, middle, float(kappa), (s.end - s.start) / length)
+        return out
+
+    def mix_matter(self) -> None:
+        """Change the links that dielectrics alone meet, and those beside them."""
+        la = self.background.lattice
+        noted = [key for key, matter in self.matter.items() if matter is not None]
+        wanted = set(noted)
+        for axis, a in noted:
+            strides = storey_of(la, a).strides
+            for node in (a, a + strides[axis]):
+                for other in {0, 1, 2} - {axis}:
+                    wanted |= {(other, node), (other, node - strides[other])} - set(self.matter)
+        for axis, a in wanted:
+            b = a + storey_of(la, a).strides[axis]
+            weight = float(la.weights[axis, a])
+            if (axis, a) in self.cut_of or weight == 0.0 or a in self.inside or b in self.inside:
+                continue
+            if la.owner[a] != FREE and la.owner[a] == la.owner[b]:
+                continue
+            eps = mixed_permittivity(la, self.matter, set(self.cut_of), axis, a, b)
+            if abs(eps - 1.0) > 1e-9:
+                link = _Link(weight, 0.0, 1.0, (a, b), (-3, -3))
+                self._lay_dielectric(axis, link, weight * (eps - 1.0))
 
     def _lay_dielectric(self, axis: int, link: _Link, change: float) -> None:
         """Change the weight of a link or half-link that no conductor meets in this share."""

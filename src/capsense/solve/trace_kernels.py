@@ -27,6 +27,16 @@ from capsense.solve.finding_kernels import (
     value_on_link,
 )
 from capsense.solve.inside_kernels import close_inside, mark_inside, place
+from capsense.solve.matter_kernels import (
+    MATTER,
+    add_matter,
+    clear_matter,
+    clear_record,
+    mix_matter,
+    note_matter,
+    note_shared,
+    thinness,
+)
 
 _SNAP = 1e-6
 """Fraction of a link within which a surface counts as lying on a node."""
@@ -41,6 +51,7 @@ ROOM = np.dtype(
         ("ends", np.float64, (7, 2 * MAX_STRETCHES)),
         ("bodies", np.int64, (3, 2 * MAX_STRETCHES)),
         ("stretches", np.float64, (MESH_STRETCHES, 2)),
+        ("own", MATTER),
     ]
 )
 """Room for the stretches of one line."""
@@ -114,26 +125,32 @@ def _join(joined, a, b):
 @kernel
 def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, stored, bodies, grids,
           contact, joined, weight, extra, inside, inside_nodes, ties, energies, couples, within,
-          counts, room, near, parts):  # fmt: skip
+          counts, space, near, parts, matter, touched):  # fmt: skip
     """Scan a scene: change ``weight`` (3, n) and ``extra`` (n,), list ties, energies and couples.
 
     ``stored`` (n, pairs) holds the energies of the links to the next nodes, for each pair of
     terminals; those that lie inside conductors are summed in ``within`` (pairs,) where whole.
     ``joined[c]`` leads from a conductor to one it touches. ``counts`` holds the numbers of ties,
-    energies, couples and nodes inside conductors. ``room`` (a ``ROOM``), ``near`` and ``parts``
-    (bodies,) are room to work in. Returns ``FULL``, ``CROWDED`` or ``SHORT``.
+    energies, couples, nodes inside conductors, and links in matter. ``space`` (a ``ROOM``),
+    ``near`` and ``parts`` (bodies,), ``matter`` (3, n) and ``touched`` (3 n,) are room to work in.
+    Returns ``FULL``, ``CROWDED`` or ``SHORT``.
     """
     counts[:3] = 0
     counts[3] = mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside,
-                            inside_nodes, counts[3], room.stretches)  # fmt: skip
+                            inside_nodes, counts[3], space.stretches)  # fmt: skip
     for s in range(storeys.shape[0]):
         for axis in range(3):
             status = _trace_axis(
                 storeys[s], axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
-                weight, extra, inside, ties, energies, couples, counts, room, near, parts,
+                weight, extra, inside, ties, energies, couples, counts, space, near, parts,
+                matter, touched,
             )  # fmt: skip
             if status != FULL:
+                clear_matter(matter, touched, counts)
                 return status
+    if not mix_matter(storeys, axes, nodes, links, inside, matter, touched, weight, ties, energies,
+                      couples, counts):  # fmt: skip
+        return SHORT
     if not close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, inside_nodes,
                          ties, energies, couples, within, counts):  # fmt: skip
         return SHORT
@@ -150,8 +167,8 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, store
 
 @kernel
 def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, contact, joined,
-                weight, extra, inside, ties, energies, couples, counts, room, near,
-                parts):  # fmt: skip
+                weight, extra, inside, ties, energies, couples, counts, space, near,
+                parts, matter, touched):  # fmt: skip
     """Scan the lines of a storey along one axis; lines on the walls carry no unknowns."""
     p, q = 1 if axis == 0 else 0, 1 if axis == 2 else 2
     shape, begin = storey.shape, storey.begin
@@ -161,10 +178,10 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
     cp, fp = axes[begin[p] : begin[p] + shape[p]], faces[begin[p] : begin[p] + shape[p]]
     cq, fq = axes[begin[q] : begin[q] + shape[q]], faces[begin[q] : begin[q] + shape[q]]
     lowest, highest = storey.lowest[axis], storey.highest[axis]
-    t0, t1, u0, u1 = room.ends[0], room.ends[1], room.ends[2], room.ends[3]
-    r0, r1, ends = room.ends[4], room.ends[5], room.ends[6]
-    who, uwho, rwho = room.bodies[0], room.bodies[1], room.bodies[2]
-    scratch = room.stretches
+    t0, t1, u0, u1 = space.ends[0], space.ends[1], space.ends[2], space.ends[3]
+    r0, r1, ends = space.ends[4], space.ends[5], space.ends[6]
+    who, uwho, rwho = space.bodies[0], space.bodies[1], space.bodies[2]
+    scratch = space.stretches
     for ip in range(1, cp.shape[0] - 1):
         n_near = 0
         for m in range(bodies.shape[0]):
@@ -203,7 +220,7 @@ def _trace_axis(storey, axis, axes, faces, nodes, links, cuts, bodies, grids, co
                 if n > 0 and not _lay_line(
                     axis, line, stride, c, lowest, highest, upper - lower, n, r0, r1, rwho, parts,
                     nodes, links, cuts, bodies, contact, weight, extra, inside, ties, energies,
-                    couples, counts,
+                    couples, counts, space, matter, touched,
                 ):  # fmt: skip
                     return SHORT
                 lower = upper
@@ -225,7 +242,7 @@ def _next_edge(lower, total, who, parts):
 @inlined
 def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, parts, nodes, links,
               cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
-              counts):  # fmt: skip
+              counts, space, matter, touched):  # fmt: skip
     """Lay ``n`` disjoint stretches over the links of a line; False: the findings do not fit."""
     last = c.shape[0] - 1
     m = max(0, place(c, r0[0]) - 1)
@@ -243,13 +260,13 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, pa
         link = links[axis, a]
         whole_inside = link.cut < 0 and inside[a] >= 0 and inside[b] >= 0
         one_sheet = nodes[a].owner != -1 and nodes[a].owner == nodes[b].owner
-        if not whole_inside and not one_sheet and (link.cut >= 0 or link.weight > 0.0):
+        if not whole_inside and not one_sheet:
             if not room(ties, energies, couples, counts):
                 return False
             for part in range(1 if link.cut < 0 else 2):
                 _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1,
                           rwho, parts, nodes, cuts, bodies, contact, weight, extra, inside, ties,
-                          energies, couples, counts)  # fmt: skip
+                          energies, couples, counts, space, matter, touched)  # fmt: skip
         m += 1
     return True
 
@@ -257,7 +274,7 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, pa
 @inlined
 def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, r1, rwho, parts,
               nodes, cuts, bodies, contact, weight, extra, inside, ties, energies, couples,
-              counts):  # fmt: skip
+              counts, space, matter, touched):  # fmt: skip
     """Change a link, or one part of a cut link, by the stretches on it from number ``seg`` on."""
     ta, tb = c[m], c[m + 1]
     pa, pb = ta, tb
@@ -278,15 +295,17 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     length = pb - pa
     # series resistance up to the first conductor, and back from the last
     resist, pos, k = 0.0, pa, seg
+    own = space.own
+    clear_record(own)
     first_r, first_t, first_c, first_deep = -1.0, pa, -1, False
     last_t, last_c, last_deep = pa, -1, False
     off_line = 0.0
-    touched, parted = False, False
+    met, parted = False, False
     while k < n and r0[k] < pb:
         s0, s1 = max(r0[k], pa), min(r1[k], pb)
         if s1 > s0:
             who = bodies[rwho[k]].conductor
-            touched = True
+            met = True
             if s0 > pos:
                 resist += (s0 - pos) / length
             if who >= 0:
@@ -303,10 +322,14 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
                 last_deep = r1[k] > pb + _SNAP * length
                 resist = 0.0
             else:
-                resist += (s1 - s0) / length * link.eps_r / bodies[rwho[k]].eps_r
+                kappa = bodies[rwho[k]].eps_r / link.eps_r
+                resist += (s1 - s0) / length / kappa
+                filled = (s1 - s0) / length
+                add_matter(own, filled, (0.5 * (s0 + s1) - pa) / length, kappa,
+                           thinness(r1[k] - r0[k], length))  # fmt: skip
             pos = s1
         k += 1
-    if not touched:
+    if not met:
         return
     if pos < pb:
         resist += (pb - pos) / length
@@ -314,6 +337,13 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     inside_b = nb >= 0 and inside[nb] >= 0
     free_a = na >= 0 and nodes[na].owner == -1
     free_b = nb >= 0 and nodes[nb].owner == -1
+    if link.cut < 0:
+        if first_c < 0 and share >= 1.0 - _THIN and not inside_a and not inside_b:
+            note_matter(matter, touched, counts, axis, a, own, resist)
+            return
+        note_shared(matter, touched, counts, axis, a)
+        if link.weight == 0.0:
+            return  # another storey has this link
     if first_c < 0:
         # dielectric only
         if abs(resist - 1.0) <= 1e-9:

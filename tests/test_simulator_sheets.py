@@ -1,0 +1,53 @@
+"""Thin dielectrics, like cloth: seen wherever they lie between the planes of the lattice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sheet_theory import first_order
+
+import capsense as cs
+
+EPS_R = 1.6
+SIZE = 0.2
+
+
+def sheet(z: float, thickness: float = 0.001, eps_r: float = EPS_R) -> cs.Body:
+    """A level sheet [m]."""
+    return cs.Body(
+        cs.Box((SIZE, SIZE, thickness)), cs.Pose((0.0, 0.0, z)), cs.Material("cloth", eps_r)
+    )
+
+
+@pytest.mark.parametrize("thickness", [0.0005, 0.001, 0.002])
+def test_level_sheets_against_first_order_theory(simulators, thickness):
+    """Measured: within 16 %, on a lattice plane and between two, up to 33 mm away."""
+    sim = simulators("six_patch")
+    for z in (0.008, 0.010, 0.012, 0.0147, 0.018, 0.022, 0.025, 0.030, 0.033):
+        sim.reset()
+        found = sim.step(cs.Scene([sheet(z, thickness)])).delta[1, 1]
+        ratio = found / first_order(sim, z, thickness, SIZE, EPS_R, 1)
+        assert 0.84 <= ratio <= 1.16, f"{ratio:.2f} of the theory at {1e3 * z:.1f} mm"
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.2, 0.5, 0.785])
+def test_a_sheet_that_rises_is_followed(simulators, turn):
+    """Measured: no step over 0.5 mm takes more than a quarter of what the sheet does."""
+    sim = simulators("six_patch")
+    values = []
+    for k in range(24):
+        pose = cs.Pose((0, 0, 0.045 + 5e-4 * k), (0, np.sin(turn / 2), 0, np.cos(turn / 2)))
+        body = cs.Body(cs.Box((SIZE, SIZE, 0.001)), pose, cs.Material("cloth", EPS_R))
+        values.append(sim.step(cs.Scene([body])).delta[1, 1])
+    assert np.abs(np.diff(values)).max() <= 0.25 * np.mean(values)
+    assert values[-1] < values[0]
+
+
+def test_twice_the_sheet_does_twice_as_much(simulators):
+    """Invariant: to first order, in thickness and in permittivity less one."""
+    sim = simulators("six_patch")
+    for z in (0.012, 0.02, 0.03):
+        thin, thick = (sim.step(cs.Scene([sheet(z, t)])).delta[1, 1] for t in (2.5e-4, 5e-4))
+        assert thick == pytest.approx(2 * thin, rel=0.03)
+        light, dense = (sim.step(cs.Scene([sheet(z, 5e-4, e)])).delta[1, 1] for e in (1.01, 1.02))
+        assert dense == pytest.approx(2 * light, rel=0.03)
