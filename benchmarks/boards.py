@@ -28,9 +28,7 @@ def reference(design: cs.Design, centre: np.ndarray, empty: tuple, scale: float)
     """ΔC [F] by the bar at ``centre`` [m]."""
     surface = box(centre, np.array(SIZE))
     bar = Conductor("bar", Role.GROUND, surface)
-    full = BoundarySolution(
-        replace(design, conductors=(*design.conductors, bar)), Accuracy(scale)
-    )
+    full = BoundarySolution(replace(design, conductors=(*design.conductors, bar)), Accuracy(scale))
     density = full.densities(np.eye(len(terminals(design))))
     panels = full.model.panels
     half = np.array(SIZE) / 2 + 1e-9

@@ -44,6 +44,7 @@ try:
     while True:
         run.step(recorded_scenes.frame_at(taken % 7), 0.01 * taken)
         taken += 1
+        time.sleep(0.02)  # what is written at once fits, on fast machines too
 except OSError as error:
     print(taken, flush=True)
     print(error, flush=True)

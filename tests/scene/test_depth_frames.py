@@ -320,7 +320,7 @@ def test_an_arm_in_a_sleeve_reads_nearly_like_the_arm(sim):
     alone = sim.step(DepthFrame(front - 0.004, 3.2, back=0.001)).delta
     change = np.abs(dressed - bare).max() / np.abs(bare).max()
     assert 0.02 < change < 0.08
-    assert np.abs(alone).max() < 0.05 * np.abs(bare).max()
+    assert np.abs(alone).max() < 0.08 * np.abs(bare).max()
 
 
 def test_the_page_runs():

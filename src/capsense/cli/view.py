@@ -153,7 +153,6 @@ def _announce(view: View, args: argparse.Namespace) -> None:
     """Say where the page is, and how to get at it."""
     from capsense.cli.main import say
 
-    print(view.url, flush=True)
     if args.host.startswith("127.") or args.host in LOOPBACK:
         if not args.quiet:
             port = view.url.rpartition(":")[2]
@@ -163,3 +162,4 @@ def _announce(view: View, args: argparse.Namespace) -> None:
             )
     else:
         say("warning: whoever reaches this address sees the page and can move it about")
+    print(view.url, flush=True)  # last: whoever waits for it may stop the view at once
