@@ -15,11 +15,11 @@ from capsense.solve.finding_kernels import add_energy, room
 
 MATTER = np.dtype(
     [
-        ("fill", np.float64, (2,)),
-        ("gain", np.float64, (2,)),
-        ("thin", np.float64, (2,)),
-        ("series", np.float64),
-        ("mark", np.int64),
+        ("fill", np.float32, (2,)),
+        ("gain", np.float32, (2,)),
+        ("thin", np.float32, (2,)),
+        ("series", np.float32),
+        ("mark", np.int32),
     ]
 )
 """Of a link in matter: the fraction filled, the mean of κ − 1 along it, and what of the fraction

@@ -52,9 +52,10 @@ ROOM = np.dtype(
         ("bodies", np.int64, (3, 2 * MAX_STRETCHES)),
         ("stretches", np.float64, (MESH_STRETCHES, 2)),
         ("own", MATTER),
+        ("dielectrics", np.bool_),
     ]
 )
-"""Room for the stretches of one line."""
+"""Room for the stretches of a line, for what matter does to a link, and whether there is matter."""
 
 
 @kernel
@@ -136,6 +137,9 @@ def trace(storeys, axes, faces, nodes, links, cuts, ceiling, parent, home, store
     Returns ``FULL``, ``CROWDED`` or ``SHORT``.
     """
     counts[:3] = 0
+    space.dielectrics = False
+    for m in range(bodies.shape[0]):
+        space.dielectrics = space.dielectrics or bodies[m].conductor < 0
     counts[3] = mark_inside(storeys, axes, nodes, ceiling, parent, bodies, grids, inside,
                             inside_nodes, counts[3], space.stretches)  # fmt: skip
     for s in range(storeys.shape[0]):
@@ -260,7 +264,8 @@ def _lay_line(axis, line, stride, c, lowest, highest, share, n, r0, r1, rwho, pa
         link = links[axis, a]
         whole_inside = link.cut < 0 and inside[a] >= 0 and inside[b] >= 0
         one_sheet = nodes[a].owner != -1 and nodes[a].owner == nodes[b].owner
-        if not whole_inside and not one_sheet:
+        here = link.cut >= 0 or link.weight > 0.0 or space.dielectrics
+        if here and not whole_inside and not one_sheet:
             if not room(ties, energies, couples, counts):
                 return False
             for part in range(1 if link.cut < 0 else 2):
@@ -337,7 +342,7 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
     inside_b = nb >= 0 and inside[nb] >= 0
     free_a = na >= 0 and nodes[na].owner == -1
     free_b = nb >= 0 and nodes[nb].owner == -1
-    if link.cut < 0:
+    if link.cut < 0 and space.dielectrics:
         if first_c < 0 and share >= 1.0 - _THIN and not inside_a and not inside_b:
             note_matter(matter, touched, counts, axis, a, own, resist)
             return
