@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 from typing import Any
 
@@ -288,3 +289,12 @@ def test_a_missing_gmsh_names_the_mend(monkeypatch, failure, mend):
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(MissingDependencyError, match=mend):
         mesh_design(small())
+
+
+def test_a_connection_that_breaks_does_not_end_the_process(patches):
+    """Regression: Gmsh made a broken pipe deadly, for sockets and pipes of the whole process."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with pytest.raises(BrokenPipeError):
+        os.write(writing, b"x")
+    os.close(writing)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import math
 import re
+import signal
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -164,7 +166,11 @@ def _session(gmsh: ModuleType) -> Iterator[None]:
     """A fresh Gmsh model; afterwards Gmsh is as it was, initialised by the caller or not."""
     ours = not gmsh.isInitialized()
     if ours:
+        broken_pipe = signal.getsignal(signal.SIGPIPE)
         gmsh.initialize(readConfigFiles=False, interruptible=False)
+        if broken_pipe is not None and threading.current_thread() is threading.main_thread():
+            # Gmsh sets it so that a connection that breaks later would end the process
+            signal.signal(signal.SIGPIPE, broken_pipe)
     previous = "" if ours else gmsh.model.getCurrent()
     saved = {name: gmsh.option.getNumber(name) for name in _OPTIONS}
     try:
