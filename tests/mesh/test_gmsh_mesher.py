@@ -253,6 +253,7 @@ def test_gmsh_is_finalised_after_a_failure(monkeypatch):
     assert not gmsh.isInitialized()
 
 
+@pytest.mark.usefixtures("broken_pipes_ignored")
 def test_a_session_of_the_caller_survives():
     gmsh.initialize(interruptible=False, readConfigFiles=False)
     try:

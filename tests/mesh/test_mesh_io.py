@@ -60,6 +60,7 @@ def test_msh_round_trip(mesh, tmp_path, version):
 
 
 @pytest.mark.parametrize("version", ["4.1", "2.2"])
+@pytest.mark.usefixtures("broken_pipes_ignored")
 def test_gmsh_reads_and_rewrites_our_msh(mesh, tmp_path, version):
     gmsh = pytest.importorskip("gmsh", exc_type=(ImportError, OSError))
     save_mesh(mesh, tmp_path / "ours.msh", msh_version=version)
