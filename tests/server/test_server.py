@@ -146,10 +146,8 @@ def test_readout(dome: np.ndarray) -> None:
         assert sensor.step(dome, time=1e12).sequence == 0
 
 
-def test_newest_frame_wins(
-    served: RunningServer, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """While one frame is solved, all that come but the last are dropped, and counted."""
+def hold_solves(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Make every solve wait: events that tell that one has begun, and that let them go on."""
     begun, go = threading.Event(), threading.Event()
     solve = ServedSensor.solve
 
@@ -159,6 +157,14 @@ def test_newest_frame_wins(
         return solve(self, frame)  # type: ignore[arg-type]
 
     monkeypatch.setattr(ServedSensor, "solve", slow)
+    return begun, go
+
+
+def test_newest_frame_wins(
+    served: RunningServer, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While one frame is solved, all that come but the last are dropped, and counted."""
+    begun, go = hold_solves(monkeypatch)
     with served.client() as client:
         sensor = client.open()
         sensor.send(dome)
@@ -177,15 +183,7 @@ def test_frames_that_a_reset_or_the_end_overtakes(
     served: RunningServer, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They count as dropped, and no reading of a sensor comes after it is closed."""
-    begun, go = threading.Event(), threading.Event()
-    solve = ServedSensor.solve
-
-    def slow(self: ServedSensor, frame: object) -> bytes:
-        begun.set()
-        assert go.wait(10)
-        return solve(self, frame)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(ServedSensor, "solve", slow)
+    begun, go = hold_solves(monkeypatch)
     with served.client() as client:
         busy, ended, restarted = client.open(), client.open(), client.open()
         busy.send(dome)
@@ -295,15 +293,7 @@ def test_health_and_log(dome: np.ndarray) -> None:
 
 def test_stopping_closes_connections(dome: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frame at hand is answered; clients are told that the server goes away, new ones too."""
-    begun, go = threading.Event(), threading.Event()
-    solve = ServedSensor.solve
-
-    def slow(self: ServedSensor, frame: object) -> bytes:
-        begun.set()
-        assert go.wait(10)
-        return solve(self, frame)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(ServedSensor, "solve", slow)
+    begun, go = hold_solves(monkeypatch)
     with RunningServer() as server, server.client() as client, server.client():
         sensor = client.open()
         sensor.send(dome)

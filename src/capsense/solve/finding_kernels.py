@@ -63,6 +63,17 @@ COUPLE = np.dtype([("a", np.int64), ("b", np.int64), ("weight", np.float64)])
 
 
 @kernel
+def storey_of(storeys, node, guess):
+    """Number of the storey that a node is of, searched from a guess on."""
+    s = guess
+    while node < storeys[s].first:
+        s -= 1
+    while s + 1 < storeys.shape[0] and node >= storeys[s + 1].first:
+        s += 1
+    return s
+
+
+@kernel
 def room(ties, energies, couples, counts):
     """Whether the buffers hold what one link may add."""
     return (

@@ -6,7 +6,7 @@ import math
 
 from capsense._jit import kernel
 from capsense.solve.column_kernels import pierce
-from capsense.solve.finding_kernels import add_energy, add_tie, room
+from capsense.solve.finding_kernels import add_energy, add_tie, room, storey_of
 
 
 @kernel
@@ -79,10 +79,7 @@ def close_inside(storeys, nodes, links, cuts, stored, weight, extra, inside, ins
     s = 0
     for i in range(counts[3]):
         a = inside_nodes[i]
-        while a < storeys[s].first:
-            s -= 1
-        while s + 1 < storeys.shape[0] and a >= storeys[s + 1].first:
-            s += 1
+        s = storey_of(storeys, a, s)
         strides = (storeys[s].shape[1] * storeys[s].shape[2], storeys[s].shape[2], 1)
         deep = nodes[a].plain
         for axis in range(3):

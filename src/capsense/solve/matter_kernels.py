@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense.solve.finding_kernels import add_energy, room
+from capsense.solve.finding_kernels import add_energy, room, storey_of
 
 MATTER = np.dtype(
     [
@@ -89,10 +89,7 @@ def mix_matter(storeys, axes, nodes, links, inside, matter, touched, weight, tie
         axis, a = touched[i] % 3, touched[i] // 3
         if matter[axis, a].mark == SHARED:
             continue
-        while a < storeys[s].first:
-            s -= 1
-        while s + 1 < storeys.shape[0] and a >= storeys[s + 1].first:
-            s += 1
+        s = storey_of(storeys, a, s)
         storey = storeys[s]
         strides = (storey.shape[1] * storey.shape[2], storey.shape[2], 1)
         fits = fits and _mix(storey, strides, axis, a, axes, nodes, links, inside, matter, touched,
