@@ -9,31 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recorded_scenes
+from ball_scenario import ball_scenario
 
 import capsense as cs
 from capsense.cli.main import main
 from capsense.errors import RecordingError
 
-SCENARIO = """
-name = "ball over six electrodes"
-design = "six_patch"
-sample_rate = 10.0
-[[body]]
-name = "ball"
-shape = "sphere"
-radius = 0.02
-material = "steel"
-[body.trajectory]
-waypoints = [[-0.06, 0.0, 0.04], [0.06, 0.0, 0.04]]
-speed = 0.1
-"""
 COUNT = 13
 
 
 @pytest.fixture
 def scenario(tmp_path: Path) -> Path:
     path = tmp_path / "ball.toml"
-    path.write_text(SCENARIO, encoding="utf-8")
+    path.write_text(ball_scenario(), encoding="utf-8")
     return path
 
 
