@@ -9,6 +9,7 @@ from random_scenes import random_body, random_scene
 
 import capsense as cs
 from capsense.errors import SolveError
+from capsense.solve.packed import Workspace
 
 FACTOR = 10.0
 """Each of the two solutions is within ``stats.tolerance`` of the exact one by an *estimate*; the
@@ -129,10 +130,10 @@ def test_what_is_not_finite_does_not_reach_the_next_step(simulators, monkeypatch
     expected = sim.step(scene).delta
     solver = sim._solver
 
-    def spoil(scene: cs.Scene, *rest: object) -> None:
-        prepare(scene, *rest)
-        for block in solver._blocks:
-            block.u[:], block.p[:], block.ap[:] = np.nan, np.nan, np.nan
+    def spoil(work: Workspace, *rest: object) -> None:
+        prepare(work, *rest)
+        for values in (*solver._u, *(b.p for b in work.blocks(1)), *(b.z for b in work.blocks(1))):
+            values[:] = np.nan
 
     prepare = solver._prepare
     monkeypatch.setattr(solver, "_prepare", spoil)

@@ -13,18 +13,19 @@ from numpy.typing import NDArray
 from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
 from capsense.scene import Scene
+from capsense.solve import load_kernels as loading
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
 from capsense.solve.column_kernels import MAX_STRETCHES, PART
 from capsense.solve.conductors import Conductors
+from capsense.solve.factor_kernels import factorise
 from capsense.solve.finding_kernels import UNIT
-from capsense.solve.matter_kernels import MATTER
-from capsense.solve.packed import Block, Found, PackedLattice, pack_bodies
+from capsense.solve.packed import Workspace, pack_bodies, packed_lattice
+from capsense.solve.simd import LANES, aligned_zeros
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
-LANES = pcg.LANES
 CONTACT = 1e-4
 """Thickness [m] of the insulating film that keeps a conductor off an electrode it touches."""
 
@@ -68,32 +69,20 @@ class PerturbationSolver:
         self.relative_tolerance = relative_tolerance
         self.frequency = frequency
         self.max_iterations = max_iterations
-        la = background.lattice
-        n = la.n_nodes
         self._n_terminals = len(background.terminals)
-        self._base_weight, self._base_extra = self._base_operator()
-        self._mesh = PackedLattice(background, self._base_weight)
-        self._diagonal, self._active = np.ones(n, np.float32), np.zeros(n, np.float32)
-        self._inverse, self._woken = np.zeros(n, np.float32), np.empty(n, np.int64)
-        self._share = np.zeros(len(la.joints), np.float32)
-        self._stamp, self._mark = np.zeros(n, np.int64), 0
-        self._inside, self._inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
-        self._counts, self._room = np.zeros(5, np.int64), np.zeros(1, tracing.ROOM)[0]
-        self._matter, self._touched = np.zeros((3, n), MATTER), np.empty(3 * n, np.int64)
-        self._matter["series"] = 1.0
-        self._found = Found(self._mesh, max(4096, n // 4))
-        self._pool: list[Block] = []
-        self._blocks: list[Block] = []
+        self._mesh = packed_lattice(background)
+        self._active = np.zeros(background.lattice.n_nodes, np.uint8)
+        self._u: list[Array32] = []
+        self._n_blocks = 0
         self._lanes: tuple[object, ...] = ()
         self._rested = True
 
     def reset(self) -> None:
         """Forget the last solution."""
-        for block in self._blocks:
-            for values in (block.u, block.r, block.p, block.ap):
-                values[:] = 0.0
+        for u in self._u:
+            u[:] = 0.0
         self._rested = True
-        self._active[:] = 0.0
+        self._active[:] = 0
 
     def step(self, scene: Scene) -> Perturbation:
         """Solve a scene.
@@ -107,16 +96,18 @@ class PerturbationSolver:
             self.reset()
             return Perturbation(np.zeros((n_terminals, n_terminals)), 0, 0.0, self.tolerance)
         conductors = Conductors(scene, self.frequency)
-        n_tie, n_energy, n_couple = self._trace(scene, conductors)
-        lanes, grounds = conductors.lanes(n_terminals)
-        self._prepare(scene, lanes, n_terminals + len(grounds))
-        energy, iterations, left, goal = self._solve_blocks(n_tie, n_energy, lanes)
-        energy = energy[: n_terminals + len(grounds), : n_terminals + len(grounds)]
-        conductors.add_couplings(energy, self._found.couples[:n_couple], lanes)
-        delta = _reduce(energy, n_terminals, grounds)
-        if not np.isfinite(delta).all():
-            self.reset()  # nothing of it must reach the next step
-            raise SolveError("a step gave a capacitance that is not finite")
+        with self._mesh.workspace() as work:
+            ties, energies, couples = self._trace(work, scene, conductors)
+            lanes, grounds = conductors.lanes(n_terminals)
+            n_lanes = n_terminals + len(grounds)
+            self._prepare(work, (len(scene), *lanes.tolist()), n_lanes)
+            energy, iterations, left, goal = self._solve_blocks(work, ties, energies, lanes)
+            energy = energy[:n_lanes, :n_lanes]
+            conductors.add_couplings(energy, couples, lanes)
+            delta = _reduce(energy, n_terminals, grounds)
+            if not np.isfinite(delta).all():
+                self.reset()  # nothing of it, nor of the workspace, must reach the next step
+                raise SolveError("a step gave a capacitance that is not finite")
         if iterations >= self.max_iterations and left > goal:
             raise SolveError(
                 f"no convergence in {iterations} iterations: estimated error {left:.2e} F, "
@@ -133,7 +124,7 @@ class PerturbationSolver:
         """Change of the potentials at the nodes in the last step [V], shape (n, terminals)."""
         if self._rested:
             return np.zeros((self.background.lattice.n_nodes, self._n_terminals))
-        stacked = np.concatenate([b.u for b in self._blocks], axis=1)
+        stacked = np.concatenate(self._u[: self._n_blocks], axis=1)
         out = stacked[:, : self._n_terminals].astype(float)
         la = self.background.lattice
         inside = (self._active == 0) & la.unknown
@@ -143,127 +134,110 @@ class PerturbationSolver:
 
     # -- the stages ---------------------------------------------------------------------------
 
-    def _base_operator(self) -> tuple[Array32, Array32]:
-        la = self.background.lattice
-        weight = la.weights / UNIT
-        extra = np.zeros(la.n_nodes)
-        cuts, half = la.cuts, self.background.half_weights / UNIT
-        if len(cuts):
-            weight[cuts.axis, cuts.node] = 0.0
-            np.add.at(extra, cuts.node, half[:, 0])
-            np.add.at(extra, la.beyond(cuts.axis, cuts.node), half[:, 1])
-        return weight.astype(np.float32), extra.astype(np.float32)
-
-    def _trace(self, scene: Scene, conductors: Conductors) -> tuple[int, int, int]:
+    def _trace(
+        self, work: Workspace, scene: Scene, conductors: Conductors
+    ) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]]:
+        """Change the empty domain's operator; return ties, energy terms and couplings."""
         bodies, grids = pack_bodies(scene, conductors)
         near, parts = np.empty(len(scene), np.int64), np.empty(len(scene), PART)
-        mesh = self._mesh
+        mesh, weight = self._mesh, work.operator.weight
         while True:
-            found = self._found
-            found.weight[:] = self._base_weight
-            found.extra[:] = self._base_extra
+            weight[:] = mesh.weight
+            work.extra[:] = mesh.extra
             conductors.parent[:] = np.arange(len(conductors.parent))
             status = tracing.trace(
                 mesh.scan_storeys, mesh.axes, mesh.faces, mesh.nodes, mesh.links, mesh.cuts,
                 mesh.ceiling, mesh.parent, mesh.home, mesh.stored, bodies, grids, CONTACT,
-                conductors.parent, found.weight, found.extra, self._inside, self._inside_nodes,
-                found.ties, found.energies, found.couples, found.within, self._counts,
-                self._room, near, parts, self._matter, self._touched,
+                conductors.parent, weight, work.extra, work.inside, work.inside_nodes, work.ties,
+                work.energies, work.couples, work.within, work.counts, work.room, near, parts,
+                work.matter, work.touched,
             )  # fmt: skip
             if status == tracing.FULL:
-                ties, energies, couples, _, _ = self._counts.tolist()
-                return ties, energies, couples
+                n_tie, n_energy, n_couple, _, _ = work.counts.tolist()
+                return work.ties[:n_tie], work.energies[:n_energy], work.couples[:n_couple]
             if status == tracing.CROWDED:
                 raise SceneError(
                     f"more than {MAX_STRETCHES} stretches of bodies lie on one line "
                     "through the domain; join small bodies into one mesh"
                 )
-            self._found = Found(mesh, 2 * len(found.ties))
+            work.fit(2 * len(work.ties))
 
-    def _prepare(self, scene: Scene, lanes: NDArray[np.int64], n_lanes: int) -> None:
-        """Build diagonal and preconditioner; carry the last solution over."""
-        la = self.background.lattice
-        found, mesh = self._found, self._mesh
-        n_woken = pcg.factorise(
-            found.weight, found.extra, la.owner, mesh.storeys, mesh.ceiling, mesh.parent,
-            self._share, self._diagonal, self._active, self._inverse, self._woken,
+    def _prepare(self, work: Workspace, signature: tuple[object, ...], n_lanes: int) -> None:
+        """Set up operator and preconditioner; carry the last solution over."""
+        mesh, operator = self._mesh, work.operator
+        factorise(
+            operator.weight, work.extra, mesh.unknown, mesh.storeys, mesh.ceiling, mesh.parent,
+            operator.share, operator.diagonal, self._active, operator.inverse, work.changed,
         )  # fmt: skip
-        signature = (len(scene), *lanes.tolist())
         if signature != self._lanes:
             self._assign_lanes(n_lanes)
             self._lanes = signature
         if not self._rested:
-            woken = self._woken[:n_woken]
-            for block in self._blocks:
-                block.u[woken] = -block.phi[woken]
+            for lanes, u in zip(mesh.lanes(self._n_blocks), self._u, strict=False):
+                loading.carry_over(work.changed, self._active, lanes.phi, u)
         self._rested = False
 
     def _assign_lanes(self, n_lanes: int) -> None:
         """Have as many blocks as needed; the lanes of terminals keep their solution."""
-        for first in range(LANES * len(self._pool), n_lanes, LANES):
-            self._pool.append(Block(first, self.background.potentials))
-        self._blocks = self._pool[: -(-n_lanes // LANES)]
-        for block in self._blocks:
-            block.u[:, max(0, self._n_terminals - block.first) :] = 0.0
+        self._n_blocks = -(-n_lanes // LANES)
+        while len(self._u) < self._n_blocks:
+            self._u.append(aligned_zeros((len(self._active), LANES), np.float32))
+        for k, u in enumerate(self._u):
+            u[:, max(0, self._n_terminals - k * LANES) :] = 0.0
 
     def _solve_blocks(
-        self, n_tie: int, n_energy: int, lanes: NDArray[np.int64]
+        self,
+        work: Workspace,
+        ties: NDArray[np.void],
+        energies: NDArray[np.void],
+        lanes: NDArray[np.int64],
     ) -> tuple[Array, int, float, float]:
-        mesh, count = self._mesh, len(self._blocks)
-        ties, energies = self._found.ties[:n_tie], self._found.energies[:n_energy]
+        """Energies of all pairs of lanes [F], iterations, error left and asked for [F]."""
+        count = self._n_blocks
+        blocks, held = work.blocks(count), self._mesh.lanes(count)
         energy = np.zeros((count * LANES, count * LANES))
+        rows, columns = self._mesh.pairs
+        energy[rows, columns] = energy[columns, rows] = work.within
         iterations, left, goal = 0, 0.0, self.tolerance
-        for block in self._blocks:
-            block.rhs[:] = 0.0
-            block.value = np.empty((n_tie, LANES))
-            block.drop = np.empty((n_energy, LANES))
-            local = np.where((lanes >= block.first) & (lanes < block.first + LANES), lanes, -1)
-            pcg.load_scene(
-                block.phi, np.where(local >= 0, local - block.first, -1), block.held, ties,
-                energies, block.rhs, block.value, block.drop,
-            )  # fmt: skip
-        for i, first in enumerate(self._blocks):
-            for j, second in enumerate(self._blocks[i:], start=i):
-                part = np.zeros((LANES, LANES))
-                pcg.gram(ties, first.value, second.value, part)
-                pcg.gram(energies, first.drop, second.drop, part)
-                _place(energy, i, j, part)
-        rows, columns = mesh.pairs
-        energy[rows, columns] += self._found.within
-        energy[columns, rows] = energy[rows, columns]
-        for i, block in enumerate(self._blocks):
-            start = np.abs(np.diag(energy))[i * LANES : (i + 1) * LANES]
-            wanted = np.maximum(
-                self.tolerance / UNIT, self.relative_tolerance * np.maximum(0.2 * start, 1e-9)
+        for block, base, u in zip(blocks, held, self._u, strict=False):
+            block.fit(len(ties), len(energies))
+            own = energy.diagonal()[base.place].reshape(1, LANES).copy()
+            local = np.where(
+                (lanes >= 0) & (lanes // LANES == base.first // LANES), lanes % LANES, -1
             )
-            rest = np.zeros(LANES)
-            done = pcg.solve(
-                self._found.weight, self._diagonal, self._active, self._inverse, mesh.storeys,
-                mesh.ceiling, mesh.parent, self._share, block.rhs, block.u, block.r, block.z,
-                block.p, block.ap, wanted, self.max_iterations, rest,
+            loading.load_scene(
+                base.phi, local, base.first, base.held, ties, energies, block.r, block.value,
+                block.drop, own,
             )  # fmt: skip
+            wanted = np.maximum(
+                self.tolerance / UNIT,
+                self.relative_tolerance * np.maximum(0.2 * np.abs(own[0]), 1e-9),
+            )
+            rest, part = np.zeros(LANES), np.zeros((LANES, LANES))
+            done = pcg.solve(
+                work.operator, pcg.Vectors(u, block.r, block.z, block.p), wanted,
+                self.max_iterations, rest, work.sums, work.factors, part,
+            )  # fmt: skip
+            energy[base.place, base.place] -= 0.5 * (part + part.T)
             iterations = max(iterations, done)
             left, goal = max(left, rest.max() * UNIT), max(goal, wanted.max() * UNIT)
-        for i, first in enumerate(self._blocks):
-            for j, second in enumerate(self._blocks[i:], start=i):
+        for i, first in enumerate(blocks):
+            for j, second in enumerate(blocks[i:], start=i):
                 part = np.zeros((LANES, LANES))
-                self._mark += 1
-                pcg.sparse_inner(
-                    ties, energies, self._stamp, self._mark, self._active, first.rhs, second.u,
+                if i < j:
+                    pcg.inner(work.operator, self._u[i], second.r, part)
+                    part = -part
+                loading.add_energies(
+                    ties, energies, first.value, first.drop, second.value, second.drop, self._u[j],
                     part,
                 )  # fmt: skip
-                pcg.inner(first.u, second.r, part)
-                if i == j:
-                    part = 0.5 * (part + part.T)
-                _place(energy, i, j, -part)
+                here, there = held[i].place, held[j].place
+                if i < j:
+                    energy[here, there] += part
+                    energy[there, here] += part.T
+                else:
+                    energy[here, here] += 0.5 * (part + part.T)
         return energy * UNIT, iterations, left, goal
-
-
-def _place(energy: Array, i: int, j: int, part: Array) -> None:
-    rows, cols = slice(i * LANES, (i + 1) * LANES), slice(j * LANES, (j + 1) * LANES)
-    energy[rows, cols] += part
-    if i != j:
-        energy[cols, rows] += part.T
 
 
 def _reduce(energy: Array, n: int, grounds: Array) -> Array:
