@@ -21,7 +21,7 @@ WITHIN = 2e-5
 
 @pytest.fixture(scope="module", params=[0, 1, 2])
 def case(request, simulators) -> tuple[Operator, Array, Array]:
-    """The operator that a random scene leaves behind, its unknowns that are on, and their matrix."""
+    """The operator that a random scene leaves behind, the nodes that are on, their matrix."""
     sim = simulators("three_stripes", settings=COARSE)
     sim.step(random_scene(np.random.default_rng(request.param), 1 + request.param))
     mesh = packed_lattice(sim.background)
