@@ -21,28 +21,18 @@ _INF = math.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def place_bodies(
-    kinds: NDArray[np.int64],
-    params: Array,
-    centre: Array,
-    quaternion: Array,
-    position: Array,
-    rotation: Array,
-    bounds: Array,
-) -> None:
+def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
     """Fill rotation matrices and sensor-frame bounding boxes of all bodies.
 
     Args:
-        kinds: Shape kinds, shape (n,).
-        params: Sizes [m], shape (n, 3).
-        centre: Centres of the local bounding boxes [m], shape (n, 3).
-        quaternion: Unit quaternions (x, y, z, w), shape (n, 4).
-        position: Origins of the bodies' frames [m], shape (n, 3).
+        table: A row for each body, shape (n, 14): shape kind, three sizes [m], centre of the local
+            bounding box [m], unit quaternion (x, y, z, w), origin of the body's frame [m].
         rotation: Receives the rotation matrices, shape (n, 3, 3).
         bounds: Receives lower and upper corners [m], shape (n, 2, 3).
     """
-    for i in range(kinds.shape[0]):
-        x, y, z, w = quaternion[i, 0], quaternion[i, 1], quaternion[i, 2], quaternion[i, 3]
+    for i in range(table.shape[0]):
+        kind, centre, position = table[i, 0], table[i, 4:7], table[i, 11:14]
+        x, y, z, w = table[i, 7], table[i, 8], table[i, 9], table[i, 10]
         r = rotation[i]
         r[0, 0] = 1 - 2 * (y * y + z * z)
         r[0, 1] = 2 * (x * y - z * w)
@@ -53,8 +43,7 @@ def place_bodies(
         r[2, 0] = 2 * (x * z - y * w)
         r[2, 1] = 2 * (y * z + x * w)
         r[2, 2] = 1 - 2 * (x * x + y * y)
-        a, b, c = params[i, 0], params[i, 1], params[i, 2]
-        kind = kinds[i]
+        a, b, c = table[i, 1], table[i, 2], table[i, 3]
         for k in range(3):
             if kind == _SPHERE:
                 half = a
@@ -66,12 +55,7 @@ def place_bodies(
                 half = math.sqrt((a * r[k, 0]) ** 2 + (b * r[k, 1]) ** 2 + (c * r[k, 2]) ** 2)
             else:
                 half = a * abs(r[k, 0]) + b * abs(r[k, 1]) + c * abs(r[k, 2])
-            middle = (
-                position[i, k]
-                + r[k, 0] * centre[i, 0]
-                + r[k, 1] * centre[i, 1]
-                + r[k, 2] * centre[i, 2]
-            )
+            middle = position[k] + r[k, 0] * centre[0] + r[k, 1] * centre[1] + r[k, 2] * centre[2]
             bounds[i, 0, k] = middle - half
             bounds[i, 1, k] = middle + half
 

@@ -94,12 +94,12 @@ class Scene:
 
         n = len(self.bodies)
         shapes = tuple([b.shape for b in self.bodies])
-        kinds = np.array([int(s.kind) for s in shapes], dtype=np.int64)
-        static = np.array([s.packed for s in shapes]).reshape(n, 6)
-        params, centre = static[:, :3].copy(), static[:, 3:].copy()
-        quaternion = np.array([b.pose.quaternion for b in self.bodies]).reshape(n, 4)
-        position = np.array([b.pose.position for b in self.bodies]).reshape(n, 3)
+        table = np.array(
+            [(b.shape.kind, *b.shape.packed, *b.pose.quaternion, *b.pose.position)
+             for b in self.bodies]
+        ).reshape(n, 14)  # fmt: skip
         rotation = np.empty((n, 3, 3))
         bounds = np.empty((n, 2, 3))
-        place_bodies(kinds, params, centre, quaternion, position, rotation, bounds)
-        return PackedScene(kinds, params, rotation, position, bounds, shapes)
+        place_bodies(table, rotation, bounds)
+        kinds = table[:, 0].astype(np.int64)
+        return PackedScene(kinds, table[:, 1:4], rotation, table[:, 11:], bounds, shapes)

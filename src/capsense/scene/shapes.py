@@ -95,8 +95,16 @@ def _meet(*intervals: tuple[Array, Array]) -> Array:
     return np.stack([np.where(hit, lower, np.inf), np.where(hit, upper, -np.inf)], axis=1)
 
 
+class _Primitive(Shape):
+    """A shape whose bounding box is centred on its origin."""
+
+    @cached_property
+    def packed(self) -> tuple[float, ...]:
+        return (*self.params.tolist(), 0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
-class Box(Shape):
+class Box(_Primitive):
     """A box of full edge lengths ``size`` [m], centred on its origin.
 
     Raises:
@@ -136,7 +144,7 @@ class Box(Shape):
 
 
 @dataclass(frozen=True)
-class Sphere(Shape):
+class Sphere(_Primitive):
     """A ball of ``radius`` [m].
 
     Raises:
@@ -174,7 +182,7 @@ class Sphere(Shape):
 
 
 @dataclass(frozen=True)
-class Capsule(Shape):
+class Capsule(_Primitive):
     """A cylinder along z with half balls on both ends: ``length`` [m] is without the caps.
 
     Raises:
@@ -234,7 +242,7 @@ class Capsule(Shape):
 
 
 @dataclass(frozen=True)
-class Cylinder(Shape):
+class Cylinder(_Primitive):
     """A cylinder of ``radius`` and full ``length`` [m] along z.
 
     Raises:
@@ -282,7 +290,7 @@ class Cylinder(Shape):
 
 
 @dataclass(frozen=True)
-class Ellipsoid(Shape):
+class Ellipsoid(_Primitive):
     """An ellipsoid of the three half axes ``radii`` [m] along x, y, z.
 
     Raises:

@@ -36,6 +36,8 @@ class Conductors:
 
     def lanes(self, n_terminals: int) -> tuple[NDArray[np.int64], Array]:
         """Lane of each conductor (−1: at ground) and capacitance to ground of each lane [F]."""
+        if np.isinf(self._ties).all():
+            return np.full(max(1, len(self._ties)), -1, dtype=np.int64), np.zeros(0)
         roots = [self._root(c) for c in range(len(self._ties))]
         total = np.zeros(len(self._ties))
         for c, root in enumerate(roots):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense.solve.pcg_kernels import add_products
-from capsense.solve.simd import load, madd, narrow, splat, store, vmadd, widen
+from capsense.solve.pcg_kernels import add_products, solve
+from capsense.solve.simd import LANES, load, madd, narrow, splat, store, vmadd, widen
 
 _ZERO = np.float32(0.0)
 
@@ -21,11 +21,12 @@ def carry_over(changed, active, phi, u):
 
 
 @kernel
-def load_scene(phi, floating_lane, first, n_held, ties, energies, r, value, drop, energy):
+def load_scene(phi, lanes, first, n_held, ties, energies, r, value, drop, energy):
     """Fill one block's right-hand sides, and each tie's and energy term's value per lane.
 
-    Lane k is that of terminal ``first + k`` for the first ``n_held`` lanes. ``floating_lane[c]`` is
-    the lane of conductor c in this block, or −1. Adds each lane's own energy to ``energy`` (1, 8).
+    The block's lanes are those from number ``first`` on; the first ``n_held`` of them are
+    terminals. ``lanes[c]`` is the number of conductor c's lane, or −1. Adds each lane's own energy
+    to ``energy`` (1, 8).
     """
     none = splat(0.0)
     every = load(energy, 0)
@@ -40,9 +41,8 @@ def load_scene(phi, floating_lane, first, n_held, ties, energies, r, value, drop
         store(value, i, v)
         if first <= tie.end < first + n_held:
             value[i, tie.end - first] += tie.end_coef
-        lane = floating_lane[tie.conductor]
-        if lane >= 0:
-            value[i, lane] = -1.0
+        if first <= lanes[tie.conductor] < first + LANES:
+            value[i, lanes[tie.conductor] - first] = -1.0
         v = load(value, i)
         if tie.node >= 0:
             store(r, tie.node, narrow(madd(-tie.weight, v, widen(load(r, tie.node)))))
@@ -104,3 +104,45 @@ def add_energies(ties, energies, value, drop, other_value, other_drop, u, out):
     store(out, 5, s5)
     store(out, 6, s6)
     store(out, 7, s7)
+
+
+@kernel
+def solve_block(
+    op,
+    vectors,
+    phi,
+    lanes,
+    first,
+    n_held,
+    ties,
+    energies,
+    value,
+    drop,
+    tolerance,
+    relative,
+    max_iterations,
+    wanted,
+    left,
+    sums,
+    factors,
+    own,
+    energy,
+):
+    """Solve for the lanes of one block, and add their energies to ``energy`` (8, 8).
+
+    Iterates until the energy that is missing is below ``tolerance`` or ``relative`` times the
+    lane's own, of which ``own`` (1, 8) holds what ties and changed links do not. Writes what was
+    ``wanted`` and what is ``left`` (8,). Returns the iterations.
+    """
+    load_scene(phi, lanes, first, n_held, ties, energies, vectors.r, value, drop, own)
+    for k in range(LANES):
+        wanted[k] = max(tolerance, relative * max(0.2 * abs(own[0, k]), 1e-9))
+    done = solve(op, vectors, wanted, max_iterations, left, sums, factors, energy)
+    for k in range(LANES):
+        for m in range(LANES):
+            energy[k, m] = -energy[k, m]
+    add_energies(ties, energies, value, drop, value, drop, vectors.u, energy)
+    for k in range(LANES):
+        for m in range(k):
+            energy[k, m] = energy[m, k] = 0.5 * (energy[k, m] + energy[m, k])
+    return done

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
 from capsense.scene import Scene
+from capsense.solve import factor_kernels as factors
 from capsense.solve import load_kernels as loading
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
 from capsense.solve.column_kernels import MAX_STRETCHES, PART
 from capsense.solve.conductors import Conductors
-from capsense.solve.factor_kernels import factorise
 from capsense.solve.finding_kernels import UNIT
 from capsense.solve.packed import Workspace, pack_bodies, packed_lattice
 from capsense.solve.simd import LANES, aligned_zeros
@@ -165,7 +165,7 @@ class PerturbationSolver:
     def _prepare(self, work: Workspace, signature: tuple[object, ...], n_lanes: int) -> None:
         """Set up operator and preconditioner; carry the last solution over."""
         mesh, operator = self._mesh, work.operator
-        factorise(
+        factors.factorise(
             operator.weight, work.extra, mesh.unknown, mesh.storeys, mesh.ceiling, mesh.parent,
             operator.share, operator.diagonal, self._active, operator.inverse, work.changed,
         )  # fmt: skip
@@ -198,46 +198,32 @@ class PerturbationSolver:
         energy = np.zeros((count * LANES, count * LANES))
         rows, columns = self._mesh.pairs
         energy[rows, columns] = energy[columns, rows] = work.within
-        iterations, left, goal = 0, 0.0, self.tolerance
-        for block, base, u in zip(blocks, held, self._u, strict=False):
+        own = energy.diagonal().reshape(-1, 1, LANES).copy()
+        iterations, left, wanted = 0, np.zeros((count, LANES)), np.zeros((count, LANES))
+        for k, (block, base) in enumerate(zip(blocks, held, strict=True)):
             block.fit(len(ties), len(energies))
-            own = energy.diagonal()[base.place].reshape(1, LANES).copy()
-            local = np.where(
-                (lanes >= 0) & (lanes // LANES == base.first // LANES), lanes % LANES, -1
-            )
-            loading.load_scene(
-                base.phi, local, base.first, base.held, ties, energies, block.r, block.value,
-                block.drop, own,
+            part = np.zeros((LANES, LANES))
+            done = loading.solve_block(
+                work.operator, pcg.Vectors(self._u[k], block.r, block.z, block.p), base.phi, lanes,
+                base.first, base.held, ties, energies, block.value, block.drop,
+                self.tolerance / UNIT, self.relative_tolerance, self.max_iterations, wanted[k],
+                left[k], work.sums, work.factors, own[k], part,
             )  # fmt: skip
-            wanted = np.maximum(
-                self.tolerance / UNIT,
-                self.relative_tolerance * np.maximum(0.2 * np.abs(own[0]), 1e-9),
-            )
-            rest, part = np.zeros(LANES), np.zeros((LANES, LANES))
-            done = pcg.solve(
-                work.operator, pcg.Vectors(u, block.r, block.z, block.p), wanted,
-                self.max_iterations, rest, work.sums, work.factors, part,
-            )  # fmt: skip
-            energy[base.place, base.place] -= 0.5 * (part + part.T)
+            energy[base.place, base.place] += part
             iterations = max(iterations, done)
-            left, goal = max(left, rest.max() * UNIT), max(goal, wanted.max() * UNIT)
         for i, first in enumerate(blocks):
-            for j, second in enumerate(blocks[i:], start=i):
+            for j, second in enumerate(blocks[i + 1 :], start=i + 1):
                 part = np.zeros((LANES, LANES))
-                if i < j:
-                    pcg.inner(work.operator, self._u[i], second.r, part)
-                    part = -part
+                pcg.inner(work.operator, self._u[i], second.r, part)
+                part = -part
                 loading.add_energies(
                     ties, energies, first.value, first.drop, second.value, second.drop, self._u[j],
                     part,
                 )  # fmt: skip
-                here, there = held[i].place, held[j].place
-                if i < j:
-                    energy[here, there] += part
-                    energy[there, here] += part.T
-                else:
-                    energy[here, here] += 0.5 * (part + part.T)
-        return energy * UNIT, iterations, left, goal
+                energy[held[i].place, held[j].place] += part
+                energy[held[j].place, held[i].place] += part.T
+        goal = max(self.tolerance, float(wanted.max()) * UNIT)
+        return energy * UNIT, iterations, float(left.max()) * UNIT, goal
 
 
 def _reduce(energy: Array, n: int, grounds: Array) -> Array:
