@@ -65,7 +65,8 @@ def on_mesh(scale: float, folder: Path, names: tuple[str, ...]) -> Makers:
     mesh = conforming_mesh(scale, folder)
     system = p1_system(mesh)
     known: Makers = {
-        "paper": lambda: PaperScheme(mesh),
+        "paper": lambda: PaperScheme(mesh, warm_start=False),
+        "paper, warm": lambda: PaperScheme(mesh, warm_start=True),
         "pardiso": lambda: Pardiso(system),
         "cholmod": lambda: Cholmod(system),
         "jacobi": lambda: JacobiCg(system),
@@ -81,15 +82,19 @@ def on_mesh(scale: float, folder: Path, names: tuple[str, ...]) -> Makers:
 def groups(folder: Path) -> dict[str, Callable[[], Makers]]:
     """What is measured together, by name; meshes are made when a group's turn comes."""
     everyone = (
-        "paper", "pardiso", "cholmod", "jacobi", "plain cg", "amg", "amg rebuilt", "skfem",
-        "ngsolve",
+        "paper", "paper, warm", "pardiso", "cholmod", "jacobi", "plain cg", "amg", "amg rebuilt",
+        "skfem", "ngsolve",
     )  # fmt: skip
     return {
         "30k": lambda: {
             "capsense": lambda: CapSense(0.65), **on_mesh(SCALES["30k"], folder, everyone)
         },
         "100k": lambda: {"capsense": CapSense, **on_mesh(SCALES["100k"], folder, everyone)},
-        "same planes": lambda: {"capsense": CapSense, "paper": PaperOnLattice},
+        "same planes": lambda: {
+            "capsense": CapSense,
+            "paper": lambda: PaperOnLattice(warm_start=False),
+            "paper, warm": lambda: PaperOnLattice(warm_start=True),
+        },
         "P2, 10k": lambda: {
             "pardiso": lambda: Pardiso(p2_system(conforming_mesh(2.4, folder))),
         },

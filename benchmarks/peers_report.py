@@ -23,7 +23,7 @@ def rows(results: dict[str, Any], group: str) -> dict[str, Row]:
 
 def is_peer(row: Row) -> bool:
     """An off-the-shelf solver."""
-    return row["label"] not in ("capsense", "paper")
+    return row["label"] not in ("capsense", "paper", "paper, warm")
 
 
 def report(results: dict[str, Any]) -> str:
@@ -69,6 +69,7 @@ def _time_to_good(results: dict[str, Any]) -> list[str]:
 STYLES = {
     "CapSense": ("o", "#D55E00"),
     "the paper's scheme": ("s", "black"),
+    "the paper's scheme, warm start": ("s", "0.6"),
     "SciPy Jacobi-CG": ("D", "#56B4E9"),
     "NGSolve": ("X", "#009E73"),
     "scikit-fem": ("P", "#CC79A7"),

@@ -160,6 +160,7 @@ class Simulator:
         n = len(self.design.electrodes)
         floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
         names = self.background.terminals
+        self._names = self.design.electrode_names
         self._electrodes = np.arange(n)
         self._floating = np.array([names.index(f) for f in floating], dtype=np.int64)
         self._shields = np.array(
@@ -173,7 +174,7 @@ class Simulator:
     @property
     def electrode_names(self) -> tuple[str, ...]:
         """Electrode names in matrix order."""
-        return self.design.electrode_names
+        return self._names
 
     def step(self, scene: Scene | DepthFrame) -> Reading:
         """Return the reading of a scene or of a depth camera's view, given in the sensor frame.
@@ -197,7 +198,7 @@ class Simulator:
         delta = change[:n, :n]
         stats = StepStats(iterations, error, goal, time.perf_counter() - start)
         return Reading(
-            self.baseline + delta, delta.copy(), stats, self.electrode_names,
+            self.baseline + delta, delta.copy(), stats, self._names,
             total[:n, n:].sum(axis=1),
         )  # fmt: skip
 
@@ -298,7 +299,7 @@ class Simulator:
 
 
 def _check_view(where: str, scene: object) -> None:
-    if not isinstance(scene, Scene | DepthFrame):
+    if not isinstance(scene, (Scene, DepthFrame)):
         raise SceneError(
             f"{where} a Scene or a DepthFrame, not {type(scene).__name__}; write Scene([...])"
         )

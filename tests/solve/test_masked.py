@@ -129,6 +129,16 @@ def test_warm_start_saves_iterations(mesh, bar):
     assert cold > 20
 
 
+def test_without_a_warm_start_every_step_is_the_first(mesh, bar):
+    """Invariant: same iterations and result, whatever was solved before."""
+    masked = MaskedSolver(mesh, STRIPES, warm_start=False)
+    first, iterations = masked.step(bar, [80.0]), masked.stats.iterations
+    masked.step(np.full(mesh.n_tets, -1), [])
+    np.testing.assert_allclose(masked.step(bar, [80.0]), first, rtol=1e-12)
+    assert abs(masked.stats.iterations - iterations) <= 1
+    np.testing.assert_allclose(first, MaskedSolver(mesh, STRIPES).step(bar, [80.0]), rtol=1e-7)
+
+
 def test_an_electrode_inside_a_conductor_keeps_its_potential(mesh):
     inside = np.where(box(mesh, (-0.06, -0.045, -0.01), (0.06, -0.015, 0.01)), 0, -1)
     got = MaskedSolver(mesh, STRIPES).step(inside, [GROUNDED])

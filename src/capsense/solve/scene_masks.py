@@ -21,13 +21,20 @@ class MaskedScenes:
     """Masks the Kuhn tetrahedra of the online lattice with a scene's bodies and solves in full.
 
     Floating conductors are met by a large permittivity, as a scheme that knows only permittivity
-    must; impedances to ground cannot be represented and are refused.
+    must; impedances to ground cannot be represented and are refused. Each scene is solved from the
+    last one's potentials, or from zero.
     """
 
     FLOATING_EPS_R = 1e4
 
     def __init__(
-        self, design: Design, background: BackgroundField, settings: BuildSettings, frequency: float
+        self,
+        design: Design,
+        background: BackgroundField,
+        settings: BuildSettings,
+        frequency: float,
+        *,
+        warm_start: bool = True,
     ) -> None:
         self._frequency = frequency
         axes = plan_axes(design, settings.lattice)
@@ -51,8 +58,9 @@ class MaskedScenes:
             inside = (self._centroids > layer.lower) & (self._centroids < layer.upper)
             eps[inside.all(axis=1)] = layer.eps_r
         self._solver = MaskedSolver(
-            self._mesh, list(background.terminals), ("ground",), eps_background=eps
-        )
+            self._mesh, list(background.terminals), ("ground",), eps_background=eps,
+            warm_start=warm_start,
+        )  # fmt: skip
         empty = np.full(self._mesh.n_tets, -1, dtype=np.int64)
         self._empty = self._solver.step(empty, [])
 
