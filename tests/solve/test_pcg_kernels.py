@@ -9,7 +9,7 @@ from random_scenes import random_scene
 
 import capsense as cs
 from capsense.solve.packed import packed_lattice
-from capsense.solve.pcg_kernels import Operator, Vectors, apply_operator, backward, forward, start
+from capsense.solve.pcg_kernels import Operator, Vectors, backward, finish, forward, start
 from capsense.solve.simd import LANES, aligned_zeros
 
 Array = np.ndarray
@@ -96,46 +96,68 @@ def test_pivots_are_those_of_the_slow_factorisation(case):
 
 
 def test_start_takes_the_residual_and_preconditions_it(case):
-    """Differential: r − A u, and M⁻¹ of it, by :func:`backward` with and without a direction."""
+    """Differential: r − A u, the first direction M⁻¹ r, its image, and what both come to."""
     operator, on, a = case
-    vectors, (u, r, p) = filled(operator, on, np.random.default_rng(5))
-    rz = aligned_zeros((1, LANES), np.float64)
-    start(operator, vectors, rz)
+    vectors, (u, r, _) = filled(operator, on, np.random.default_rng(5))
+    rz, pap = aligned_zeros((1, LANES), np.float64), aligned_zeros((1, LANES), np.float64)
+    start(operator, vectors, rz, False)
     residual = r - a @ u
     assert_close(vectors.r[on], residual)
     z = preconditioned(a, pivots(operator, on, a), residual)
     assert_close(rz[0], (residual * z).sum(axis=0))
-    beta = np.linspace(-1, 2, LANES, dtype=np.float32)[None]
-    lower_solved = vectors.z.copy()
-    backward(operator, vectors, beta, False)
-    assert_close(vectors.p[on], z + beta * p)
-    vectors.z[:], vectors.p[:] = lower_solved, np.nan
-    backward(operator, vectors, beta, True)
+    vectors.p[on] = np.nan  # whatever was left there
+    backward(operator, vectors, *steps(), True, pap)
     assert_close(vectors.p[on], z)
+    assert_close(vectors.z[on], a @ z)
+    assert_close(pap[0], (z * (a @ z)).sum(axis=0))
+    assert_close(vectors.u[on], u)
+
+
+def test_a_fresh_start_takes_the_solution_for_zero(case):
+    """Differential: the same as with a solution of zeros."""
+    operator, on, _ = case
+    vectors, (_, r, _) = filled(operator, on, np.random.default_rng(7))
+    rz, same = aligned_zeros((1, LANES), np.float64), aligned_zeros((1, LANES), np.float64)
+    start(operator, vectors, rz, True)
+    assert_close(vectors.r[on], r)
+    fresh = vectors.z.copy()
+    vectors.u[:] = 0.0
+    start(operator, vectors, same, False)
+    np.testing.assert_array_equal(vectors.z, fresh)
+    np.testing.assert_array_equal(rz, same)
 
 
 def test_an_iteration_goes_on_along_its_direction(case):
-    """Differential: A p, p · A p, then u + α p, r − α A p, and r · M⁻¹ r."""
+    """Differential: r − α A p and its M⁻¹; u + α p, z + β p and its image; u and r at the end."""
     operator, on, a = case
     vectors, (u, r, p) = filled(operator, on, np.random.default_rng(6))
-    backward_of_nothing(operator, vectors)
-    pap, rz = aligned_zeros((1, LANES), np.float64), aligned_zeros((1, LANES), np.float64)
-    apply_operator(operator, vectors, pap)
-    image = a @ p
-    assert_close(vectors.z[on], image)
-    assert_close(pap[0], (p * image).sum(axis=0))
-    alpha = np.linspace(0.1, 0.8, LANES, dtype=np.float32)
-    forward(operator, vectors, np.stack([alpha, -alpha]), rz)
-    residual = r - alpha * image
-    assert_close(vectors.u[on], u + alpha * p)
+    alpha, beta = steps()
+    image = np.random.default_rng(9).normal(size=p.shape).astype(np.float32)
+    vectors.z[on] = image  # A p, as far as the sweep knows
+    rz, pap = aligned_zeros((1, LANES), np.float64), aligned_zeros((1, LANES), np.float64)
+    forward(operator, vectors, alpha, rz)
+    residual = r - alpha[0] * image
     assert_close(vectors.r[on], residual)
     z = preconditioned(a, pivots(operator, on, a), residual)
     assert_close(rz[0], (residual * z).sum(axis=0))
+    backward(operator, vectors, alpha, beta, False, pap)
+    direction = z + beta[0] * p
+    assert_close(vectors.u[on], u + alpha[0] * p)
+    assert_close(vectors.p[on], direction)
+    assert_close(vectors.z[on], a @ direction)
+    assert_close(pap[0], (direction * (a @ direction)).sum(axis=0))
+    out = np.ones((LANES, LANES))
+    finish(operator, vectors, alpha, out)
+    last, left = u + alpha[0] * (p + direction), residual - alpha[0] * (a @ direction)
+    assert_close(vectors.u[on], last)
+    assert_close(vectors.r[on], left)
+    assert_close(out, 1 + last.T @ left)
 
 
-def backward_of_nothing(operator: Operator, vectors: Vectors) -> None:
-    """Bring floors and ceilings of p up to date: z is zero, and p ← 0 + 1 p."""
-    backward(operator, vectors, np.ones((1, LANES), np.float32), False)
+def steps() -> tuple[Array, Array]:
+    """α and −α, and β, different in every lane."""
+    alpha = np.linspace(0.1, 0.8, LANES, dtype=np.float32)
+    return np.stack([alpha, -alpha]), np.linspace(-1, 2, LANES, dtype=np.float32)[None]
 
 
 def test_sensors_of_a_design_hand_their_working_space_on(simulators):

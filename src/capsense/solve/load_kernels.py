@@ -107,37 +107,20 @@ def add_energies(ties, energies, value, drop, other_value, other_drop, u, out):
 
 
 @kernel
-def solve_block(
-    op,
-    vectors,
-    phi,
-    lanes,
-    first,
-    n_held,
-    ties,
-    energies,
-    value,
-    drop,
-    tolerance,
-    relative,
-    max_iterations,
-    wanted,
-    left,
-    sums,
-    factors,
-    own,
-    energy,
-):
+def solve_block(op, vectors, fresh, phi, lanes, first, n_held, ties, energies, value, drop,
+                tolerance, relative, max_iterations, wanted, left, sums, factors, own,
+                energy):  # fmt: skip
     """Solve for the lanes of one block, and add their energies to ``energy`` (8, 8).
 
     Iterates until the energy that is missing is below ``tolerance`` or ``relative`` times the
     lane's own, of which ``own`` (1, 8) holds what ties and changed links do not. Writes what was
-    ``wanted`` and what is ``left`` (8,). Returns the iterations.
+    ``wanted`` and what is ``left`` (8,). Where ``fresh``, nothing was solved before. Returns the
+    iterations.
     """
     load_scene(phi, lanes, first, n_held, ties, energies, vectors.r, value, drop, own)
     for k in range(LANES):
         wanted[k] = max(tolerance, relative * max(0.2 * abs(own[0, k]), 1e-9))
-    done = solve(op, vectors, wanted, max_iterations, left, sums, factors, energy)
+    done = solve(op, vectors, fresh, wanted, max_iterations, left, sums, factors, energy)
     for k in range(LANES):
         for m in range(LANES):
             energy[k, m] = -energy[k, m]

@@ -66,7 +66,7 @@ class Workspace:
         n, pairs = mesh.stored.shape
         self.operator = Operator(
             aligned_zeros((3, n), np.float32), np.ones(n, np.float32), np.zeros(n, np.float32),
-            mesh.storeys, mesh.joints, mesh.ceiling, mesh.parent,
+            mesh.storeys, mesh.joints, mesh.ceiling, mesh.parent, np.unique(mesh.parent) - 1,
             np.zeros(len(mesh.ceiling), np.float32),
         )  # fmt: skip
         self.extra = np.zeros(n, np.float32)

@@ -40,6 +40,8 @@ class Operator(NamedTuple):
     """Ceiling node of each joint."""
     parent: Any
     """The node that each ceiling node stands for."""
+    floor: Any
+    """Floor nodes, each once."""
     share: Any
     """Part of each joint in the floor node's link, (joints,)."""
 
@@ -88,17 +90,19 @@ def _flow_in(wx, wy, wz, diagonal, sx, sy, p, a, below, here, above, add):
 
 
 @kernel
-def start(op, vectors, rz):
+def start(op, vectors, rz, fresh):
     """Turn right-hand sides into residuals, r ← r − A u, and solve the lower factor for z.
 
-    Writes r · M⁻¹ r per lane to ``rz`` (1, 8), M being the product of the incomplete factors.
+    Where ``fresh``, u is zero. Writes r · M⁻¹ r per lane to ``rz`` (1, 8), M being the product of
+    the incomplete factors.
     """
     wx, wy, wz, inverse = op.weight[0], op.weight[1], op.weight[2], op.inverse
     u, r, z = vectors.u, vectors.r, vectors.z
     zero = splat(_ZERO)
     every = splat(0.0)
-    lift(op, 0, op.ceiling.shape[0], u)
-    lower(op, 0, op.ceiling.shape[0], u)
+    if not fresh:
+        lift(op, 0, op.ceiling.shape[0], u)
+        lower(op, 0, op.ceiling.shape[0], u)
     for s in range(op.storeys.shape[0]):
         first, nx, ny, nz = op.storeys[s]
         sx, sy = ny * nz, nz
@@ -108,14 +112,17 @@ def start(op, vectors, rz):
             total = zero
             for j in range(1, ny - 1):
                 begin = first + i * sx + j * sy
-                below, here, last = load(u, begin), load(u, begin + 1), load(z, begin)
+                if not fresh:
+                    below, here = load(u, begin), load(u, begin + 1)
+                    for a in range(begin + 1, begin + nz - 1):
+                        above = load(u, a + 1)
+                        v = _flow_in(wx, wy, wz, op.diagonal, sx, sy, u, a, below, here, above,
+                                     load(r, a))  # fmt: skip
+                        store(r, a, v)
+                        below, here = here, above
+                last = load(z, begin)
                 for a in range(begin + 1, begin + nz - 1):
-                    above = load(u, a + 1)
-                    v = _flow_in(wx, wy, wz, op.diagonal, sx, sy, u, a, below, here, above,
-                                 load(r, a))  # fmt: skip
-                    store(r, a, v)
-                    below, here = here, above
-                    v = madd(at(wy, a - sy), load(z, a - sy), v)
+                    v = madd(at(wy, a - sy), load(z, a - sy), load(r, a))
                     v = madd(at(wx, a - sx), load(z, a - sx), v)
                     own = madd(at(inverse, a), v, zero)
                     v = madd(at(wz, a - 1), last, v)
@@ -128,16 +135,16 @@ def start(op, vectors, rz):
 
 @kernel
 def forward(op, vectors, alpha, rz):
-    """Go on along the direction, u ← u + alpha p and r ← r − alpha A p, and solve for z.
+    """Go on along the direction, r ← r − alpha A p, and solve the lower factor for z.
 
-    ``alpha`` has shape (2, 8): alpha and −alpha; A p lies in z, which it leaves for the solution of
-    the lower factor. Writes r · M⁻¹ r per lane to ``rz`` (1, 8).
+    ``alpha`` has shape (2, 8): alpha and −alpha; A p lies in z, which it leaves for the solution.
+    Writes r · M⁻¹ r per lane to ``rz`` (1, 8).
     """
     wx, wy, wz, inverse = op.weight[0], op.weight[1], op.weight[2], op.inverse
-    u, r, z, p = vectors.u, vectors.r, vectors.z, vectors.p
+    r, z = vectors.r, vectors.z
     zero = splat(_ZERO)
     every = splat(0.0)
-    on, back = load(alpha, 0), load(alpha, 1)
+    back = load(alpha, 1)
     for s in range(op.storeys.shape[0]):
         first, nx, ny, nz = op.storeys[s]
         sx, sy = ny * nz, nz
@@ -149,7 +156,6 @@ def forward(op, vectors, alpha, rz):
                 begin = first + i * sx + j * sy
                 last = load(z, begin)
                 for a in range(begin + 1, begin + nz - 1):
-                    store(u, a, vmadd(on, load(p, a), load(u, a)))
                     v = vmadd(back, load(z, a), load(r, a))
                     store(r, a, v)
                     # what waits for the node below comes last
@@ -165,16 +171,27 @@ def forward(op, vectors, alpha, rz):
 
 
 @kernel
-def backward(op, vectors, beta, fresh):
-    """Solve the upper factor in place, in z, and set p ← z + beta p, or p ← z where ``fresh``."""
+def backward(op, vectors, alpha, beta, fresh, pap):
+    """Solve the upper factor, take a new direction, and write its image to z.
+
+    With the solution z: u ← u + alpha p and p ← z + beta p, or p ← z alone where ``fresh``; then
+    z ← A p, and p · A p per lane to ``pap`` (1, 8). The image of a plane is taken as soon as its
+    neighbours have their direction, while all three are in the nearest cache. What comes to it
+    from floor nodes, which know their direction last, is added at the end.
+    """
     wx, wy, wz, inverse = op.weight[0], op.weight[1], op.weight[2], op.inverse
-    z, p = vectors.z, vectors.p
+    u, z, p = vectors.u, vectors.z, vectors.p
     zero = splat(_ZERO)
-    b = load(beta, 0)
+    every = splat(0.0)
+    on, b = load(alpha, 0), load(beta, 0)
+    for j in range(op.floor.shape[0]):
+        store(p, op.floor[j], zero)
     for s in range(op.storeys.shape[0] - 1, -1, -1):
         first, nx, ny, nz = op.storeys[s]
         sx, sy = ny * nz, nz
-        lower(op, op.joints[s], op.joints[s + 1], z)
+        lower(op, op.joints[s], op.joints[s + 1], p)
+        for j in range(op.joints[s], op.joints[s + 1]):
+            store(z, op.ceiling[j], load(z, op.parent[j] - 1))
         for i in range(nx - 2, 0, -1):
             for j in range(ny - 2, 0, -1):
                 begin = first + i * sx + j * sy
@@ -185,38 +202,45 @@ def backward(op, vectors, beta, fresh):
                     own = madd(at(inverse, a), v, load(z, a))
                     last = madd(at(inverse, a) * at(wz, a), last, own)
                     store(z, a, last)
-                    store(p, a, last if fresh else vmadd(b, load(p, a), last))
+                    if fresh:
+                        store(p, a, last)
+                    else:
+                        old = load(p, a)
+                        store(u, a, vmadd(on, old, load(u, a)))
+                        store(p, a, vmadd(b, old, last))
+                if s > 0:  # for the storey below, when the image has taken its place
+                    store(z, begin, last)
+            if i < nx - 2:
+                every = madd(1.0, widen(_image(op, vectors, first, ny, nz, i + 1)), every)
+        every = madd(1.0, widen(_image(op, vectors, first, ny, nz, 1)), every)
     lift(op, 0, op.ceiling.shape[0], p)
-    lower(op, 0, op.ceiling.shape[0], p)
+    for j in range(op.floor.shape[0]):
+        a = op.floor[j]
+        missing = madd(-at(wz, a), load(p, a), zero)
+        store(z, a + 1, vmadd(missing, splat(np.float32(1.0)), load(z, a + 1)))
+        every = madd(1.0, widen(vmadd(missing, load(p, a + 1), zero)), every)
+    store(pap, 0, every)
 
 
 @kernel
-def apply_operator(op, vectors, pap):
-    """Write the operator times p to z, and p · A p per lane to ``pap`` (1, 8).
-
-    Floor and ceiling nodes of p must be up to date.
-    """
-    wx, wy, wz = op.weight[0], op.weight[1], op.weight[2]
+def _image(op, vectors, first, ny, nz, i):
+    """Write the operator times p to z in plane i of a storey; returns p · A p per lane."""
+    wx, wy, wz, diagonal = op.weight[0], op.weight[1], op.weight[2], op.diagonal
     z, p = vectors.z, vectors.p
     zero = splat(_ZERO)
-    every = splat(0.0)
-    for s in range(op.storeys.shape[0]):
-        first, nx, ny, nz = op.storeys[s]
-        sx, sy = ny * nz, nz
-        for i in range(1, nx - 1):
-            total = zero
-            for j in range(1, ny - 1):
-                begin = first + i * sx + j * sy
-                below, here = load(p, begin), load(p, begin + 1)
-                for a in range(begin + 1, begin + nz - 1):
-                    above = load(p, a + 1)
-                    v = _flow_in(wx, wy, wz, op.diagonal, sx, sy, p, a, below, here, above, zero)
-                    v = madd(np.float32(-1.0), v, zero)
-                    store(z, a, v)
-                    total = vmadd(here, v, total)
-                    below, here = here, above
-            every = madd(1.0, widen(total), every)
-    store(pap, 0, every)
+    total = zero
+    sx, sy = ny * nz, nz
+    for j in range(1, ny - 1):
+        begin = first + i * sx + j * sy
+        below, here = load(p, begin), load(p, begin + 1)
+        for a in range(begin + 1, begin + nz - 1):
+            above = load(p, a + 1)
+            v = _flow_in(wx, wy, wz, diagonal, sx, sy, p, a, below, here, above, zero)
+            v = madd(np.float32(-1.0), v, zero)
+            store(z, a, v)
+            total = vmadd(here, v, total)
+            below, here = here, above
+    return total
 
 
 @kernel
@@ -248,7 +272,7 @@ def _flush(sums, out):
 
 @kernel
 def finish(op, vectors, alpha, out):
-    """Go on along the direction as :func:`forward` does, and add uᵀ r to ``out`` (8, 8)."""
+    """Go on along the direction, u ← u + alpha p and r ← r − alpha A p; add uᵀ r to ``out``."""
     u, r, z, p = vectors.u, vectors.r, vectors.z, vectors.p
     zero = splat(_ZERO)
     on, back = load(alpha, 0), load(alpha, 1)
@@ -282,24 +306,24 @@ def inner(op, left, right, out):
 
 
 @kernel
-def solve(op, vectors, tolerance, max_iterations, left, sums, factors, out):
+def solve(op, vectors, fresh, tolerance, max_iterations, left, sums, factors, out):
     """Iterate until the energy still missing is below ``tolerance`` in every lane.
 
     Each iteration lowers the energy of a lane by α (r · z) exactly (Hestenes and Stiefel 1952).
-    What is still missing is estimated from the last decrements and their ratio. ``tolerance`` and
+    What is still missing is estimated from the last decrements and their ratio. Where ``fresh``,
+    the solution is zero before. ``tolerance`` and
     ``left`` (output) are per lane, in the units of the energy. ``sums`` (4, 8) in double and
     ``factors`` (3, 8) in single precision are room to work in. Adds uᵀ r to ``out`` (8, 8) and
     returns the iterations done, one at least.
     """
     rz, pap, old, previous = sums[0:1], sums[1:2], sums[2], sums[3]
     alpha, beta = factors[0:2], factors[2:3]
-    start(op, vectors, rz)
+    start(op, vectors, rz, fresh)
     iteration = 0
     while True:
         for k in range(LANES):
             beta[0, k] = 0.0 if iteration == 0 or old[k] <= 0.0 else rz[0, k] / old[k]
-        backward(op, vectors, beta, iteration == 0)
-        apply_operator(op, vectors, pap)
+        backward(op, vectors, alpha, beta, iteration == 0, pap)
         done = True
         for k in range(LANES):
             step = rz[0, k] / pap[0, k] if pap[0, k] > 0.0 else 0.0

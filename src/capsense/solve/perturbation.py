@@ -100,8 +100,8 @@ class PerturbationSolver:
             ties, energies, couples = self._trace(work, scene, conductors)
             lanes, grounds = conductors.lanes(n_terminals)
             n_lanes = n_terminals + len(grounds)
-            self._prepare(work, (len(scene), *lanes.tolist()), n_lanes)
-            energy, iterations, left, goal = self._solve_blocks(work, ties, energies, lanes)
+            fresh = self._prepare(work, (len(scene), *lanes.tolist()), n_lanes)
+            energy, iterations, left, goal = self._solve_blocks(work, fresh, ties, energies, lanes)
             energy = energy[:n_lanes, :n_lanes]
             conductors.add_couplings(energy, couples, lanes)
             delta = _reduce(energy, n_terminals, grounds)
@@ -162,8 +162,11 @@ class PerturbationSolver:
                 )
             work.fit(2 * len(work.ties))
 
-    def _prepare(self, work: Workspace, signature: tuple[object, ...], n_lanes: int) -> None:
-        """Set up operator and preconditioner; carry the last solution over."""
+    def _prepare(self, work: Workspace, signature: tuple[object, ...], n_lanes: int) -> bool:
+        """Set up operator and preconditioner; carry the last solution over, if there is one.
+
+        Returns whether there is none.
+        """
         mesh, operator = self._mesh, work.operator
         factors.factorise(
             operator.weight, work.extra, mesh.unknown, mesh.storeys, mesh.ceiling, mesh.parent,
@@ -172,10 +175,11 @@ class PerturbationSolver:
         if signature != self._lanes:
             self._assign_lanes(n_lanes)
             self._lanes = signature
-        if not self._rested:
+        fresh, self._rested = self._rested, False
+        if not fresh:
             for lanes, u in zip(mesh.lanes(self._n_blocks), self._u, strict=False):
                 loading.carry_over(work.changed, self._active, lanes.phi, u)
-        self._rested = False
+        return fresh
 
     def _assign_lanes(self, n_lanes: int) -> None:
         """Have as many blocks as needed; the lanes of terminals keep their solution."""
@@ -188,6 +192,7 @@ class PerturbationSolver:
     def _solve_blocks(
         self,
         work: Workspace,
+        fresh: bool,
         ties: NDArray[np.void],
         energies: NDArray[np.void],
         lanes: NDArray[np.int64],
@@ -204,8 +209,8 @@ class PerturbationSolver:
             block.fit(len(ties), len(energies))
             part = np.zeros((LANES, LANES))
             done = loading.solve_block(
-                work.operator, pcg.Vectors(self._u[k], block.r, block.z, block.p), base.phi, lanes,
-                base.first, base.held, ties, energies, block.value, block.drop,
+                work.operator, pcg.Vectors(self._u[k], block.r, block.z, block.p), fresh, base.phi,
+                lanes, base.first, base.held, ties, energies, block.value, block.drop,
                 self.tolerance / UNIT, self.relative_tolerance, self.max_iterations, wanted[k],
                 left[k], work.sums, work.factors, own[k], part,
             )  # fmt: skip
