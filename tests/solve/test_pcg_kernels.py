@@ -177,21 +177,26 @@ def test_sensors_of_a_design_hand_their_working_space_on(simulators):
     assert len(spare) == before
 
 
-def test_a_step_that_fails_keeps_its_working_space_from_others(simulators, monkeypatch):
-    """What a failed step has left in it is not used again."""
+@pytest.mark.parametrize("stage", ["_prepare", "_solve_blocks", "_trace"])
+def test_a_step_that_is_cut_off_leaves_nothing_behind(simulators, monkeypatch, stage):
+    """Its working space is not used again, and the next step starts from rest."""
     sim = simulators("three_stripes", settings=COARSE)
-    scene = cs.Scene([cs.Body(cs.Sphere(0.02), cs.Pose((0, 0, 0.05)))])
-    expected = sim.step(scene).delta
+    ball = cs.Body(cs.Sphere(0.02))
+    here, there = (cs.Scene([ball.moved(cs.Pose((0, y, 0.05)))]) for y in (-0.02, 0.02))
+    expected = sim.step(here).delta
     sim.reset()
+    sim.step(here)
     spare = packed_lattice(sim.background).spare
     before = len(spare)
+    work = getattr(sim._solver, stage)
 
-    def fail(*_: object) -> None:
+    def cut_off(*arguments: object) -> None:
+        work(*arguments)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(sim._solver, "_prepare", fail)
+        patch.setattr(sim._solver, stage, cut_off)
         with pytest.raises(KeyboardInterrupt):
-            sim.step(scene)
+            sim.step(there)
     assert len(spare) == before - 1
-    np.testing.assert_array_equal(sim.step(scene).delta, expected)
+    np.testing.assert_array_equal(sim.step(here).delta, expected)

@@ -95,19 +95,11 @@ class PerturbationSolver:
         if len(scene) == 0:
             self.reset()
             return Perturbation(np.zeros((n_terminals, n_terminals)), 0, 0.0, self.tolerance)
-        conductors = Conductors(scene, self.frequency)
-        with self._mesh.workspace() as work:
-            ties, energies, couples = self._trace(work, scene, conductors)
-            lanes, grounds = conductors.lanes(n_terminals)
-            n_lanes = n_terminals + len(grounds)
-            fresh = self._prepare(work, (len(scene), *lanes.tolist()), n_lanes)
-            energy, iterations, left, goal = self._solve_blocks(work, fresh, ties, energies, lanes)
-            energy = energy[:n_lanes, :n_lanes]
-            conductors.add_couplings(energy, couples, lanes)
-            delta = _reduce(energy, n_terminals, grounds)
-            if not np.isfinite(delta).all():
-                self.reset()  # nothing of it, nor of the workspace, must reach the next step
-                raise SolveError("a step gave a capacitance that is not finite")
+        try:
+            delta, iterations, left, goal = self._solve_scene(scene)
+        except BaseException:
+            self.reset()  # half a solution must not reach the next step
+            raise
         if iterations >= self.max_iterations and left > goal:
             raise SolveError(
                 f"no convergence in {iterations} iterations: estimated error {left:.2e} F, "
@@ -133,6 +125,23 @@ class PerturbationSolver:
         return out
 
     # -- the stages ---------------------------------------------------------------------------
+
+    def _solve_scene(self, scene: Scene) -> tuple[Array, int, float, float]:
+        """Change of the matrix [F], iterations, error left and asked for [F]."""
+        n_terminals = self._n_terminals
+        conductors = Conductors(scene, self.frequency)
+        with self._mesh.workspace() as work:
+            ties, energies, couples = self._trace(work, scene, conductors)
+            lanes, grounds = conductors.lanes(n_terminals)
+            n_lanes = n_terminals + len(grounds)
+            fresh = self._prepare(work, (len(scene), *lanes.tolist()), n_lanes)
+            energy, iterations, left, goal = self._solve_blocks(work, fresh, ties, energies, lanes)
+            energy = energy[:n_lanes, :n_lanes]
+            conductors.add_couplings(energy, couples, lanes)
+            delta = _reduce(energy, n_terminals, grounds)
+            if not np.isfinite(delta).all():
+                raise SolveError("a step gave a capacitance that is not finite")
+        return delta, iterations, left, goal
 
     def _trace(
         self, work: Workspace, scene: Scene, conductors: Conductors
