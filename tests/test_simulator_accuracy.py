@@ -112,10 +112,19 @@ def _capsule_errors() -> dict:
     return capsule_figures()["cases"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", [c for c in figures()["six_patch_midcube"] if c != "none"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(c, marks=[] if c == "sphere_diel_80.0" else pytest.mark.slow)
+        for c in figures()["six_patch_midcube"]
+        if c != "none"
+    ],
+)
 def test_patches_far_from_the_floor(simulators, case):
-    """Measured: the same patches and plate in the middle of the box."""
+    """Measured: the same patches and plate in the middle of the box.
+
+    Lines of its lattice graze the ball, whose rim once counted as a sheet.
+    """
     design = cs.load_design("six_patch")
     middle = dataclasses.replace(design, domain=Domain((0.5, 0.5, 0.5), 0.25))
     bounds = (0.03, 0.05) if case.startswith("bar") else (0.05, 0.05)

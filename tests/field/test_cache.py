@@ -356,6 +356,7 @@ def test_a_killed_builder_frees_the_lock_and_leaves_its_work(
     log = tmp_path / "log"
     builder = _start(tmp_path, log, 0.3)
     _wait_for(log, f"{builder.pid} {NODES}", 4)
+    builder.send_signal(signal.SIGSTOP)  # on a busy machine it would end before the other begins
     waiter = _start(tmp_path, log, 0.0)
     _wait_for(log, f"{waiter.pid} waiting for another process")
     builder.send_signal(signal.SIGKILL)

@@ -164,6 +164,18 @@ def test_bounds_volume_and_surface_mesh(shape):
     assert np.abs(shape.signed_distance(mesh.vertices)).max() < 1e-9
 
 
+@shapes
+def test_breadth_is_that_of_the_largest_ball_inside(shape):
+    """Differential: twice the greatest depth of a primitive; a mesh may own to a little less."""
+    axes = [np.linspace(-t, t, 41) for t in shape.bounds()[1]]
+    points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    deepest = -shape.signed_distance(points).min()
+    assert shape.breadth == pytest.approx(2 * deepest, rel=1e-9)
+    mesh = shape.to_trimesh()
+    copied = TriMesh(mesh.vertices, mesh.faces, cell=0.002)
+    assert shape.breadth - 0.006 <= copied.breadth <= shape.breadth
+
+
 @pytest.mark.parametrize("scale", [1e-3, 0.1, 1.5])
 def test_surface_meshes_of_any_size_are_closed(scale):
     """Small ones too: every kind, as a solid of triangles of the same volume."""

@@ -87,6 +87,11 @@ class TriMesh(Shape):
         return half
 
     @cached_property
+    def breadth(self) -> float:
+        deepest = -float(self.grid.values.min())
+        return max(0.0, 2.0 * (deepest - self.cell))  # deep inside, distances may be too large
+
+    @cached_property
     def volume(self) -> float:
         return enclosed_volume(self.vertices, self.faces)
 

@@ -50,10 +50,15 @@ class Shape(ABC):
     def params(self) -> Array:
         """Sizes [m] as the kernels take them, see :class:`ShapeKind`, shape (3,), read-only."""
 
+    @property
+    def breadth(self) -> float:
+        """Diameter of the largest ball inside [m], or less where it is not known."""
+        return 0.0
+
     @cached_property
     def packed(self) -> tuple[float, ...]:
-        """``params`` and the centre of the local bounding box [m], six numbers."""
-        return (*self.params.tolist(), *self.bounds().mean(axis=0).tolist())
+        """``params``, the centre of the local bounding box and ``breadth`` [m], seven numbers."""
+        return (*self.params.tolist(), *self.bounds().mean(axis=0).tolist(), self.breadth)
 
     @property
     @abstractmethod

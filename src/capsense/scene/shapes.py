@@ -100,7 +100,7 @@ class _Primitive(Shape):
 
     @cached_property
     def packed(self) -> tuple[float, ...]:
-        return (*self.params.tolist(), 0.0, 0.0, 0.0)
+        return (*self.params.tolist(), 0.0, 0.0, 0.0, self.breadth)
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,10 @@ class Box(_Primitive):
     @cached_property
     def params(self) -> Array:
         return _frozen(*(0.5 * s for s in self.size))
+
+    @property
+    def breadth(self) -> float:
+        return min(self.size)
 
     @property
     def volume(self) -> float:
@@ -163,6 +167,10 @@ class Sphere(_Primitive):
         return _frozen(self.radius, 0.0, 0.0)
 
     @property
+    def breadth(self) -> float:
+        return 2.0 * self.radius
+
+    @property
     def volume(self) -> float:
         return 4 / 3 * math.pi * self.radius**3
 
@@ -201,6 +209,10 @@ class Capsule(_Primitive):
     @cached_property
     def params(self) -> Array:
         return _frozen(self.radius, 0.5 * self.length, 0.0)
+
+    @property
+    def breadth(self) -> float:
+        return 2.0 * self.radius
 
     @property
     def volume(self) -> float:
@@ -263,6 +275,10 @@ class Cylinder(_Primitive):
         return _frozen(self.radius, 0.5 * self.length, 0.0)
 
     @property
+    def breadth(self) -> float:
+        return min(2.0 * self.radius, self.length)
+
+    @property
     def volume(self) -> float:
         return math.pi * self.radius**2 * self.length
 
@@ -307,6 +323,10 @@ class Ellipsoid(_Primitive):
     @cached_property
     def params(self) -> Array:
         return _frozen(*self.radii)
+
+    @property
+    def breadth(self) -> float:
+        return 2.0 * min(self.radii)
 
     @property
     def volume(self) -> float:

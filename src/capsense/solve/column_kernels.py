@@ -42,6 +42,7 @@ BODY = np.dtype(
         ("bounds", np.float64, (2, 3)),
         ("conductor", np.int64),
         ("eps_r", np.float64),
+        ("breadth", np.float64),
         ("grid_first", np.int64),
         ("grid_shape", np.int64, (3,)),
         ("grid_origin", np.float64, (3,)),

@@ -197,7 +197,7 @@ def pack_bodies(scene: Scene, conductors: Conductors) -> tuple[NDArray[np.void],
     for name, values in (
         ("kind", packed.kinds), ("params", packed.params), ("rotation", packed.rotation),
         ("position", packed.position), ("bounds", packed.bounds),
-        ("conductor", conductors.index), ("eps_r", conductors.eps_r),
+        ("conductor", conductors.index), ("eps_r", conductors.eps_r), ("breadth", packed.breadth),
     ):  # fmt: skip
         bodies[name] = values
     parts: list[Array32] = []

@@ -282,7 +282,8 @@ class _Problem:
             eps = self.scene[s.body].material.at(self.frequency).eps_r
             kappa = eps / self.background.lattice.eps_r[axis, link.nodes[0]]
             middle = (0.5 * (a + b) - link.starts) / length
-            out.add((b - a) / length, middle, float(kappa), (s.end - s.start) / length)
+            thick = max(s.end - s.start, self.scene[s.body].shape.breadth)
+            out.add((b - a) / length, middle, float(kappa), thick / length)
         return out
 
     def mix_matter(self) -> None:

@@ -36,7 +36,11 @@ class Matter:
     """Fraction filled by thin sheets."""
 
     def add(self, fill: float, middle: float, kappa: float, thick: float) -> None:
-        """Add a stretch at ``middle`` of a body as ``thick`` there, in lengths of the link."""
+        """Add a stretch at ``middle`` of a body as ``thick`` there, in lengths of the link.
+
+        A body is as thick as the line's stretch inside it, and nowhere less than the largest ball
+        that it holds: where a ball ends, it is no sheet.
+        """
         part = fill * np.array([1.0 - middle, middle])
         self.fill += part
         self.gain += part * (kappa - 1.0)

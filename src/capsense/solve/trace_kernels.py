@@ -327,11 +327,12 @@ def _lay_link(axis, a, b, link, part, c, m, lowest, highest, share, seg, n, r0, 
                 last_deep = r1[k] > pb + _SNAP * length
                 resist = 0.0
             else:
-                kappa = bodies[rwho[k]].eps_r / link.eps_r
+                body = bodies[rwho[k]]
+                kappa = body.eps_r / link.eps_r
                 resist += (s1 - s0) / length / kappa
                 filled = (s1 - s0) / length
                 add_matter(own, filled, (0.5 * (s0 + s1) - pa) / length, kappa,
-                           thinness(r1[k] - r0[k], length))  # fmt: skip
+                           thinness(max(r1[k] - r0[k], body.breadth), length))  # fmt: skip
             pos = s1
         k += 1
     if not met:
