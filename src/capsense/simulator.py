@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -156,7 +157,8 @@ class Simulator:
                 self.background, tolerance=tolerance, relative_tolerance=relative_tolerance,
                 frequency=frequency,
             )  # fmt: skip
-        self._batch: list[Simulator] = []
+        self._batch: list[Simulator] = []  # a sensor for each thread
+        self._worlds: list[Simulator] = []  # a sensor for each scene that follows another
         n = len(self.design.electrodes)
         floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
         names = self.background.terminals
@@ -203,17 +205,26 @@ class Simulator:
         )  # fmt: skip
 
     def step_batch(
-        self, scenes: Sequence[Scene | DepthFrame], *, threads: int | None = None
+        self,
+        scenes: Sequence[Scene | DepthFrame],
+        *,
+        threads: int | None = None,
+        warm_start: bool = False,
     ) -> list[Reading]:
-        """Return the readings of scenes that have nothing to do with each other.
+        """Return the readings of many scenes, each solved on whichever thread is free.
 
-        Each is solved from rest, on whichever thread is free: a reading is that of
-        :meth:`reset` and :meth:`step`, to the last bit, whatever stands beside it in the batch and
-        however many threads there are. This sensor's own last step and count stay as they are.
+        Readings do not depend on the number of threads, nor on what stands beside them in the
+        batch. By default scenes have nothing to do with each other: a reading is that of
+        :meth:`reset` and :meth:`step`, to the last bit. With ``warm_start``, scene k follows scene
+        k of the last such batch, as in environments that are stepped together: a reading is that
+        of a sensor of its own that steps from one to the next. This takes a third of the iterations
+        and some memory for each scene, 0.8 MB with ``six_patch``, kept until :meth:`reset`. This
+        sensor's own last step and count stay as they are.
 
         Args:
             scenes: Scenes or depth frames, in the sensor frame.
             threads: How many threads solve; by default as many as the process may use processors.
+            warm_start: Start from the solution of the scene before.
 
         Raises:
             SceneError: Something in ``scenes`` is neither a scene nor a depth frame, or
@@ -223,22 +234,24 @@ class Simulator:
         for number, scene in enumerate(scenes):
             _check_view(f"scenes[{number}]: a batch holds", scene)
         crew = Crew(threads)
-        while len(self._batch) < min(crew.threads, len(scenes)):
-            self._batch.append(self.sibling())
+        sensors = self._worlds if warm_start else self._batch
+        wanted = len(scenes) if warm_start else min(crew.threads, len(scenes))
+        while len(sensors) < wanted:
+            sensors.append(self.sibling())
         idle = deque(self._batch)
 
-        def solve(scene: Scene | DepthFrame) -> Callable[[], Reading]:
-            def task() -> Reading:
-                sensor = idle.popleft()
-                try:
-                    sensor.reset()
-                    return sensor.step(scene)
-                finally:
-                    idle.append(sensor)
+        def from_rest(scene: Scene | DepthFrame) -> Reading:
+            sensor = idle.popleft()
+            try:
+                sensor.reset()
+                return sensor.step(scene)
+            finally:
+                idle.append(sensor)
 
-            return task
-
-        readings, failures = crew.run({k: solve(v) for k, v in enumerate(scenes)})
+        readings, failures = crew.run(
+            {k: partial(self._worlds[k].step if warm_start else from_rest, scene)
+             for k, scene in enumerate(scenes)}
+        )  # fmt: skip
         if failures:
             raise BatchError(some_failed("scenes", failures, len(scenes)), readings, failures)
         return list(readings.values())
@@ -268,8 +281,9 @@ class Simulator:
         )  # fmt: skip
 
     def reset(self) -> None:
-        """Forget the previous step."""
+        """Forget the previous step, and the scenes of batches that followed each other."""
         self._solver.reset()
+        self._worlds.clear()
         self.steps = 0
 
     def describe(self) -> dict[str, float | int | str]:
