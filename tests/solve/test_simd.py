@@ -14,6 +14,8 @@ from capsense.solve.simd import (
     madd,
     narrow,
     put,
+    put_span,
+    span,
     splat,
     store,
     vmadd,
@@ -33,6 +35,12 @@ def _convert(single, double, wide, slim):
     for a in range(single.shape[0]):
         store(wide, a, widen(load(single, a)))
         store(slim, a, narrow(load(double, a)))
+
+
+@njit
+def _shift(x, out):
+    for k in range(3, x.size - 8, 8):
+        put_span(out, k, span(x, k + 1))
 
 
 @njit
@@ -68,6 +76,17 @@ def test_elements_are_read_and_written_as_they_lie_in_memory(kind):
     out = np.zeros_like(x)
     _turn_round(x, out)
     np.testing.assert_array_equal(out.ravel(), x.ravel()[::-1])
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_spans_begin_anywhere(kind):
+    """Differential: a row moved by one element, in pieces of eight."""
+    x = np.arange(43).astype(kind)
+    out = np.zeros_like(x)
+    _shift(x, out)
+    np.testing.assert_array_equal(out[3:35], x[4:36])
+    assert not out[:3].any()
+    assert not out[35:].any()
 
 
 def test_aligned_arrays_begin_on_a_cache_line():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense.solve.simd import at, put
+from capsense.solve.simd import LANES, at, madd, put, put_span, span, splat, vmadd
 
 _RELAX = np.float32(0.97)
 """Share of the dropped fill-in that is moved to the diagonal."""
@@ -23,7 +23,7 @@ _ROWS = 4
 
 @kernel
 def factorise(weight, extra, unknown, storeys, ceiling, parent, share, diagonal, active, inverse,
-              changed):  # fmt: skip
+              taken, changed):  # fmt: skip
     """Set up the operator and its incomplete factors, storey by storey.
 
     Sums the links and ties at each unknown; nodes inside a conductor are off: ``active`` 0. Writes
@@ -31,6 +31,7 @@ def factorise(weight, extra, unknown, storeys, ceiling, parent, share, diagonal,
     for. A floor node's link upward is what leads to it from below, ``share`` holds each column's
     part in it, and its "pivot" is what the elimination of these columns takes from the node above.
     Lists the nodes that went on or off from ``changed[1]`` on, and their number in ``changed[0]``.
+    ``taken`` (3, n) is room to work in.
     """
     wx, wy, wz = weight[0], weight[1], weight[2]
     for j in range(ceiling.shape[0]):
@@ -46,7 +47,7 @@ def factorise(weight, extra, unknown, storeys, ceiling, parent, share, diagonal,
     for s in range(storeys.shape[0]):
         first, nx, ny, nz = storeys[s]
         _factorise_storey(wx, wy, wz, extra, unknown, first, nx, ny, nz, diagonal, active, inverse,
-                          changed)  # fmt: skip
+                          taken, changed)  # fmt: skip
         stop = first + nx * ny * nz
         begin = done
         while done < ceiling.shape[0] and ceiling[done] < stop:
@@ -64,7 +65,7 @@ def factorise(weight, extra, unknown, storeys, ceiling, parent, share, diagonal,
 
 @kernel
 def _factorise_storey(wx, wy, wz, extra, unknown, first, nx, ny, nz, diagonal, active, inverse,
-                      changed):  # fmt: skip
+                      taken, changed):  # fmt: skip
     """Pivots of a storey, four columns at a time.
 
     A pivot waits for that of the node below, for a division each time. Four columns, each one back
@@ -72,6 +73,9 @@ def _factorise_storey(wx, wy, wz, extra, unknown, first, nx, ny, nz, diagonal, a
     """
     sx, sy = ny * nz, nz
     aside = sx - sy
+    tx, ty, tz = taken[0], taken[1], taken[2]
+    _prepare(wx, wy, wz, extra, sx, sy, first + sx + sy, first + (nx - 1) * sx - sy, diagonal, tx,
+             ty, tz)  # fmt: skip
     for i in range(1, nx - 1, _ROWS):
         for j in range(1, ny - 1 + _ROWS - 1):
             start = first + i * sx + j * sy
@@ -79,39 +83,60 @@ def _factorise_storey(wx, wy, wz, extra, unknown, first, nx, ny, nz, diagonal, a
                 p, q = at(inverse, start), at(inverse, start + aside)
                 r, s = at(inverse, start + 2 * aside), at(inverse, start + 3 * aside)
                 for a in range(start + 1, start + nz - 1):
-                    p = _pivot(wx, wy, wz, extra, unknown, sx, sy, diagonal, active, inverse,
-                               changed, a, p)  # fmt: skip
-                    q = _pivot(wx, wy, wz, extra, unknown, sx, sy, diagonal, active, inverse,
-                               changed, a + aside, q)  # fmt: skip
-                    r = _pivot(wx, wy, wz, extra, unknown, sx, sy, diagonal, active, inverse,
-                               changed, a + 2 * aside, r)  # fmt: skip
-                    s = _pivot(wx, wy, wz, extra, unknown, sx, sy, diagonal, active, inverse,
-                               changed, a + 3 * aside, s)  # fmt: skip
+                    p = _pivot(unknown, sx, sy, diagonal, active, inverse, tx, ty, tz, changed,
+                               a, p)  # fmt: skip
+                    q = _pivot(unknown, sx, sy, diagonal, active, inverse, tx, ty, tz, changed,
+                               a + aside, q)  # fmt: skip
+                    r = _pivot(unknown, sx, sy, diagonal, active, inverse, tx, ty, tz, changed,
+                               a + 2 * aside, r)  # fmt: skip
+                    s = _pivot(unknown, sx, sy, diagonal, active, inverse, tx, ty, tz, changed,
+                               a + 3 * aside, s)  # fmt: skip
                 continue
             for k in range(_ROWS):
                 if i + k < nx - 1 and j - k >= 1 and j - k < ny - 1:
                     begin = start + k * aside
                     p = at(inverse, begin)
                     for a in range(begin + 1, begin + nz - 1):
-                        p = _pivot(wx, wy, wz, extra, unknown, sx, sy, diagonal, active, inverse,
-                                   changed, a, p)  # fmt: skip
+                        p = _pivot(unknown, sx, sy, diagonal, active, inverse, tx, ty, tz, changed,
+                                   a, p)  # fmt: skip
 
 
 @kernel
-def _pivot(wx, wy, wz, extra, unknown, sx, sy, diagonal, active, inverse, changed, a, below):
-    """Set up node a, given the inverse pivot of the node below; returns its own."""
-    b, c, d = a - sx, a - sy, a - 1
-    x, y, z = at(wx, b), at(wy, c), at(wz, d)
-    full = at(wx, a) + x + at(wy, a) + y + at(wz, a) + z + at(extra, a)
-    # fill-in towards nodes that are off is lost on ties, which are in the diagonal
-    taken = x * at(inverse, b) * (x + _RELAX * (at(wy, b) + at(wz, b)))
-    taken += y * at(inverse, c) * (y + _RELAX * (at(wx, c) + at(wz, c)))
-    rise = z * (z + _RELAX * (at(wx, d) + at(wy, d)))
+def _prepare(wx, wy, wz, extra, sx, sy, begin, end, diagonal, tx, ty, tz):
+    """Diagonal at nodes [begin, end), eight at a time, and what its neighbours will take from it.
+
+    These are factors of the inverse pivots of the nodes before along x, y and z. Nodes on the walls
+    get numbers too, which mean nothing.
+    """
+    zero, one = splat(_ZERO), splat(_ONE)
+    a = begin
+    while a < end:
+        k = max(min(a, end - LANES), begin - sy)  # in the smallest storeys, from a wall on
+        x, y, z = span(wx, k - sx), span(wy, k - sy), span(wz, k - 1)
+        full = vmadd(one, span(wx, k), x)
+        full = vmadd(one, span(wy, k), vmadd(one, y, full))
+        full = vmadd(one, span(wz, k), vmadd(one, z, full))
+        put_span(diagonal, k, vmadd(one, span(extra, k), full))
+        # fill-in towards nodes that are off is lost on ties, which are in the diagonal
+        side = vmadd(one, span(wy, k - sx), span(wz, k - sx))
+        put_span(tx, k, vmadd(x, madd(_RELAX, side, x), zero))
+        side = vmadd(one, span(wx, k - sy), span(wz, k - sy))
+        put_span(ty, k, vmadd(y, madd(_RELAX, side, y), zero))
+        side = vmadd(one, span(wx, k - 1), span(wy, k - 1))
+        put_span(tz, k, vmadd(z, madd(_RELAX, side, z), zero))
+        a += LANES
+
+
+@kernel
+def _pivot(unknown, sx, sy, diagonal, active, inverse, tx, ty, tz, changed, a, below):
+    """Inverse pivot of node a, given that of the node below; notes if the node goes on or off."""
+    full = at(diagonal, a)
+    rest = full - at(tx, a) * at(inverse, a - sx) - at(ty, a) * at(inverse, a - sy)
+    rest -= at(tz, a) * below
     on = at(unknown, a) != 0 and full > _ZERO
-    out = _ONE / max(full - taken - rise * below, _LOWEST * full)
+    out = _ONE / max(rest, _LOWEST * full)
     if not on:
         out = _ZERO
-    put(diagonal, a, full)
     put(inverse, a, out)
     now = np.uint8(on)
     if now != at(active, a):

@@ -71,6 +71,7 @@ class Workspace:
         )  # fmt: skip
         self.extra = np.zeros(n, np.float32)
         self.changed = np.zeros(n + 1, np.int64)
+        self.taken = np.zeros((3, n), np.float32)
         self.inside, self.inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
         self.counts, self.room = np.zeros(5, np.int64), np.zeros(1, ROOM)[0]
         self.matter, self.touched = np.zeros((3, n), MATTER), np.empty(3 * n, np.int64)

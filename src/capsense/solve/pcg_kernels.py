@@ -90,6 +90,19 @@ def _flow_in(wx, wy, wz, diagonal, sx, sy, p, a, below, here, above, add):
 
 
 @kernel
+def _lower_factor(wx, wy, wz, inverse, sx, sy, z, a, v, below):
+    """The lower factor's equation at node a, given its solution below: its side and its solution.
+
+    What waits for the node below comes last.
+    """
+    v = madd(at(wy, a - sy), load(z, a - sy), v)
+    v = madd(at(wx, a - sx), load(z, a - sx), v)
+    own = madd(at(inverse, a), v, splat(_ZERO))
+    side = madd(at(wz, a - 1), below, v)
+    return side, madd(at(inverse, a) * at(wz, a - 1), below, own)
+
+
+@kernel
 def start(op, vectors, rz, fresh):
     """Turn right-hand sides into residuals, r ← r − A u, and solve the lower factor for z.
 
@@ -122,11 +135,7 @@ def start(op, vectors, rz, fresh):
                         below, here = here, above
                 last = load(z, begin)
                 for a in range(begin + 1, begin + nz - 1):
-                    v = madd(at(wy, a - sy), load(z, a - sy), load(r, a))
-                    v = madd(at(wx, a - sx), load(z, a - sx), v)
-                    own = madd(at(inverse, a), v, zero)
-                    v = madd(at(wz, a - 1), last, v)
-                    last = madd(at(inverse, a) * at(wz, a - 1), last, own)
+                    v, last = _lower_factor(wx, wy, wz, inverse, sx, sy, z, a, load(r, a), last)
                     store(z, a, last)
                     total = vmadd(last, v, total)
             every = madd(1.0, widen(total), every)
@@ -158,12 +167,7 @@ def forward(op, vectors, alpha, rz):
                 for a in range(begin + 1, begin + nz - 1):
                     v = vmadd(back, load(z, a), load(r, a))
                     store(r, a, v)
-                    # what waits for the node below comes last
-                    v = madd(at(wy, a - sy), load(z, a - sy), v)
-                    v = madd(at(wx, a - sx), load(z, a - sx), v)
-                    own = madd(at(inverse, a), v, zero)
-                    v = madd(at(wz, a - 1), last, v)
-                    last = madd(at(inverse, a) * at(wz, a - 1), last, own)
+                    v, last = _lower_factor(wx, wy, wz, inverse, sx, sy, z, a, v, last)
                     store(z, a, last)
                     total = vmadd(last, v, total)
             every = madd(1.0, widen(total), every)

@@ -179,7 +179,8 @@ class PerturbationSolver:
         mesh, operator = self._mesh, work.operator
         factors.factorise(
             operator.weight, work.extra, mesh.unknown, mesh.storeys, mesh.ceiling, mesh.parent,
-            operator.share, operator.diagonal, self._active, operator.inverse, work.changed,
+            operator.share, operator.diagonal, self._active, operator.inverse, work.taken,
+            work.changed,
         )  # fmt: skip
         if signature != self._lanes:
             self._assign_lanes(n_lanes)

@@ -6,8 +6,9 @@ float32 or float64 array of shape (n, 8), ``store(x, a, v)`` writes it, ``splat(
 lanes, ``madd(s, v, w)`` is ``s v + w`` with a scalar s, and ``vmadd(u, v, w)`` is ``u v + w`` lane
 by lane; ``widen(v)`` and ``narrow(v)`` turn single into double precision and back.
 
-``at(x, k)`` is element k of a C-ordered array of any shape, ``put(x, k, s)`` writes it: unlike
-``x[k]``, which counts from the end where k is negative, they do not look at k.
+``at(x, k)`` is element k of a C-ordered array of any shape, ``put(x, k, s)`` writes it, ``span``
+and ``put_span`` do the same with the eight from k on: unlike ``x[k]``, which counts from the end
+where k is negative, they do not look at k.
 
 All work in compiled code only; ``tests/solve/test_simd.py`` holds them against numpy.
 """
@@ -60,10 +61,14 @@ def _place(context: Any, builder: Any, array_type: Any, array: Any, index: Any) 
     return builder.gep(data, [index])
 
 
+def _from(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    place = _place(context, builder, array_type, array, index)
+    return builder.bitcast(place, _CODE[array_type.dtype].as_pointer())
+
+
 def _row(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
     offset = builder.mul(index, ir.Constant(index.type, LANES))
-    place = _place(context, builder, array_type, array, offset)
-    return builder.bitcast(place, _CODE[array_type.dtype].as_pointer())
+    return _from(context, builder, array_type, array, offset)
 
 
 def _fill(builder: Any, scalar: Any) -> Any:
@@ -120,6 +125,30 @@ def put(typing: Any, array: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, array.dtype), code
+
+
+@intrinsic
+def span(typing: Any, array: Any, index: Any) -> Any:
+    """Eight elements from ``index`` on, as they lie in memory."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = builder.load(_from(context, builder, signature.args[0], *args))
+        value.align = signature.args[0].dtype.bitwidth // 8
+        return value
+
+    return _of(array.dtype)(array, types.intp), code
+
+
+@intrinsic
+def put_span(typing: Any, array: Any, index: Any, value: Any) -> Any:
+    """Write eight elements from ``index`` on, as they lie in memory."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = _from(context, builder, signature.args[0], args[0], args[1])
+        builder.store(args[2], place).align = signature.args[0].dtype.bitwidth // 8
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _of(array.dtype)), code
 
 
 @intrinsic
