@@ -137,9 +137,14 @@ def main() -> None:
                   flush=True)  # fmt: skip
         if refinement <= 1:
             cells = sim.describe()["tetrahedra"]
-            batches.append({"tetrahedra": cells, **time_batch(sim, 2)})
-            print("{tetrahedra:10,d} batch, two threads: {clock_per_s:.0f} scenes a second by the "
-                  "clock, {per_s:.0f} by the processor".format(**batches[-1]))  # fmt: skip
+            for warm in (False, True):
+                batches.append({"tetrahedra": cells, "warm_start": warm,
+                                **time_batch(sim, 2, warm)})  # fmt: skip
+                print("{tetrahedra:10,d} batch, two threads, {start}: {clock_per_s:.0f} scenes a "
+                      "second by the clock, {per_s:.0f} by the processor".format(
+                          start="each after one before" if warm else "each from rest",
+                          **batches[-1]), flush=True)  # fmt: skip
+            sim.reset()
     found = {
         **machine,
         **started,

@@ -27,9 +27,10 @@ def test_bench_writes_what_it_prints(tmp_path: Path, capsys: pytest.CaptureFixtu
             assert 0 < row[f"{clock}median_ms"] <= row[f"{clock}p95_ms"] <= row[f"{clock}p99_ms"]
         assert f"{row['clock_median_ms']:.2f}" in text
         assert row["error"] < 0.05
-    batch = figures["batch"]
-    assert f"{batch['clock_per_s']:.0f} scenes a second" in text
-    assert batch["clock_per_s"] > 0
+    for start, name in (("from rest", "batch"), ("after one before", "worlds_at_once")):
+        batch = figures[name]
+        assert f"{start}: {batch['clock_per_s']:.0f} scenes a second" in text
+        assert batch["clock_per_s"] > 0
     for name in ("import_s", "simulator_s", "first_step_s"):
         assert figures[name] > 0
 
@@ -51,8 +52,12 @@ def test_errors_are_of_the_world_itself(name: str) -> None:
 
 
 def test_scenes_of_a_batch_differ() -> None:
-    places = {body.pose.position for scene in batch_scenes() for body in scene}
-    assert len(places) == BATCH
+    places, later = (
+        np.array([body.pose.position for scene in batch_scenes(after=k) for body in scene])
+        for k in (0, 2)
+    )
+    assert len(np.unique(places, axis=0)) == BATCH
+    np.testing.assert_allclose(np.linalg.norm(later - places, axis=1), 2 * 0.116 / 100)
 
 
 def test_times_leave_warm_up_out() -> None:

@@ -86,9 +86,12 @@ def report(figures: dict[str, Any]) -> str:
     ]
     columns = ("world", "median [ms]", "p95 [ms]", "p99 [ms]", "processor [ms]", "iterations",
                "error [%]")  # fmt: skip
-    batch = figures["batch"]
-    rates = (
-        f"batch of {batch['scenes']} scenes, {batch['threads']} threads: "
-        f"{batch['clock_per_s']:.0f} scenes a second (processor: {batch['per_s']:.0f})"
-    )
-    return f"{facts(head)}\n\n{table(columns, rows)}\n\n{rates}"
+    batches = [
+        f"batch of {row['scenes']} scenes, {row['threads']} threads, {start}: "
+        f"{row['clock_per_s']:.0f} scenes a second (processor: {row['per_s']:.0f})"
+        for row, start in (
+            (figures["batch"], "each from rest"),
+            (figures["worlds_at_once"], "each after one before"),
+        )
+    ]
+    return "\n\n".join([facts(head), table(columns, rows), "\n".join(batches)])
