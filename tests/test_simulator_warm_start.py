@@ -130,13 +130,12 @@ def test_what_is_not_finite_does_not_reach_the_next_step(simulators, monkeypatch
     expected = sim.step(scene).delta
     solver = sim._solver
 
-    def spoil(work: Workspace, *rest: object) -> None:
-        prepare(work, *rest)
-        for values in (*solver._u, *(b.p for b in work.blocks(1)), *(b.z for b in work.blocks(1))):
-            values[:] = np.nan
+    def spoil(work: Workspace, *rest: object) -> object:
+        work.setup.extra[:] = np.nan
+        return solve(work, *rest)
 
-    prepare = solver._prepare
-    monkeypatch.setattr(solver, "_prepare", spoil)
+    solve = solver._solve_blocks
+    monkeypatch.setattr(solver, "_solve_blocks", spoil)
     with pytest.raises(SolveError, match="not finite"):
         sim.step(cs.Scene([bar(0.02)]))
     monkeypatch.undo()

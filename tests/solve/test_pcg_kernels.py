@@ -177,7 +177,7 @@ def test_sensors_of_a_design_hand_their_working_space_on(simulators):
     assert len(spare) == before
 
 
-@pytest.mark.parametrize("stage", ["_prepare", "_solve_blocks", "_trace"])
+@pytest.mark.parametrize("stage", ["_solve_blocks", "_trace"])
 def test_a_step_that_is_cut_off_leaves_nothing_behind(simulators, monkeypatch, stage):
     """Its working space is not used again, and the next step starts from rest."""
     sim = simulators("three_stripes", settings=COARSE)

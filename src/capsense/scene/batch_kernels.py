@@ -20,7 +20,7 @@ _ELLIPSOID = int(ShapeKind.ELLIPSOID)
 _INF = math.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")  # too short to let other threads in
 def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
     """Fill rotation matrices and sensor-frame bounding boxes of all bodies.
 

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from capsense._jit import kernel
+from capsense.solve.factor_kernels import factorise
 from capsense.solve.pcg_kernels import add_products, solve
 from capsense.solve.simd import LANES, load, madd, narrow, splat, store, vmadd, widen
 
 _ZERO = np.float32(0.0)
+
+
+class Setup(NamedTuple):
+    """What a scan leaves to set up an operator with, and room to do it."""
+
+    extra: Any
+    """Conductance of each node's ties, single precision, (n,)."""
+    taken: Any
+    """Room for the factors, (3, n)."""
+    changed: Any
+    """How many nodes went on or off, and which, (n + 1,)."""
 
 
 @kernel
@@ -107,16 +121,22 @@ def add_energies(ties, energies, value, drop, other_value, other_drop, u, out):
 
 
 @kernel
-def solve_block(op, vectors, fresh, phi, lanes, first, n_held, ties, energies, value, drop,
-                tolerance, relative, max_iterations, wanted, left, sums, factors, own,
-                energy):  # fmt: skip
+def solve_block(op, setup, unknown, active, vectors, fresh, phi, lanes, first, n_held, ties,
+                energies, value, drop, tolerance, relative, max_iterations, wanted, left, sums,
+                factors, own, energy):  # fmt: skip
     """Solve for the lanes of one block, and add their energies to ``energy`` (8, 8).
 
-    Iterates until the energy that is missing is below ``tolerance`` or ``relative`` times the
-    lane's own, of which ``own`` (1, 8) holds what ties and changed links do not. Writes what was
-    ``wanted`` and what is ``left`` (8,). Where ``fresh``, nothing was solved before. Returns the
-    iterations.
+    For the first block, sets up operator and preconditioner before. All of it is one call: between
+    calls, threads wait for the interpreter. Iterates until the energy that is missing is below
+    ``tolerance`` or ``relative`` times the lane's own, of which ``own`` (1, 8) holds what ties and
+    changed links do not. Writes what was ``wanted`` and what is ``left`` (8,). Where ``fresh``,
+    nothing was solved before. Returns the iterations.
     """
+    if first == 0:
+        factorise(op.weight, setup.extra, unknown, op.storeys, op.ceiling, op.parent, op.share,
+                  op.diagonal, active, op.inverse, setup.taken, setup.changed)  # fmt: skip
+    if not fresh:
+        carry_over(setup.changed, active, phi, vectors.u)
     load_scene(phi, lanes, first, n_held, ties, energies, vectors.r, value, drop, own)
     for k in range(LANES):
         wanted[k] = max(tolerance, relative * max(0.2 * abs(own[0, k]), 1e-9))

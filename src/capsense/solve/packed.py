@@ -16,6 +16,7 @@ from capsense.scene.layers import Layers
 from capsense.solve.column_kernels import BODY
 from capsense.solve.conductors import Conductors
 from capsense.solve.finding_kernels import COUPLE, CUT, ENERGY, LINK, NODE, STOREY, TIE, UNIT
+from capsense.solve.load_kernels import Setup
 from capsense.solve.matter_kernels import MATTER
 from capsense.solve.pcg_kernels import Operator
 from capsense.solve.simd import LANES, aligned_zeros
@@ -69,9 +70,9 @@ class Workspace:
             mesh.storeys, mesh.joints, mesh.ceiling, mesh.parent, np.unique(mesh.parent) - 1,
             np.zeros(len(mesh.ceiling), np.float32),
         )  # fmt: skip
-        self.extra = np.zeros(n, np.float32)
-        self.changed = np.zeros(n + 1, np.int64)
-        self.taken = np.zeros((3, n), np.float32)
+        self.setup = Setup(
+            np.zeros(n, np.float32), np.zeros((3, n), np.float32), np.zeros(n + 1, np.int64)
+        )
         self.inside, self.inside_nodes = np.full(n, -1, np.int64), np.empty(n, np.int64)
         self.counts, self.room = np.zeros(5, np.int64), np.zeros(1, ROOM)[0]
         self.matter, self.touched = np.zeros((3, n), MATTER), np.empty(3 * n, np.int64)
@@ -90,7 +91,7 @@ class Workspace:
     def blocks(self, count: int) -> list[Block]:
         """Room for so many times eight right-hand sides."""
         while len(self._blocks) < count:
-            self._blocks.append(Block(len(self.extra)))
+            self._blocks.append(Block(len(self.inside)))
         return self._blocks[:count]
 
 

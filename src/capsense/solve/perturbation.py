@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
 from capsense.scene import Scene
-from capsense.solve import factor_kernels as factors
 from capsense.solve import load_kernels as loading
 from capsense.solve import pcg_kernels as pcg
 from capsense.solve import trace_kernels as tracing
@@ -134,8 +133,11 @@ class PerturbationSolver:
             ties, energies, couples = self._trace(work, scene, conductors)
             lanes, grounds = conductors.lanes(n_terminals)
             n_lanes = n_terminals + len(grounds)
-            fresh = self._prepare(work, (len(scene), *lanes.tolist()), n_lanes)
-            energy, iterations, left, goal = self._solve_blocks(work, fresh, ties, energies, lanes)
+            signature = (len(scene), *lanes.tolist())
+            if signature != self._lanes:
+                self._assign_lanes(n_lanes)
+                self._lanes = signature
+            energy, iterations, left, goal = self._solve_blocks(work, ties, energies, lanes)
             energy = energy[:n_lanes, :n_lanes]
             conductors.add_couplings(energy, couples, lanes)
             delta = _reduce(energy, n_terminals, grounds)
@@ -152,14 +154,14 @@ class PerturbationSolver:
         mesh, weight = self._mesh, work.operator.weight
         while True:
             weight[:] = mesh.weight
-            work.extra[:] = mesh.extra
+            work.setup.extra[:] = mesh.extra
             conductors.parent[:] = np.arange(len(conductors.parent))
             status = tracing.trace(
                 mesh.scan_storeys, mesh.axes, mesh.faces, mesh.nodes, mesh.links, mesh.cuts,
                 mesh.ceiling, mesh.parent, mesh.home, mesh.stored, bodies, grids, CONTACT,
-                conductors.parent, weight, work.extra, work.inside, work.inside_nodes, work.ties,
-                work.energies, work.couples, work.within, work.counts, work.room, near, parts,
-                work.matter, work.touched,
+                conductors.parent, weight, work.setup.extra, work.inside, work.inside_nodes,
+                work.ties, work.energies, work.couples, work.within, work.counts, work.room, near,
+                parts, work.matter, work.touched,
             )  # fmt: skip
             if status == tracing.FULL:
                 n_tie, n_energy, n_couple, _, _ = work.counts.tolist()
@@ -170,26 +172,6 @@ class PerturbationSolver:
                     "through the domain; join small bodies into one mesh"
                 )
             work.fit(2 * len(work.ties))
-
-    def _prepare(self, work: Workspace, signature: tuple[object, ...], n_lanes: int) -> bool:
-        """Set up operator and preconditioner; carry the last solution over, if there is one.
-
-        Returns whether there is none.
-        """
-        mesh, operator = self._mesh, work.operator
-        factors.factorise(
-            operator.weight, work.extra, mesh.unknown, mesh.storeys, mesh.ceiling, mesh.parent,
-            operator.share, operator.diagonal, self._active, operator.inverse, work.taken,
-            work.changed,
-        )  # fmt: skip
-        if signature != self._lanes:
-            self._assign_lanes(n_lanes)
-            self._lanes = signature
-        fresh, self._rested = self._rested, False
-        if not fresh:
-            for lanes, u in zip(mesh.lanes(self._n_blocks), self._u, strict=False):
-                loading.carry_over(work.changed, self._active, lanes.phi, u)
-        return fresh
 
     def _assign_lanes(self, n_lanes: int) -> None:
         """Have as many blocks as needed; the lanes of terminals keep their solution."""
@@ -202,7 +184,6 @@ class PerturbationSolver:
     def _solve_blocks(
         self,
         work: Workspace,
-        fresh: bool,
         ties: NDArray[np.void],
         energies: NDArray[np.void],
         lanes: NDArray[np.int64],
@@ -214,13 +195,15 @@ class PerturbationSolver:
         rows, columns = self._mesh.pairs
         energy[rows, columns] = energy[columns, rows] = work.within
         own = energy.diagonal().reshape(-1, 1, LANES).copy()
+        fresh, self._rested = self._rested, False
         iterations, left, wanted = 0, np.zeros((count, LANES)), np.zeros((count, LANES))
         for k, (block, base) in enumerate(zip(blocks, held, strict=True)):
             block.fit(len(ties), len(energies))
             part = np.zeros((LANES, LANES))
             done = loading.solve_block(
-                work.operator, pcg.Vectors(self._u[k], block.r, block.z, block.p), fresh, base.phi,
-                lanes, base.first, base.held, ties, energies, block.value, block.drop,
+                work.operator, work.setup, self._mesh.unknown, self._active,
+                pcg.Vectors(self._u[k], block.r, block.z, block.p), fresh, base.phi, lanes,
+                base.first, base.held, ties, energies, block.value, block.drop,
                 self.tolerance / UNIT, self.relative_tolerance, self.max_iterations, wanted[k],
                 left[k], work.sums, work.factors, own[k], part,
             )  # fmt: skip
