@@ -35,12 +35,12 @@ REFINEMENTS = (0.33, 0.6, 1.0, 1.5, 2.25)
 """Lattices, as multiples of the default's nodes along an axis; about 10,000 to 1,000,000."""
 LANES, SINGLE = 8, 4
 """Right-hand sides that go together, and bytes of a number."""
-ITERATION = (13, 13)
-"""Passes over vectors of all lanes, and over numbers one a node, in an iteration: forward sweep
-(reads u, p, r, A p and four coefficients, writes u, r, z), backward sweep (reads and writes z and
-p, four coefficients), operator (reads p and five coefficients, writes A p)."""
-AROUND = (17, 25)
-"""The same for what a step does once: weights copied, factors, loads, start, end, energies."""
+ITERATION = (10, 9)
+"""Vectors of right-hand sides and single numbers a node that an iteration moves: backward sweep and
+image (reads and writes u, p, z; five coefficients), forward sweep (reads and writes r, z; four)."""
+AROUND = (7, 23)
+"""The same for what a step does besides: weights copied, factors, loads, start, and the end, which
+moves u too, in place of the last forward sweep."""
 
 
 def bytes_moved(nodes: int, iterations: float) -> float:
@@ -50,8 +50,8 @@ def bytes_moved(nodes: int, iterations: float) -> float:
 
 
 def working_set(nodes: int) -> int:
-    """Bytes of the six vectors and eight coefficients that an iteration goes through."""
-    return nodes * SINGLE * (6 * LANES + 8)
+    """Bytes of the four vectors and nine coefficients that a step goes through."""
+    return nodes * SINGLE * (4 * LANES + 9)
 
 
 @njit(fastmath=True)
