@@ -270,7 +270,11 @@ def test_a_session_of_the_caller_survives():
         assert gmsh.option.getNumber("Mesh.Algorithm3D") == 10
     finally:
         gmsh.finalize()
-    np.testing.assert_array_equal(mesh.tets, mesh_design(small(), size_at_edges=0.02).tets)
+    # now and then Gmsh numbers nodes and tetrahedra in another order; the caller's algorithm would
+    # make a tenth fewer of them
+    alone = mesh_design(small(), size_at_edges=0.02)
+    assert mesh.n_points == alone.n_points
+    assert mesh.n_tets == pytest.approx(alone.n_tets, rel=0.03)
 
 
 @pytest.mark.parametrize(
