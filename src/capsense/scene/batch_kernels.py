@@ -25,15 +25,14 @@ def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
     """Fill rotation matrices and sensor-frame bounding boxes of all bodies.
 
     Args:
-        table: A row for each body, shape (n, 15): shape kind, three sizes [m], centre of the local
-            bounding box [m], a number more, unit quaternion (x, y, z, w), origin of the body's
-            frame [m].
+        table: A row for each body, shape (n, 14): shape kind, three sizes [m], centre of the local
+            bounding box [m], unit quaternion (x, y, z, w), origin of the body's frame [m].
         rotation: Receives the rotation matrices, shape (n, 3, 3).
         bounds: Receives lower and upper corners [m], shape (n, 2, 3).
     """
     for i in range(table.shape[0]):
-        kind, centre, position = table[i, 0], table[i, 4:7], table[i, 12:15]
-        x, y, z, w = table[i, 8], table[i, 9], table[i, 10], table[i, 11]
+        kind, centre, position = table[i, 0], table[i, 4:7], table[i, 11:14]
+        x, y, z, w = table[i, 7], table[i, 8], table[i, 9], table[i, 10]
         r = rotation[i]
         r[0, 0] = 1 - 2 * (y * y + z * z)
         r[0, 1] = 2 * (x * y - z * w)

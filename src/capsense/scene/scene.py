@@ -29,8 +29,6 @@ class PackedScene:
     """Origins of the bodies' frames [m] in the sensor frame, shape (n, 3)."""
     bounds: Array
     """Lower and upper corners of the bounding boxes [m] in the sensor frame, shape (n, 2, 3)."""
-    breadth: Array
-    """Diameters of the largest balls inside [m], or less where not known, shape (n,)."""
     shapes: tuple[Shape, ...]
     """The shapes themselves; meshes carry their distance grids."""
 
@@ -99,11 +97,9 @@ class Scene:
         table = np.array(
             [(b.shape.kind, *b.shape.packed, *b.pose.quaternion, *b.pose.position)
              for b in self.bodies]
-        ).reshape(n, 15)  # fmt: skip
+        ).reshape(n, 14)  # fmt: skip
         rotation = np.empty((n, 3, 3))
         bounds = np.empty((n, 2, 3))
         place_bodies(table, rotation, bounds)
         kinds = table[:, 0].astype(np.int64)
-        return PackedScene(
-            kinds, table[:, 1:4], rotation, table[:, 12:], bounds, table[:, 7], shapes
-        )
+        return PackedScene(kinds, table[:, 1:4], rotation, table[:, 11:], bounds, shapes)

@@ -57,8 +57,8 @@ class Shape(ABC):
 
     @cached_property
     def packed(self) -> tuple[float, ...]:
-        """``params``, the centre of the local bounding box and ``breadth`` [m], seven numbers."""
-        return (*self.params.tolist(), *self.bounds().mean(axis=0).tolist(), self.breadth)
+        """``params`` and the centre of the local bounding box [m], six numbers."""
+        return (*self.params.tolist(), *self.bounds().mean(axis=0).tolist())
 
     @property
     @abstractmethod

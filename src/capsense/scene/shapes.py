@@ -100,7 +100,7 @@ class _Primitive(Shape):
 
     @cached_property
     def packed(self) -> tuple[float, ...]:
-        return (*self.params.tolist(), 0.0, 0.0, 0.0, self.breadth)
+        return (*self.params.tolist(), 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

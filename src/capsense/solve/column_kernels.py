@@ -50,7 +50,7 @@ BODY = np.dtype(
     ]
 )
 """A body of a scene as the scan sees it: shape and pose, the index of a conductor (−1: dielectric),
-and where the grid of a mesh or of layers begins among those of all."""
+a dielectric's breadth, and where the grid of a mesh or of layers begins among those of all."""
 
 PART = np.dtype(
     [

@@ -199,9 +199,11 @@ def pack_bodies(scene: Scene, conductors: Conductors) -> tuple[NDArray[np.void],
     for name, values in (
         ("kind", packed.kinds), ("params", packed.params), ("rotation", packed.rotation),
         ("position", packed.position), ("bounds", packed.bounds),
-        ("conductor", conductors.index), ("eps_r", conductors.eps_r), ("breadth", packed.breadth),
+        ("conductor", conductors.index), ("eps_r", conductors.eps_r),
     ):  # fmt: skip
         bodies[name] = values
+    for k in np.flatnonzero(conductors.index < 0):
+        bodies["breadth"][k] = packed.shapes[k].breadth  # of a mesh, known by its grid alone
     parts: list[Array32] = []
     offset = 0
     for i, shape in enumerate(packed.shapes):
