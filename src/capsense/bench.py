@@ -175,12 +175,12 @@ def time_batch(
     """
     threads = threads or len(os.sched_getaffinity(0))
     rates = []
-    for k in range(-2, REPEATS):  # the first ones make room for solutions
-        scenes = batch_scenes(after=k + 2)
+    for k in range(2 + REPEATS):  # the first two make room for solutions
+        scenes = batch_scenes(after=k)
         clock, processor = time.perf_counter(), time.process_time()
         sim.step_batch(scenes, threads=threads, warm_start=warm_start)
         spent = time.process_time() - processor
-        if k >= 0:
+        if k >= 2:
             rates.append((BATCH / (time.perf_counter() - clock), threads * BATCH / spent))
     by_clock, by_processor = np.median(rates, axis=0).tolist()
     return {"scenes": BATCH, "threads": threads, "clock_per_s": by_clock, "per_s": by_processor}

@@ -238,7 +238,7 @@ class Simulator:
         wanted = len(scenes) if warm_start else min(crew.threads, len(scenes))
         while len(sensors) < wanted:
             sensors.append(self.sibling())
-        idle = deque(self._batch)
+        idle = deque(sensors)
 
         def from_rest(scene: Scene | DepthFrame) -> Reading:
             sensor = idle.popleft()
@@ -248,10 +248,10 @@ class Simulator:
             finally:
                 idle.append(sensor)
 
+        solvers = [s.step for s in sensors] if warm_start else [from_rest] * len(scenes)
         readings, failures = crew.run(
-            {k: partial(self._worlds[k].step if warm_start else from_rest, scene)
-             for k, scene in enumerate(scenes)}
-        )  # fmt: skip
+            {k: partial(solvers[k], scene) for k, scene in enumerate(scenes)}
+        )
         if failures:
             raise BatchError(some_failed("scenes", failures, len(scenes)), readings, failures)
         return list(readings.values())

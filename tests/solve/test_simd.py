@@ -18,6 +18,7 @@ from capsense.solve.simd import (
     span,
     splat,
     store,
+    vadd,
     vmadd,
     widen,
 )
@@ -27,7 +28,7 @@ from capsense.solve.simd import (
 def _combine(x, y, scalar, two, out):
     for a in range(x.shape[0]):
         left, right = load(x, a), load(y, a)
-        store(out, a, vmadd(left, right, madd(scalar, left, splat(two))))
+        store(out, a, vmadd(left, right, vadd(madd(scalar, left, splat(two)), right)))
 
 
 @njit
@@ -51,12 +52,12 @@ def _turn_round(x, out):
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_every_lane_and_row_is_treated_alike(kind):
-    """Differential: s x + 2 + x y, row by row and lane by lane."""
+    """Differential: s x + 2 + x y + y, row by row and lane by lane."""
     rng = np.random.default_rng(3)
     x, y = rng.normal(size=(2, 37, LANES)).astype(kind)
     out = np.full_like(x, np.nan)
     _combine(x, y, kind(-1.5), kind(2.0), out)
-    np.testing.assert_allclose(out, x * y - 1.5 * x + 2.0, rtol=0, atol=20 * np.finfo(kind).eps)
+    np.testing.assert_allclose(out, x * y - 1.5 * x + 2.0 + y, rtol=0, atol=20 * np.finfo(kind).eps)
 
 
 def test_precision_is_raised_and_lowered_as_numpy_does():

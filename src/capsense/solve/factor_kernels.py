@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense.solve.simd import LANES, at, madd, put, put_span, span, splat, vmadd
+from capsense.solve.simd import LANES, at, madd, put, put_span, span, splat, vadd, vmadd
 
 _RELAX = np.float32(0.97)
 """Share of the dropped fill-in that is moved to the diagonal."""
@@ -108,21 +108,21 @@ def _prepare(wx, wy, wz, extra, sx, sy, begin, end, diagonal, tx, ty, tz):
     These are factors of the inverse pivots of the nodes before along x, y and z. Nodes on the walls
     get numbers too, which mean nothing.
     """
-    zero, one = splat(_ZERO), splat(_ONE)
+    zero = splat(_ZERO)
     a = begin
     while a < end:
         k = max(min(a, end - LANES), begin - sy)  # in the smallest storeys, from a wall on
         x, y, z = span(wx, k - sx), span(wy, k - sy), span(wz, k - 1)
-        full = vmadd(one, span(wx, k), x)
-        full = vmadd(one, span(wy, k), vmadd(one, y, full))
-        full = vmadd(one, span(wz, k), vmadd(one, z, full))
-        put_span(diagonal, k, vmadd(one, span(extra, k), full))
+        full = vadd(span(wx, k), x)
+        full = vadd(span(wy, k), vadd(y, full))
+        full = vadd(span(wz, k), vadd(z, full))
+        put_span(diagonal, k, vadd(span(extra, k), full))
         # fill-in towards nodes that are off is lost on ties, which are in the diagonal
-        side = vmadd(one, span(wy, k - sx), span(wz, k - sx))
+        side = vadd(span(wy, k - sx), span(wz, k - sx))
         put_span(tx, k, vmadd(x, madd(_RELAX, side, x), zero))
-        side = vmadd(one, span(wx, k - sy), span(wz, k - sy))
+        side = vadd(span(wx, k - sy), span(wz, k - sy))
         put_span(ty, k, vmadd(y, madd(_RELAX, side, y), zero))
-        side = vmadd(one, span(wx, k - 1), span(wy, k - 1))
+        side = vadd(span(wx, k - 1), span(wy, k - 1))
         put_span(tz, k, vmadd(z, madd(_RELAX, side, z), zero))
         a += LANES
 

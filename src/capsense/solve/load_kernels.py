@@ -9,7 +9,7 @@ import numpy as np
 from capsense._jit import kernel
 from capsense.solve.factor_kernels import factorise
 from capsense.solve.pcg_kernels import add_products, solve
-from capsense.solve.simd import LANES, load, madd, narrow, splat, store, vmadd, widen
+from capsense.solve.simd import LANES, load, madd, narrow, splat, store, vadd, vmadd, widen
 
 _ZERO = np.float32(0.0)
 
@@ -98,14 +98,14 @@ def add_energies(ties, energies, value, drop, other_value, other_drop, u, out):
         tie = ties[i]
         v = load(other_value, i)
         if tie.node >= 0:
-            v = madd(1.0, widen(load(u, tie.node)), v)
+            v = vadd(widen(load(u, tie.node)), v)
         sums = add_products(value, i, madd(tie.weight, v, none), sums)
     for i in range(energies.shape[0]):
         term = energies[i]
         v = load(other_drop, i)
         if term.drives:
             if term.a >= 0:
-                v = madd(1.0, widen(load(u, term.a)), v)
+                v = vadd(widen(load(u, term.a)), v)
             if term.b >= 0:
                 v = madd(-1.0, widen(load(u, term.b)), v)
         sums = add_products(drop, i, madd(term.weight, v, none), sums)

@@ -63,10 +63,10 @@ class MaskedSolver:
     preconditioner D, from the potentials of the step before unless told otherwise, until
     ‖b − Kφ‖ ≤ tolerance·‖b‖ in the norm of D⁻¹, where b is the load of the electrode.
     Capacitances are energies, so their error goes with the square of the tolerance: below 1e-9 of
-    the largest entry at 1e-5. With
-    "lu" the free part of K is factorised at every step, which is exact but slower: for three
-    electrodes and a moving bar, 39 against 12 ms (eps_r = 80) and 21 against 6 ms (grounded) at
-    30k tetrahedra, 329 against 34 ms and 231 against 19 ms at 95k, one core.
+    the largest entry at 1e-5. With "lu" the free part of K is factorised at every step, which is
+    exact but slower: for three electrodes and a moving bar, 39 against 12 ms (eps_r = 80) and 21
+    against 6 ms (grounded) at 30k tetrahedra, 329 against 34 ms and 231 against 19 ms at 95k, one
+    core.
     """
 
     def __init__(

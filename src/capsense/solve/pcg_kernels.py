@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from capsense._jit import kernel
-from capsense.solve.simd import LANES, at, load, madd, splat, store, vmadd, widen
+from capsense.solve.simd import LANES, at, load, madd, splat, store, vadd, vmadd, widen
 
 _ZERO = np.float32(0.0)
 
@@ -138,7 +138,7 @@ def start(op, vectors, rz, fresh):
                     v, last = _lower_factor(wx, wy, wz, inverse, sx, sy, z, a, load(r, a), last)
                     store(z, a, last)
                     total = vmadd(last, v, total)
-            every = madd(1.0, widen(total), every)
+            every = vadd(widen(total), every)
     store(rz, 0, every)
 
 
@@ -170,7 +170,7 @@ def forward(op, vectors, alpha, rz):
                     v, last = _lower_factor(wx, wy, wz, inverse, sx, sy, z, a, v, last)
                     store(z, a, last)
                     total = vmadd(last, v, total)
-            every = madd(1.0, widen(total), every)
+            every = vadd(widen(total), every)
     store(rz, 0, every)
 
 
@@ -215,14 +215,14 @@ def backward(op, vectors, alpha, beta, fresh, pap):
                 if s > 0:  # for the storey below, when the image has taken its place
                     store(z, begin, last)
             if i < nx - 2:
-                every = madd(1.0, widen(_image(op, vectors, first, ny, nz, i + 1)), every)
-        every = madd(1.0, widen(_image(op, vectors, first, ny, nz, 1)), every)
+                every = vadd(widen(_image(op, vectors, first, ny, nz, i + 1)), every)
+        every = vadd(widen(_image(op, vectors, first, ny, nz, 1)), every)
     lift(op, 0, op.ceiling.shape[0], p)
     for j in range(op.floor.shape[0]):
         a = op.floor[j]
         missing = madd(-at(wz, a), load(p, a), zero)
-        store(z, a + 1, vmadd(missing, splat(np.float32(1.0)), load(z, a + 1)))
-        every = madd(1.0, widen(vmadd(missing, load(p, a + 1), zero)), every)
+        store(z, a + 1, vadd(missing, load(z, a + 1)))
+        every = vadd(widen(vmadd(missing, load(p, a + 1), zero)), every)
     store(pap, 0, every)
 
 
@@ -264,14 +264,14 @@ def add_products(left, a, right, sums):
 def _flush(sums, out):
     """Add eight rows of products in single precision to ``out`` (8, 8) in double."""
     s0, s1, s2, s3, s4, s5, s6, s7 = sums
-    store(out, 0, madd(1.0, widen(s0), load(out, 0)))
-    store(out, 1, madd(1.0, widen(s1), load(out, 1)))
-    store(out, 2, madd(1.0, widen(s2), load(out, 2)))
-    store(out, 3, madd(1.0, widen(s3), load(out, 3)))
-    store(out, 4, madd(1.0, widen(s4), load(out, 4)))
-    store(out, 5, madd(1.0, widen(s5), load(out, 5)))
-    store(out, 6, madd(1.0, widen(s6), load(out, 6)))
-    store(out, 7, madd(1.0, widen(s7), load(out, 7)))
+    store(out, 0, vadd(widen(s0), load(out, 0)))
+    store(out, 1, vadd(widen(s1), load(out, 1)))
+    store(out, 2, vadd(widen(s2), load(out, 2)))
+    store(out, 3, vadd(widen(s3), load(out, 3)))
+    store(out, 4, vadd(widen(s4), load(out, 4)))
+    store(out, 5, vadd(widen(s5), load(out, 5)))
+    store(out, 6, vadd(widen(s6), load(out, 6)))
+    store(out, 7, vadd(widen(s7), load(out, 7)))
 
 
 @kernel
@@ -315,10 +315,9 @@ def solve(op, vectors, fresh, tolerance, max_iterations, left, sums, factors, ou
 
     Each iteration lowers the energy of a lane by α (r · z) exactly (Hestenes and Stiefel 1952).
     What is still missing is estimated from the last decrements and their ratio. Where ``fresh``,
-    the solution is zero before. ``tolerance`` and
-    ``left`` (output) are per lane, in the units of the energy. ``sums`` (4, 8) in double and
-    ``factors`` (3, 8) in single precision are room to work in. Adds uᵀ r to ``out`` (8, 8) and
-    returns the iterations done, one at least.
+    the solution is zero before. ``tolerance`` and ``left`` (output) are per lane, in the units of
+    the energy. ``sums`` (4, 8) in double and ``factors`` (3, 8) in single precision are room to
+    work in. Adds uᵀ r to ``out`` (8, 8) and returns the iterations done, one at least.
     """
     rz, pap, old, previous = sums[0:1], sums[1:2], sums[2], sums[3]
     alpha, beta = factors[0:2], factors[2:3]

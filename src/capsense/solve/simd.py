@@ -3,8 +3,9 @@
 Numba's loops over a short last axis stay scalar. The functions below are one LLVM vector
 instruction each, whatever the processor's own width: ``load(x, a)`` is row ``a`` of a C-ordered
 float32 or float64 array of shape (n, 8), ``store(x, a, v)`` writes it, ``splat(s)`` fills all
-lanes, ``madd(s, v, w)`` is ``s v + w`` with a scalar s, and ``vmadd(u, v, w)`` is ``u v + w`` lane
-by lane; ``widen(v)`` and ``narrow(v)`` turn single into double precision and back.
+lanes, ``madd(s, v, w)`` is ``s v + w`` with a scalar s, ``vmadd(u, v, w)`` is ``u v + w`` lane by
+lane, ``vadd(u, v)`` is ``u + v``; ``widen(v)`` and ``narrow(v)`` turn single into double precision
+and back.
 
 ``at(x, k)`` is element k of a C-ordered array of any shape, ``put(x, k, s)`` writes it, ``span``
 and ``put_span`` do the same with the eight from k on: unlike ``x[k]``, which counts from the end
@@ -82,73 +83,62 @@ def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     return builder.fadd(builder.fmul(a, b, flags=_FLAGS), c, flags=_FLAGS)
 
 
-@intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """Row ``index`` of an array of shape (n, 8)."""
+def _read(place: Any) -> Any:
+    """How to read what stands at a place in an array."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = builder.load(_row(context, builder, signature.args[0], *args))
+        value = builder.load(place(context, builder, signature.args[0], *args))
         value.align = signature.args[0].dtype.bitwidth // 8
         return value
 
-    return _of(array.dtype)(array, types.intp), code
+    return code
+
+
+def _write(place: Any) -> Any:
+    """How to write to a place in an array."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        where = place(context, builder, signature.args[0], args[0], args[1])
+        builder.store(args[2], where).align = signature.args[0].dtype.bitwidth // 8
+        return context.get_dummy_value()
+
+    return code
+
+
+@intrinsic
+def load(typing: Any, array: Any, index: Any) -> Any:
+    """Row ``index`` of an array of shape (n, 8)."""
+    return _of(array.dtype)(array, types.intp), _read(_row)
 
 
 @intrinsic
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write row ``index`` of an array of shape (n, 8)."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = _row(context, builder, signature.args[0], args[0], args[1])
-        builder.store(args[2], place).align = signature.args[0].dtype.bitwidth // 8
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, _of(array.dtype)), code
+    return types.void(array, types.intp, _of(array.dtype)), _write(_row)
 
 
 @intrinsic
 def at(typing: Any, array: Any, index: Any) -> Any:
     """Element ``index`` of an array as it lies in memory."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(_place(context, builder, signature.args[0], *args))
-
-    return array.dtype(array, types.intp), code
+    return array.dtype(array, types.intp), _read(_place)
 
 
 @intrinsic
 def put(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write element ``index`` of an array as it lies in memory."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], _place(context, builder, signature.args[0], args[0], args[1]))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, array.dtype), code
+    return types.void(array, types.intp, array.dtype), _write(_place)
 
 
 @intrinsic
 def span(typing: Any, array: Any, index: Any) -> Any:
     """Eight elements from ``index`` on, as they lie in memory."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = builder.load(_from(context, builder, signature.args[0], *args))
-        value.align = signature.args[0].dtype.bitwidth // 8
-        return value
-
-    return _of(array.dtype)(array, types.intp), code
+    return _of(array.dtype)(array, types.intp), _read(_from)
 
 
 @intrinsic
 def put_span(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write eight elements from ``index`` on, as they lie in memory."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = _from(context, builder, signature.args[0], args[0], args[1])
-        builder.store(args[2], place).align = signature.args[0].dtype.bitwidth // 8
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, _of(array.dtype)), code
+    return types.void(array, types.intp, _of(array.dtype)), _write(_from)
 
 
 @intrinsic
@@ -159,6 +149,16 @@ def splat(typing: Any, scalar: Any) -> Any:
         return _fill(builder, args[0])
 
     return _of(scalar)(scalar), code
+
+
+@intrinsic
+def vadd(typing: Any, left: Any, right: Any) -> Any:
+    """``left + right``, lane by lane."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.fadd(*args, flags=_FLAGS)
+
+    return left(left, left), code
 
 
 @intrinsic
