@@ -1,0 +1,142 @@
+"""A rigid shape as the step takes it: charge functions, and their energies in free space.
+
+The functions are the equilibrium charge of the shape and, for every split of a binary tree of its
+panels, one part's share of it minus the other's: Haar functions, weighted with the equilibrium
+charge. All but the first are without net charge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from capsense.errors import SolveError
+from capsense.surface import tree_kernels
+from capsense.surface.blocks import free_block, impedance
+from capsense.surface.panels import SurfacePanels
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+_NORMALS = 0.6
+"""How far apart two opposite normals count, as a share of the shape's extent, in splitting."""
+_LEAST_CHARGE = 1e-6
+"""Smallest charge of a panel, as a part of the largest: those within a cavity have none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """Clusters of panels, breadth first; n panels make 2 n - 1 of them."""
+
+    kids: Ints
+    """The two parts of each cluster, -1 for a single panel, shape (2 n - 1, 2)."""
+    function: Ints
+    """Charge function that splits a cluster, -1 for a single panel, shape (2 n - 1,)."""
+    panel: Ints
+    """Panel of a cluster without parts, else -1, shape (2 n - 1,)."""
+    charge: Array
+    """Share of each cluster in the equilibrium charge, shape (2 n - 1,)."""
+    center: Array
+    """Centres of charge [m], shape (2 n - 1, 3)."""
+    points: Array
+    """Four points with the centre and the two largest second moments of a cluster's charge [m],
+    shape (2 n - 1, 4, 3)."""
+    extent: Array
+    """Length of a uniform rod with the cluster's largest second moment [m], shape (2 n - 1,)."""
+
+    def to_functions(self, rows: Array) -> Array:
+        """Integrate rows of panel values with every charge function, shape (k, n) -> (k, n)."""
+        out = np.empty(rows.shape)
+        tree_kernels.to_functions(
+            np.ascontiguousarray(rows), self.kids, self.panel, self.charge, self.function,
+            np.empty(len(self.kids)), out,
+        )  # fmt: skip
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class RigidShape:
+    """Charge functions of a shape in its own frame; 4π eps0 = 1 in all energies."""
+
+    panels: SurfacePanels
+    tree: Tree
+    free: Array
+    """Mean potential on one panel of unit charge on another, free space [1/m], shape (n, n)."""
+    energy: Array32
+    """The same of the charge functions [1/m], shape (n, n)."""
+    capacitance: float
+    """Capacitance in free space over 4π eps0 [m]."""
+
+    @cached_property
+    def own(self) -> Array:
+        """Diagonal of ``energy`` [1/m], shape (n,)."""
+        return np.ascontiguousarray(np.diag(self.energy).astype(float))
+
+    @cached_property
+    def impedance(self) -> Array32:
+        """Interior impedance Z of the charge functions [1/m], shape (n, n).
+
+        A body of permittivity eps adds ``Z / (eps - 1)`` to ``energy``.
+
+        Raises:
+            SceneError: The surface is open.
+        """
+        return _of_functions(self.tree, impedance(self.panels, self.free))
+
+
+def rigid_shape(panels: SurfacePanels) -> RigidShape:
+    """Work out charge functions and energies.
+
+    Raises:
+        SolveError: The panels lie within each other, so that their block is not definite.
+    """
+    free = free_block(panels)
+    try:
+        factor = scipy.linalg.cho_factor(free, lower=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        raise SolveError(
+            f"the surface of {len(panels)} panels meets itself, so that no charge can be told; "
+            "remove doubled faces"
+        ) from None
+    charge = scipy.linalg.cho_solve(factor, np.ones(len(panels)), check_finite=False)
+    tree = build_tree(panels, np.maximum(charge, _LEAST_CHARGE * charge.max()))
+    return RigidShape(panels, tree, free, _of_functions(tree, free), float(charge.sum()))
+
+
+def build_tree(panels: SurfacePanels, charge: Array) -> Tree:
+    """Split panels into clusters; ``charge`` (n,) is their equilibrium charge, above zero."""
+    n = len(panels)
+    extent = float(np.ptp(panels.centers, axis=0).max())
+    features = np.concatenate([panels.centers, _NORMALS * extent * panels.normals], axis=1)
+    order, first, last = np.empty(n, np.int64), *np.empty((2, 2 * n - 1), np.int64)
+    kids = np.empty((2 * n - 1, 2), np.int64)
+    tree_kernels.split(features, charge, 1e-9 * extent, order, first, last, kids)
+    single = kids[:, 0] < 0
+    panel = np.where(single, order[first], -1)
+    function = np.where(single, -1, np.cumsum(~single))
+    share, center, spread = (
+        np.empty(2 * n - 1),
+        np.empty((2 * n - 1, 3)),
+        np.empty((2 * n - 1, 3, 3)),
+    )
+    share[single] = charge[panel[single]] / charge.sum()
+    center[single], spread[single] = panels.centers[panel[single]], panels.moments[panel[single]]
+    tree_kernels.moments(kids, panel, share, center, spread)
+    size, axes = np.linalg.eigh(spread)
+    arms = (axes * np.sqrt(np.maximum(size, 0.0))[:, None]).transpose(0, 2, 1)
+    signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    points = center[:, None] + signs @ arms[:, 1:]
+    return Tree(
+        kids, function, panel, share, center, points, np.sqrt(12.0 * np.maximum(size[:, 2], 0.0))
+    )
+
+
+def _of_functions(tree: Tree, block: Array) -> Array32:
+    """Change a symmetric block of panels to one of charge functions."""
+    half = tree.to_functions(block)
+    return np.ascontiguousarray(tree.to_functions(half.T), dtype=np.float32)

@@ -1,0 +1,300 @@
+"""The step, compiled: the matrix of the chosen charge functions, its solution, what was left out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import carray
+from numpy.typing import NDArray
+
+from capsense.surface.step_kernels import (
+    choose,
+    climb,
+    leaf_pairs,
+    leaf_points,
+    leaf_rows,
+    score,
+    shares,
+)
+from capsense.surface.vector_kernels import (
+    WIDTH,
+    cholesky,
+    integers,
+    fast,
+    multiply,
+    singles,
+    substitute,
+)
+
+GAIN = 1.3
+"""What the functions directly below the cut stand for: themselves, and all below them."""
+
+
+class Functions(NamedTuple):
+    """The charge functions of a cut: those solved for, then those of the estimate."""
+
+    cluster: NDArray[Any]
+    """Cluster in the cut that a function splits, -1 - cluster for the net charge, shape (f,)."""
+    number: NDArray[Any]
+    """Its number among the functions of the shape, shape (f,)."""
+    body: NDArray[Any]
+    """Its body, shape (f,)."""
+    solved: int
+    """How many are solved for."""
+
+
+class Solution(NamedTuple):
+    """What a scene does to a design; 4π eps0 = 1."""
+
+    delta: NDArray[Any]
+    """Change of the Maxwell matrix [m], shape (m, m)."""
+    left: NDArray[Any]
+    """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    charge: NDArray[Any]
+    """Charge on each leaf for each terminal at 1 V [m], shape (l, m)."""
+    points: NDArray[Any]
+    """Four points of each leaf [m], shape (l, 4, 3)."""
+    extent: NDArray[Any]
+    """Extent of each leaf [m], shape (l,)."""
+    owner: NDArray[Any]
+    """Body of each leaf, shape (l,)."""
+    size: int
+    """Functions solved for; 0 where the matrix was not definite."""
+
+
+@fast
+def solve(bodies, green, threshold, width):
+    """Solve a scene of rigid bodies."""
+    first = np.zeros(bodies.shape[0] + 1, np.int64)
+    for b in range(bodies.shape[0]):
+        first[b + 1] = first[b] + 2 * bodies[b].n - 1
+    weight, scores = np.empty(green.terminals), np.empty(first[-1])
+    score(bodies, first, green, weight, scores)
+    cut = choose(bodies, first, scores, threshold, width)
+    points, extent = leaf_points(bodies, cut)
+    rows = leaf_rows(points, shares(points, green), green)
+    leaves = cut.leaves.shape[0]
+    owner = np.empty(leaves, np.int64)
+    for j in range(leaves):
+        owner[j] = cut.body[cut.leaves[j]]
+    pairs = np.empty((leaves, leaves), np.float32)
+    leaf_pairs(points, extent, owner, green.floor, pairs)
+    functions = _list_functions(bodies, cut)
+    phi, matrix, rest, own = _assemble(bodies, cut, functions, rows, pairs, green)
+    delta, left, x = _reduce(cut, functions, phi, matrix, rest, own)
+    charge = _leaf_charges(cut, functions, x, leaves)
+    return Solution(delta, left, charge, points, extent, owner,
+                    functions.solved if delta[0, 0] == delta[0, 0] else 0)  # fmt: skip
+
+
+@fast
+def _list_functions(bodies, cut):
+    count = bodies.shape[0]
+    for a in range(cut.node.shape[0]):
+        if cut.kids[a, 0] >= 0:
+            count += 1
+    cluster, number, body = (
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+    )
+    f = solved = 0
+    for rest in range(2):
+        for a in range(cut.node.shape[0]):
+            b = cut.body[a]
+            if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral:
+                cluster[f], number[f], body[f] = -1 - a, 0, b
+                f += 1
+            if cut.kids[a, 0] >= 0 and (cut.fade[a] == 0.0) == (rest == 1):
+                # functions are numbered breadth first, as clusters are
+                cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
+                f += 1
+        if rest == 0:
+            solved = f
+    return Functions(cluster[:f], number[:f], body[:f], solved)
+
+
+@fast
+def _function(body, node):
+    from_address = carray(integers(body.function), (2 * body.n - 1,))
+    return from_address[node]
+
+
+@fast
+def _differences(cut, functions, values, out):
+    """Integrals with the functions (f, m) of what has these means on the clusters, (k, m)."""
+    for f in range(functions.cluster.shape[0]):
+        a = functions.cluster[f]
+        if a < 0:
+            out[f] = values[-1 - a]
+        else:
+            x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
+            for i in range(values.shape[1]):
+                out[f, i] = x[i] - y[i]
+
+
+@fast
+def _assemble(bodies, cut, functions, rows, pairs, green):
+    """φ⁰ of the functions, their matrix, the rows below it, and the diagonal of all of them."""
+    clusters, leaves = cut.node.shape[0], cut.leaves.shape[0]
+    total, solved = functions.cluster.shape[0], functions.solved
+    lead, width = green.lead, rows.shape[1]
+    values = np.empty((clusters, width + leaves), np.float32)
+    for j in range(leaves):
+        a = cut.leaves[j]
+        values[a, :width] = rows[j]
+        values[a, width:] = pairs[j]
+    climb(cut, values)
+    wide = np.empty((total, width + leaves), np.float32)
+    _differences(cut, functions, values, wide)
+    columns = np.empty((clusters, total), np.float32)
+    for j in range(leaves):
+        for f in range(total):
+            columns[cut.leaves[j], f] = wide[f, width + j]
+    climb(cut, columns)
+    outer = np.empty((total, total), np.float32)
+    _differences(cut, functions, columns, outer)
+    psi = np.ascontiguousarray(wide[:, lead:width])
+    padded = WIDTH * ((solved + WIDTH - 1) // WIDTH)
+    turned = np.zeros((width - lead, padded), np.float32)
+    for f in range(solved):
+        for k in range(width - lead):
+            turned[k, f] = psi[f, k]
+    response = np.empty((total, padded), np.float32)
+    multiply(psi, turned, response)
+    phi, own = np.empty((total, green.terminals)), np.empty(total)
+    matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
+    for f in range(total):
+        body = bodies[functions.body[f]]
+        energy = carray(singles(body.energy), (body.n, body.n))
+        for i in range(green.terminals):
+            phi[f, i] = wide[f, i]
+        at_f = functions.number[f]
+        for e in range(min(f + 1, solved) if f < solved else solved):
+            value = float(outer[e, f]) - float(response[f, e])
+            if functions.body[e] == functions.body[f]:
+                value += float(energy[at_f, functions.number[e]]) / body.scale
+            if f < solved:
+                matrix[f, e] = value
+                matrix[e, f] = value
+            else:
+                rest[f - solved, e] = value
+        if f < solved:
+            own[f] = matrix[f, f]
+        else:
+            square = 0.0
+            for k in range(width - lead):
+                square += float(psi[f, k]) * float(psi[f, k])
+            own[f] = float(outer[f, f]) - square + float(energy[at_f, at_f]) / body.scale
+    _add_matter(bodies, functions, matrix, rest, own)
+    return phi, matrix, rest, own
+
+
+@fast
+def _add_matter(bodies, functions, matrix, rest, own):
+    """Add what ties bodies to ground, and the inside of dielectrics."""
+    solved = functions.solved
+    for f in range(functions.cluster.shape[0]):
+        body = bodies[functions.body[f]]
+        if functions.cluster[f] < 0 and f < solved:
+            matrix[f, f] += body.tie
+            own[f] += body.tie
+        if body.softness == 0.0 or functions.cluster[f] < 0:
+            continue
+        inside = carray(singles(body.impedance), (body.n, body.n))
+        factor = body.softness / body.scale
+        for e in range(solved):
+            if functions.body[e] == functions.body[f] and functions.cluster[e] >= 0:
+                value = factor * float(inside[functions.number[f], functions.number[e]])
+                if f < solved:
+                    matrix[f, e] += value
+                else:
+                    rest[f - solved, e] += value
+        own[f] += factor * float(inside[functions.number[f], functions.number[f]])
+
+
+@fast
+def _reduce(cut, functions, phi, matrix, rest, own):
+    """ΔC, the part of it that was estimated, and the charges of all functions.
+
+    Functions that fade in by t are taken as √t A √t with their own energy whole. What they lack,
+    and functions not solved for, add the energy that the potential they leave has in them alone.
+    """
+    total, solved, m = functions.cluster.shape[0], functions.solved, phi.shape[1]
+    root = np.empty(solved)
+    for f in range(solved):
+        a = functions.cluster[f]
+        root[f] = 1.0 if a < 0 else math.sqrt(cut.fade[a])
+    factor, x = np.empty((solved, solved)), np.empty((total, m))
+    for f in range(solved):
+        for e in range(f):
+            factor[f, e] = root[f] * matrix[f, e] * root[e]
+        factor[f, f] = matrix[f, f]
+        for i in range(m):
+            x[f, i] = root[f] * phi[f, i]
+    delta, left = np.zeros((m, m)), np.zeros((m, m))
+    if not cholesky(factor):
+        delta[:] = np.nan
+        x[:] = np.nan
+        return delta, left, x
+    substitute(factor, x[:solved])
+    for f in range(solved):
+        for i in range(m):
+            x[f, i] *= root[f]
+            for j in range(i + 1):
+                delta[i, j] += 0.0
+    for f in range(solved):
+        for i in range(m):
+            for j in range(m):
+                delta[i, j] += phi[f, i] * x[f, j]
+    residual = np.empty(m)
+    for f in range(total):
+        a = functions.cluster[f]
+        if a < 0 or cut.fade[a] >= 1.0:
+            continue
+        for i in range(m):
+            residual[i] = phi[f, i]
+        line = matrix[f] if f < solved else rest[f - solved]
+        for e in range(solved):
+            for i in range(m):
+                residual[i] -= line[e] * x[e, i]
+        lack = GAIN * (1.0 - cut.fade[a]) * (1.0 - (1.0 - cut.above[a]) ** 4) / own[f]
+        for i in range(m):
+            for j in range(m):
+                left[i, j] += lack * residual[i] * residual[j]
+        if f >= solved:
+            for i in range(m):
+                x[f, i] = lack * residual[i]
+    for i in range(m):
+        for j in range(m):
+            delta[i, j] += left[i, j]
+    for i in range(m):
+        for j in range(i):
+            delta[i, j] = delta[j, i] = 0.5 * (delta[i, j] + delta[j, i])
+    return delta, left, x
+
+
+@fast
+def _leaf_charges(cut, functions, x, leaves):
+    """Charges on the leaves (l, m) of charges of the functions (f, m)."""
+    clusters, m = cut.node.shape[0], x.shape[1]
+    charge = np.zeros((clusters, m))
+    for f in range(functions.cluster.shape[0]):
+        a = functions.cluster[f]
+        for i in range(m):
+            if a < 0:
+                charge[-1 - a, i] += x[f, i]
+            else:
+                charge[cut.kids[a, 0], i] += x[f, i]
+                charge[cut.kids[a, 1], i] -= x[f, i]
+    out = np.empty((leaves, m))
+    for a in range(clusters):
+        if cut.kids[a, 0] >= 0:
+            for i in range(m):
+                charge[cut.kids[a, 0], i] += cut.share[a] * charge[a, i]
+                charge[cut.kids[a, 1], i] += (1.0 - cut.share[a]) * charge[a, i]
+        else:
+            out[cut.leaf[a]] = charge[a]
+    return out

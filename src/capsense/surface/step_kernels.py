@@ -1,0 +1,347 @@
+"""The step, compiled: which charge functions a scene needs, their matrix, their charges.
+
+Lengths in metres, 4π eps0 = 1; symbols as in ``docs/theory.md``. A *row* is a cluster's mean of
+the terminals' potentials φ⁰ (first ``Green.lead`` columns) and of the modes ψ of g.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import carray
+from numpy.typing import NDArray
+
+from capsense.surface.pair_kernels import mean_inverse
+from capsense.surface.vector_kernels import (
+    doubles,
+    fast,
+    integers,
+    multiply,
+    point_potentials,
+    singles,
+    source_potentials,
+)
+
+BODY = np.dtype(
+    [
+        ("n", np.int64),  # panels; there are 2 n - 1 clusters
+        ("kids", np.int64), ("function", np.int64), ("charge", np.int64), ("center", np.int64),
+        ("points", np.int64), ("extent", np.int64), ("own", np.int64), ("energy", np.int64),
+        ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
+        ("scale", np.float64),  # the body is so many times as large as the shape
+        ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
+        ("neutral", np.int64),  # whether it carries no net charge
+        ("tie", np.float64),  # added to the energy of the net charge [1/m]
+        ("softness", np.float64),  # 1 / (eps - 1), 0 for a conductor
+    ]
+)  # fmt: skip
+"""One body, as the kernels take it."""
+
+USED, FRONTIER, LEAF = 2, 1, 0
+"""State of a cluster: its function is used; it is split for an estimate only; it is not split."""
+
+
+class Green(NamedTuple):
+    """A design's Green's function, as the kernels take it; single precision."""
+
+    near: NDArray[Any]
+    """Sources for points near the sensor [m], shape (3, s)."""
+    near_table: NDArray[Any]
+    """What each source adds to φ⁰ and ψ, shape (s, w)."""
+    far: NDArray[Any]
+    """Sources for points far from it [m], shape (3, f)."""
+    far_table: NDArray[Any]
+    """The same of these, shape (f, v), v <= w."""
+    score_table: NDArray[Any]
+    """φ⁰ alone, from the far sources, shape (f, lead)."""
+    lead: int
+    """Columns of φ⁰, padded."""
+    terminals: int
+    """How many of them are terminals."""
+    floor: float
+    """Height of the floor [m]."""
+    box: NDArray[Any]
+    """Corners of the design [m], shape (2, 3)."""
+    blend: NDArray[Any]
+    """Distances [m] from ``box`` between which near sources give way to far ones, shape (2,)."""
+
+
+class Cut(NamedTuple):
+    """The clusters that a scene needs, parts behind wholes, body after body."""
+
+    body: NDArray[Any]
+    """Body of a cluster, shape (k,)."""
+    node: NDArray[Any]
+    """Its place in the body's tree, shape (k,)."""
+    kids: NDArray[Any]
+    """Its parts in this list, -1 for a leaf, shape (k, 2)."""
+    share: NDArray[Any]
+    """Share of the first part in its charge, shape (k,)."""
+    leaf: NDArray[Any]
+    """Its number among the leaves, else -1, shape (k,)."""
+    fade: NDArray[Any]
+    """How far its function is faded in, 0 to 1, shape (k,)."""
+    above: NDArray[Any]
+    """The same of the cluster above, 1 at the top, shape (k,)."""
+    leaves: NDArray[Any]
+    """The leaves in this list, shape (l,)."""
+
+
+@fast
+def score(bodies, first, green, weight, scores):
+    """Share of the electrodes' energies that each charge function takes up alone.
+
+    Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
+    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster.
+    """
+    terminals, lead = green.terminals, green.lead
+    means = np.empty((first[-1], lead), np.float32)
+    energy = np.zeros(terminals)
+    for b in range(bodies.shape[0]):
+        body = bodies[b]
+        count = 2 * body.n - 1
+        kids = carray(integers(body.kids), (count, 2))
+        function = carray(integers(body.function), (count,))
+        charge = carray(doubles(body.charge), (count,))
+        own = carray(doubles(body.own), (body.n,))
+        _panel_potentials(body, kids, green, means[first[b] : first[b + 1]])
+        mean = means[first[b] : first[b + 1]]
+        for k in range(count - 1, -1, -1):
+            if kids[k, 0] >= 0:
+                p = np.float32(charge[kids[k, 0]] / charge[k])
+                q = np.float32(1.0) - p
+                stiffness = body.scale / own[function[k]]
+                for i in range(lead):
+                    x, y = mean[kids[k, 0], i], mean[kids[k, 1], i]
+                    mean[k, i] = p * x + q * y
+                for i in range(terminals):
+                    d = float(mean[kids[k, 0], i] - mean[kids[k, 1], i])
+                    energy[i] += d * d * stiffness
+        if not body.neutral:
+            for i in range(terminals):
+                energy[i] += float(mean[0, i]) ** 2 / (own[0] / body.scale + body.tie)
+    whole = 0.0
+    for i in range(terminals):
+        whole += energy[i] ** 2
+    for i in range(terminals):
+        weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
+    for b in range(bodies.shape[0]):
+        _raise_scores(
+            bodies[b], means[first[b] : first[b + 1]], weight, scores[first[b] : first[b + 1]]
+        )
+
+
+@fast
+def _panel_potentials(body, kids, green, means):
+    """φ⁰ at the panels, from the far sources."""
+    count = 2 * body.n - 1
+    center = carray(doubles(body.center), (count, 3))
+    places = np.empty(body.n, np.int64)
+    points = np.empty((body.n, 3), np.float32)
+    found = 0
+    for k in range(count):
+        if kids[k, 0] < 0:
+            places[found] = k
+            for i in range(3):
+                points[found, i] = body.position[i] + body.scale * (
+                    body.rotation[i, 0] * center[k, 0] + body.rotation[i, 1] * center[k, 1]
+                    + body.rotation[i, 2] * center[k, 2])  # fmt: skip
+            found += 1
+    values = np.empty((body.n, green.far.shape[1]), np.float32)
+    point_potentials(points, green.far, np.float32(green.floor), values)
+    for j in range(body.n):
+        for i in range(green.lead):
+            means[places[j], i] = 0.0
+        for s in range(green.far.shape[1]):
+            x = values[j, s]
+            for i in range(green.lead):
+                means[places[j], i] += x * green.score_table[s, i]
+
+
+@fast
+def _raise_scores(body, mean, weight, scores):
+    count = 2 * body.n - 1
+    kids = carray(integers(body.kids), (count, 2))
+    function = carray(integers(body.function), (count,))
+    own = carray(doubles(body.own), (body.n,))
+    for k in range(count - 1, -1, -1):
+        scores[k] = 0.0
+        if kids[k, 0] >= 0:
+            value = 0.0
+            for i in range(weight.shape[0]):
+                d = float(mean[kids[k, 0], i] - mean[kids[k, 1], i])
+                value += weight[i] * d * d
+            value *= body.scale / own[function[k]]
+            for c in range(2):
+                below = scores[kids[k, c]]
+                value = max(value, below) + 0.5 * min(value, below)
+            scores[k] = value
+
+
+@fast
+def choose(bodies, first, scores, threshold, width):
+    """Return the clusters whose score is above a threshold, and those directly below them.
+
+    A function fades in while its score grows from ``threshold`` to ``width`` times that.
+    """
+    total = first[-1]
+    state = np.full(total, -1, np.int8)
+    fades, above = np.zeros(total), np.zeros(total)
+    place = np.full(total, -1, np.int64)
+    count = leaves = 0
+    for b in range(bodies.shape[0]):
+        kids = carray(integers(bodies[b].kids), (2 * bodies[b].n - 1, 2))
+        o = first[b]
+        state[o], above[o] = FRONTIER, 1.0
+        for k in range(2 * bodies[b].n - 1):
+            if state[o + k] < 0:
+                continue
+            place[o + k] = count
+            count += 1
+            if state[o + k] == LEAF or kids[k, 0] < 0:
+                state[o + k] = LEAF
+                leaves += 1
+                continue
+            x = math.log(max(scores[o + k], 1e-300) / threshold) / math.log(width)
+            x = min(1.0, max(0.0, x))
+            fades[o + k] = min(x * x * (3.0 - 2.0 * x), above[o + k])
+            state[o + k] = USED if fades[o + k] > 0.0 else FRONTIER
+            for c in range(2):
+                state[o + kids[k, c]] = LEAF if state[o + k] == FRONTIER else FRONTIER
+                above[o + kids[k, c]] = fades[o + k]
+    return _collect(bodies, first, state, place, fades, above, count, leaves)
+
+
+@fast
+def _collect(bodies, first, state, place, fades, above, count, leaves):
+    cut = Cut(
+        np.empty(count, np.int64), np.empty(count, np.int64), np.full((count, 2), -1, np.int64),
+        np.zeros(count), np.full(count, -1, np.int64), np.empty(count), np.empty(count),
+        np.empty(leaves, np.int64),
+    )  # fmt: skip
+    leaf = 0
+    for b in range(bodies.shape[0]):
+        nodes = 2 * bodies[b].n - 1
+        kids = carray(integers(bodies[b].kids), (nodes, 2))
+        charge = carray(doubles(bodies[b].charge), (nodes,))
+        o = first[b]
+        for k in range(nodes):
+            a = place[o + k]
+            if a < 0:
+                continue
+            cut.body[a], cut.node[a] = b, k
+            cut.fade[a], cut.above[a] = fades[o + k], above[o + k]
+            if state[o + k] == LEAF:
+                cut.leaf[a], cut.leaves[leaf] = leaf, a
+                leaf += 1
+            else:
+                cut.kids[a, 0], cut.kids[a, 1] = place[o + kids[k, 0]], place[o + kids[k, 1]]
+                cut.share[a] = charge[kids[k, 0]] / charge[k]
+    return cut
+
+
+@fast
+def leaf_points(bodies, cut):
+    """Four points of each leaf and its extent [m] in the sensor frame, (l, 4, 3) and (l,)."""
+    n = cut.leaves.shape[0]
+    points, extent = np.empty((n, 4, 3)), np.empty(n)
+    for j in range(n):
+        a = cut.leaves[j]
+        body = bodies[cut.body[a]]
+        k = cut.node[a]
+        local = carray(doubles(body.points), (2 * body.n - 1, 4, 3))
+        extent[j] = body.scale * carray(doubles(body.extent), (2 * body.n - 1,))[k]
+        for q in range(4):
+            for i in range(3):
+                points[j, q, i] = body.position[i] + body.scale * (
+                    body.rotation[i, 0] * local[k, q, 0] + body.rotation[i, 1] * local[k, q, 1]
+                    + body.rotation[i, 2] * local[k, q, 2])  # fmt: skip
+    return points, extent
+
+
+@fast
+def shares(points, green):
+    """Share of the near sources in each leaf's row, shape (l,)."""
+    out = np.empty(points.shape[0])
+    for j in range(points.shape[0]):
+        d = 0.0
+        for i in range(3):
+            c = 0.25 * (points[j, 0, i] + points[j, 1, i] + points[j, 2, i] + points[j, 3, i])
+            off = max(green.box[0, i] - c, c - green.box[1, i], 0.0)
+            d += off * off
+        x = (green.blend[1] - math.sqrt(d)) / (green.blend[1] - green.blend[0])
+        x = min(1.0, max(0.0, x))
+        out[j] = x * x * (3.0 - 2.0 * x)
+    return out
+
+
+@fast
+def leaf_rows(points, share, green):
+    """Rows of the leaves, shape (l, w)."""
+    n, width = points.shape[0], green.near_table.shape[1]
+    out = np.zeros((n, width), np.float32)
+    for far in range(2):
+        chosen = np.empty(n, np.int64)
+        count = 0
+        for j in range(n):
+            if (far == 0 and share[j] > 0.0) or (far == 1 and share[j] < 1.0):
+                chosen[count] = j
+                count += 1
+        if count == 0:
+            continue
+        some = np.empty((count, 4, 3), np.float32)
+        for c in range(count):
+            some[c] = points[chosen[c]]
+        if far == 1:
+            _add_rows(
+                some, chosen[:count], share, green.far, green.far_table, green.floor, far, out
+            )
+        else:
+            _add_rows(
+                some, chosen[:count], share, green.near, green.near_table, green.floor, far, out
+            )
+    return out
+
+
+@fast
+def _add_rows(points, chosen, share, sources, table, floor, far, out):
+    values = np.empty((points.shape[0], sources.shape[1]), np.float32)
+    source_potentials(points, sources, np.float32(floor), values)
+    rows = np.empty((points.shape[0], table.shape[1]), np.float32)
+    multiply(values, table, rows)
+    for c in range(chosen.shape[0]):
+        part = share[chosen[c]] if far == 0 else 1.0 - share[chosen[c]]
+        for i in range(table.shape[1]):
+            out[chosen[c], i] += np.float32(part) * rows[c, i]
+
+
+@fast
+def leaf_pairs(points, extent, owner, floor, out):
+    """Mean of 1/r between bodies, and of -1/r to all images in the floor, into ``out`` (l, l)."""
+    n = points.shape[0]
+    image = points.copy()
+    for j in range(n):
+        for q in range(4):
+            image[j, q, 2] = 2.0 * floor - points[j, q, 2]
+    for i in range(n):
+        for j in range(i + 1):
+            value = -mean_inverse(points[i], image[j], extent[i], extent[j])
+            if owner[i] != owner[j]:
+                value += mean_inverse(points[i], points[j], extent[i], extent[j])
+            out[i, j] = value
+            out[j, i] = value
+
+
+@fast
+def climb(cut, values):
+    """Fill the means (k, m) of all clusters of a cut from those of its leaves."""
+    for a in range(cut.node.shape[0] - 1, -1, -1):
+        if cut.kids[a, 0] >= 0:
+            p = np.float32(cut.share[a])
+            q = np.float32(1.0) - p
+            x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
+            row = values[a]
+            for i in range(values.shape[1]):
+                row[i] = p * x[i] + q * y[i]

@@ -1,0 +1,136 @@
+"""Compiled kernels that split a surface into clusters and change to hierarchical charge functions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_SHARP = 0.3
+"""Share of the spread of normals that a jump between two of them must have to be an edge."""
+
+
+@njit(cache=True, nogil=True)
+def split(features, charges, spatial, order, first, last, kids):
+    """Split a surface into a binary tree of clusters, breadth first.
+
+    A cluster is split across the feature that varies most: in the middle of its extent along a
+    coordinate, at the largest jump of a normal. Panels that do not differ are halved.
+
+    Args:
+        features: Centres [m] and scaled normals of the panels, shape (n, 6).
+        charges: Equilibrium charges of the panels, shape (n,).
+        spatial: Differences below this [m] count as none.
+        order: Filled with the panels, those of a cluster side by side, shape (n,).
+        first: Filled with the first place in ``order`` of each cluster, shape (2 n - 1,).
+        last: Filled with the place behind the last one, shape (2 n - 1,).
+        kids: Filled with the two parts of each cluster, -1 for a single panel, shape (2 n - 1, 2).
+    """
+    n = features.shape[0]
+    for i in range(n):
+        order[i] = i
+    first[0], last[0] = 0, n
+    made, k = 1, 0
+    values = np.empty(n)
+    while k < made:
+        a, b = first[k], last[k]
+        kids[k, 0] = kids[k, 1] = -1
+        if b - a > 1:
+            axis, best = 0, -1.0
+            for d in range(6):
+                low, high = np.inf, -np.inf
+                for i in range(a, b):
+                    low = min(low, features[order[i], d])
+                    high = max(high, features[order[i], d])
+                if high - low > best:
+                    axis, best = d, high - low
+            for i in range(a, b):
+                values[i] = features[order[i], axis]
+            rank = np.argsort(values[a:b], kind="mergesort")
+            members = order[a:b].copy()
+            for i in range(b - a):
+                order[a + i] = members[rank[i]]
+                values[a + i] = features[order[a + i], axis]
+            cut = _cut(values[a:b], order[a:b], charges, axis >= 3, spatial)
+            kids[k, 0], kids[k, 1] = made, made + 1
+            first[made], last[made] = a, a + cut
+            first[made + 1], last[made + 1] = a + cut, b
+            made += 2
+        k += 1
+
+
+@njit(cache=True, nogil=True)
+def _cut(values, members, charges, of_normals, spatial):
+    """How many of the sorted members go into the first part."""
+    n = values.shape[0]
+    spread = values[n - 1] - values[0]
+    if of_normals:
+        jump, at = 0.0, -1
+        for i in range(n - 1):
+            if values[i + 1] - values[i] > jump:
+                jump, at = values[i + 1] - values[i], i + 1
+        if jump > _SHARP * spread:
+            return at
+    total = 0.0
+    for i in range(n):
+        total += charges[members[i]]
+    best, cut, half = np.inf, n // 2, 0.0
+    for i in range(n - 1):
+        half += charges[members[i]]
+        if values[i + 1] - values[i] > spatial:
+            off = (
+                abs(2.0 * half - total)
+                if of_normals
+                else (abs(values[i] + values[i + 1] - values[0] - values[n - 1]))
+            )
+            if off < best * (1.0 - 1e-9):
+                best, cut = off, i + 1
+    return cut
+
+
+@njit(cache=True, nogil=True)
+def moments(kids, panel, charge, center, spread):
+    """Charge, centre of charge and second central moments of all clusters, from their parts.
+
+    ``panel`` is the panel of a cluster without parts, whose row of ``charge``, ``center`` and
+    ``spread`` is filled; the others are written.
+    """
+    for k in range(kids.shape[0] - 1, -1, -1):
+        if kids[k, 0] < 0:
+            continue
+        a, b = kids[k, 0], kids[k, 1]
+        whole = charge[a] + charge[b]
+        p, q = charge[a] / whole, charge[b] / whole
+        charge[k] = whole
+        for i in range(3):
+            center[k, i] = p * center[a, i] + q * center[b, i]
+        for i in range(3):
+            for j in range(3):
+                spread[k, i, j] = p * (
+                    spread[a, i, j] + (center[a, i] - center[k, i]) * (center[a, j] - center[k, j])
+                ) + q * (
+                    spread[b, i, j] + (center[b, i] - center[k, i]) * (center[b, j] - center[k, j])
+                )
+
+
+@njit(cache=True, nogil=True)
+def to_functions(rows, kids, panel, charge, function, means, out):
+    """Integrate rows of panel values with every charge function.
+
+    Args:
+        rows: Mean values on the panels, shape (k, n).
+        kids: Parts of the clusters, shape (2 n - 1, 2).
+        panel: Panel of a cluster without parts, shape (2 n - 1,).
+        charge: Charges of the clusters, shape (2 n - 1,).
+        function: Number of a cluster's function, -1 for a single panel, shape (2 n - 1,).
+        means: Room for the mean values on the clusters, shape (2 n - 1,).
+        out: Filled, function 0 with the mean over the body, shape (k, n).
+    """
+    for r in range(rows.shape[0]):
+        for k in range(kids.shape[0] - 1, -1, -1):
+            a, b = kids[k, 0], kids[k, 1]
+            if a < 0:
+                means[k] = rows[r, panel[k]]
+            else:
+                means[k] = (charge[a] * means[a] + charge[b] * means[b]) / charge[k]
+                out[r, function[k]] = means[a] - means[b]
+        out[r, 0] = means[0]

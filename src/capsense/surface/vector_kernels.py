@@ -1,0 +1,232 @@
+"""Building blocks of the step: potentials of point sources, products of small dense matrices.
+
+Single precision, eight numbers at a time (:mod:`capsense.solve.simd`); widths are multiples of 32.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from capsense.solve.simd import at, madd, put_span, span, splat
+
+WIDTH = 32
+"""Tables have a multiple of so many columns."""
+
+_FAST = frozenset({"contract", "nsz", "reassoc", "arcp"})
+fast = njit(cache=True, nogil=True, error_model="numpy", fastmath=set(_FAST))
+"""Compiled with sums in any order; NaN and infinity keep their meaning."""
+
+
+@intrinsic
+def rsqrt(typing: Any, value: Any) -> Any:
+    """``1 / sqrt(value)`` in single precision, to 3e-7, for a normal number above zero.
+
+    The bits of a float are nearly its logarithm, which gives a first guess; three of Newton's
+    steps follow. Unlike a division and a root this takes a few cycles for many numbers at once.
+    """
+    if value != types.float32:
+        return None
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        integer, single = ir.IntType(32), ir.FloatType()
+        flags = ("contract", "nsz", "reassoc")
+        bits = builder.bitcast(args[0], integer)
+        half = builder.lshr(bits, ir.Constant(integer, 1))
+        y = builder.bitcast(builder.sub(ir.Constant(integer, 0x5F375A86), half), single)
+        x = builder.fmul(args[0], ir.Constant(single, -0.5), flags=flags)
+        for _ in range(3):
+            square = builder.fmul(y, y, flags=flags)
+            step = builder.fadd(builder.fmul(x, square, flags=flags), ir.Constant(single, 1.5),
+                                flags=flags)  # fmt: skip
+            y = builder.fmul(y, step, flags=flags)
+        return y
+
+    return types.float32(types.float32), code
+
+
+@intrinsic
+def address_of(typing: Any, array: Any) -> Any:
+    """Where an array's elements begin in memory."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.ptrtoint(data, cgutils.intp_t)
+
+    return types.intp(array), code
+
+
+def _pointer(kind: Any) -> Any:
+    @intrinsic
+    def pointer(typing: Any, address: Any) -> Any:
+        """A pointer to the numbers that stand at an address."""
+
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+        return types.CPointer(kind)(types.intp), code
+
+    return pointer
+
+
+singles, doubles, integers = _pointer(types.float32), _pointer(types.float64), _pointer(types.int64)
+
+
+@fast
+def source_potentials(points, sources, floor, out):
+    """Mean over four points of the potential of every unit source and its image in the floor.
+
+    Args:
+        points: [m], shape (k, 4, 3), single precision, as all that follows.
+        sources: [m], shape (3, s).
+        floor: Height of the floor [m].
+        out: Filled [1/m], shape (k, s).
+    """
+    quarter = np.float32(0.25)
+    two = np.float32(2.0) * floor
+    for i in range(points.shape[0]):
+        for q in range(points.shape[1]):
+            x, y, z = points[i, q, 0], points[i, q, 1], points[i, q, 2]
+            for s in range(sources.shape[1]):
+                dx = x - sources[0, s]
+                dy = y - sources[1, s]
+                dz = z - sources[2, s]
+                ez = z + sources[2, s] - two
+                across = dx * dx + dy * dy
+                value = quarter * (rsqrt(across + dz * dz) - rsqrt(across + ez * ez))
+                if q == 0:
+                    out[i, s] = value
+                else:
+                    out[i, s] += value
+
+
+@fast
+def point_potentials(points, sources, floor, out):
+    """The same at single points, shape (k, 3)."""
+    two = np.float32(2.0) * floor
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for s in range(sources.shape[1]):
+            dx = x - sources[0, s]
+            dy = y - sources[1, s]
+            dz = z - sources[2, s]
+            ez = z + sources[2, s] - two
+            across = dx * dx + dy * dy
+            out[i, s] = rsqrt(across + dz * dz) - rsqrt(across + ez * ez)
+
+
+@fast
+def multiply(left, table, out):
+    """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 32.
+
+    Four rows and 32 columns at a time: sixteen sums stay in registers.
+    """
+    k, s, w = left.shape[0], left.shape[1], table.shape[1]
+    zero = splat(np.float32(0.0))
+    for j in range(0, w, WIDTH):
+        for i in range(0, k - 3, 4):
+            a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = zero
+            c0 = c1 = c2 = c3 = d0 = d1 = d2 = d3 = zero
+            p = i * s
+            for t in range(s):
+                o = t * w + j
+                v0, v1, v2, v3 = (
+                    span(table, o),
+                    span(table, o + 8),
+                    span(table, o + 16),
+                    span(table, o + 24),
+                )
+                x = at(left, p + t)
+                a0, a1, a2, a3 = madd(x, v0, a0), madd(x, v1, a1), madd(x, v2, a2), madd(x, v3, a3)
+                x = at(left, p + s + t)
+                b0, b1, b2, b3 = madd(x, v0, b0), madd(x, v1, b1), madd(x, v2, b2), madd(x, v3, b3)
+                x = at(left, p + 2 * s + t)
+                c0, c1, c2, c3 = madd(x, v0, c0), madd(x, v1, c1), madd(x, v2, c2), madd(x, v3, c3)
+                x = at(left, p + 3 * s + t)
+                d0, d1, d2, d3 = madd(x, v0, d0), madd(x, v1, d1), madd(x, v2, d2), madd(x, v3, d3)
+            _put(out, i * w + j, a0, a1, a2, a3)
+            _put(out, (i + 1) * w + j, b0, b1, b2, b3)
+            _put(out, (i + 2) * w + j, c0, c1, c2, c3)
+            _put(out, (i + 3) * w + j, d0, d1, d2, d3)
+        for i in range(k - k % 4, k):
+            a0 = a1 = a2 = a3 = zero
+            for t in range(s):
+                o = t * w + j
+                x = at(left, i * s + t)
+                a0, a1 = madd(x, span(table, o), a0), madd(x, span(table, o + 8), a1)
+                a2, a3 = madd(x, span(table, o + 16), a2), madd(x, span(table, o + 24), a3)
+            _put(out, i * w + j, a0, a1, a2, a3)
+
+
+@njit(inline="always")
+def _put(out, place, a, b, c, d):
+    put_span(out, place, a)
+    put_span(out, place + 8, b)
+    put_span(out, place + 16, c)
+    put_span(out, place + 24, d)
+
+
+@fast
+def cholesky(matrix):
+    """Replace the lower half of a symmetric matrix (n, n) by its Cholesky factor.
+
+    Returns:
+        Whether the matrix is positive definite.
+    """
+    n = matrix.shape[0]
+    for i in range(n):
+        for j in range(0, i + 1, 4):
+            if j + 4 <= i:
+                s0 = s1 = s2 = s3 = 0.0
+                for k in range(j):
+                    x = matrix[i, k]
+                    s0 += x * matrix[j, k]
+                    s1 += x * matrix[j + 1, k]
+                    s2 += x * matrix[j + 2, k]
+                    s3 += x * matrix[j + 3, k]
+                l0 = (matrix[i, j] - s0) / matrix[j, j]
+                l1 = (matrix[i, j + 1] - s1 - l0 * matrix[j + 1, j]) / matrix[j + 1, j + 1]
+                l2 = (matrix[i, j + 2] - s2 - l0 * matrix[j + 2, j]
+                      - l1 * matrix[j + 2, j + 1]) / matrix[j + 2, j + 2]  # fmt: skip
+                l3 = (matrix[i, j + 3] - s3 - l0 * matrix[j + 3, j] - l1 * matrix[j + 3, j + 1]
+                      - l2 * matrix[j + 3, j + 2]) / matrix[j + 3, j + 3]  # fmt: skip
+                matrix[i, j], matrix[i, j + 1], matrix[i, j + 2], matrix[i, j + 3] = l0, l1, l2, l3
+            else:
+                for c in range(j, min(j + 4, i + 1)):
+                    total = matrix[i, c]
+                    for k in range(c):
+                        total -= matrix[i, k] * matrix[c, k]
+                    if c < i:
+                        matrix[i, c] = total / matrix[c, c]
+                    elif not total > 0.0:
+                        return False
+                    else:
+                        matrix[i, i] = np.sqrt(total)
+    return True
+
+
+@fast
+def substitute(factor, sides):
+    """Replace right-hand sides (n, m) by the solution; ``factor`` is from :func:`cholesky`."""
+    n, m = sides.shape
+    for i in range(n):
+        for k in range(i):
+            x = factor[i, k]
+            for c in range(m):
+                sides[i, c] -= x * sides[k, c]
+        x = 1.0 / factor[i, i]
+        for c in range(m):
+            sides[i, c] *= x
+    for i in range(n - 1, -1, -1):
+        x = 1.0 / factor[i, i]
+        for c in range(m):
+            sides[i, c] *= x
+        for k in range(i):
+            x = factor[i, k]
+            for c in range(m):
+                sides[k, c] -= x * sides[i, c]
