@@ -9,15 +9,16 @@ import numpy as np
 from numba import carray
 from numpy.typing import NDArray
 
+from capsense.surface.pair_kernels import leaf_pairs
 from capsense.surface.step_kernels import (
     choose,
     climb,
-    leaf_pairs,
     leaf_points,
     leaf_rows,
     score,
     shares,
 )
+from capsense.solve.simd import at, madd, put_span, span
 from capsense.surface.vector_kernels import (
     WIDTH,
     cholesky,
@@ -85,7 +86,8 @@ def solve(bodies, green, threshold, width):
     phi, matrix, rest, own = _assemble(bodies, cut, functions, rows, pairs, green)
     delta, left, x = _reduce(cut, functions, phi, matrix, rest, own)
     charge = _leaf_charges(cut, functions, x, leaves)
-    return Solution(delta, left, charge, points, extent, owner,
+    m = green.terminals
+    return Solution(delta[:m, :m], left[:m, :m], charge, points, extent, owner,
                     functions.solved if delta[0, 0] == delta[0, 0] else 0)  # fmt: skip
 
 
@@ -164,12 +166,12 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
             turned[k, f] = psi[f, k]
     response = np.empty((total, padded), np.float32)
     multiply(psi, turned, response)
-    phi, own = np.empty((total, green.terminals)), np.empty(total)
+    phi, own = np.empty((total, lead)), np.empty(total)
     matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
     for f in range(total):
         body = bodies[functions.body[f]]
         energy = carray(singles(body.energy), (body.n, body.n))
-        for i in range(green.terminals):
+        for i in range(lead):
             phi[f, i] = wide[f, i]
         at_f = functions.number[f]
         for e in range(min(f + 1, solved) if f < solved else solved):
@@ -223,11 +225,15 @@ def _reduce(cut, functions, phi, matrix, rest, own):
     and functions not solved for, add the energy that the potential they leave has in them alone.
     """
     total, solved, m = functions.cluster.shape[0], functions.solved, phi.shape[1]
-    root = np.empty(solved)
-    for f in range(solved):
+    root, lack = np.empty(solved), np.zeros(total)
+    for f in range(total):
         a = functions.cluster[f]
-        root[f] = 1.0 if a < 0 else math.sqrt(cut.fade[a])
-    factor, x = np.empty((solved, solved)), np.empty((total, m))
+        fade = 1.0 if a < 0 else cut.fade[a]
+        if f < solved:
+            root[f] = math.sqrt(fade)
+        if fade < 1.0:
+            lack[f] = GAIN * (1.0 - fade) * (1.0 - (1.0 - cut.above[a]) ** 4) / own[f]
+    factor, x = np.empty((solved, solved)), np.zeros((total, m))
     for f in range(solved):
         for e in range(f):
             factor[f, e] = root[f] * matrix[f, e] * root[e]
@@ -237,36 +243,29 @@ def _reduce(cut, functions, phi, matrix, rest, own):
     delta, left = np.zeros((m, m)), np.zeros((m, m))
     if not cholesky(factor):
         delta[:] = np.nan
-        x[:] = np.nan
         return delta, left, x
     substitute(factor, x[:solved])
     for f in range(solved):
         for i in range(m):
             x[f, i] *= root[f]
-            for j in range(i + 1):
-                delta[i, j] += 0.0
-    for f in range(solved):
-        for i in range(m):
-            for j in range(m):
-                delta[i, j] += phi[f, i] * x[f, j]
-    residual = np.empty(m)
+    _add_products(phi[:solved], x[:solved], delta)
     for f in range(total):
-        a = functions.cluster[f]
-        if a < 0 or cut.fade[a] >= 1.0:
-            continue
+        if lack[f] > 0.0:
+            for c in range(0, m, 8):
+                residual = span(phi, f * m + c)
+                for e in range(solved):
+                    value = at(matrix, f * solved + e) if f < solved else at(rest, (f - solved) * solved + e)
+                    residual = madd(-value, span(x, e * m + c), residual)
+                put_span(phi, f * m + c, residual)
+    charge = np.zeros((total, m))
+    for f in range(total):
         for i in range(m):
-            residual[i] = phi[f, i]
-        line = matrix[f] if f < solved else rest[f - solved]
-        for e in range(solved):
-            for i in range(m):
-                residual[i] -= line[e] * x[e, i]
-        lack = GAIN * (1.0 - cut.fade[a]) * (1.0 - (1.0 - cut.above[a]) ** 4) / own[f]
-        for i in range(m):
-            for j in range(m):
-                left[i, j] += lack * residual[i] * residual[j]
-        if f >= solved:
-            for i in range(m):
-                x[f, i] = lack * residual[i]
+            charge[f, i] = lack[f] * phi[f, i]
+            if lack[f] == 0.0:
+                phi[f, i] = 0.0
+    _add_products(phi, charge, left)
+    for f in range(solved, total):
+        x[f] = charge[f]
     for i in range(m):
         for j in range(m):
             delta[i, j] += left[i, j]
@@ -274,6 +273,18 @@ def _reduce(cut, functions, phi, matrix, rest, own):
         for j in range(i):
             delta[i, j] = delta[j, i] = 0.5 * (delta[i, j] + delta[j, i])
     return delta, left, x
+
+
+@fast
+def _add_products(left, right, out):
+    """``out += left.T @ right``, shapes (n, m), (n, m) and (m, m); m a multiple of 8."""
+    n, m = left.shape
+    for i in range(m):
+        for c in range(0, m, 8):
+            total = span(out, i * m + c)
+            for f in range(n):
+                total = madd(at(left, f * m + i), span(right, f * m + c), total)
+            put_span(out, i * m + c, total)
 
 
 @fast

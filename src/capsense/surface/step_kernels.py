@@ -13,14 +13,13 @@ import numpy as np
 from numba import carray
 from numpy.typing import NDArray
 
-from capsense.surface.pair_kernels import mean_inverse
 from capsense.surface.vector_kernels import (
     doubles,
     fast,
     integers,
     multiply,
+    multiply_lanes,
     point_potentials,
-    singles,
     source_potentials,
 )
 
@@ -138,8 +137,9 @@ def _panel_potentials(body, kids, green, means):
     """φ⁰ at the panels, from the far sources."""
     count = 2 * body.n - 1
     center = carray(doubles(body.center), (count, 3))
+    rounded = 4 * ((body.n + 3) // 4)
     places = np.empty(body.n, np.int64)
-    points = np.empty((body.n, 3), np.float32)
+    points = np.zeros((rounded, 3), np.float32)
     found = 0
     for k in range(count):
         if kids[k, 0] < 0:
@@ -149,15 +149,12 @@ def _panel_potentials(body, kids, green, means):
                     body.rotation[i, 0] * center[k, 0] + body.rotation[i, 1] * center[k, 1]
                     + body.rotation[i, 2] * center[k, 2])  # fmt: skip
             found += 1
-    values = np.empty((body.n, green.far.shape[1]), np.float32)
+    values = np.empty((rounded, green.far.shape[1]), np.float32)
     point_potentials(points, green.far, np.float32(green.floor), values)
+    phi = np.empty((rounded, green.lead), np.float32)
+    multiply_lanes(values, green.score_table, phi)
     for j in range(body.n):
-        for i in range(green.lead):
-            means[places[j], i] = 0.0
-        for s in range(green.far.shape[1]):
-            x = values[j, s]
-            for i in range(green.lead):
-                means[places[j], i] += x * green.score_table[s, i]
+        means[places[j]] = phi[j]
 
 
 @fast
@@ -279,8 +276,11 @@ def shares(points, green):
 
 @fast
 def leaf_rows(points, share, green):
-    """Rows of the leaves, shape (l, w)."""
-    n, width = points.shape[0], green.near_table.shape[1]
+    """Rows of the leaves, shape (l, w); no wider than that of far points where none is near."""
+    n, width = points.shape[0], green.far_table.shape[1]
+    for j in range(n):
+        if share[j] > 0.0:
+            width = green.near_table.shape[1]
     out = np.zeros((n, width), np.float32)
     for far in range(2):
         chosen = np.empty(n, np.int64)
@@ -315,23 +315,6 @@ def _add_rows(points, chosen, share, sources, table, floor, far, out):
         part = share[chosen[c]] if far == 0 else 1.0 - share[chosen[c]]
         for i in range(table.shape[1]):
             out[chosen[c], i] += np.float32(part) * rows[c, i]
-
-
-@fast
-def leaf_pairs(points, extent, owner, floor, out):
-    """Mean of 1/r between bodies, and of -1/r to all images in the floor, into ``out`` (l, l)."""
-    n = points.shape[0]
-    image = points.copy()
-    for j in range(n):
-        for q in range(4):
-            image[j, q, 2] = 2.0 * floor - points[j, q, 2]
-    for i in range(n):
-        for j in range(i + 1):
-            value = -mean_inverse(points[i], image[j], extent[i], extent[j])
-            if owner[i] != owner[j]:
-                value += mean_inverse(points[i], points[j], extent[i], extent[j])
-            out[i, j] = value
-            out[j, i] = value
 
 
 @fast

@@ -172,6 +172,26 @@ def _put(out, place, a, b, c, d):
 
 
 @fast
+def multiply_lanes(left, table, out):
+    """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 8, k of 4."""
+    k, s, w = left.shape[0], left.shape[1], table.shape[1]
+    for j in range(0, w, 8):
+        for i in range(0, k, 4):
+            a = b = c = d = splat(np.float32(0.0))
+            p = i * s
+            for t in range(s):
+                v = span(table, t * w + j)
+                a, b = madd(at(left, p + t), v, a), madd(at(left, p + s + t), v, b)
+                c = madd(at(left, p + 2 * s + t), v, c)
+                d = madd(at(left, p + 3 * s + t), v, d)
+            o = i * w + j
+            put_span(out, o, a)
+            put_span(out, o + w, b)
+            put_span(out, o + 2 * w, c)
+            put_span(out, o + 3 * w, d)
+
+
+@fast
 def cholesky(matrix):
     """Replace the lower half of a symmetric matrix (n, n) by its Cholesky factor.
 
@@ -212,21 +232,20 @@ def cholesky(matrix):
 
 @fast
 def substitute(factor, sides):
-    """Replace right-hand sides (n, m) by the solution; ``factor`` is from :func:`cholesky`."""
+    """Replace right-hand sides (n, m) by the solution; ``factor`` is from :func:`cholesky`.
+
+    Columns go eight at a time; m is a multiple of 8.
+    """
     n, m = sides.shape
-    for i in range(n):
-        for k in range(i):
-            x = factor[i, k]
-            for c in range(m):
-                sides[i, c] -= x * sides[k, c]
-        x = 1.0 / factor[i, i]
-        for c in range(m):
-            sides[i, c] *= x
-    for i in range(n - 1, -1, -1):
-        x = 1.0 / factor[i, i]
-        for c in range(m):
-            sides[i, c] *= x
-        for k in range(i):
-            x = factor[i, k]
-            for c in range(m):
-                sides[k, c] -= x * sides[i, c]
+    for c in range(0, m, 8):
+        for i in range(n):
+            total = span(sides, i * m + c)
+            for k in range(i):
+                total = madd(-at(factor, i * n + k), span(sides, k * m + c), total)
+            put_span(sides, i * m + c, madd(1.0 / factor[i, i], total, splat(0.0)))
+        for i in range(n - 1, -1, -1):
+            done = madd(1.0 / factor[i, i], span(sides, i * m + c), splat(0.0))
+            put_span(sides, i * m + c, done)
+            for k in range(i):
+                put_span(sides, k * m + c,
+                         madd(-at(factor, i * n + k), done, span(sides, k * m + c)))  # fmt: skip
