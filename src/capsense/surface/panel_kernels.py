@@ -126,7 +126,7 @@ def fill_free(panels, out):
             span = reach + flat[9, j]
             r2 = x * x + y * y + z * z
             if r2 < NEAR * NEAR * span * span:
-                small, large = (i, j) if reach <= flat[9, j] else (j, i)
+                small, large = (i, j) if reach < (1.0 + 1e-6) * flat[9, j] else (j, i)
                 rule = fine if r2 < TOUCHING * TOUCHING * span * span else coarse
                 out[i, j] = _mean_potential(rule[small], frames[large]) / areas[large]
         out[i, i] = _mean_potential(rim[i], frames[i]) / areas[i]

@@ -1,0 +1,1 @@
+"""Charge on the surfaces of bodies: panels of a rigid shape, and what they need of it once."""

@@ -1,0 +1,235 @@
+"""Flat polygons that cover boxes and bodies of revolution, finer where charge gathers.
+
+All shapes are convex and centred on the origin of their own frame. Rings of nodes are moved out
+so far that the mean square distance of the flat panels is that of the curved surface; with few
+panels this leaves the least error of the capacitance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Profile = tuple[Array, Array, NDArray[np.int64]]
+"""Rings from the lower to the upper pole: radii, heights, and numbers of nodes (1 at a pole)."""
+
+_EDGE = 1.8
+"""Power of the distance to an edge by which the cells of a flat face shrink."""
+_LEAST = 12
+"""Fewest panels round the widest ring."""
+_LEAST_INNER = 5
+"""Fewest panels round any ring."""
+
+
+def box_polygons(size: tuple[float, float, float], count: int) -> Array:
+    """About ``count`` rectangles on a box of full edge lengths ``size`` [m], shape (n, 4, 3)."""
+
+    thin, middle, _ = sorted(size)
+    least = 2 if 2 * thin < middle else 3  # of a rod, both widths matter
+
+    def cells(cell: float) -> list[int]:
+        return [max(least, round(s / cell)) for s in size]
+
+    def total(k: list[int]) -> int:
+        return 2 * (k[0] * k[1] + k[1] * k[2] + k[0] * k[2])
+
+    k = cells(_best_cell(max(size), count, lambda cell: total(cells(cell))))
+    lines = [0.5 * s * _graded(n) for s, n in zip(size, k, strict=True)]
+    faces = []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        low_u, low_v = (x.ravel() for x in np.meshgrid(lines[u][:-1], lines[v][:-1]))
+        top_u, top_v = (x.ravel() for x in np.meshgrid(lines[u][1:], lines[v][1:]))
+        for side in (-0.5, 0.5):
+            face = np.empty((len(low_u), 4, 3))
+            face[..., axis] = side * size[axis]
+            face[..., u] = np.stack([low_u, top_u, top_u, low_u], axis=1)
+            face[..., v] = np.stack([low_v, low_v, top_v, top_v], axis=1)
+            faces.append(face if side > 0 else face[:, ::-1])
+    return np.concatenate(faces)
+
+
+def ellipsoid_polygons(radii: tuple[float, float, float], count: int) -> Array:
+    """About ``count`` polygons on an ellipsoid of half axes ``radii`` [m], shape (n, 4, 3).
+
+    Affine images of the panels of a ball: the charge of a lone conducting ellipsoid is the image
+    of the even charge of a ball. The poles lie on the axis that differs most from the others.
+    """
+    short, middle, long = (int(k) for k in np.argsort(radii, kind="stable"))
+    pole = long if radii[long] * radii[short] > radii[middle] ** 2 else short
+    order = [(pole + 1) % 3, (pole + 2) % 3, pole]
+    a = 0.5 * (radii[order[0]] + radii[order[1]])
+    c = radii[pole]
+
+    def profile(cell: float) -> Profile:
+        arc = math.pi * math.sqrt(0.5 * (a * a + c * c))
+        n = max(4, round(arc / cell))
+        angle = np.linspace(0.0, math.pi, n + 1)
+        rho, z = np.sin(angle), -np.cos(angle)
+        rho[[0, -1]] = 0.0
+        step = (math.pi / n) * np.hypot(a * z, c * rho)
+        return rho, z, _ring_counts(a * rho, np.maximum(step, 0.3 * cell), 2 * math.pi * a / cell)
+
+    rho, z, nodes = profile(_best_cell(max(a, c), count, lambda h: _panels(profile(h)[2])))
+    factor = _ring_factors(rho, z, nodes, 0.0, 1.0)
+    ball = _revolve(rho * factor, z * factor, nodes)
+    out = np.empty_like(ball)
+    for k, axis in enumerate(order):
+        out[..., axis] = radii[axis] * ball[..., k]
+    return out
+
+
+def capsule_polygons(radius: float, length: float, count: int) -> Array:
+    """About ``count`` polygons on a capsule of ``length`` [m] without caps, shape (n, 4, 3)."""
+    half = 0.5 * length
+
+    def profile(cell: float) -> Profile:
+        n = max(3, round(0.5 * math.pi * radius / cell))
+        k = max(1, round(length / cell))
+        angle = np.linspace(0.0, 0.5 * math.pi, n + 1)
+        tube = np.linspace(-half, half, k + 1)[1:-1]
+        rho = radius * np.concatenate([np.sin(angle), np.ones(k - 1), np.cos(angle)])
+        z = np.concatenate([-half - radius * np.cos(angle), tube, half + radius * np.sin(angle)])
+        rho[[0, -1]] = 0.0
+        step = np.full(len(rho), 0.5 * math.pi * radius / n)
+        return rho, z, _ring_counts(rho, step, 2 * math.pi * radius / cell)
+
+    rho, z, nodes = profile(_best_cell(half + radius, count, lambda h: _panels(profile(h)[2])))
+    factor = _ring_factors(rho, z, nodes, half, radius)
+    axis = np.clip(z, -half, half)
+    return _revolve(rho * factor, axis + (z - axis) * factor, nodes)
+
+
+def cylinder_polygons(radius: float, length: float, count: int) -> Array:
+    """About ``count`` polygons on a cylinder of full ``length`` [m] along z, shape (n, 4, 3)."""
+
+    def profile(cell: float) -> Profile:
+        n = max(3, round(1.4 * radius / cell))
+        k = max(2, round(length / cell))
+        end = np.sin(np.linspace(0.0, 0.5 * math.pi, n + 1))
+        rho = radius * np.concatenate([end, np.ones(k - 1), end[::-1]])
+        side = 0.5 * length * _graded(k)
+        z = np.concatenate([np.full(n, side[0]), side, np.full(n, side[-1])])
+        step = np.full(len(rho), 0.7 * cell)
+        return rho, z, _ring_counts(rho, step, 2 * math.pi * radius / cell)
+
+    size = max(radius, 0.5 * length)
+    rho, z, nodes = profile(_best_cell(size, count, lambda h: _panels(profile(h)[2])))
+    chord = math.sin(math.pi / nodes.max())
+    return _revolve(rho / math.sqrt(1 - 2 / 3 * chord * chord), z, nodes)
+
+
+def _graded(n: int) -> Array:
+    """Ends of n cells on [−1, 1] that shrink towards both ends."""
+    t = np.linspace(-1.0, 1.0, n + 1)
+    return np.sign(t) * (1 - (1 - np.abs(t)) ** _EDGE)
+
+
+def _best_cell(size: float, count: int, panels: Callable[[float], int]) -> float:
+    """The cell size [m] that makes nearest to ``count`` panels."""
+    low, high = 0.5 * size / count, 4.0 * size
+    best = (count, high)
+    for _ in range(14):
+        cell = math.sqrt(low * high)
+        found = panels(cell)
+        best = min(best, (abs(found - count), cell))
+        low, high = (cell, high) if found > count else (low, cell)
+    return best[1]
+
+
+def _ring_counts(rho: Array, step: Array, widest: float) -> NDArray[np.int64]:
+    """Nodes on every ring of radius ``rho`` [m]: ``widest`` on the widest, halved towards poles.
+
+    Neighbours have equal numbers or twice as many. ``step`` [m] is the height of the cells.
+    """
+    most = max(_LEAST, 4 * round(widest / 4))
+    least = 0.7 * np.minimum(step, 2 * math.pi * rho.max() / most)
+    out = np.empty(len(rho), dtype=np.int64)
+    middle = int(np.argmax(rho))
+    last = len(rho) - 1 - int(np.argmax(rho[::-1]))
+    out[middle : last + 1] = most
+    for first, stop, way in ((middle - 1, -1, -1), (last + 1, len(rho), 1)):
+        nodes = most
+        for i in range(first, stop, way):
+            inner = i + way != stop
+            fewer = nodes % 2 == 0 and nodes // 2 >= _LEAST_INNER
+            if inner and fewer and 2 * math.pi * rho[i] / nodes < least[i]:
+                nodes //= 2
+            out[i] = nodes if inner else 1
+    return out
+
+
+def _panels(nodes: NDArray[np.int64]) -> int:
+    """How many panels :func:`_revolve` makes."""
+    low, high = np.minimum(nodes[:-1], nodes[1:]), np.maximum(nodes[:-1], nodes[1:])
+    return int(np.where(low == high, low, np.where(low == 1, high, 3 * low)).sum())
+
+
+def _revolve(rho: Array, z: Array, nodes: NDArray[np.int64]) -> Array:
+    """Polygons between rings of nodes, corners of shape (n, 4, 3), counter-clockwise from outside.
+
+    Trapezoids between rings of equal numbers, else triangles, which repeat their last corner.
+    """
+    rings = []
+    for r, h, n in zip(rho, z, nodes, strict=True):
+        t = 2 * math.pi * np.arange(n) / n
+        rings.append(np.stack([r * np.cos(t), r * np.sin(t), np.full(n, h)], axis=1))
+    out = []
+    for low, top in pairwise(rings):
+        few, many = (low, top) if len(low) <= len(top) else (top, low)
+        few_next, many_next = np.roll(few, -1, axis=0), np.roll(many, -1, axis=0)
+        if len(few) == len(many):
+            band = np.stack([few, few_next, many_next, many], axis=1)
+        elif len(few) == 1:
+            tip = np.repeat(few, len(many), axis=0)
+            band = np.stack([many, many_next, tip, tip], axis=1)
+        else:
+            a, middle, b = many[::2], many[1::2], np.roll(many[::2], -1, axis=0)
+            fans = ((few, a, middle), (few, middle, few_next), (few_next, middle, b))
+            band = np.concatenate([np.stack([p, q, r, r], axis=1) for p, q, r in fans])
+        normal = np.cross(band[:, 1] - band[:, 0], band[:, 2] - band[:, 0])
+        inward = np.einsum("ij,ij->i", normal, band.mean(axis=1)) < 0
+        band[inward] = _turned(band[inward])
+        out.append(band)
+    return np.concatenate(out)
+
+
+def _turned(polygons: Array) -> Array:
+    """The same polygons with the other winding, repeated corners last."""
+    triangle = (polygons[:, 2] == polygons[:, 3]).all(axis=1)
+    order = np.where(triangle[:, None], [1, 0, 2, 3], [3, 2, 1, 0])
+    return np.take_along_axis(polygons, order[:, :, None], axis=1)
+
+
+def _ring_factors(
+    rho: Array, z: Array, nodes: NDArray[np.int64], half: float, radius: float
+) -> Array:
+    """How far out each ring moves from the stretch −half <= z <= half of the axis.
+
+    Each panel asks for the factor that makes the mean of its squared distance from that stretch
+    ``radius`` squared; a ring takes the mean over its panels, weighted with area.
+    """
+    polygons = _revolve(rho, z, nodes)
+    p = polygons.copy()
+    p[..., 2] -= np.clip(p[..., 2], -half, half)
+    area, square = np.zeros(len(p)), np.zeros(len(p))
+    for a, b, c in ((0, 1, 2), (0, 2, 3)):
+        cross = np.cross(polygons[:, b] - polygons[:, a], polygons[:, c] - polygons[:, a])
+        part = np.linalg.norm(cross, axis=1)
+        corner = (p[:, a] ** 2 + p[:, b] ** 2 + p[:, c] ** 2).sum(axis=1)
+        total = ((p[:, a] + p[:, b] + p[:, c]) ** 2).sum(axis=1)
+        area += part
+        square += part * (corner + total) / 12
+    wanted = radius / np.sqrt(square / area)
+    heights = np.sort(polygons[..., 2], axis=1)
+    weight, sums = np.zeros(len(z)), np.zeros(len(z))
+    for end in (heights[:, 0], heights[:, -1]):
+        ring = np.abs(end[:, None] - z).argmin(axis=1)
+        weight += np.bincount(ring, area, len(z))
+        sums += np.bincount(ring, area * wanted, len(z))
+    return sums / weight

@@ -1,0 +1,130 @@
+"""Flat panels on the surface of a rigid body, in its own frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import SceneError
+from capsense.scene.mesh_shape import TriMesh
+from capsense.scene.shape import Shape
+from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
+from capsense.surface import grids
+from capsense.surface.triangles import reduced_triangles
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePanels:
+    """Flat convex polygons of three or four corners, n of them; arrays are read-only."""
+
+    corners: Array
+    """Corners [m], counter-clockwise about the normal, shape (n, 4, 3). A triangle repeats its
+    last corner."""
+    centers: Array
+    """Centroids [m], shape (n, 3)."""
+    normals: Array
+    """Unit normals, shape (n, 3); outward where the surface is closed."""
+    areas: Array
+    """Areas [m²], shape (n,)."""
+    moments: Array
+    """Second central moments of area over the area [m²], shape (n, 3, 3)."""
+    parts: NDArray[np.int64]
+    """Connected part of the surface that a panel belongs to, 0, 1, ..., shape (n,)."""
+    closed: bool
+    """Whether the surface bounds a volume."""
+
+    def __len__(self) -> int:
+        return len(self.areas)
+
+    def scaled(self, factor: float) -> SurfacePanels:
+        """The panels of the body made ``factor`` times as large. F and Z go with 1/factor."""
+        return replace(
+            self,
+            corners=_read_only(factor * self.corners),
+            centers=_read_only(factor * self.centers),
+            areas=_read_only(factor**2 * self.areas),
+            moments=_read_only(factor**2 * self.moments),
+        )
+
+
+def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
+    """Cover a rigid shape with about ``count`` flat panels.
+
+    Panels of boxes and cylinders shrink towards edges. Triangle meshes are reduced, or their
+    triangles halved, to about ``count``; every connected part keeps 40 triangles or all it has.
+
+    Args:
+        shape: A primitive or a mesh, or the corners of triangles [m], shape (m, 3, 3), of an open
+            or a closed surface with any winding.
+        count: Number of panels to aim at.
+
+    Returns:
+        Panels in the frame of the shape. The same input always gives the same panels.
+
+    Raises:
+        SceneError: A shape without one surface of its own (layers), triangles of a wrong shape or
+            with numbers that are not finite, or no triangle of an area above zero.
+    """
+    match shape:
+        case Box():
+            return _from_polygons(grids.box_polygons(shape.size, count))
+        case Sphere():
+            radii = (shape.radius,) * 3
+            return _from_polygons(grids.ellipsoid_polygons(radii, count))
+        case Ellipsoid():
+            return _from_polygons(grids.ellipsoid_polygons(shape.radii, count))
+        case Capsule():
+            return _from_polygons(grids.capsule_polygons(shape.radius, shape.length, count))
+        case Cylinder():
+            return _from_polygons(grids.cylinder_polygons(shape.radius, shape.length, count))
+        case TriMesh():
+            triangles = shape.vertices[shape.faces]
+        case Shape():
+            raise SceneError(f"{type(shape).__name__}: this kind of shape has no panels")
+        case _:
+            triangles = np.asarray(shape, dtype=float)
+    reduced = reduced_triangles(triangles, count)
+    corners = reduced.corners[:, [0, 1, 2, 2]]
+    return _from_polygons(corners, reduced.parts, reduced.closed)
+
+
+def _read_only(values: Array) -> Array:
+    out = np.ascontiguousarray(values)
+    out.setflags(write=False)
+    return out
+
+
+def _from_polygons(
+    corners: Array, parts: NDArray[np.int64] | None = None, closed: bool = True
+) -> SurfacePanels:
+    """Panels of planar polygons, corners [m] of shape (n, 4, 3), seen from the outside."""
+    origin = corners[:, 0]
+    u, v, w = (corners[:, k] - origin for k in (1, 2, 3))
+    first, second = np.cross(u, v), np.cross(v, w)
+    total = first + second
+    double = np.linalg.norm(total, axis=1)
+    share = np.stack([np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)])
+    share /= share.sum(axis=0)
+    center = share[0, :, None] * (u + v) / 3 + share[1, :, None] * (v + w) / 3
+    moments = np.zeros((len(corners), 3, 3))
+    for part, (a, b) in zip(share, ((u, v), (v, w)), strict=True):
+        # of a triangle with one corner at the origin
+        middle = a + b
+        square = sum(x[:, :, None] * x[:, None, :] for x in (a, b, middle)) / 12
+        moments += part[:, None, None] * square
+    moments -= center[:, :, None] * center[:, None, :]
+    labels = np.zeros(len(corners), dtype=np.int64) if parts is None else parts
+    labels.setflags(write=False)
+    return SurfacePanels(
+        _read_only(corners),
+        _read_only(origin + center),
+        _read_only(total / double[:, None]),
+        _read_only(0.5 * double),
+        _read_only(moments),
+        labels,
+        closed,
+    )

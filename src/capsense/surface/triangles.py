@@ -1,0 +1,250 @@
+"""Triangle meshes brought to a wanted number of triangles of even size."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.errors import SceneError
+from capsense.scene.surface import clean_surface
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+_WELD = 1e-6
+"""Corners nearer than this part of the longest extent are one."""
+_WELD_MOST = 0.03
+"""How far welding may go where a mesh falls into very many parts."""
+_LEAST = 40
+"""Triangles that every connected part keeps, if it has them."""
+_LEAST_OF_MANY = 12
+"""The same for a mesh of very many parts."""
+_SPARE = 1.25
+"""Halving slivers may make this many times as many triangles as wanted."""
+_SLIVER = 12.0
+"""Square of the longest edge over the area (2.3 if equilateral) above which it is halved."""
+
+_BASE = 0.6
+"""Part of the triangles before those at sharp edges are halved."""
+_FEW_SHARP = 0.02
+"""Share of sharp edges up to which none is heeded."""
+_BENT = 0.77
+"""Cosine of the angle between normals below which an edge is sharp, 40 degrees."""
+_AT_EDGE = 3.0
+"""How much longer triangles at sharp edges count."""
+
+
+class Triangles(NamedTuple):
+    """Triangles of a surface."""
+
+    corners: Array
+    """Corners [m], shape (m, 3, 3)."""
+    parts: Index
+    """Connected part that each belongs to, shape (m,)."""
+    closed: bool
+    """Whether the surface bounds a volume; then normals point out of it."""
+
+
+def reduced_triangles(triangles: Array, count: int) -> Triangles:
+    """Reduce a mesh, or halve its triangles, until it has about ``count``.
+
+    Connected parts are reduced one by one by quadric error (Garland and Heckbert, *Surface
+    simplification using quadric error metrics*, SIGGRAPH 1997), each to its share of the area.
+    Triangles that coincide count once, those without area not at all.
+
+    Args:
+        triangles: Corners [m], shape (m, 3, 3); any winding, open or closed.
+        count: Number of triangles to aim at.
+
+    Raises:
+        SceneError: A wrong shape, a number that is not finite, or no triangle with an area.
+    """
+    _check(triangles)
+    vertices, faces = _welded(triangles, count)
+    extent = float(np.ptp(vertices, axis=0).max())
+    try:
+        unit, faces = clean_surface(vertices / extent, faces)
+        vertices, closed = extent * unit, True
+    except SceneError:
+        closed = False
+    label = _parts(faces, len(vertices))
+    area = np.bincount(label, _areas(vertices[faces]))
+    least = _LEAST if _LEAST * len(area) <= 2 * count else _LEAST_OF_MANY
+    share = np.maximum(least, np.rint(count * area / area.sum()).astype(np.int64))
+    corners, sharp, parts = [], [], []
+    for k in range(len(area)):
+        own = faces[label == k]
+        part, edges = _simplified(vertices, own, int(share[k]))
+        base = max(least, round(_BASE * share[k]))
+        if edges.mean() > _FEW_SHARP and len(own) > base:
+            part, edges = _simplified(vertices, own, base)
+        corners.append(part)
+        sharp.append(edges)
+        parts.append(np.full(len(part), k))
+    out, which = np.concatenate(corners), np.concatenate(parts)
+    out, which = _halved(out, which, np.concatenate(sharp), count)
+    keep = _apart(out)
+    out, which = out[keep], which[keep]
+    _, which = np.unique(which, return_inverse=True)
+    if closed:
+        normal = np.cross(out[:, 1] - out[:, 0], out[:, 2] - out[:, 0])
+        closed = bool(
+            np.linalg.norm(normal.sum(axis=0)) < 1e-3 * np.linalg.norm(normal, axis=1).sum()
+        )
+    return Triangles(out, which.reshape(-1).astype(np.int64), closed)
+
+
+def _check(triangles: Array) -> None:
+    if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
+        raise SceneError(f"triangles have shape {triangles.shape}; give (m, 3, 3), metres")
+    bad = np.flatnonzero(~np.isfinite(triangles).all(axis=(1, 2)))
+    if len(bad):
+        raise SceneError(f"triangle {bad[0]} holds a number that is not finite")
+    if not len(triangles) or not _areas(triangles).max() > 0:
+        raise SceneError("the surface has no triangle of an area above zero")
+
+
+def _areas(triangles: Array) -> Array:
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _welded(triangles: Array, count: int) -> tuple[Array, Index]:
+    """Vertices and faces with corners that coincide made one, and every face once.
+
+    A heap of very many loose triangles is welded more and more coarsely.
+    """
+    points = triangles.reshape(-1, 3)
+    low, extent = points.min(axis=0), float(np.ptp(points, axis=0).max())
+    tolerance = _WELD
+    found: tuple[Array, Index] | None = None
+    while True:
+        keys = np.round((points - low) / (tolerance * extent)).astype(np.int64)
+        _, first, face = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        vertices, faces = points[first], face.reshape(-1, 3)
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+        faces = faces[np.sort(once)]
+        if len(faces) and _areas(vertices[faces]).max() > 0:
+            found = vertices, faces
+        elif found is not None:
+            return found
+        else:
+            raise SceneError("the surface has no triangle of an area above zero")
+        many = len(faces) > 2 * count and (
+            _LEAST_OF_MANY * (1 + _parts(faces, len(vertices)).max()) > 2 * count
+        )
+        if not many or tolerance > _WELD_MOST:
+            return found
+        tolerance *= 4
+
+
+def _parts(faces: Index, vertices: int) -> Index:
+    """Number of the connected part of each face; parts share no vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    row = np.concatenate([faces[:, 0], faces[:, 1]])
+    column = np.concatenate([faces[:, 1], faces[:, 2]])
+    graph = coo_matrix((np.ones(len(row), dtype=bool), (row, column)), shape=(vertices,) * 2)
+    label = connected_components(graph, directed=False)[1]
+    _, out = np.unique(label[faces[:, 0]], return_inverse=True)
+    return out.reshape(-1).astype(np.int64)
+
+
+def _simplified(vertices: Array, faces: Index, count: int) -> tuple[Array, Flags]:
+    """Corners of one part [m], reduced to ``count`` triangles where it has more, and sharp edges.
+
+    Returns:
+        Shapes (m, 3, 3) and (m, 3); edge k runs from corner k to the next.
+    """
+    from fast_simplification import simplify
+
+    if len(faces) <= count:
+        return vertices[faces], _sharp(vertices, faces)
+    used, local = np.unique(faces, return_inverse=True)
+    points = vertices[used]
+    center, extent = points.mean(axis=0), np.ptp(points, axis=0).max()
+    reduced, triangles = simplify(
+        (points - center) / extent, local.reshape(-1, 3).astype(np.int32), target_count=count
+    )
+    moved = center + extent * np.asarray(reduced, dtype=float)
+    if not len(triangles) or not _areas(moved[triangles]).max() > 0:
+        return vertices[faces], _sharp(vertices, faces)
+    return moved[triangles], _sharp(moved, np.asarray(triangles, dtype=np.int64))
+
+
+def _sharp(vertices: Array, faces: Index) -> Flags:
+    """Which edges are rims or bend by more than _BENT, shape (m, 3)."""
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    key = np.minimum(start, end) * len(vertices) + np.maximum(start, end)
+    _, edge, number = np.unique(key, return_inverse=True, return_counts=True)
+    edge = edge.reshape(-1)
+    order = np.argsort(edge, kind="stable")
+    first = order[np.cumsum(number) - number]
+    last = order[np.cumsum(number) - 1]
+    way = np.where(start[first] == start[last], -1.0, 1.0)  # windings that disagree
+    cosine = way * np.einsum("ij,ij->i", normal[first // 3], normal[last // 3])
+    return ((number != 2) | (cosine < _BENT))[edge].reshape(-1, 3)
+
+
+def _halved(corners: Array, parts: Index, sharp: Flags, count: int) -> tuple[Array, Index]:
+    """Cut triangles in two across their longest edge: the longest first, then slivers.
+
+    Triangles at sharp edges count as longer, as charge gathers there. Neighbours may stay whole:
+    panels need not meet corner to corner.
+    """
+    most = round(_SPARE * count)
+    for _ in range(40):
+        edge = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        longest, area = edge.max(axis=1), _areas(corners)
+        if len(corners) < count:
+            wanted = longest * np.where(sharp.any(axis=1), _AT_EDGE, 1.0)
+            order = np.argsort(-wanted, kind="stable")
+            chosen = order[: count - len(corners)]
+            chosen = chosen[wanted[chosen] > 0.7 * wanted[order[0]]]
+        else:
+            usual = np.sqrt(2.3 * area.sum() / count)
+            ratio = np.where(longest > usual, longest**2 / np.maximum(area, 1e-300), 0.0)
+            order = np.argsort(-ratio, kind="stable")
+            chosen = order[: max(0, most - len(corners))]
+            chosen = chosen[ratio[chosen] > _SLIVER]
+        if not len(chosen):
+            break
+        first = edge[chosen].argmax(axis=1)
+        a, b, c = (corners[chosen, (first + k) % 3] for k in range(3))
+        cut, next_, last = (sharp[chosen, (first + k) % 3] for k in range(3))
+        middle = 0.5 * (a + b)
+        inner = np.zeros(len(chosen), dtype=bool)
+        corners = np.concatenate([corners, np.stack([middle, b, c], axis=1)])
+        corners[chosen] = np.stack([a, middle, c], axis=1)
+        sharp = np.concatenate([sharp, np.stack([cut, next_, inner], axis=1)])
+        sharp[chosen] = np.stack([cut, inner, last], axis=1)
+        parts = np.concatenate([parts, parts[chosen]])
+    return corners, parts
+
+
+def _apart(corners: Array) -> NDArray[np.bool_]:
+    """Which triangles to keep: those with an area that coincide with no earlier one."""
+    from scipy.spatial import cKDTree
+
+    area = _areas(corners)
+    longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+    keep = (area > 1e-6 * longest**2) & (longest > 1e-9 * longest.max())
+    center = corners.mean(axis=1)
+    size = np.sqrt(area)
+    pairs = cKDTree(center).query_pairs(1e-3 * float(size.max()), output_type="ndarray")
+    if len(pairs):
+        i, j = pairs.min(axis=1), pairs.max(axis=1)
+        near = np.linalg.norm(center[i] - center[j], axis=1) < 1e-3 * np.minimum(size[i], size[j])
+        same = np.abs(area[i] - area[j]) < 1e-2 * area[i]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cosine = np.einsum("ij,ij->i", cross[i], cross[j])
+        keep[j[near & same & (np.abs(cosine) > 0.999 * 4 * area[i] * area[j])]] = False
+    return keep
