@@ -1,0 +1,229 @@
+"""Reference ΔC of what sensor designers ask for, sensor and object solved as one.
+
+    python benchmarks/reference_designs.py              # writes tests/data/reference_designs.json
+    python benchmarks/reference_designs.py --method perturbation     # errors against that file
+
+A guarded pad, on air and on FR4, bare and under a plastic cover, with a grounded plate before it;
+and a pair of pads with a block of plastic before them. The object is put into the design, as a
+grounded conductor or a layer, and the package's boundary elements (``capsense.field.boundary``)
+solve both designs: ΔC = C(with) − C(without), so every boundary sees every other. Two panel sizes
+are extrapolated; what that adds is the stated error.
+
+"self" is what a self-mode channel reads, shields driven with the pad; "pad" the diagonal of the
+Maxwell matrix, shields at ground; "mutual" the largest entry off the diagonal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import sys
+import time
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import on_one_core
+from numpy.typing import NDArray
+
+import capsense as cs
+from capsense.design.loader import parse_design
+from capsense.design.model import Role
+from capsense.field.boundary import Accuracy, BoundarySolution, terminals
+
+Array = NDArray[np.float64]
+OUTPUT = Path(__file__).parents[1] / "tests" / "data" / "reference_designs.json"
+SCALES = (1.4, 1.0)
+ORDER = 1.5
+"""Power of the panel size that errors go with: between rims, first, and faces, second."""
+FEMTO = 1e-15
+
+GUARDED = """name = "guarded_pad"
+[domain]
+size = [0.5, 0.5, 0.5]
+backplane = 0.1
+[[electrode]]
+name = "pad"
+shape = "rectangle"
+size = [0.020, 0.020]
+[[conductor]]
+name = "ring"
+role = "shield"
+shape = "polygon"
+points = [[-0.0153, -0.0153], [0.0153, -0.0153], [0.0153, 0.0153], [-0.0153, 0.0153]]
+holes = [[[-0.0103, -0.0103], [0.0103, -0.0103], [0.0103, 0.0103], [-0.0103, 0.0103]]]
+[[conductor]]
+name = "back"
+role = "shield"
+shape = "rectangle"
+size = [0.0306, 0.0306]
+center = [0.0, 0.0, -0.0016]
+"""
+BOARD = """[[layer]]
+name = "board"
+eps_r = 4.4
+size = [0.040, 0.040]
+z = [-0.0016, 0.0]
+"""
+COVER = """[[layer]]
+name = "cover"
+eps_r = 3.0
+size = [0.060, 0.060]
+z = [0.0, 0.003]
+"""
+PAIR = """name = "pair"
+[domain]
+size = [0.5, 0.5, 0.5]
+backplane = 0.1
+[[electrode]]
+name = "TX"
+shape = "rectangle"
+size = [0.020, 0.020]
+center = [-0.015, 0.0]
+[[electrode]]
+name = "RX"
+shape = "rectangle"
+size = [0.020, 0.020]
+center = [0.015, 0.0]
+"""
+PLATE = (0.060, 0.060, 0.002)
+BLOCK = (0.060, 0.040, 0.020)
+
+
+def plate(gap: float, size: tuple[float, float, float] = PLATE) -> dict[str, Any]:
+    """A grounded plate, ``gap`` [m] above the electrodes."""
+    return {"shape": "box", "size": list(size), "position": [0.0, 0.0, gap + size[2] / 2],
+            "quaternion": [0.0, 0.0, 0.0, 1.0], "kind": "grounded", "eps_r": 1.0}  # fmt: skip
+
+
+def cases() -> list[dict[str, Any]]:
+    """Name, design and body of each, without figures."""
+    out = []
+    for name, design in (("guarded pad on air", GUARDED), ("guarded pad on FR4", GUARDED + BOARD)):
+        for gap in (2, 3, 5):
+            out.append((f"{name}, plate at {gap} mm", design, plate(1e-3 * gap)))
+    design = GUARDED + BOARD + COVER
+    for gap in (3, 4, 5, 8):
+        out.append(
+            (f"guarded pad on FR4, 3 mm cover, plate at {gap} mm", design, plate(1e-3 * gap))
+        )
+    block = {**plate(0.005, BLOCK), "kind": "diel", "eps_r": 3.0}
+    out.append(("pair, block of eps 3 at 5 mm", PAIR, block))
+    return [{"name": n, "design": d, "bodies": [b]} for n, d, b in out]
+
+
+def with_body(data: dict[str, Any], body: dict[str, Any]) -> dict[str, Any]:
+    """The design as a dictionary, the body one of its parts."""
+    data = copy.deepcopy(data)
+    (sx, sy, sz), (x, y, z) = body["size"], body["position"]
+    if body["kind"] == "diel":
+        layer = {"name": "object", "eps_r": body["eps_r"], "size": [sx, sy], "center": [x, y],
+                 "z": [z - sz / 2, z + sz / 2]}  # fmt: skip
+        data.setdefault("layer", []).append(layer)
+    else:
+        conductor = {"name": "object", "role": "ground", "shape": "box", "size": [sx, sy, sz],
+                     "center": [x, y, z]}  # fmt: skip
+        data.setdefault("conductor", []).append(conductor)
+    return data
+
+
+def readings(design: cs.Design, scale: float) -> tuple[Array, Array, int]:
+    """Maxwell matrix of the electrodes, their self capacitances [F], and panels."""
+    solution = BoundarySolution(design, Accuracy(scale))
+    names = terminals(design)
+    charges = solution.terminal_charges(solution.densities(np.eye(len(names))))
+    matrix = (charges + charges.T) / 2
+    n = len(design.electrodes)
+    shields = [c.name for c in design.conductors if c.role == Role.SHIELD]
+    with_shields = matrix[:n, [names.index(s) for s in shields]].sum(axis=1)
+    return matrix[:n, :n], np.diag(matrix)[:n] + with_shields, len(solution.model.panels)
+
+
+_EMPTY: dict[tuple[str, float], tuple[Array, Array, int]] = {}
+
+
+def change(case: dict[str, Any], scale: float) -> tuple[Array, int]:
+    """ΔC of the electrodes' matrix with that of the self readings as its last row, and panels."""
+    data = tomllib.loads(case["design"])
+    key = case["design"], scale
+    if key not in _EMPTY:
+        _EMPTY[key] = readings(parse_design(data), scale)
+    full, self_full, count = readings(parse_design(with_body(data, case["bodies"][0])), scale)
+    empty, self_empty, _ = _EMPTY[key]
+    return np.vstack([full - empty, self_full - self_empty]), count
+
+
+def converged(case: dict[str, Any]) -> dict[str, Any]:
+    """The case with its figures."""
+    started = time.perf_counter()
+    (coarse, _), (fine, panels) = (change(case, s) for s in SCALES)
+    best = fine + (fine - coarse) / ((SCALES[0] / SCALES[1]) ** ORDER - 1)
+    error = np.abs(best - fine)[[0, -1], [0, 0]] / np.abs(best[[0, -1], [0, 0]])
+    rounded = [[float(f"{v:.6g}") for v in row] for row in best / FEMTO]
+    print(f"{case['name']:50s} pad {rounded[0][0]:9.3f} fF, error {100 * error[0]:.2f} %; self "
+          f"{rounded[-1][0]:9.3f} fF, error {100 * error[1]:.2f} %; {panels} panels, "
+          f"{time.perf_counter() - started:.0f} s", flush=True)  # fmt: skip
+    return {**case, "delta_fF": rounded[:-1], "self_delta_fF": rounded[-1],
+            "error": [float(f"{e:.2g}") for e in error], "panels": panels}  # fmt: skip
+
+
+def write(found: list[dict[str, Any]]) -> None:
+    """The file."""
+    text = {
+        "about": "A sensor designer's cases; written by benchmarks/reference_designs.py",
+        "note": "delta_fF: change of the electrodes' Maxwell matrix, shields at ground; "
+        "self_delta_fF: change of what self-mode channels read, shields driven with the electrode; "
+        "error: what the extrapolation over two panel sizes adds, relative, of the first entry of "
+        "each; panels: of sensor and object in the finer one. Bodies as in reference_map.json.",
+        "cases": found,
+    }
+    OUTPUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n")
+
+
+def compare(method: str, only: str) -> None:
+    """Errors of a method of the simulator."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+    from reference_scenes import body_of_json
+
+    print(f"{'':50s} {'pad, fF':>10s} {'off %':>7s} {'mutual':>10s} {'off %':>7s} "
+          f"{'self, fF':>10s} {'off %':>7s} {'ref. %':>7s}")  # fmt: skip
+    for case in json.loads(OUTPUT.read_text())["cases"]:
+        if only not in case["name"]:
+            continue
+        sim = cs.Simulator(parse_design(tomllib.loads(case["design"])), method=method)
+        rest = sim.step(cs.Scene([])).self_capacitance
+        reading = sim.step(cs.Scene([body_of_json(b) for b in case["bodies"]]))
+        truth, self_truth = np.array(case["delta_fF"]), case["self_delta_fF"][0]
+        got, self_got = reading.delta / FEMTO, (reading.self_capacitance - rest)[0] / FEMTO
+        other = (truth[0, 1], got[0, 1]) if len(truth) > 1 else (np.nan, np.nan)
+        cells = "".join(
+            f" {t:10.3f} {100 * (g / t - 1):+7.2f}"
+            for t, g in ((truth[0, 0], got[0, 0]), other, (self_truth, self_got))
+        )
+        print(f"{case['name']:50s}{cells} {100 * max(case['error']):7.2f}", flush=True)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--method", help="measure a method of Simulator instead of writing")
+    parser.add_argument("--only", default="", help="names with this in them")
+    args = parser.parse_args()
+    on_one_core()
+    if args.method:
+        compare(args.method, args.only)
+        return
+    have = {c["name"]: c for c in json.loads(OUTPUT.read_text())["cases"]} if (
+        OUTPUT.exists()) else {}  # fmt: skip
+    for case in cases():
+        if args.only in case["name"]:
+            have[case["name"]] = converged(case)
+            write([have[c["name"]] for c in cases() if c["name"] in have])
+
+
+if __name__ == "__main__":
+    main()
