@@ -18,6 +18,7 @@ from capsense.errors import SolveError
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
 from capsense.surface.panels import SurfacePanels
+from capsense.surface.step_kernels import BODY
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -76,6 +77,16 @@ class RigidShape:
     def own(self) -> Array:
         """Diagonal of ``energy`` [1/m], shape (n,)."""
         return np.ascontiguousarray(np.diag(self.energy).astype(float))
+
+    @cached_property
+    def record(self) -> np.void:
+        """What the kernels take of a body that is known of its shape; points to arrays held here."""
+        record = np.zeros(1, BODY)[0]
+        record["n"] = len(self.panels)
+        record["energy"], record["own"] = self.energy.ctypes.data, self.own.ctypes.data
+        for name in ("kids", "function", "charge", "center", "points", "extent"):
+            record[name] = getattr(self.tree, name).ctypes.data
+        return record
 
     @cached_property
     def impedance(self) -> Array32:

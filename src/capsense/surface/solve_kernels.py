@@ -13,10 +13,10 @@ from capsense.surface.pair_kernels import leaf_pairs
 from capsense.surface.step_kernels import (
     choose,
     climb,
+    distances,
     leaf_points,
     leaf_rows,
     score,
-    shares,
 )
 from capsense.solve.simd import at, madd, put_span, span
 from capsense.surface.vector_kernels import (
@@ -75,7 +75,7 @@ def solve(bodies, green, threshold, width):
     score(bodies, first, green, weight, scores)
     cut = choose(bodies, first, scores, threshold, width)
     points, extent = leaf_points(bodies, cut)
-    rows = leaf_rows(points, shares(points, green), green)
+    rows = leaf_rows(points, distances(points, green), green)
     leaves = cut.leaves.shape[0]
     owner = np.empty(leaves, np.int64)
     for j in range(leaves):
@@ -200,9 +200,11 @@ def _add_matter(bodies, functions, matrix, rest, own):
     solved = functions.solved
     for f in range(functions.cluster.shape[0]):
         body = bodies[functions.body[f]]
-        if functions.cluster[f] < 0 and f < solved:
-            matrix[f, f] += body.tie
+        if functions.cluster[f] < 0:
             own[f] += body.tie
+            for e in range(solved):
+                if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
+                    matrix[f, e] += body.tie
         if body.softness == 0.0 or functions.cluster[f] < 0:
             continue
         inside = carray(singles(body.impedance), (body.n, body.n))

@@ -32,7 +32,8 @@ BODY = np.dtype(
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("neutral", np.int64),  # whether it carries no net charge
-        ("tie", np.float64),  # added to the energy of the net charge [1/m]
+        ("group", np.int64),  # bodies that touch are one conductor, named by its first body
+        ("tie", np.float64),  # energy of a group's net charge beyond that of its field [1/m]
         ("softness", np.float64),  # 1 / (eps - 1), 0 for a conductor
     ]
 )  # fmt: skip
@@ -47,14 +48,18 @@ class Green(NamedTuple):
 
     near: NDArray[Any]
     """Sources for points near the sensor [m], shape (3, s)."""
+    close_table: NDArray[Any]
+    """What each source adds to φ⁰ and ψ, all modes, shape (s, u)."""
     near_table: NDArray[Any]
-    """What each source adds to φ⁰ and ψ, shape (s, w)."""
+    """The same with the modes that matter beyond ``close[1]``, shape (s, w), w <= u."""
     far: NDArray[Any]
     """Sources for points far from it [m], shape (3, f)."""
     far_table: NDArray[Any]
     """The same of these, shape (f, v), v <= w."""
     score_table: NDArray[Any]
     """φ⁰ alone, from the far sources, shape (f, lead)."""
+    close: NDArray[Any]
+    """Distances [m] from ``box`` between which the last modes fade out, shape (2,)."""
     lead: int
     """Columns of φ⁰, padded."""
     terminals: int
@@ -259,62 +264,78 @@ def leaf_points(bodies, cut):
 
 
 @fast
-def shares(points, green):
-    """Share of the near sources in each leaf's row, shape (l,)."""
+def distances(points, green):
+    """Distance [m] of each leaf's centre from the design's box, shape (l,)."""
     out = np.empty(points.shape[0])
     for j in range(points.shape[0]):
         d = 0.0
         for i in range(3):
-            c = 0.25 * (points[j, 0, i] + points[j, 1, i] + points[j, 2, i] + points[j, 3, i])
+            c = 0.5 * (points[j, 0, i] + points[j, 3, i])
             off = max(green.box[0, i] - c, c - green.box[1, i], 0.0)
             d += off * off
-        x = (green.blend[1] - math.sqrt(d)) / (green.blend[1] - green.blend[0])
-        x = min(1.0, max(0.0, x))
-        out[j] = x * x * (3.0 - 2.0 * x)
+        out[j] = math.sqrt(d)
     return out
 
 
 @fast
-def leaf_rows(points, share, green):
+def _share(distance, blend):
+    """One below the first distance of a blend, zero above the second, smooth in between."""
+    x = min(1.0, max(0.0, (blend[1] - distance) / (blend[1] - blend[0])))
+    return x * x * (3.0 - 2.0 * x)
+
+
+@fast
+def leaf_rows(points, distance, green):
     """Rows of the leaves, shape (l, w); no wider than that of far points where none is near."""
-    n, width = points.shape[0], green.far_table.shape[1]
-    for j in range(n):
-        if share[j] > 0.0:
-            width = green.near_table.shape[1]
+    n, nearest = points.shape[0], distance.min()
+    width = green.far_table.shape[1]
+    if nearest < green.close[1]:
+        width = green.close_table.shape[1]
+    elif nearest < green.blend[1]:
+        width = green.near_table.shape[1]
     out = np.zeros((n, width), np.float32)
-    for far in range(2):
-        chosen = np.empty(n, np.int64)
+    chosen, share = np.empty(n, np.int64), np.empty(n)
+    for band in range(3):
         count = 0
         for j in range(n):
-            if (far == 0 and share[j] > 0.0) or (far == 1 and share[j] < 1.0):
+            d = distance[j]
+            if ((band == 0 and d < green.close[1])
+                    or (band == 1 and green.close[1] <= d < green.blend[1])
+                    or (band == 2 and d > green.blend[0])):  # fmt: skip
                 chosen[count] = j
+                near = _share(d, green.blend)
+                share[count] = near if band < 2 else 1.0 - near
                 count += 1
         if count == 0:
             continue
         some = np.empty((count, 4, 3), np.float32)
         for c in range(count):
-            some[c] = points[chosen[c]]
-        if far == 1:
-            _add_rows(
-                some, chosen[:count], share, green.far, green.far_table, green.floor, far, out
-            )
+            for q in range(4):
+                for i in range(3):
+                    some[c, q, i] = points[chosen[c], q, i]
+        if band == 0:
+            _add_rows(some, chosen, share, green.near, green.close_table, green.floor, out)
+            for c in range(count):
+                fade = np.float32(_share(distance[chosen[c]], green.close))
+                for i in range(green.near_table.shape[1], width):
+                    out[chosen[c], i] *= fade
+        elif band == 1:
+            _add_rows(some, chosen, share, green.near, green.near_table, green.floor, out)
         else:
-            _add_rows(
-                some, chosen[:count], share, green.near, green.near_table, green.floor, far, out
-            )
+            _add_rows(some, chosen, share, green.far, green.far_table, green.floor, out)
     return out
 
 
 @fast
-def _add_rows(points, chosen, share, sources, table, floor, far, out):
+def _add_rows(points, chosen, share, sources, table, floor, out):
     values = np.empty((points.shape[0], sources.shape[1]), np.float32)
     source_potentials(points, sources, np.float32(floor), values)
     rows = np.empty((points.shape[0], table.shape[1]), np.float32)
     multiply(values, table, rows)
-    for c in range(chosen.shape[0]):
-        part = share[chosen[c]] if far == 0 else 1.0 - share[chosen[c]]
+    for c in range(points.shape[0]):
+        part, line, to = np.float32(share[c]), rows[c], out[chosen[c]]
         for i in range(table.shape[1]):
-            out[chosen[c], i] += np.float32(part) * rows[c, i]
+            to[i] += part * line[i]
 
 
 @fast
