@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense.solve.simd import LANES, at, madd, put, put_span, span, splat, vadd, vmadd
+from capsense._simd import LANES, at, madd, put, put_span, span, splat, vadd, vmadd
 
 _RELAX = np.float32(0.97)
 """Share of the dropped fill-in that is moved to the diagonal."""

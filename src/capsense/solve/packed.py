@@ -19,7 +19,7 @@ from capsense.solve.finding_kernels import COUPLE, CUT, ENERGY, LINK, NODE, STOR
 from capsense.solve.load_kernels import Setup
 from capsense.solve.matter_kernels import MATTER
 from capsense.solve.pcg_kernels import Operator
-from capsense.solve.simd import LANES, aligned_zeros
+from capsense._simd import LANES, aligned_zeros
 from capsense.solve.trace_kernels import ROOM
 
 Array = NDArray[np.float64]

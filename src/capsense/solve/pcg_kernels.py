@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from capsense._jit import kernel
-from capsense.solve.simd import LANES, at, load, madd, splat, store, vadd, vmadd, widen
+from capsense._simd import LANES, at, load, madd, splat, store, vadd, vmadd, widen
 
 _ZERO = np.float32(0.0)
 

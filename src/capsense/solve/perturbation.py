@@ -20,7 +20,7 @@ from capsense.solve.column_kernels import MAX_STRETCHES, PART
 from capsense.solve.conductors import Conductors
 from capsense.solve.finding_kernels import UNIT
 from capsense.solve.packed import Workspace, pack_bodies, packed_lattice
-from capsense.solve.simd import LANES, aligned_zeros
+from capsense._simd import LANES, aligned_zeros
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

@@ -18,7 +18,7 @@ from capsense.surface.step_kernels import (
     leaf_rows,
     score,
 )
-from capsense.solve.simd import at, madd, put_span, span
+from capsense._simd import at, madd, put_span, span
 from capsense.surface.vector_kernels import (
     WIDTH,
     cholesky,

@@ -1,6 +1,6 @@
 """Building blocks of the step: potentials of point sources, products of small dense matrices.
 
-Single precision, eight numbers at a time (:mod:`capsense.solve.simd`); widths are multiples of 32.
+Single precision, eight numbers at a time (:mod:`capsense._simd`); widths are multiples of 32.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from capsense.solve.simd import at, madd, put_span, span, splat
+from capsense._simd import at, madd, put_span, span, splat
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""

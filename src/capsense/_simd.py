@@ -11,7 +11,7 @@ and back.
 and ``put_span`` do the same with the eight from k on: unlike ``x[k]``, which counts from the end
 where k is negative, they do not look at k.
 
-All work in compiled code only; ``tests/solve/test_simd.py`` holds them against numpy.
+All work in compiled code only; ``tests/test_simd.py`` holds them against numpy.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from capsense.solve.simd import (
+from capsense._simd import (
     LANES,
     aligned_zeros,
     at,
