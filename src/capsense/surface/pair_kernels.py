@@ -10,19 +10,22 @@ from capsense.surface.vector_kernels import fast, rsqrt
 
 _FAR = 1.5
 """Clusters farther apart than so many of their joint extents are met by their moments."""
+_CLOSE = 0.6
+"""Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
 _SOFT = 0.15
 """Distance, as a part of the larger extent, below which 1/r of two points is bounded: clusters
 that coincide then have less energy between them than each has alone."""
 
 
 @fast
-def leaf_pairs(points, extent, owner, floor, out):
-    """Mean of 1/r between bodies, and of -1/r to all images in the floor.
+def leaf_pairs(points, extent, owner, changing, floor, out):
+    """Mean of 1/r between bodies and within changing ones, and of -1/r to all images in the floor.
 
     Args:
         points: Four points of each cluster [m], shape (l, 4, 3).
         extent: Extents [m], shape (l,).
         owner: Body of each cluster, ascending, shape (l,).
+        changing: Whether a cluster's body has no energies of its own, shape (l,).
         floor: Height of the floor [m].
         out: Filled [1/m], shape (l, l).
     """
@@ -47,6 +50,12 @@ def leaf_pairs(points, extent, owner, floor, out):
             for j in range(behind):
                 if line[j] < 0.0:
                     line[j] = mean_inverse(points[i], points[j], max(extent[i], extent[j]))
+                out[i, j] += line[j]
+        if changing[i]:
+            _far_means(shapes, i, shapes, line[: i + 1])
+            for j in range(behind, i + 1):
+                if line[j] < 0.0 or j == i:
+                    line[j] = _near_mean(points[i], points[j], extent[i], extent[j], j == i)
                 out[i, j] += line[j]
         for j in range(i):
             out[j, i] = out[i, j]
@@ -103,3 +112,71 @@ def mean_inverse(first, second, extent):
             s = x * x + y * y + z * z
             total += 1.0 / math.sqrt(math.sqrt(s * s + bound))
     return total / 16.0
+
+
+@fast
+def _near_mean(first, second, extent, other, same):
+    """Mean of 1/r [1/m] between two rectangles of one surface, given by their four points."""
+    if same:
+        return _self_mean(_arm(first, 1), _arm(first, 2))
+    x = 0.5 * (first[0, 0] + first[3, 0] - second[0, 0] - second[3, 0])
+    y = 0.5 * (first[0, 1] + first[3, 1] - second[0, 1] - second[3, 1])
+    z = 0.5 * (first[0, 2] + first[3, 2] - second[0, 2] - second[3, 2])
+    reach = _CLOSE * (extent + other)
+    if x * x + y * y + z * z > reach * reach:
+        return mean_inverse(first, second, 0.0)
+    # points on the smaller one, the larger one in closed form; both ways where they are alike
+    ratio = (extent / other) ** 4
+    share = ratio / (1.0 + ratio)
+    total = 0.0
+    if share < 0.95:
+        total += (1.0 - share) * _mean_potential(first, second)
+    if share > 0.05:
+        total += share * _mean_potential(second, first)
+    return total / (max(0.0, 1.0 - share if share < 0.95 else 0.0) + (share if share > 0.05 else 0.0))
+
+
+@fast
+def _arm(corners, which):
+    """Half the distance [m] between two of the four points."""
+    total = 0.0
+    for i in range(3):
+        total += (corners[0, i] - corners[which, i]) ** 2
+    return 0.5 * math.sqrt(total)
+
+
+@fast
+def _mean_potential(outer, inner):
+    """Mean over the points of one rectangle of the potential of unit charge on the other [1/m]."""
+    root = math.sqrt(3.0)
+    short, long = _arm(inner, 1) + 1e-9, _arm(inner, 2) + 1e-9
+    b, a = root * short, root * long
+    total = 0.0
+    for q in range(4):
+        u = v = square = 0.0
+        for i in range(3):
+            d = outer[q, i] - 0.5 * (inner[0, i] + inner[3, i])
+            u += d * 0.5 * (inner[0, i] - inner[2, i]) / long
+            v += d * 0.5 * (inner[0, i] - inner[1, i]) / short
+            square += d * d
+        w = math.sqrt(max(square - u * u - v * v, 0.0)) + 1e-9
+        total += (_corner(a - u, b - v, w) - _corner(-a - u, b - v, w)
+                  - _corner(a - u, -b - v, w) + _corner(-a - u, -b - v, w))  # fmt: skip
+    return total / (16.0 * a * b)
+
+
+@fast
+def _corner(x, y, z):
+    """Antiderivative of 1/r over a rectangle (Wilton et al. 1984), z > 0."""
+    r = math.sqrt(x * x + y * y + z * z)
+    return (x * math.log(y + r + 1e-12) + y * math.log(x + r + 1e-12)
+            - z * math.atan(x * y / (z * r)))  # fmt: skip
+
+
+@fast
+def _self_mean(first, second):
+    """Mean of 1/r [1/m] within a rectangle of two given standard deviations [m]."""
+    a, b = math.sqrt(12.0) * first + 1e-9, math.sqrt(12.0) * second + 1e-9
+    d = math.sqrt(a * a + b * b)
+    return 2.0 * (a * a * b * math.log((b + d) / a) + a * b * b * math.log((a + d) / b)
+                  + (a**3 + b**3 - d**3) / 3.0) / (a * a * b * b)  # fmt: skip

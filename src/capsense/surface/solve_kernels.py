@@ -77,11 +77,12 @@ def solve(bodies, green, threshold, width):
     points, extent = leaf_points(bodies, cut)
     rows = leaf_rows(points, distances(points, green), green)
     leaves = cut.leaves.shape[0]
-    owner = np.empty(leaves, np.int64)
+    owner, changing = np.empty(leaves, np.int64), np.empty(leaves, np.bool_)
     for j in range(leaves):
         owner[j] = cut.body[cut.leaves[j]]
+        changing[j] = bodies[owner[j]].spread != 0
     pairs = np.empty((leaves, leaves), np.float32)
-    leaf_pairs(points, extent, owner, green.floor, pairs)
+    leaf_pairs(points, extent, owner, changing, green.floor, pairs)
     functions = _list_functions(bodies, cut)
     phi, matrix, rest, own = _assemble(bodies, cut, functions, rows, pairs, green)
     delta, left, x = _reduce(cut, functions, phi, matrix, rest, own)
@@ -176,7 +177,7 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
         at_f = functions.number[f]
         for e in range(min(f + 1, solved) if f < solved else solved):
             value = float(outer[e, f]) - float(response[f, e])
-            if functions.body[e] == functions.body[f]:
+            if functions.body[e] == functions.body[f] and body.energy != 0:
                 value += float(energy[at_f, functions.number[e]]) / body.scale
             if f < solved:
                 matrix[f, e] = value
@@ -189,7 +190,9 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
             square = 0.0
             for k in range(width - lead):
                 square += float(psi[f, k]) * float(psi[f, k])
-            own[f] = float(outer[f, f]) - square + float(energy[at_f, at_f]) / body.scale
+            own[f] = float(outer[f, f]) - square
+            if body.energy != 0:
+                own[f] += float(energy[at_f, at_f]) / body.scale
     _add_matter(bodies, functions, matrix, rest, own)
     return phi, matrix, rest, own
 

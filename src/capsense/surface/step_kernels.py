@@ -29,6 +29,7 @@ BODY = np.dtype(
         ("kids", np.int64), ("function", np.int64), ("charge", np.int64), ("center", np.int64),
         ("points", np.int64), ("extent", np.int64), ("own", np.int64), ("energy", np.int64),
         ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
+        ("spread", np.int64),  # second moments of a changing surface, else 0: it has no energies
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("neutral", np.int64),  # whether it carries no net charge
@@ -248,19 +249,69 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
 def leaf_points(bodies, cut):
     """Four points of each leaf and its extent [m] in the sensor frame, (l, 4, 3) and (l,)."""
     n = cut.leaves.shape[0]
-    points, extent = np.empty((n, 4, 3)), np.empty(n)
+    points, extent, corners = np.empty((n, 4, 3)), np.empty(n), np.empty((4, 3))
     for j in range(n):
         a = cut.leaves[j]
         body = bodies[cut.body[a]]
         k = cut.node[a]
-        local = carray(doubles(body.points), (2 * body.n - 1, 4, 3))
-        extent[j] = body.scale * carray(doubles(body.extent), (2 * body.n - 1,))[k]
+        if body.spread != 0:
+            spread = carray(doubles(body.spread), (2 * body.n - 1, 3, 3))
+            center = carray(doubles(body.center), (2 * body.n - 1, 3))
+            extent[j] = body.scale * four_points(spread[k], center[k], corners)
+        else:
+            extent[j] = body.scale * carray(doubles(body.extent), (2 * body.n - 1,))[k]
+            local = carray(doubles(body.points), (2 * body.n - 1, 4, 3))
+            corners[:] = local[k]
         for q in range(4):
             for i in range(3):
                 points[j, q, i] = body.position[i] + body.scale * (
-                    body.rotation[i, 0] * local[k, q, 0] + body.rotation[i, 1] * local[k, q, 1]
-                    + body.rotation[i, 2] * local[k, q, 2])  # fmt: skip
+                    body.rotation[i, 0] * corners[q, 0] + body.rotation[i, 1] * corners[q, 1]
+                    + body.rotation[i, 2] * corners[q, 2])  # fmt: skip
     return points, extent
+
+
+@fast
+def four_points(spread, center, out):
+    """Four points of equal weight with a centre and the two largest of its second moments.
+
+    Args:
+        spread: Second central moments [m²], shape (3, 3).
+        center: [m], shape (3,).
+        out: Filled [m], shape (4, 3).
+
+    Returns:
+        Length of a uniform rod with the largest second moment [m].
+    """
+    a, v = spread.copy(), np.eye(3)
+    for _ in range(6):  # Jacobi's rotations
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if abs(a[p, q]) < 1e-12 * (abs(a[p, p]) + abs(a[q, q])) + 1e-300:
+                    continue
+                angle = 0.5 * math.atan2(2.0 * a[p, q], a[q, q] - a[p, p])
+                c, s = math.cos(angle), math.sin(angle)
+                for k in range(3):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
+                    x, y = v[k, p], v[k, q]
+                    v[k, p], v[k, q] = c * x - s * y, s * x + c * y
+    least = 0
+    for i in range(1, 3):
+        if a[i, i] < a[least, least]:
+            least = i
+    first, second = (least + 1) % 3, (least + 2) % 3
+    if a[first, first] < a[second, second]:
+        first, second = second, first
+    long = math.sqrt(max(a[first, first], 0.0))
+    short = math.sqrt(max(a[second, second], 0.0))
+    for i in range(3):
+        x, y = long * v[i, first], short * v[i, second]
+        out[0, i], out[1, i] = center[i] + x + y, center[i] + x - y
+        out[2, i], out[3, i] = center[i] - x + y, center[i] - x - y
+    return math.sqrt(12.0) * long
 
 
 @fast

@@ -134,3 +134,43 @@ def to_functions(rows, kids, panel, charge, function, means, out):
                 means[k] = (charge[a] * means[a] + charge[b] * means[b]) / charge[k]
                 out[r, function[k]] = means[a] - means[b]
         out[r, 0] = means[0]
+
+
+@njit(cache=True, nogil=True)
+def prune(kids, panel, wanted, new_kids, new_panel, function, room):
+    """Leave out panels: clusters without any go, those with one part left become that part.
+
+    Args:
+        kids: Parts of the clusters of the whole tree, -1 for single panels, shape (2 n - 1, 2).
+        panel: Panel of a cluster without parts, shape (2 n - 1,).
+        wanted: Which panels stay, at least one, shape (n,).
+        new_kids, new_panel, function: Filled with the tree of m panels, as in ``Tree``; room for n.
+        room: Room to work in, shape (2, 2 n - 1).
+
+    Returns:
+        m, the number of panels that stay.
+    """
+    stands, queue = room[0], room[1]  # the cluster that a cluster has become, -1 for none
+    count = 0
+    for k in range(kids.shape[0] - 1, -1, -1):
+        if kids[k, 0] < 0:
+            stands[k] = k if wanted[panel[k]] else -1
+            count += 1 if wanted[panel[k]] else 0
+        else:
+            a, b = stands[kids[k, 0]], stands[kids[k, 1]]
+            stands[k] = k if a >= 0 and b >= 0 else max(a, b)
+    queue[0] = stands[0]
+    made, functions = 1, 0
+    for k in range(2 * count - 1):
+        old = queue[k]
+        if kids[old, 0] < 0:
+            new_kids[k, 0] = new_kids[k, 1] = -1
+            new_panel[k], function[k] = panel[old], -1
+        else:
+            functions += 1
+            new_panel[k], function[k] = -1, functions
+            for c in range(2):
+                queue[made] = stands[kids[old, c]]
+                new_kids[k, c] = made
+                made += 1
+    return count

@@ -1,0 +1,74 @@
+"""Surfaces without energies of their own: depth images, cloth, bodies that the box cuts off.
+
+Their clusters are fixed; charge, centres and second moments follow the panels at every step, and
+clusters meet each other as rectangles of the same moments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.surface import tree_kernels
+from capsense.surface.rigid import Tree
+from capsense.surface.step_kernels import BODY
+
+Array = NDArray[np.float64]
+
+_OWN = 4.0
+"""Energy of a charge function times the extent of its cluster, as far as scores need it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Small flat pieces of a surface, n of them, in the frame of their body."""
+
+    centers: Array
+    """[m], shape (n, 3)."""
+    areas: Array
+    """[m²], shape (n,)."""
+    moments: Array
+    """Second central moments of area over the area [m²], shape (n, 3, 3)."""
+
+
+class ChangingBody:
+    """A surface as the step takes it; ``record`` points to arrays that are held here.
+
+    Args:
+        tree: Clusters of all pieces.
+        surface: The pieces as they are now.
+        wanted: Which of them count, at least one, shape (n,); all by default.
+    """
+
+    def __init__(self, tree: Tree, surface: Surface, wanted: NDArray[np.bool_] | None = None) -> None:
+        n = len(surface.areas)
+        self._kids, self._panel, self._function = tree.kids, tree.panel, tree.function
+        if wanted is not None and not wanted.all():
+            self._kids, self._panel, self._function = (
+                np.empty_like(a) for a in (tree.kids, tree.panel, tree.function)
+            )
+            n = tree_kernels.prune(
+                tree.kids, tree.panel, wanted, self._kids, self._panel, self._function,
+                np.empty((2, len(tree.kids)), np.int64),
+            )  # fmt: skip
+            self._kids, self._panel, self._function = (
+                np.ascontiguousarray(a[: 2 * n - 1]) for a in (self._kids, self._panel, self._function)
+            )
+        nodes = 2 * n - 1
+        single = self._panel >= 0
+        at = self._panel[single]
+        self._charge, self._center, self._spread = np.empty(nodes), np.empty((nodes, 3)), np.empty((nodes, 3, 3))
+        self._charge[single] = surface.areas[at]
+        self._center[single], self._spread[single] = surface.centers[at], surface.moments[at]
+        tree_kernels.moments(self._kids, self._panel, self._charge, self._center, self._spread)
+        extent = np.sqrt(6.0 * np.trace(self._spread, axis1=1, axis2=2)) + 1e-9
+        self._own = np.empty(n)
+        self._own[0] = 0.5 * _OWN / extent[0]
+        self._own[self._function[~single]] = _OWN / extent[~single]
+        record = np.zeros(1, BODY)[0]
+        record["n"], record["scale"] = n, 1.0
+        for name in ("kids", "function", "charge", "center", "spread", "own"):
+            record[name] = getattr(self, f"_{name}").ctypes.data
+        self.record = record
