@@ -42,7 +42,9 @@ class ChangingBody:
         wanted: Which of them count, at least one, shape (n,); all by default.
     """
 
-    def __init__(self, tree: Tree, surface: Surface, wanted: NDArray[np.bool_] | None = None) -> None:
+    def __init__(
+        self, tree: Tree, surface: Surface, wanted: NDArray[np.bool_] | None = None
+    ) -> None:
         n = len(surface.areas)
         self._kids, self._panel, self._function = tree.kids, tree.panel, tree.function
         if wanted is not None and not wanted.all():
@@ -54,12 +56,17 @@ class ChangingBody:
                 np.empty((2, len(tree.kids)), np.int64),
             )  # fmt: skip
             self._kids, self._panel, self._function = (
-                np.ascontiguousarray(a[: 2 * n - 1]) for a in (self._kids, self._panel, self._function)
+                np.ascontiguousarray(a[: 2 * n - 1])
+                for a in (self._kids, self._panel, self._function)
             )
         nodes = 2 * n - 1
         single = self._panel >= 0
         at = self._panel[single]
-        self._charge, self._center, self._spread = np.empty(nodes), np.empty((nodes, 3)), np.empty((nodes, 3, 3))
+        self._charge, self._center, self._spread = (
+            np.empty(nodes),
+            np.empty((nodes, 3)),
+            np.empty((nodes, 3, 3)),
+        )
         self._charge[single] = surface.areas[at]
         self._center[single], self._spread[single] = surface.centers[at], surface.moments[at]
         tree_kernels.moments(self._kids, self._panel, self._charge, self._center, self._spread)

@@ -30,9 +30,10 @@ def leaf_pairs(points, extent, owner, changing, floor, out):
         out: Filled [1/m], shape (l, l).
     """
     n = points.shape[0]
-    image = points.copy()
+    image = np.empty((n, 4, 3))
     for j in range(n):
         for q in range(4):
+            image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = _moments(points, extent), _moments(image, extent)
     line = np.empty(n, np.float32)
@@ -133,7 +134,9 @@ def _near_mean(first, second, extent, other, same):
         total += (1.0 - share) * _mean_potential(first, second)
     if share > 0.05:
         total += share * _mean_potential(second, first)
-    return total / (max(0.0, 1.0 - share if share < 0.95 else 0.0) + (share if share > 0.05 else 0.0))
+    return total / (
+        max(0.0, 1.0 - share if share < 0.95 else 0.0) + (share if share > 0.05 else 0.0)
+    )
 
 
 @fast

@@ -6,7 +6,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import carray
 from numpy.typing import NDArray
 
 from capsense.surface.pair_kernels import leaf_pairs
@@ -22,6 +21,7 @@ from capsense._simd import at, madd, put_span, span
 from capsense.surface.vector_kernels import (
     WIDTH,
     cholesky,
+    entry,
     integers,
     fast,
     multiply,
@@ -65,7 +65,7 @@ class Solution(NamedTuple):
     """Functions solved for; 0 where the matrix was not definite."""
 
 
-@fast
+@entry
 def solve(bodies, green, threshold, width):
     """Solve a scene of rigid bodies."""
     first = np.zeros(bodies.shape[0] + 1, np.int64)
@@ -121,8 +121,7 @@ def _list_functions(bodies, cut):
 
 @fast
 def _function(body, node):
-    from_address = carray(integers(body.function), (2 * body.n - 1,))
-    return from_address[node]
+    return integers(body.function)[node]
 
 
 @fast
@@ -131,7 +130,8 @@ def _differences(cut, functions, values, out):
     for f in range(functions.cluster.shape[0]):
         a = functions.cluster[f]
         if a < 0:
-            out[f] = values[-1 - a]
+            for i in range(values.shape[1]):
+                out[f, i] = values[-1 - a, i]
         else:
             x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
             for i in range(values.shape[1]):
@@ -147,8 +147,10 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
     values = np.empty((clusters, width + leaves), np.float32)
     for j in range(leaves):
         a = cut.leaves[j]
-        values[a, :width] = rows[j]
-        values[a, width:] = pairs[j]
+        for i in range(width):
+            values[a, i] = rows[j, i]
+        for i in range(leaves):
+            values[a, width + i] = pairs[j, i]
     climb(cut, values)
     wide = np.empty((total, width + leaves), np.float32)
     _differences(cut, functions, values, wide)
@@ -159,7 +161,10 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
     climb(cut, columns)
     outer = np.empty((total, total), np.float32)
     _differences(cut, functions, columns, outer)
-    psi = np.ascontiguousarray(wide[:, lead:width])
+    psi = np.empty((total, width - lead), np.float32)
+    for f in range(total):
+        for k in range(width - lead):
+            psi[f, k] = wide[f, lead + k]
     padded = WIDTH * ((solved + WIDTH - 1) // WIDTH)
     turned = np.zeros((width - lead, padded), np.float32)
     for f in range(solved):
@@ -171,14 +176,14 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
     matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
     for f in range(total):
         body = bodies[functions.body[f]]
-        energy = carray(singles(body.energy), (body.n, body.n))
+        energy = singles(body.energy)
         for i in range(lead):
             phi[f, i] = wide[f, i]
         at_f = functions.number[f]
         for e in range(min(f + 1, solved) if f < solved else solved):
             value = float(outer[e, f]) - float(response[f, e])
             if functions.body[e] == functions.body[f] and body.energy != 0:
-                value += float(energy[at_f, functions.number[e]]) / body.scale
+                value += float(energy[at_f * body.n + functions.number[e]]) / body.scale
             if f < solved:
                 matrix[f, e] = value
                 matrix[e, f] = value
@@ -192,7 +197,7 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
                 square += float(psi[f, k]) * float(psi[f, k])
             own[f] = float(outer[f, f]) - square
             if body.energy != 0:
-                own[f] += float(energy[at_f, at_f]) / body.scale
+                own[f] += float(energy[at_f * body.n + at_f]) / body.scale
     _add_matter(bodies, functions, matrix, rest, own)
     return phi, matrix, rest, own
 
@@ -210,16 +215,16 @@ def _add_matter(bodies, functions, matrix, rest, own):
                     matrix[f, e] += body.tie
         if body.softness == 0.0 or functions.cluster[f] < 0:
             continue
-        inside = carray(singles(body.impedance), (body.n, body.n))
+        inside = singles(body.impedance)
         factor = body.softness / body.scale
         for e in range(solved):
             if functions.body[e] == functions.body[f] and functions.cluster[e] >= 0:
-                value = factor * float(inside[functions.number[f], functions.number[e]])
+                value = factor * float(inside[functions.number[f] * body.n + functions.number[e]])
                 if f < solved:
                     matrix[f, e] += value
                 else:
                     rest[f - solved, e] += value
-        own[f] += factor * float(inside[functions.number[f], functions.number[f]])
+        own[f] += factor * float(inside[functions.number[f] * (body.n + 1)])
 
 
 @fast
@@ -247,7 +252,7 @@ def _reduce(cut, functions, phi, matrix, rest, own):
             x[f, i] = root[f] * phi[f, i]
     delta, left = np.zeros((m, m)), np.zeros((m, m))
     if not cholesky(factor):
-        delta[:] = np.nan
+        delta[0, 0] = np.nan
         return delta, left, x
     substitute(factor, x[:solved])
     for f in range(solved):
@@ -259,7 +264,11 @@ def _reduce(cut, functions, phi, matrix, rest, own):
             for c in range(0, m, 8):
                 residual = span(phi, f * m + c)
                 for e in range(solved):
-                    value = at(matrix, f * solved + e) if f < solved else at(rest, (f - solved) * solved + e)
+                    value = (
+                        at(matrix, f * solved + e)
+                        if f < solved
+                        else at(rest, (f - solved) * solved + e)
+                    )
                     residual = madd(-value, span(x, e * m + c), residual)
                 put_span(phi, f * m + c, residual)
     charge = np.zeros((total, m))
@@ -270,7 +279,8 @@ def _reduce(cut, functions, phi, matrix, rest, own):
                 phi[f, i] = 0.0
     _add_products(phi, charge, left)
     for f in range(solved, total):
-        x[f] = charge[f]
+        for i in range(m):
+            x[f, i] = charge[f, i]
     for i in range(m):
         for j in range(m):
             delta[i, j] += left[i, j]
@@ -312,5 +322,6 @@ def _leaf_charges(cut, functions, x, leaves):
                 charge[cut.kids[a, 0], i] += cut.share[a] * charge[a, i]
                 charge[cut.kids[a, 1], i] += (1.0 - cut.share[a]) * charge[a, i]
         else:
-            out[cut.leaf[a]] = charge[a]
+            for i in range(m):
+                out[cut.leaf[a], i] = charge[a, i]
     return out

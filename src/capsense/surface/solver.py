@@ -100,7 +100,9 @@ class SurfaceSolver:
     def pack(self, scene: Scene) -> tuple[NDArray[np.void], list[RigidShape]]:
         """Lay out the bodies that lie in the domain, and the shapes that the layout points to."""
         packed = scene.pack()
-        inside = (packed.bounds[:, 1] > self._room[0]).all(1) & (packed.bounds[:, 0] < self._room[1]).all(1)
+        inside = (packed.bounds[:, 1] > self._room[0]).all(1) & (
+            packed.bounds[:, 0] < self._room[1]
+        ).all(1)
         chosen = np.flatnonzero(inside)
         bodies, shapes = np.zeros(len(chosen), BODY), []
         for place, k in enumerate(chosen):
@@ -133,20 +135,17 @@ def pack_green(green: GreenFunction) -> Green:
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
 
-    def table(phi: NDArray, modes: NDArray, few: int | None = None) -> NDArray:
+    def table(phi: NDArray, modes: NDArray) -> NDArray:
         width = WIDTH * -(-(lead + modes.shape[1]) // WIDTH)
         out = np.zeros((len(phi), width), np.float32)
         out[:, :terminals] = phi
         out[:, lead : lead + modes.shape[1]] = modes
-        if few is None:
-            return out
-        return np.ascontiguousarray(out[:, : WIDTH * (-(-(lead + few) // WIDTH))])
+        return out
 
     far = table(green.far_phi, green.far_modes)
     return Green(
         np.ascontiguousarray(green.near_sources.T), table(green.near_phi, green.near_modes),
-        table(green.near_phi, green.near_modes, green.mid_modes),
         np.ascontiguousarray(green.far_sources.T), far, np.ascontiguousarray(far[:, :lead]),
-        np.asarray(green.mid_blend, float), lead, terminals, float(green.floor),
-        np.asarray(green.box, float), np.asarray(green.blend, float),
+        lead, terminals, float(green.floor), np.asarray(green.box, float),
+        np.asarray(green.blend, float),
     )  # fmt: skip

@@ -10,7 +10,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import carray
 from numpy.typing import NDArray
 
 from capsense.surface.vector_kernels import (
@@ -49,18 +48,14 @@ class Green(NamedTuple):
 
     near: NDArray[Any]
     """Sources for points near the sensor [m], shape (3, s)."""
-    close_table: NDArray[Any]
-    """What each source adds to φ⁰ and ψ, all modes, shape (s, u)."""
     near_table: NDArray[Any]
-    """The same with the modes that matter beyond ``close[1]``, shape (s, w), w <= u."""
+    """What each source adds to φ⁰ and ψ, shape (s, w)."""
     far: NDArray[Any]
     """Sources for points far from it [m], shape (3, f)."""
     far_table: NDArray[Any]
     """The same of these, shape (f, v), v <= w."""
     score_table: NDArray[Any]
     """φ⁰ alone, from the far sources, shape (f, lead)."""
-    close: NDArray[Any]
-    """Distances [m] from ``box`` between which the last modes fade out, shape (2,)."""
     lead: int
     """Columns of φ⁰, padded."""
     terminals: int
@@ -107,22 +102,22 @@ def score(bodies, first, green, weight, scores):
     for b in range(bodies.shape[0]):
         body = bodies[b]
         count = 2 * body.n - 1
-        kids = carray(integers(body.kids), (count, 2))
-        function = carray(integers(body.function), (count,))
-        charge = carray(doubles(body.charge), (count,))
-        own = carray(doubles(body.own), (body.n,))
+        kids = integers(body.kids)
+        function = integers(body.function)
+        charge = doubles(body.charge)
+        own = doubles(body.own)
         _panel_potentials(body, kids, green, means[first[b] : first[b + 1]])
         mean = means[first[b] : first[b + 1]]
         for k in range(count - 1, -1, -1):
-            if kids[k, 0] >= 0:
-                p = np.float32(charge[kids[k, 0]] / charge[k])
+            if kids[2 * k + 0] >= 0:
+                p = np.float32(charge[kids[2 * k + 0]] / charge[k])
                 q = np.float32(1.0) - p
                 stiffness = body.scale / own[function[k]]
                 for i in range(lead):
-                    x, y = mean[kids[k, 0], i], mean[kids[k, 1], i]
+                    x, y = mean[kids[2 * k + 0], i], mean[kids[2 * k + 1], i]
                     mean[k, i] = p * x + q * y
                 for i in range(terminals):
-                    d = float(mean[kids[k, 0], i] - mean[kids[k, 1], i])
+                    d = float(mean[kids[2 * k + 0], i] - mean[kids[2 * k + 1], i])
                     energy[i] += d * d * stiffness
         if not body.neutral:
             for i in range(terminals):
@@ -142,43 +137,44 @@ def score(bodies, first, green, weight, scores):
 def _panel_potentials(body, kids, green, means):
     """φ⁰ at the panels, from the far sources."""
     count = 2 * body.n - 1
-    center = carray(doubles(body.center), (count, 3))
+    center = doubles(body.center)
     rounded = 4 * ((body.n + 3) // 4)
     places = np.empty(body.n, np.int64)
     points = np.zeros((rounded, 3), np.float32)
     found = 0
     for k in range(count):
-        if kids[k, 0] < 0:
+        if kids[2 * k + 0] < 0:
             places[found] = k
             for i in range(3):
                 points[found, i] = body.position[i] + body.scale * (
-                    body.rotation[i, 0] * center[k, 0] + body.rotation[i, 1] * center[k, 1]
-                    + body.rotation[i, 2] * center[k, 2])  # fmt: skip
+                    body.rotation[i, 0] * center[3 * k + 0] + body.rotation[i, 1] * center[3 * k + 1]
+                    + body.rotation[i, 2] * center[3 * k + 2])  # fmt: skip
             found += 1
     values = np.empty((rounded, green.far.shape[1]), np.float32)
     point_potentials(points, green.far, np.float32(green.floor), values)
     phi = np.empty((rounded, green.lead), np.float32)
     multiply_lanes(values, green.score_table, phi)
     for j in range(body.n):
-        means[places[j]] = phi[j]
+        for i in range(green.lead):
+            means[places[j], i] = phi[j, i]
 
 
 @fast
 def _raise_scores(body, mean, weight, scores):
     count = 2 * body.n - 1
-    kids = carray(integers(body.kids), (count, 2))
-    function = carray(integers(body.function), (count,))
-    own = carray(doubles(body.own), (body.n,))
+    kids = integers(body.kids)
+    function = integers(body.function)
+    own = doubles(body.own)
     for k in range(count - 1, -1, -1):
         scores[k] = 0.0
-        if kids[k, 0] >= 0:
+        if kids[2 * k + 0] >= 0:
             value = 0.0
             for i in range(weight.shape[0]):
-                d = float(mean[kids[k, 0], i] - mean[kids[k, 1], i])
+                d = float(mean[kids[2 * k + 0], i] - mean[kids[2 * k + 1], i])
                 value += weight[i] * d * d
             value *= body.scale / own[function[k]]
             for c in range(2):
-                below = scores[kids[k, c]]
+                below = scores[kids[2 * k + c]]
                 value = max(value, below) + 0.5 * min(value, below)
             scores[k] = value
 
@@ -190,12 +186,13 @@ def choose(bodies, first, scores, threshold, width):
     A function fades in while its score grows from ``threshold`` to ``width`` times that.
     """
     total = first[-1]
-    state = np.full(total, -1, np.int8)
+    state, place = np.empty(total, np.int64), np.empty(total, np.int64)
     fades, above = np.zeros(total), np.zeros(total)
-    place = np.full(total, -1, np.int64)
+    for k in range(total):
+        state[k] = place[k] = -1
     count = leaves = 0
     for b in range(bodies.shape[0]):
-        kids = carray(integers(bodies[b].kids), (2 * bodies[b].n - 1, 2))
+        kids = integers(bodies[b].kids)
         o = first[b]
         state[o], above[o] = FRONTIER, 1.0
         for k in range(2 * bodies[b].n - 1):
@@ -203,7 +200,7 @@ def choose(bodies, first, scores, threshold, width):
                 continue
             place[o + k] = count
             count += 1
-            if state[o + k] == LEAF or kids[k, 0] < 0:
+            if state[o + k] == LEAF or kids[2 * k + 0] < 0:
                 state[o + k] = LEAF
                 leaves += 1
                 continue
@@ -212,23 +209,23 @@ def choose(bodies, first, scores, threshold, width):
             fades[o + k] = min(x * x * (3.0 - 2.0 * x), above[o + k])
             state[o + k] = USED if fades[o + k] > 0.0 else FRONTIER
             for c in range(2):
-                state[o + kids[k, c]] = LEAF if state[o + k] == FRONTIER else FRONTIER
-                above[o + kids[k, c]] = fades[o + k]
+                state[o + kids[2 * k + c]] = LEAF if state[o + k] == FRONTIER else FRONTIER
+                above[o + kids[2 * k + c]] = fades[o + k]
     return _collect(bodies, first, state, place, fades, above, count, leaves)
 
 
 @fast
 def _collect(bodies, first, state, place, fades, above, count, leaves):
     cut = Cut(
-        np.empty(count, np.int64), np.empty(count, np.int64), np.full((count, 2), -1, np.int64),
-        np.zeros(count), np.full(count, -1, np.int64), np.empty(count), np.empty(count),
+        np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),
+        np.zeros(count), np.empty(count, np.int64), np.empty(count), np.empty(count),
         np.empty(leaves, np.int64),
     )  # fmt: skip
     leaf = 0
     for b in range(bodies.shape[0]):
         nodes = 2 * bodies[b].n - 1
-        kids = carray(integers(bodies[b].kids), (nodes, 2))
-        charge = carray(doubles(bodies[b].charge), (nodes,))
+        kids = integers(bodies[b].kids)
+        charge = doubles(bodies[b].charge)
         o = first[b]
         for k in range(nodes):
             a = place[o + k]
@@ -236,12 +233,16 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
                 continue
             cut.body[a], cut.node[a] = b, k
             cut.fade[a], cut.above[a] = fades[o + k], above[o + k]
+            cut.leaf[a] = cut.kids[a, 0] = cut.kids[a, 1] = -1
             if state[o + k] == LEAF:
                 cut.leaf[a], cut.leaves[leaf] = leaf, a
                 leaf += 1
             else:
-                cut.kids[a, 0], cut.kids[a, 1] = place[o + kids[k, 0]], place[o + kids[k, 1]]
-                cut.share[a] = charge[kids[k, 0]] / charge[k]
+                cut.kids[a, 0], cut.kids[a, 1] = (
+                    place[o + kids[2 * k + 0]],
+                    place[o + kids[2 * k + 1]],
+                )
+                cut.share[a] = charge[kids[2 * k + 0]] / charge[k]
     return cut
 
 
@@ -250,18 +251,24 @@ def leaf_points(bodies, cut):
     """Four points of each leaf and its extent [m] in the sensor frame, (l, 4, 3) and (l,)."""
     n = cut.leaves.shape[0]
     points, extent, corners = np.empty((n, 4, 3)), np.empty(n), np.empty((4, 3))
+    moments, turn, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for j in range(n):
         a = cut.leaves[j]
         body = bodies[cut.body[a]]
         k = cut.node[a]
         if body.spread != 0:
-            spread = carray(doubles(body.spread), (2 * body.n - 1, 3, 3))
-            center = carray(doubles(body.center), (2 * body.n - 1, 3))
-            extent[j] = body.scale * four_points(spread[k], center[k], corners)
+            spread, center = doubles(body.spread), doubles(body.center)
+            for i in range(3):
+                middle[i] = center[3 * k + i]
+                for q in range(3):
+                    moments[i, q] = spread[9 * k + 3 * i + q]
+            extent[j] = body.scale * four_points(moments, middle, turn, corners)
         else:
-            extent[j] = body.scale * carray(doubles(body.extent), (2 * body.n - 1,))[k]
-            local = carray(doubles(body.points), (2 * body.n - 1, 4, 3))
-            corners[:] = local[k]
+            extent[j] = body.scale * doubles(body.extent)[k]
+            local = doubles(body.points)
+            for q in range(4):
+                for i in range(3):
+                    corners[q, i] = local[12 * k + 3 * q + i]
         for q in range(4):
             for i in range(3):
                 points[j, q, i] = body.position[i] + body.scale * (
@@ -271,18 +278,21 @@ def leaf_points(bodies, cut):
 
 
 @fast
-def four_points(spread, center, out):
+def four_points(a, center, v, out):
     """Four points of equal weight with a centre and the two largest of its second moments.
 
     Args:
-        spread: Second central moments [m²], shape (3, 3).
+        a: Second central moments [m²], shape (3, 3); lost.
         center: [m], shape (3,).
+        v: Room to work in, shape (3, 3).
         out: Filled [m], shape (4, 3).
 
     Returns:
         Length of a uniform rod with the largest second moment [m].
     """
-    a, v = spread.copy(), np.eye(3)
+    for i in range(3):
+        for k in range(3):
+            v[i, k] = 1.0 if i == k else 0.0
     for _ in range(6):  # Jacobi's rotations
         for p in range(2):
             for q in range(p + 1, 3):
@@ -337,43 +347,31 @@ def _share(distance, blend):
 
 @fast
 def leaf_rows(points, distance, green):
-    """Rows of the leaves, shape (l, w); no wider than that of far points where none is near."""
-    n, nearest = points.shape[0], distance.min()
-    width = green.far_table.shape[1]
-    if nearest < green.close[1]:
-        width = green.close_table.shape[1]
-    elif nearest < green.blend[1]:
-        width = green.near_table.shape[1]
-    out = np.zeros((n, width), np.float32)
+    """Rows of the leaves, shape (l, w); no wider than those of far points where none is near."""
+    n = points.shape[0]
+    near = False
+    for j in range(n):
+        near = near or distance[j] < green.blend[1]
+    out = np.zeros((n, green.near_table.shape[1] if near else green.far_table.shape[1]), np.float32)
     chosen, share = np.empty(n, np.int64), np.empty(n)
-    for band in range(3):
+    some = np.empty((n, 4, 3), np.float32)
+    for far in range(2):
         count = 0
         for j in range(n):
-            d = distance[j]
-            if ((band == 0 and d < green.close[1])
-                    or (band == 1 and green.close[1] <= d < green.blend[1])
-                    or (band == 2 and d > green.blend[0])):  # fmt: skip
-                chosen[count] = j
-                near = _share(d, green.blend)
-                share[count] = near if band < 2 else 1.0 - near
+            part = _share(distance[j], green.blend)
+            part = 1.0 - part if far == 1 else part
+            if part > 0.0:
+                chosen[count], share[count] = j, part
+                for q in range(4):
+                    for i in range(3):
+                        some[count, q, i] = points[j, q, i]
                 count += 1
         if count == 0:
             continue
-        some = np.empty((count, 4, 3), np.float32)
-        for c in range(count):
-            for q in range(4):
-                for i in range(3):
-                    some[c, q, i] = points[chosen[c], q, i]
-        if band == 0:
-            _add_rows(some, chosen, share, green.near, green.close_table, green.floor, out)
-            for c in range(count):
-                fade = np.float32(_share(distance[chosen[c]], green.close))
-                for i in range(green.near_table.shape[1], width):
-                    out[chosen[c], i] *= fade
-        elif band == 1:
-            _add_rows(some, chosen, share, green.near, green.near_table, green.floor, out)
+        if far == 1:
+            _add_rows(some[:count], chosen, share, green.far, green.far_table, green.floor, out)
         else:
-            _add_rows(some, chosen, share, green.far, green.far_table, green.floor, out)
+            _add_rows(some[:count], chosen, share, green.near, green.near_table, green.floor, out)
     return out
 
 

@@ -45,17 +45,39 @@ def split(features, charges, spatial, order, first, last, kids):
                     axis, best = d, high - low
             for i in range(a, b):
                 values[i] = features[order[i], axis]
-            rank = np.argsort(values[a:b], kind="mergesort")
-            members = order[a:b].copy()
-            for i in range(b - a):
-                order[a + i] = members[rank[i]]
-                values[a + i] = features[order[a + i], axis]
+            _sort(values[a:b], order[a:b])
             cut = _cut(values[a:b], order[a:b], charges, axis >= 3, spatial)
             kids[k, 0], kids[k, 1] = made, made + 1
             first[made], last[made] = a, a + cut
             first[made + 1], last[made + 1] = a + cut, b
             made += 2
         k += 1
+
+
+@njit(cache=True, nogil=True)
+def _sort(values, members):
+    """Heap sort by value, equal ones by number."""
+    n = values.shape[0]
+    for start in range(n // 2 - 1, -n, -1):
+        root, end = start, n
+        if start < 0:  # the largest is in place; sift the one that takes its turn
+            root, end = 0, n + start
+            values[0], values[end] = values[end], values[0]
+            members[0], members[end] = members[end], members[0]
+        while 2 * root + 1 < end:
+            child = 2 * root + 1
+            if child + 1 < end and (
+                values[child] < values[child + 1]
+                or (values[child] == values[child + 1] and members[child] < members[child + 1])
+            ):
+                child += 1
+            if values[root] > values[child] or (
+                values[root] == values[child] and members[root] > members[child]
+            ):
+                break
+            values[root], values[child] = values[child], values[root]
+            members[root], members[child] = members[child], members[root]
+            root = child
 
 
 @njit(cache=True, nogil=True)
