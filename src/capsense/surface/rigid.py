@@ -31,8 +31,8 @@ _LEAST_CHARGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
-    """Clusters of panels, breadth first; n panels make 2 n - 1 of them."""
+class Clusters:
+    """A binary tree of clusters, breadth first; n panels make 2 n - 1 of them."""
 
     kids: Ints
     """The two parts of each cluster, -1 for a single panel, shape (2 n - 1, 2)."""
@@ -40,6 +40,12 @@ class Tree:
     """Charge function that splits a cluster, -1 for a single panel, shape (2 n - 1,)."""
     panel: Ints
     """Panel of a cluster without parts, else -1, shape (2 n - 1,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tree(Clusters):
+    """Clusters of panels, with the equilibrium charge on them."""
+
     charge: Array
     """Share of each cluster in the equilibrium charge, shape (2 n - 1,)."""
     center: Array
@@ -124,27 +130,34 @@ def build_tree(panels: SurfacePanels, charge: Array) -> Tree:
     n = len(panels)
     extent = float(np.ptp(panels.centers, axis=0).max())
     features = np.concatenate([panels.centers, _NORMALS * extent * panels.normals], axis=1)
-    order, first, last = np.empty(n, np.int64), *np.empty((2, 2 * n - 1), np.int64)
-    kids = np.empty((2 * n - 1, 2), np.int64)
-    tree_kernels.split(features, charge, 1e-9 * extent, order, first, last, kids)
-    single = kids[:, 0] < 0
-    panel = np.where(single, order[first], -1)
-    function = np.where(single, -1, np.cumsum(~single))
-    share, center, spread = (
-        np.empty(2 * n - 1),
-        np.empty((2 * n - 1, 3)),
-        np.empty((2 * n - 1, 3, 3)),
-    )
+    clusters = split(features, charge)
+    kids, panel = clusters.kids, clusters.panel
+    single = panel >= 0
+    share, center = np.empty(2 * n - 1), np.empty((2 * n - 1, 3))
+    spread = np.empty((2 * n - 1, 3, 3))
     share[single] = charge[panel[single]] / charge.sum()
     center[single], spread[single] = panels.centers[panel[single]], panels.moments[panel[single]]
     tree_kernels.moments(kids, panel, share, center, spread)
     size, axes = np.linalg.eigh(spread)
-    arms = (axes * np.sqrt(np.maximum(size, 0.0))[:, None]).transpose(0, 2, 1)
+    size = np.maximum(size, 0.0)
+    arms = (axes * np.sqrt(size)[:, None]).transpose(0, 2, 1)
     signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     points = center[:, None] + signs @ arms[:, 1:]
     return Tree(
-        kids, function, panel, share, center, points, np.sqrt(12.0 * np.maximum(size[:, 2], 0.0))
-    )
+        kids, clusters.function, panel, share, center, points, np.sqrt(12.0 * size[:, 2])
+    )  # fmt: skip
+
+
+def split(features: Array, charge: Array) -> Clusters:
+    """Split panels into clusters by their centres and scaled normals (n, 6) and charges (n,)."""
+    n = len(features)
+    order, first, last = np.empty(n, np.int64), *np.empty((2, 2 * n - 1), np.int64)
+    kids = np.empty((2 * n - 1, 2), np.int64)
+    extent = float(np.ptp(features[:, :3], axis=0).max())
+    tree_kernels.split(features, charge, 1e-9 * extent, order, first, last, kids)
+    single = kids[:, 0] < 0
+    panel = np.where(single, order[first], -1)
+    return Clusters(kids, np.where(single, -1, np.cumsum(~single)), panel)
 
 
 def _of_functions(tree: Tree, block: Array) -> Array32:

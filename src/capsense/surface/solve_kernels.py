@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._simd import at, madd, put_span, span
 from capsense.surface.pair_kernels import leaf_pairs
 from capsense.surface.step_kernels import (
     choose,
@@ -17,13 +18,12 @@ from capsense.surface.step_kernels import (
     leaf_rows,
     score,
 )
-from capsense._simd import at, madd, put_span, span
 from capsense.surface.vector_kernels import (
     WIDTH,
     cholesky,
     entry,
-    integers,
     fast,
+    integers,
     multiply,
     singles,
     substitute,
@@ -67,7 +67,32 @@ class Solution(NamedTuple):
 
 @entry
 def solve(bodies, green, threshold, width):
-    """Solve a scene of rigid bodies."""
+    """Solve a scene of bodies without losses."""
+    cut, functions, phi, matrix, rest, own, points, extent, owner = _prepare(
+        bodies, green, threshold, width
+    )
+    delta, left, x = _reduce(cut, functions, phi, matrix, rest, own)
+    charge = _leaf_charges(cut, functions, x, points.shape[0])
+    m = green.terminals
+    size = functions.solved if delta[0, 0] == delta[0, 0] else 0
+    return Solution(delta[:m, :m], left[:m, :m], charge, points, extent, owner, size)
+
+
+@entry
+def prepared(bodies, green, threshold, width):
+    """Return the cut, its functions, their φ⁰, matrix, rows below, diagonal, and the leaves."""
+    return _prepare(bodies, green, threshold, width)
+
+
+@entry
+def leaf_charges(cut, functions, x, leaves):
+    """Return the charges on the leaves (l, m) of charges of the functions (f, m)."""
+    return _leaf_charges(cut, functions, x, leaves)
+
+
+@fast
+def _prepare(bodies, green, threshold, width):
+    """Choose charge functions, and set up their system."""
     first = np.zeros(bodies.shape[0] + 1, np.int64)
     for b in range(bodies.shape[0]):
         first[b + 1] = first[b] + 2 * bodies[b].n - 1
@@ -85,11 +110,7 @@ def solve(bodies, green, threshold, width):
     leaf_pairs(points, extent, owner, changing, green.floor, pairs)
     functions = _list_functions(bodies, cut)
     phi, matrix, rest, own = _assemble(bodies, cut, functions, rows, pairs, green)
-    delta, left, x = _reduce(cut, functions, phi, matrix, rest, own)
-    charge = _leaf_charges(cut, functions, x, leaves)
-    m = green.terminals
-    return Solution(delta[:m, :m], left[:m, :m], charge, points, extent, owner,
-                    functions.solved if delta[0, 0] == delta[0, 0] else 0)  # fmt: skip
+    return cut, functions, phi, matrix, rest, own, points, extent, owner
 
 
 @fast

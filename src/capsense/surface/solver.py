@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.constants import EPS0
-from capsense.errors import SceneError, SolveError
+from capsense.errors import SolveError
 from capsense.field.background import BackgroundField
 from capsense.field.green import GreenFunction
-from capsense.scene import Body, Scene
-from capsense.scene.shape import ShapeKind
+from capsense.scene import Layers, Scene
+from capsense.scene.scene import PackedScene
+from capsense.surface.changing import ChangingBody, layer_pieces
+from capsense.surface.lossy import solve_lossy
+from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
 from capsense.surface.rigid import RigidShape
 from capsense.surface.solve_kernels import Solution, solve
 from capsense.surface.step_kernels import BODY, Green
@@ -21,17 +22,7 @@ from capsense.surface.store import rigid
 from capsense.surface.vector_kernels import WIDTH
 
 Array = NDArray[np.float64]
-
-UNIT = 4 * math.pi * EPS0
-"""Capacitance of a ball of one metre [F]; the kernels take it for one."""
-CONDUCTING = 1e4
-"""Magnitude of the complex permittivity from which the inside of a body holds no field."""
-_BOUND = 300.0, 3000.0
-"""Real permittivities between which displacement current comes to tie a body to ground."""
-_CONTACT = 6.0
-"""Size of a body over that of the contact that ties it to ground."""
-_SHUT = 1e9
-"""Energy of the net charge of bodies that float together, over that of a ball of one metre."""
+Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -46,8 +37,30 @@ class Preset:
     """They fade in up to so many times that."""
 
 
+PRESETS = {
+    "standard": Preset(),
+    "learning": Preset(panels=300, threshold=0.08),
+    "fine": Preset(panels=1400, threshold=0.004),
+}
+"""Presets by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class PackedBodies:
+    """The bodies of a scene that reach into the domain, as the kernels take them."""
+
+    records: NDArray[np.void]
+    """One :data:`BODY` each, shape (n,)."""
+    chosen: NDArray[np.intp]
+    """Their places in the scene, shape (n,)."""
+    matter: Matter
+    """What they are made of and what ties them to ground."""
+    shapes: list[RigidShape | ChangingBody]
+    """What the records point to."""
+
+
 class SurfaceSolver:
-    """Solves scenes of rigid bodies, each by itself.
+    """Solves scenes, each by itself.
 
     Args:
         background: Field of the design.
@@ -61,73 +74,125 @@ class SurfaceSolver:
         self.green = pack_green(background.green)
         self.frequency = frequency
         self.preset = preset or Preset()
-        axes = background.lattice.storeys[0].axes
-        top = background.lattice.storeys[-1].axes[2]
-        self._room = np.array(
-            [[axes[0][0], axes[1][0], axes[2][0]], [axes[0][-1], axes[1][-1], top[-1]]]
-        )
+        low, top = background.lattice.storeys[0].axes, background.lattice.storeys[-1].axes[2]
+        self._room = np.array([[a[0] for a in low], [low[0][-1], low[1][-1], top[-1]]])
 
-    def solve(self, scene: Scene) -> tuple[Array, int, float, float]:
-        """Return the change of the Maxwell matrix of all terminals [F], and its estimated error.
+    def solve(self, scene: Scene) -> tuple[Array, int, float]:
+        """Solve a scene.
 
         Returns:
-            Change, shape (terminals, terminals); the number of charge functions; estimated error
-            of the largest entry [F]; and the same once more.
+            Change of the Maxwell matrix of all terminals [F], shape (terminals, terminals); the
+            number of charge functions; estimated error of the largest entry [F].
 
         Raises:
+            SceneError: A dielectric has no inside, see :meth:`unsupported`.
             SolveError: Bodies lie within each other in a way that leaves no solution.
         """
-        bodies, _ = self.pack(scene)
-        n = self.green.terminals
-        if not len(bodies):
-            return np.zeros((n, n)), 0, 0.0, 0.0
-        solution = self.solution(bodies)
+        _, solution = self.solution(scene)
+        if solution is None:
+            return np.zeros((self.green.terminals,) * 2), 0, 0.0
         error = UNIT * float(np.abs(np.diag(solution.left)).max())
-        return UNIT * solution.delta, solution.size, error, error
+        return UNIT * solution.delta, solution.size, error
 
-    def reset(self) -> None:
-        """Do nothing: no scene depends on the one before."""
+    def solution(self, scene: Scene) -> tuple[PackedBodies, Solution | None]:
+        """Return the packed bodies and their charges; None where no body is in the domain.
 
-    def solution(self, bodies: NDArray[np.void]) -> Solution:
-        """Solve packed bodies."""
-        out = solve(bodies, self.green, self.preset.threshold, self.preset.width)
-        if not out.size:
+        Raises:
+            SceneError, SolveError: As :meth:`solve`.
+        """
+        bodies, preset = self.pack(scene), self.preset
+        if not len(bodies.records):
+            return bodies, None
+        if bodies.matter.lossy:
+            matter = bodies.matter
+            softness = matter.softness()
+            impedances = [
+                s.impedance if soft != 0 and isinstance(s, RigidShape) else None
+                for s, soft in zip(bodies.shapes, softness, strict=True)
+            ]
+            out = solve_lossy(
+                bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)), softness,
+                impedances, self.green, preset.threshold, preset.width,
+            )  # fmt: skip
+        else:
+            out = solve(bodies.records, self.green, preset.threshold, preset.width)
+        if not (out.size and np.isfinite(out.delta).all()):
             raise SolveError(
                 "the charges of the bodies cannot be told apart; look for bodies that coincide"
             )
-        return out
+        return bodies, out
 
-    def pack(self, scene: Scene) -> tuple[NDArray[np.void], list[RigidShape]]:
-        """Lay out the bodies that lie in the domain, and the shapes that the layout points to."""
+    def unsupported(self, scene: Scene) -> str | None:
+        """Say what of a scene has no surface charges here, if anything."""
         packed = scene.pack()
-        inside = (packed.bounds[:, 1] > self._room[0]).all(1) & (
-            packed.bounds[:, 0] < self._room[1]
-        ).all(1)
-        chosen = np.flatnonzero(inside)
-        bodies, shapes = np.zeros(len(chosen), BODY), []
-        for place, k in enumerate(chosen):
-            body = scene[int(k)]
-            shape, size = rigid(body.shape, self.preset.panels)
-            shapes.append(shape)
-            bodies[place] = shape.record
-            bodies["scale"][place] = size
-            self._set_matter(bodies[place], body, shape, size)
-        bodies["rotation"], bodies["position"] = packed.rotation[chosen], packed.position[chosen]
-        bodies["group"] = np.arange(len(chosen))
-        return bodies, shapes
+        within = self._within(packed)
+        for k in np.flatnonzero(self._met(packed)).tolist():
+            body = scene[k]
+            if matter_of([body], self.frequency).conducting[0]:
+                continue
+            if isinstance(body.shape, Layers):
+                return "a dielectric given by a depth image"
+            if not within[k]:
+                return "a dielectric that the walls of the domain cut off"
+            if not getattr(body.shape, "closed", True):
+                return "a dielectric whose surface is open"
+        return None
 
-    def _set_matter(self, record: np.void, body: Body, shape: RigidShape, size: float) -> None:
-        eps = body.material.complex_permittivity(self.frequency)
-        if abs(eps) >= CONDUCTING:
-            record["neutral"] = body.grounding == "floating"
-            if not isinstance(body.grounding, str):
-                record["tie"] = UNIT / body.grounding
-            return
-        record["neutral"] = 1
-        if abs(eps - 1) < 1e-9:
-            eps = complex(1 + 1e-9)
-        record["impedance"] = shape.impedance.ctypes.data
-        record["softness"] = 1.0 / (eps.real - 1.0)
+    def pack(self, scene: Scene) -> PackedBodies:
+        """Lay out the bodies that reach into the domain."""
+        packed = scene.pack()
+        met, within = np.flatnonzero(self._met(packed)).tolist(), self._within(packed)
+        matter = matter_of([scene[k] for k in met], self.frequency)
+        shapes: list[RigidShape | ChangingBody] = []
+        sizes: list[float] = []
+        kept: list[int] = []
+        for place, k in enumerate(met):
+            shape, size = self._shape(
+                scene, packed, k, bool(within[k] or not matter.conducting[place])
+            )
+            if shape is not None:
+                shapes.append(shape)
+                sizes.append(size)
+                kept.append(place)
+        chosen = np.array(met, np.intp)[kept]
+        matter = matter[kept].joined(scene, packed, chosen)
+        records = np.array([s.record for s in shapes], BODY)
+        records["scale"] = sizes
+        records["rotation"], records["position"] = packed.rotation[chosen], packed.position[chosen]
+        matter.write(records, shapes)
+        return PackedBodies(records, chosen, matter, shapes)
+
+    def _shape(
+        self, scene: Scene, packed: PackedScene, k: int, whole: bool
+    ) -> tuple[RigidShape | ChangingBody | None, float]:
+        """Charge functions of a body and its size; None where nothing of it is in the domain."""
+        shape = scene[k].shape
+        if isinstance(shape, Layers):
+            tree, pieces, wanted = layer_pieces(shape)
+            inside = wanted & self._inside(pieces.centers, packed, k)
+            return (ChangingBody(tree, pieces, inside) if inside.any() else None), 1.0
+        functions, size = rigid(shape, self.preset.panels)
+        if whole:
+            return functions, size
+        inside = self._inside(size * functions.panels.centers, packed, k)
+        return (
+            ChangingBody(functions.tree, functions.panels, inside) if inside.any() else None
+        ), size
+
+    def _met(self, packed: PackedScene) -> Bools:
+        """Which bodies reach into the domain."""
+        low, high = packed.bounds[:, 0], packed.bounds[:, 1]
+        return ((high > self._room[0]) & (low < self._room[1])).all(axis=1)
+
+    def _within(self, packed: PackedScene) -> Bools:
+        """Which bodies lie in the domain as a whole."""
+        low, high = packed.bounds[:, 0], packed.bounds[:, 1]
+        return ((low > self._room[0]) & (high < self._room[1])).all(axis=1)
+
+    def _inside(self, points: Array, packed: PackedScene, k: int) -> Bools:
+        """Which points of a body's frame lie in the domain."""
+        world = points @ packed.rotation[k].T + packed.position[k]
+        return ((world > self._room[0]) & (world < self._room[1])).all(axis=1)
 
 
 def pack_green(green: GreenFunction) -> Green:

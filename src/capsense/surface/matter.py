@@ -1,0 +1,161 @@
+"""What bodies are made of, and what ties them to ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.constants import EPS0
+from capsense.scene import Body, Layers, Scene, TriMesh
+from capsense.scene.scene import PackedScene
+from capsense.surface.changing import ChangingBody
+from capsense.surface.rigid import RigidShape
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Ints = NDArray[np.int64]
+
+UNIT = 4 * math.pi * EPS0
+"""Capacitance of a ball of one metre [F]; the kernels take it for one."""
+CONDUCTING = 1e4
+"""Magnitude of the complex permittivity from which the inside of a body holds no field."""
+_BOUND = 300.0, 3000.0
+"""Real permittivities between which displacement current comes to tie a body to ground."""
+_CONTACT = 6.0
+"""Size of a body over that of the contact that ties it to ground."""
+_SHUT = 1e8
+"""Energy [1/m] of the net charge of conductors that touch each other and float together."""
+_TOUCH = 1e-6
+"""Conductors nearer than this [m] touch."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matter:
+    """Permittivities and ties of n bodies."""
+
+    eps: Complex
+    """Complex relative permittivity, infinite for conductors, shape (n,)."""
+    ground: Array
+    """Capacitance to ground [F], infinite for grounded bodies, 0 for floating ones, shape (n,)."""
+    group: Ints
+    """First of the conductors that a body touches, directly or not; else itself, shape (n,)."""
+
+    def __getitem__(self, places: Sequence[int]) -> Matter:
+        """Some of the bodies, each by itself."""
+        return Matter(self.eps[places], self.ground[places], np.arange(len(places)))
+
+    @property
+    def conducting(self) -> NDArray[np.bool_]:
+        """Which bodies hold no field inside, shape (n,)."""
+        return np.isinf(self.eps.real)
+
+    @property
+    def lossy(self) -> bool:
+        """Whether a body is neither a conductor nor free of losses."""
+        return bool(((self.eps.imag != 0) & ~self.conducting).any())
+
+    def softness(self) -> Complex:
+        """1 / (eps - 1), zero for conductors, shape (n,)."""
+        out = np.zeros(len(self.eps), complex)
+        soft = ~self.conducting
+        less = self.eps[soft] - 1.0
+        out[soft] = 1.0 / np.where(np.abs(less) < 1e-9, 1e-9, less)
+        return out
+
+    def ties(self, sizes: Array) -> Complex:
+        """Energy of each body's net charge beyond that of its field [1/m]; infinite if it has none.
+
+        A conductor has that of its capacitance to ground. Current comes to other matter through a
+        contact of size ``l``, in series with it: 1 / (eps l). Displacement current counts only
+        where eps is large, so that plastics stay without net charge.
+
+        Args:
+            sizes: Capacitances of the bodies in free space over 4π eps0 [m], shape (n,).
+        """
+        with np.errstate(divide="ignore"):
+            out = (UNIT / self.ground).astype(complex)
+        for k in np.flatnonzero(~self.conducting):
+            eps = self.eps[k]
+            x = np.clip(np.log(eps.real / _BOUND[0]) / np.log(_BOUND[1] / _BOUND[0]), 0.0, 1.0)
+            current = 1j * eps.imag + eps.real * x * x * (3 - 2 * x)
+            if current == 0 or np.isinf(out[k].real):
+                out[k] = np.inf
+            else:
+                out[k] += (_CONTACT - 1.0) / (current * sizes[k])
+        return out
+
+    def joined(self, scene: Scene, packed: PackedScene, chosen: NDArray[np.intp]) -> Matter:
+        """Take conductors that touch each other for one, on the sum of their ties to ground.
+
+        Meshes and depth images are not looked at, nor are bodies that are all at ground.
+        """
+        free = self.conducting & np.isfinite(self.ground)
+        if not free.any():
+            return self
+        group = np.arange(len(chosen))
+        for a in np.flatnonzero(free).tolist():
+            near = (
+                (packed.bounds[chosen, 0] <= packed.bounds[chosen[a], 1] + _TOUCH)
+                & (packed.bounds[chosen, 1] >= packed.bounds[chosen[a], 0] - _TOUCH)
+            ).all(axis=1) & self.conducting  # fmt: skip
+            for b in np.flatnonzero(near).tolist():
+                if group[a] != group[b] and _touch(scene[int(chosen[a])], scene[int(chosen[b])]):
+                    group[group == max(group[a], group[b])] = min(group[a], group[b])
+        total = np.zeros(len(chosen))
+        np.add.at(total, group, self.ground)
+        return replace(self, ground=total[group], group=group)
+
+    def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
+        """Enter what the kernels need to know; losses are left to :mod:`capsense.surface.lossy`."""
+        ties, softness = self.ties(sizes_of(records, shapes)), self.softness()
+        members = np.bincount(self.group, minlength=len(records))[self.group]
+        none = np.isinf(ties.real)
+        shared = none & (members > 1) & self.conducting
+        records["neutral"] = none & ~shared
+        records["tie"] = np.where(shared, _SHUT, np.where(none, 0.0, ties.real))
+        records["group"], records["softness"] = self.group, softness.real
+        for record, shape, soft in zip(records, shapes, softness, strict=True):
+            if soft != 0:
+                assert isinstance(shape, RigidShape)  # others are conductors
+                record["impedance"] = shape.impedance.ctypes.data
+
+
+def matter_of(bodies: Sequence[Body], frequency: float) -> Matter:
+    """Look up what bodies are made of, at a frequency [Hz]."""
+    eps = np.array([b.material.complex_permittivity(frequency) for b in bodies], complex)
+    eps[np.abs(eps) >= CONDUCTING] = np.inf
+    known = {"grounded": np.inf, "floating": 0.0}
+    ground = [known[b.grounding] if isinstance(b.grounding, str) else b.grounding for b in bodies]
+    return Matter(eps, np.array(ground, float), np.arange(len(bodies)))
+
+
+def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> Array:
+    """Capacitances of bodies in free space over 4π eps0 [m]; 1 for surfaces that change."""
+    size = [s.capacitance if isinstance(s, RigidShape) else 1.0 for s in shapes]
+    return records["scale"] * np.array(size)
+
+
+def _touch(first: Body, second: Body) -> bool:
+    """Whether two solids meet, as far as the corners of one tell about the other."""
+    for one, other in ((first, second), (second, first)):
+        if isinstance(one.shape, TriMesh | Layers) or isinstance(other.shape, TriMesh | Layers):
+            return False
+        points = other.pose.inverse().apply(one.pose.apply(_surface_points(one)))
+        if (other.shape.signed_distance(points) <= _TOUCH).any():
+            return True
+    return False
+
+
+def _surface_points(body: Body) -> Array:
+    found = body.shape.__dict__.get("_surface_points")
+    if found is None:
+        from capsense.surface.panels import panels_of
+
+        panels = panels_of(body.shape, 300)
+        found = np.concatenate([panels.centers, panels.corners.reshape(-1, 3)])
+        body.shape.__dict__["_surface_points"] = found
+    return found
