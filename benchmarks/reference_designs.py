@@ -6,8 +6,10 @@
 A guarded pad, on air and on FR4, bare and under a plastic cover, with a grounded plate before it;
 and a pair of pads with a block of plastic before them. The object is put into the design, as a
 grounded conductor or a layer, and the package's boundary elements (``capsense.field.boundary``)
-solve both designs: ΔC = C(with) − C(without), so every boundary sees every other. Two panel sizes
-are extrapolated; what that adds is the stated error.
+solve it, every boundary seeing every other. ΔC is −∮ φ⁰_i σ_j over the object, with the potential
+of the design without it and the object's charge with it; where it lies on a layer it is the
+difference of the terminals' charges. Two panel sizes are extrapolated. The stated error is what
+that adds, or what the terminals' charges say otherwise, whichever is more.
 
 "self" is what a self-mode channel reads, shields driven with the pad; "pad" the diagonal of the
 Maxwell matrix, shields at ground; "mutual" the largest entry off the diagonal.
@@ -31,11 +33,12 @@ from numpy.typing import NDArray
 import capsense as cs
 from capsense.design.loader import parse_design
 from capsense.design.model import Role
-from capsense.field.boundary import Accuracy, BoundarySolution, terminals
+from capsense.field.boundary import GROUND, Accuracy, BoundarySolution, terminals
 
 Array = NDArray[np.float64]
 OUTPUT = Path(__file__).parents[1] / "tests" / "data" / "reference_designs.json"
-SCALES = (1.4, 1.0)
+SCALES, FINE = (1.4, 1.0), (0.7, 0.5)
+"""Panel sizes; the second pair for the pair of pads, which has few."""
 ORDER = 1.5
 """Power of the panel size that errors go with: between rims, first, and faces, second."""
 FEMTO = 1e-15
@@ -129,38 +132,63 @@ def with_body(data: dict[str, Any], body: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-def readings(design: cs.Design, scale: float) -> tuple[Array, Array, int]:
-    """Maxwell matrix of the electrodes, their self capacitances [F], and panels."""
+def charged(design: cs.Design, scale: float) -> tuple[BoundarySolution, Array]:
+    """A design's solution, and charge densities for one volt on each terminal in turn."""
     solution = BoundarySolution(design, Accuracy(scale))
-    names = terminals(design)
-    charges = solution.terminal_charges(solution.densities(np.eye(len(names))))
-    matrix = (charges + charges.T) / 2
-    n = len(design.electrodes)
-    shields = [c.name for c in design.conductors if c.role == Role.SHIELD]
-    with_shields = matrix[:n, [names.index(s) for s in shields]].sum(axis=1)
-    return matrix[:n, :n], np.diag(matrix)[:n] + with_shields, len(solution.model.panels)
+    return solution, solution.densities(np.eye(len(terminals(design))))
 
 
-_EMPTY: dict[tuple[str, float], tuple[Array, Array, int]] = {}
+def on_object(solution: BoundarySolution, body: dict[str, Any]) -> NDArray[np.int64]:
+    """Panels of the object: those of no terminal that lie on its box."""
+    model = solution.model
+    half, at = np.array(body["size"]) / 2, np.array(body["position"])
+    out = np.abs(model.panels.centers - at) - half
+    return np.flatnonzero((model.owner < 0) & (np.abs(out.max(axis=1)) < 1e-7))
 
 
-def change(case: dict[str, Any], scale: float) -> tuple[Array, int]:
-    """ΔC of the electrodes' matrix with that of the self readings as its last row, and panels."""
-    data = tomllib.loads(case["design"])
+_EMPTY: dict[tuple[str, float], tuple[BoundarySolution, Array]] = {}
+
+
+def change(case: dict[str, Any], scale: float) -> tuple[Array, Array, int]:
+    """ΔC of the electrodes' matrix with that of the self readings as its last row; the same from
+    the terminals' charges; and panels.
+    """
+    data, body = tomllib.loads(case["design"]), case["bodies"][0]
+    design = parse_design(data)
     key = case["design"], scale
     if key not in _EMPTY:
-        _EMPTY[key] = readings(parse_design(data), scale)
-    full, self_full, count = readings(parse_design(with_body(data, case["bodies"][0])), scale)
-    empty, self_empty, _ = _EMPTY[key]
-    return np.vstack([full - empty, self_full - self_empty]), count
+        _EMPTY[key] = charged(design, scale)
+    empty, before = _EMPTY[key]
+    full, after = charged(parse_design(with_body(data, body)), scale)
+    mine = on_object(full, body)
+    model, panels = full.model, full.model.panels
+    between = (model.eps_front != model.eps_back)[mine] & (model.owner[mine] == GROUND)
+    apart = full.terminal_charges(after) - empty.terminal_charges(before)
+    delta = apart
+    if not between.any():  # else the object lies on a layer, and its free charge is not at hand
+        weights = panels.weights[mine]
+        panel, _ = np.nonzero(weights)
+        phi = empty.potential(panels.quad[mine][weights > 0], before)
+        delta = -phi.T @ (weights[weights > 0][:, None] * after[mine][panel])
+    n, names = len(design.electrodes), terminals(design)
+    shields = [names.index(c.name) for c in design.conductors if c.role == Role.SHIELD]
+
+    def rows(matrix: Array) -> Array:
+        matrix = (matrix + matrix.T) / 2
+        own = np.diag(matrix)[:n] + matrix[:n, shields].sum(axis=1)
+        return np.vstack([matrix[:n, :n], own])
+
+    return rows(delta), rows(apart), len(panels)
 
 
 def converged(case: dict[str, Any]) -> dict[str, Any]:
     """The case with its figures."""
     started = time.perf_counter()
-    (coarse, _), (fine, panels) = (change(case, s) for s in SCALES)
-    best = fine + (fine - coarse) / ((SCALES[0] / SCALES[1]) ** ORDER - 1)
-    error = np.abs(best - fine)[[0, -1], [0, 0]] / np.abs(best[[0, -1], [0, 0]])
+    scales = FINE if case["design"] == PAIR else SCALES
+    (coarse, *_), (fine, apart, panels) = (change(case, s) for s in scales)
+    best = fine + (fine - coarse) / ((scales[0] / scales[1]) ** ORDER - 1)
+    off = np.maximum(np.abs(best - fine), np.abs(apart - fine))
+    error = off[[0, -1], [0, 0]] / np.abs(best[[0, -1], [0, 0]])
     rounded = [[float(f"{v:.6g}") for v in row] for row in best / FEMTO]
     print(f"{case['name']:50s} pad {rounded[0][0]:9.3f} fF, error {100 * error[0]:.2f} %; self "
           f"{rounded[-1][0]:9.3f} fF, error {100 * error[1]:.2f} %; {panels} panels, "
@@ -175,8 +203,9 @@ def write(found: list[dict[str, Any]]) -> None:
         "about": "A sensor designer's cases; written by benchmarks/reference_designs.py",
         "note": "delta_fF: change of the electrodes' Maxwell matrix, shields at ground; "
         "self_delta_fF: change of what self-mode channels read, shields driven with the electrode; "
-        "error: what the extrapolation over two panel sizes adds, relative, of the first entry of "
-        "each; panels: of sensor and object in the finer one. Bodies as in reference_map.json.",
+        "error: what the extrapolation over two panel sizes adds, or what the terminals' charges "
+        "say otherwise, if that is more; relative, of the first entry of each; panels: of sensor "
+        "and object in the finer one. Bodies as in reference_map.json.",
         "cases": found,
     }
     OUTPUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n")

@@ -70,7 +70,7 @@ def mesh(body: dict[str, Any], points: Array, scale: float, finest: float, share
     turn, at = Rotation.from_quat(body["quaternion"]).as_matrix(), np.array(body["position"])
     local = (points - at) @ turn
     curved, shape, dims = None, body["shape"], body["size"]
-    fine = 0.55 if body["kind"] == "diel" else 1.0
+    fine = 0.65 if body["kind"] == "diel" else 1.0
     scale = fine * scale
     if shape == "box":
         half = np.array(dims) / 2
@@ -81,7 +81,7 @@ def mesh(body: dict[str, Any], points: Array, scale: float, finest: float, share
             wanted: Size = lambda x: np.full(len(x), scale * 0.006)  # noqa: E731
         else:
             wanted = sizes(local, scale, 0.03, finest, max(share, 0.5))
-        corners = box_panels(half, wanted, 12 / scale, rims)
+        corners = box_panels(half, wanted, (7 if body["kind"] == "diel" else 12) / scale, rims)
     elif shape == "ellipsoid":
         r = min(dims)
         outline, _ = profile("sphere", [1.0])
@@ -137,7 +137,7 @@ def solve(case: dict[str, Any], scale: float) -> tuple[Array, int, int]:
             points = np.concatenate([plane, *(r for j, r in enumerate(rough) if j != k)])
             parts.append(mesh(body, points, scale, finest, 0.45))
         count = sum(len(p.corners) for p in parts)
-        if count < MOST:
+        if count < MOST or finest > 0.02:
             break
         finest *= 1.25
     if near and bodies[0]["shape"] != "box":
