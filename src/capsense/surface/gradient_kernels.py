@@ -1,0 +1,253 @@
+"""How the matrix changes as bodies move, by the closed adjoint; 4π eps0 = 1.
+
+With the charges q_i that a scene answers terminal i with, ΔC_ij changes with the pose as
+q_i·V_j + q_j·V_i do while the charges move in the fields ∇V as they are. V_j is the potential of
+terminal j less that of all charges q_j but those of the body itself: its own charges keep their
+distances, so that only their images in the floor, and what the design answers them with, push back.
+
+What the design does comes from its point sources, and leaves feel each other's images as one more
+table of sources. Only sums over a body enter, so forces are summed source by source first:
+
+  dΔC_ij = Σ_s (Σ_p q_i(p) ∇b_s(p)) c_sj,  plus the same with i and j exchanged
+
+and the force of a source on a body passes through that source, which gives the torque.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capsense.surface.force_kernels import (
+    near_pairs,
+    pair_line,
+    source_lines,
+    weigh,
+    wide_moments,
+)
+from capsense.surface.step_kernels import _share, distances
+from capsense.surface.vector_kernels import WIDTH, entry, fast, multiply, multiply_lanes
+
+_BLOCK = 32
+"""Leaves taken at a time, whose tables stay in the cache."""
+
+
+@entry
+def jacobian(solution, bodies, green):
+    """How the Maxwell matrix changes with the pose of each body.
+
+    Args:
+        solution: What :func:`capsense.surface.solve_kernels.solve` returned.
+        bodies: The bodies it was given.
+        green: The Green's function it was given.
+
+    Returns:
+        Shape (b, m, m, 6): moving along the sensor frame's x, y, z [1], turning about axes
+        parallel to these through the body's position [m/rad].
+    """
+    charge, points = solution.charge, solution.points
+    lead, m, count = charge.shape[1], green.terminals, bodies.shape[0]
+    bounds = np.zeros(count + 1, np.int64)
+    for j in range(points.shape[0]):
+        bounds[solution.owner[j] + 1] = j + 1
+    for b in range(count):
+        bounds[b + 1] = max(bounds[b], bounds[b + 1])
+    work = np.zeros((count, 6, lead, lead), np.float32)
+    _add_design(points, charge, bounds, green, work)
+    _add_pairs(points, solution.extent, charge, bounds, green.floor, work)
+    out = np.empty((count, m, m, 6))
+    for b in range(count):
+        x, y, z = bodies[b].position[0], bodies[b].position[1], bodies[b].position[2]
+        for i in range(m):
+            for j in range(m):
+                for r in range(6):
+                    out[b, i, j, r] = float(work[b, r, i, j]) + float(work[b, r, j, i])
+                f = out[b, i, j]
+                # so far the torques are about the origin of the sensor frame
+                f[3] -= y * f[2] - z * f[1]
+                f[4] -= z * f[0] - x * f[2]
+                f[5] -= x * f[1] - y * f[0]
+    return out
+
+
+@fast
+def _add_design(points, charge, bounds, green, work):
+    """Add forces and torques by the design's sources, (b, 6, lead, lead)."""
+    n, lead, floor = points.shape[0], charge.shape[1], np.float32(green.floor)
+    distance = distances(points, green)
+    near_share, far_share = np.empty(n), np.empty(n)
+    for j in range(n):
+        near_share[j] = _share(distance[j], green.blend)
+        far_share[j] = 1.0 - near_share[j]
+    sources, far_sources = _padded(green.near), _padded(green.far)
+    near = _source_sums(points, charge, near_share, bounds, sources, floor)
+    far = _source_sums(points, charge, far_share, bounds, far_sources, floor)
+    modes = np.zeros((lead, green.near_table.shape[1]), np.float32)
+    _add_modes(near, green.near_table, modes)
+    _add_modes(far, green.far_table, modes)
+    right = np.zeros((modes.shape[1], lead), np.float32)
+    for i in range(lead):
+        right[i, i] = 1.0
+        for k in range(lead, modes.shape[1]):
+            right[k, i] = modes[i, k]
+    _add_work(near, sources, green.near_table, right, work)
+    _add_work(far, far_sources, green.far_table, right, work)
+
+
+@fast
+def _padded(sources):
+    """Sources (3, s) and more of them that nothing depends on, up to a multiple of 32."""
+    out = np.full((3, WIDTH * ((sources.shape[1] + WIDTH - 1) // WIDTH)), np.float32(9.0))
+    for i in range(3):
+        for s in range(sources.shape[1]):
+            out[i, s] = sources[i, s]
+    return out
+
+
+@fast
+def _source_sums(points, charge, share, bounds, sources, floor):
+    """Sums over each body's charges, weighted with ``share``, of what a source does to them.
+
+    Returns:
+        Shape (b, 6, lead, s), the six numbers of
+        :func:`capsense.surface.force_kernels.source_lines`; b = 0 where no weight is above zero.
+    """
+    count, lead, width = bounds.shape[0] - 1, charge.shape[1], sources.shape[1]
+    some_count = 0
+    for j in range(points.shape[0]):
+        some_count += share[j] > 0.0
+    if some_count == 0:
+        return np.zeros((0, 6, lead, width), np.float32)
+    out = np.zeros((count, 6, lead, width), np.float32)
+    some = np.empty((_BLOCK, 4, 3), np.float32)
+    lines = np.empty((6, _BLOCK, width), np.float32)
+    sums = np.empty((lead, width), np.float32)
+    for b in range(count):
+        j = bounds[b]
+        while j < bounds[b + 1]:
+            chosen = 0
+            left = np.zeros((lead, _BLOCK), np.float32)
+            while j < bounds[b + 1] and chosen < _BLOCK:
+                if share[j] > 0.0:
+                    for i in range(lead):
+                        left[i, chosen] = 0.25 * share[j] * charge[j, i]
+                    for q in range(4):
+                        for i in range(3):
+                            some[chosen, q, i] = points[j, q, i]
+                    chosen += 1
+                j += 1
+            if chosen == 0:
+                continue
+            left = _narrowed(left, chosen)
+            source_lines(some[:chosen], sources, floor, lines)
+            for r in range(6):
+                multiply(left, lines[r, :chosen], sums)
+                _add(sums, out[b, r])
+    return out
+
+
+@fast
+def _narrowed(table, columns):
+    out = np.empty((table.shape[0], columns), np.float32)
+    for i in range(table.shape[0]):
+        for k in range(columns):
+            out[i, k] = table[i, k]
+    return out
+
+
+@fast
+def _add(addend, out):
+    for i in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            out[i, k] += addend[i, k]
+
+
+@fast
+def _add_modes(sums, table, modes):
+    """Add the sums of ψ over all charges to ``modes`` (lead, w); those of φ⁰ mean nothing."""
+    if sums.shape[0] == 0:
+        return
+    lead, s = sums.shape[2], table.shape[0]
+    whole = np.zeros((lead, s), np.float32)
+    for b in range(sums.shape[0]):
+        for i in range(lead):
+            for k in range(s):
+                whole[i, k] += sums[b, 0, i, k]
+    part = np.empty((lead, table.shape[1]), np.float32)
+    multiply(whole, table, part)
+    _add(part, modes[:, : table.shape[1]])
+
+
+@fast
+def _add_work(sums, sources, table, right, work):
+    """Add forces and torques by sources of coefficients ``table @ right``, shape (s, lead)."""
+    count, lead, width = sums.shape[0], sums.shape[2], sums.shape[3]
+    if count == 0:
+        return
+    s, v = table.shape
+    coefficients = np.zeros((width, lead), np.float32)
+    whole = 4 * (s // 4)
+    multiply_lanes(table[:whole], right[:v], coefficients[:whole])
+    for k in range(whole, s):
+        for c in range(v):
+            for i in range(lead):
+                coefficients[k, i] += table[k, c] * right[c, i]
+    for b in range(count):
+        own = sums[b]
+        for i in range(lead):
+            for k in range(width):
+                x, y = sources[0, k], sources[1, k]
+                fx, fy, fz = own[1, i, k], own[2, i, k], own[3, i, k]
+                gx, gy = own[4, i, k], own[5, i, k]
+                own[0, i, k], own[1, i, k], own[2, i, k] = fx, fy, fz
+                own[3, i, k], own[4, i, k] = y * fz - gy, gx - x * fz
+                own[5, i, k] = x * fy - y * fx
+        _add_contracted(own, coefficients, work[b])
+
+
+@fast
+def _add_contracted(sums, coefficients, work):
+    """``work += sums @ coefficients``, shapes (6, lead, lead), (6, lead, s) and (s, lead)."""
+    lead, width = sums.shape[1], sums.shape[2]
+    part = np.empty((6 * lead, lead), np.float32)
+    multiply_lanes(sums.reshape((6 * lead, width)), coefficients, part)
+    _add(part, work.reshape((6 * lead, lead)))
+
+
+@fast
+def _add_pairs(points, extent, charge, bounds, floor, work):
+    """Add forces and torques by other bodies' charges and by all images in the floor."""
+    n, lead = charge.shape
+    width = WIDTH * ((n + WIDTH - 1) // WIDTH)
+    image = np.empty((n, 4, 3))
+    for j in range(n):
+        for q in range(4):
+            image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
+            image[j, q, 2] = 2.0 * floor - points[j, q, 2]
+    shapes, mirrored = wide_moments(points, extent, width), wide_moments(image, extent, width)
+    coefficients = np.zeros((width, lead), np.float32)
+    for j in range(n):
+        for i in range(lead):
+            coefficients[j, i] = charge[j, i]
+    weight, near = np.empty(width, np.float32), np.empty((14, width), np.float32)
+    sums = np.empty((6, lead, width), np.float32)
+    for b in range(work.shape[0]):
+        start, stop = bounds[b], bounds[b + 1]
+        lines = np.zeros((6, stop - start, width), np.float32)
+        left = np.empty((lead, stop - start), np.float32)
+        for i in range(start, stop):
+            for k in range(lead):
+                left[k, i - start] = charge[i, k]
+            weigh(shapes, i, mirrored, n, 1.0, weight)
+            pair_line(shapes, i, mirrored, weight, lines, i - start)
+            near_pairs(points, image, extent, i, 0, 0, n, weight, near, lines, i - start)
+            if stop - start < n:
+                weigh(shapes, i, shapes, n, -1.0, weight)
+                for j in range(start, stop):
+                    weight[j] = 0.0
+                pair_line(shapes, i, shapes, weight, lines, i - start)
+                near_pairs(
+                    points, points, extent, i, start, stop, n, weight, near, lines, i - start
+                )
+        for r in range(6):
+            multiply(left, lines[r], sums[r])
+        _add_contracted(sums, coefficients, work[b])

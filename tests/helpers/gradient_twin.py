@@ -1,0 +1,103 @@
+"""The Jacobian of the surface step, slowly: energies of frozen charges at moved points."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from capsense.surface.pair_kernels import _FAR, _SOFT
+from capsense.surface.solve_kernels import Solution
+from capsense.surface.step_kernels import Green
+
+Array = np.ndarray
+STEP = 1e-5
+
+
+def jacobian(solution: Solution, origins: Array, green: Green) -> Array:
+    """Central differences of the energy of frozen charges, shape (b, m, m, 6).
+
+    Args:
+        solution: Result of the step.
+        origins: Where the bodies turn about [m], shape (b, 3).
+        green: The Green's function.
+    """
+    out = np.empty((len(origins), green.terminals, green.terminals, 6))
+    for b, origin in enumerate(origins):
+        own = solution.owner == b
+        for r in range(6):
+            energies = []
+            for step in (STEP, -STEP):
+                points, vector = solution.points.copy(), np.zeros(3)
+                vector[r % 3] = step
+                if r < 3:
+                    points[own] += vector
+                else:
+                    points[own] = (
+                        Rotation.from_rotvec(vector)
+                        .apply((points[own] - origin).reshape(-1, 3))
+                        .reshape(-1, 4, 3)
+                        + origin
+                    )
+                energies.append(_energy(points, solution, green))
+            out[b, :, :, r] = (energies[0] - energies[1]) / (2 * STEP)
+    return out
+
+
+def _energy(points: Array, solution: Solution, green: Green) -> Array:
+    """``Φᵀq + qᵀΦ - qᵀAq`` but for what does not change as rigid bodies move, shape (m, m)."""
+    charge = solution.charge[:, : green.terminals]
+    rows = _rows(points, solution.points, green)
+    phi, psi = rows[:, : green.terminals], rows[:, green.lead :]
+    modes = psi.T @ charge
+    image = points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * green.floor]
+    still = solution.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * green.floor]
+    pairs = -_means(points, image, _far(solution.points, still, solution.extent), solution.extent)
+    other = solution.owner[:, None] != solution.owner
+    far = _far(solution.points, solution.points, solution.extent)
+    pairs += np.where(other, _means(points, points, far, solution.extent), 0.0)
+    return phi.T @ charge + charge.T @ phi - charge.T @ pairs @ charge + modes.T @ modes
+
+
+def _rows(points: Array, still: Array, green: Green) -> Array:
+    """Means of φ⁰ and ψ over the leaves; near and far give way to each other as they did."""
+    centre = still.mean(axis=1)
+    off = np.linalg.norm(
+        np.maximum(0, np.maximum(green.box[0] - centre, centre - green.box[1])), axis=1
+    )
+    x = np.clip((green.blend[1] - off) / (green.blend[1] - green.blend[0]), 0.0, 1.0)
+    share = (x * x * (3 - 2 * x))[:, None]
+    rows = share * (_potentials(points, green.near, green.floor) @ green.near_table)
+    far = (1 - share) * (_potentials(points, green.far, green.floor) @ green.far_table)
+    rows[:, : far.shape[1]] += far
+    return rows
+
+
+def _potentials(points: Array, sources: Array, floor: float) -> Array:
+    s = sources.T.astype(float)
+    mirrored = s * [1, 1, -1] + [0, 0, 2 * floor]
+    direct = 1 / np.linalg.norm(points[:, :, None] - s, axis=-1)
+    return (direct - 1 / np.linalg.norm(points[:, :, None] - mirrored, axis=-1)).mean(axis=1)
+
+
+def _far(points: Array, others: Array, extent: Array) -> Array:
+    between = np.linalg.norm(points.mean(axis=1)[:, None] - others.mean(axis=1), axis=-1)
+    return between > _FAR * (extent[:, None] + extent)
+
+
+def _means(points: Array, others: Array, far: Array, extent: Array) -> Array:
+    """Means of 1/r, by moments where clusters are far apart, else with a bounded 1/r."""
+    d = points.mean(axis=1)[:, None] - others.mean(axis=1)
+    r = np.linalg.norm(d, axis=-1)
+    r[r == 0] = 1.0
+    second = np.zeros(r.shape)
+    for corner in (1, 2):
+        for side, arm in (
+            (points, 0.5 * (points[:, 0] - points[:, corner])[:, None]),
+            (others, 0.5 * (others[:, 0] - others[:, corner])[None]),
+        ):
+            assert side.shape[1:] == (4, 3)
+            second += 3 * (arm * d).sum(-1) ** 2 / r**2 - (arm**2).sum(-1)
+    moments = 1 / r + second / (2 * r**3)
+    s = ((points[:, None, :, None] - others[None, :, None]) ** 2).sum(-1)
+    bound = (_SOFT * np.maximum(extent[:, None], extent)) ** 4
+    return np.where(far, moments, ((s**2 + bound[..., None, None]) ** -0.25).mean((-2, -1)))

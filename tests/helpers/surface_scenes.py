@@ -1,0 +1,67 @@
+"""Scenes of a few rigid bodies, laid out for the surface kernels."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import capsense as cs
+from capsense.surface.panels import panels_of
+from capsense.surface.rigid import RigidShape, rigid_shape
+from capsense.surface.solver import pack_green
+from capsense.surface.step_kernels import BODY, Green
+
+Array = np.ndarray
+
+
+class Placed(NamedTuple):
+    """A shape somewhere."""
+
+    shape: cs.Sphere | cs.Capsule | cs.Box
+    position: tuple[float, float, float]
+    turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector [rad]."""
+    floating: bool = False
+    eps_r: float = np.inf
+
+
+@cache
+def shape_of(shape: cs.Sphere | cs.Capsule | cs.Box) -> RigidShape:
+    """The charge functions of a shape, kept for the whole run of the tests."""
+    return rigid_shape(panels_of(shape, 300))
+
+
+@cache
+def green_of(design: str = "six_patch_bare") -> Green:
+    """The Green's function of a packaged design."""
+    return pack_green(cs.Simulator(design).background.green)
+
+
+def pack(*bodies: Placed) -> Array:
+    """Lay bodies out; their shapes live on in :func:`shape_of`."""
+    out = np.zeros(len(bodies), BODY)
+    for k, body in enumerate(bodies):
+        shape = shape_of(body.shape)
+        out[k] = shape.record
+        out["scale"][k], out["position"][k], out["group"][k] = 1.0, body.position, k
+        out["rotation"][k] = Rotation.from_rotvec(body.turned).as_matrix()
+        out["neutral"][k] = body.floating or np.isfinite(body.eps_r)
+        if np.isfinite(body.eps_r):
+            out["impedance"][k] = shape.impedance.ctypes.data
+            out["softness"][k] = 1.0 / (body.eps_r - 1.0)
+    return out
+
+
+def moved(bodies: Array, which: int, direction: int, step: float) -> Array:
+    """Move a body along an axis [m], or turn it about one that passes through its origin [rad]."""
+    out = bodies.copy()
+    vector = np.zeros(3)
+    vector[direction % 3] = step
+    if direction < 3:
+        out["position"][which] += vector
+    else:
+        out["rotation"][which] = Rotation.from_rotvec(vector).as_matrix() @ out["rotation"][which]
+    return out
