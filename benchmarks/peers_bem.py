@@ -1,6 +1,6 @@
 """CapSense and boundary elements of others at three scenes: time and error of a step.
 
-    pip install FastCap2
+    pip install ".[peers]"
     python benchmarks/peers_bem.py [--method perturbation surface] [-o out/peers_bem.json]
 
 Scenes over ``six_patch_bare``: the grounded bar at 20 mm, a finger and a limb of
