@@ -363,11 +363,13 @@ def test_refused(change: tuple[str, Any], message: str) -> None:
 
 
 def test_refused_meshes(tmp_path: Path) -> None:
-    """Mesh files that are missing, broken, open or in the wrong unit."""
+    """Mesh files that are missing, broken, empty or in the wrong unit; open ones are taken."""
     trimesh.creation.box(extents=(20, 30, 40)).export(tmp_path / "brick.stl")
     open_box = trimesh.creation.box(extents=(0.02, 0.03, 0.04))
     open_box.update_faces(np.arange(10))
     open_box.export(tmp_path / "open.stl")
+    open_box.vertices[:] = open_box.vertices[0]
+    open_box.export(tmp_path / "point.stl")
     (tmp_path / "broken.ply").write_text("ply\nnonsense\n")
     (tmp_path / "brick.docx").write_text("")
     body = {"name": "m", "shape": "mesh", "material": "steel", "pose": {"position": [0, 0, 0.2]}}
@@ -375,13 +377,15 @@ def test_refused_meshes(tmp_path: Path) -> None:
         ({"file": "brick.stl"}, "missing key 'unit'"),
         ({"file": "brick.stl", "unit": "m"}, '40 m across with unit = "m"'),
         ({"file": "none.stl", "unit": "m"}, r"no file .*none\.stl"),
-        ({"file": "open.stl", "unit": "m"}, 'body "m": TriMesh'),
+        ({"file": "point.stl", "unit": "m"}, 'body "m": TriMesh'),
         ({"file": "broken.ply", "unit": "m"}, "broken.ply' (cannot be read|holds no triangles)"),
         ({"file": "brick.docx", "unit": "m"}, "no known kind; give .stl"),
     ]
     for keys, message in cases:
         with pytest.raises(ScenarioError, match=message):
             parse_scenario(changed(("body", [{**body, **keys}])), folder=tmp_path)
+    taken = {**body, "file": "open.stl", "unit": "m"}
+    parse_scenario(changed(("body", [taken])), folder=tmp_path)
 
 
 def test_refused_files(tmp_path: Path) -> None:

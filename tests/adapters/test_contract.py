@@ -260,15 +260,16 @@ def test_wrong_rules_are_refused(
         shapes_in(things, cs.Pose(), **options)
 
 
-def test_an_open_mesh_is_refused_by_name(shape_way: Way, shapes_in: SensorIn) -> None:
-    """A surface without an inside is refused, and its hull is taken on request."""
+def test_an_open_mesh_is_taken(shape_way: Way, shapes_in: SensorIn) -> None:
+    """A surface without an inside is taken as it is, or its hull on request."""
     vertices, faces = WEDGE.vertices, WEDGE.faces[:-1]
     shape = object.__new__(cs.TriMesh)
     shape.__dict__.update(vertices=vertices, faces=faces)
     things = [Thing("wedge", shape, cs.Pose((0, 0, 0.03)))]
     own_surface = {"shapes": "visual"} if shape_way.package == "pybullet" else {}
-    with pytest.raises(cs.SceneError, match=r"'wedge/.*is not closed.*hull="):
-        shapes_in(things, cs.Pose(), **own_surface)
+    (body,) = shapes_in(things, cs.Pose(), **own_surface).scene()
+    assert not body.shape.closed
+    assert len(body.shape.faces) == len(faces)
     (body,) = shapes_in(things, cs.Pose(), hull=["wedge"], **own_surface).scene()
     assert body.shape.volume == pytest.approx(WEDGE.volume, rel=1e-5)
 

@@ -278,10 +278,57 @@ def moebius():
     return np.random.default_rng(0).random((6, 3)), np.array(faces)
 
 
+def open_surfaces():
+    """Surfaces without an inside, and why."""
+    return [
+        (TriMesh(V, F[1:]), "not closed \\(3 of 120"),
+        (TriMesh(V[:4], [[0, 1, 2], [2, 1, 0]]), "no volume"),
+        (TriMesh(*moebius()), "one-sided"),
+        (TriMesh(V, np.concatenate([F, [[0, 1, 7]]])), "not closed|more than two faces"),
+        (TriMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), "not closed"),
+    ]
+
+
+def test_open_surfaces_are_taken_and_have_no_inside():
+    """Making one is fine; what needs an inside says so, and what to do."""
+    for shape, why in open_surfaces():
+        assert not shape.closed
+        assert np.isfinite(shape.bounds()).all()
+        assert np.isfinite(shape.params).all()
+        for ask in (
+            lambda s: s.volume,
+            lambda s: s.grid,
+            lambda s: s.signed_distance([(0, 0, 0)]),
+            lambda s: s.line_intervals([(0, 0, 0)], (0, 0, 1)),
+        ):
+            with pytest.raises(SceneError, match=f"({why}).*no inside.*surface.*convex_hull"):
+                ask(shape)
+    assert TriMesh(V, F).closed
+
+
+def test_copies_of_faces_are_dropped():
+    """A ball with some faces twice, once turned over, is the ball."""
+    shape = TriMesh(V, np.concatenate([F, F[:7, ::-1], F[:3]]))
+    assert shape.closed
+    assert len(shape.faces) == len(F)
+    assert shape.volume == pytest.approx(TriMesh(V, F).volume)
+
+
+def test_open_surfaces_are_wound_alike():
+    """Differential: half a ball of random winding has normals that agree with each other."""
+    half = F[V[F].mean(axis=1)[:, 2] > 0]
+    rng = np.random.default_rng(6)
+    turned = np.where(rng.random(len(half))[:, None] < 0.5, half[:, ::-1], half)
+    shape = TriMesh(V, turned)
+    corners = shape.vertices[shape.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    side = np.einsum("ij,ij->i", normal, corners.mean(axis=1))
+    assert (side > 0).all() or (side < 0).all()
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: TriMesh(V, F[1:]), "not closed \\(3 of"),
         (lambda: TriMesh(1000 * V, F), "vertices \\* 1e-3"),
         (lambda: TriMesh(V, np.where(F == 3, 99, F)), "indices run from 0 to 41"),
         (lambda: TriMesh(V, np.where(F == 3, -1, F)), "indices run from 0 to 41"),
@@ -292,8 +339,6 @@ def moebius():
         (lambda: TriMesh(V, F[:0]), "faces have shape"),
         (lambda: TriMesh(V, np.zeros((4, 4), int)), "triangles only"),
         (lambda: TriMesh(0 * V, F), "every face repeats a vertex"),
-        (lambda: TriMesh(V[:4], [[0, 1, 2], [2, 1, 0]]), "no volume"),
-        (lambda: TriMesh(*moebius()), "one-sided"),
         (lambda: TriMesh(V, F, cell=0), "cell is 0"),
         (lambda: TriMesh(V, F, cell=1.0), "at most 0.1"),
         (lambda: TriMesh(V, F, cell="x"), "cell is 'x'"),

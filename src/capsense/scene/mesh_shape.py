@@ -1,4 +1,4 @@
-"""Rigid bodies of any form: closed triangle meshes, seen through a signed-distance grid."""
+"""Rigid bodies of any form: triangle meshes, whose inside is seen through a distance grid."""
 
 from __future__ import annotations
 
@@ -42,7 +42,11 @@ class DistanceGrid:
 
 @dataclass(frozen=True, init=False, eq=False)
 class TriMesh(Shape):
-    """A closed triangle mesh, moved rigidly.
+    """A triangle mesh, moved rigidly.
+
+    It may be open, hold faces twice, cross itself, and wind any way: the surface solver takes the
+    surface as it is. What asks for its inside, such as dielectrics and everything below, needs a
+    closed one.
 
     Distances and line crossings come from a signed-distance grid that is built at first use and
     kept. Crossings are right to a small part of a cell on smooth and flat surfaces; edges and
@@ -56,14 +60,14 @@ class TriMesh(Shape):
             for flat meshes (six cells across the shortest) up to a million nodes.
 
     Raises:
-        SceneError: The mesh is not closed, encloses no volume, is longer than 10 m, holds a bad
-            number or index, or ``cell`` is out of range.
+        SceneError: The mesh is longer than 10 m, holds a bad number or index, has no triangle, or
+            ``cell`` is out of range.
     """
 
     vertices: Array
     """Cleaned vertices [m], shape (n, 3), read-only."""
     faces: NDArray[np.int64]
-    """Cleaned faces, normals out, shape (m, 3), read-only."""
+    """Cleaned faces, shape (m, 3), read-only; normals out where the mesh is closed."""
     cell: float
     """Spacing of the distance grid [m]."""
 
@@ -71,14 +75,20 @@ class TriMesh(Shape):
     max_intervals = 4
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, cell: float | None = None) -> None:
-        v, f = clean_surface(vertices, faces)
+        v, f, flaw = clean_surface(vertices, faces)
         v.setflags(write=False)
         f.setflags(write=False)
         extents = np.ptp(v, axis=0)
         fields = self.__dict__
         fields["vertices"] = v
         fields["faces"] = f
+        fields["_flaw"] = flaw
         fields["cell"] = _default_cell(extents) if cell is None else _checked_cell(cell, extents)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the mesh has an inside."""
+        return not self.__dict__["_flaw"]
 
     @cached_property
     def params(self) -> Array:
@@ -93,6 +103,7 @@ class TriMesh(Shape):
 
     @cached_property
     def volume(self) -> float:
+        self._require_inside("a volume")
         return enclosed_volume(self.vertices, self.faces)
 
     def bounds(self) -> Array:
@@ -102,9 +113,13 @@ class TriMesh(Shape):
     def grid(self) -> DistanceGrid:
         """The signed-distance grid, built at first use.
 
+        Raises:
+            SceneError: The mesh is not closed.
+
         Warns:
             UserWarning: Walls thinner than a cell are lost; a smaller ``cell`` mends it.
         """
+        self._require_inside("signed distances")
         grid = _build_grid(self.vertices[self.faces], self.cell)
         self._warn_of_lost_walls(grid)
         return grid
@@ -122,7 +137,7 @@ class TriMesh(Shape):
             Shape (n,).
 
         Raises:
-            SceneError: The points do not have shape (n, 3).
+            SceneError: The points do not have shape (n, 3), or the mesh is not closed.
         """
         from capsense.scene.batch_kernels import grid_distances
 
@@ -145,7 +160,8 @@ class TriMesh(Shape):
             with ``[inf, -inf]``. A fifth and further stretches are joined to the fourth.
 
         Raises:
-            SceneError: Wrong shapes, a number that is not finite, or a zero direction.
+            SceneError: Wrong shapes, a number that is not finite, a zero direction, or a mesh that
+                is not closed.
         """
         from capsense.scene.batch_kernels import mesh_intervals_of_lines
 
@@ -161,6 +177,15 @@ class TriMesh(Shape):
         import trimesh
 
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+    def _require_inside(self, what: str) -> None:
+        flaw = self.__dict__["_flaw"]
+        if flaw:
+            raise SceneError(
+                f'TriMesh: {flaw}, so it has no inside, and no {what}; method="surface" needs '
+                "none for conductors; else fill the holes (trimesh.repair.fill_holes) or pass the "
+                "convex hull (mesh.convex_hull)"
+            )
 
     def _warn_of_lost_walls(self, grid: DistanceGrid) -> None:
         """Warn where the interpolated distance stays above zero for a cell behind the surface."""
@@ -191,7 +216,10 @@ def _nodes(extents: Array, cell: float) -> NDArray[np.int64]:
 
 
 def _default_cell(extents: Array) -> float:
-    cell = float(min(extents.max() / _CELLS_ALONG, extents.min() / _CELLS_ACROSS))
+    longest = float(extents.max())
+    if extents.min() < 1e-6 * longest:  # a flat sheet
+        return longest / _CELLS_ALONG
+    cell = float(min(longest / _CELLS_ALONG, extents.min() / _CELLS_ACROSS))
     while math.prod(_nodes(extents, cell).tolist()) > _MAX_NODES:
         cell *= 1.02
     return cell

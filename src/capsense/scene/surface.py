@@ -1,8 +1,9 @@
-"""Checks and repairs of triangle surfaces, so that "inside" has a meaning."""
+"""Checks and repairs of triangle surfaces, and whether they have an inside."""
 
 from __future__ import annotations
 
 import warnings
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,31 +17,58 @@ _MAX_EXTENT = 10.0
 _MERGE = 1e-8
 
 
-def clean_surface(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, Faces]:
-    """Check a closed surface and bring it into order.
+class Surface(NamedTuple):
+    """A triangle surface brought into order."""
 
-    Coinciding vertices are merged, unused ones and faces with a repeated vertex are dropped,
-    and faces are turned so that normals point out. Where the given winding is consistent, it is
-    kept up to a common sign, so cavities stay cavities.
+    vertices: Array
+    """Vertices [m], shape (n, 3)."""
+    faces: Faces
+    """Vertex indices, shape (m, 3); normals point out of a closed surface."""
+    flaw: str
+    """Why it has no inside; empty for a closed surface."""
+
+
+def clean_surface(vertices: ArrayLike, faces: ArrayLike) -> Surface:
+    """Check a surface, bring it into order, and find out whether it has an inside.
+
+    Coinciding vertices are merged; unused ones, faces with a repeated vertex and copies of faces
+    are dropped. Faces of closed surfaces are turned so that normals point out. Where the given
+    winding is consistent, it is kept up to a common sign, so cavities stay cavities.
 
     Args:
         vertices: Points [m], shape (n, 3).
         faces: Vertex indices, shape (m, 3).
 
-    Returns:
-        Cleaned vertices and faces.
-
     Raises:
         SceneError: Wrong shapes or types, a number that is not finite, an index out of range,
-            an extent above 10 m, a surface with holes, or one that encloses no volume.
+            or an extent above 10 m.
     """
     v, f = _checked_arrays(vertices, faces)
     v, f = _merged(v, f)
-    f = _consistent(f, v)
+    edge, count = _edges(f, len(v))
+    if not _is_balanced(f, edge):
+        once = _without_copies(f)
+        if len(once) < len(f):
+            f = once
+            edge, count = _edges(f, len(v))
+        if not _is_balanced(f, edge):
+            turned = _rewound(f, v, edge, count)
+            f = f if turned is None else turned
+            rims = int((count == 1).sum())
+            if rims:
+                return Surface(
+                    v, f,
+                    f"the surface is not closed ({rims} of {len(count)} edges have a face on one "
+                    "side only)",
+                )  # fmt: skip
+            if not (count == 2).all():
+                return Surface(v, f, "more than two faces meet at some edges of the surface")
+            if turned is None:
+                return Surface(v, f, "the surface is one-sided")
     volume = enclosed_volume(v, f)
     if abs(volume) <= 1e-12 * float(np.ptp(v, axis=0).max()) ** 3:
-        raise SceneError("TriMesh: the surface encloses no volume; give a sheet some thickness")
-    return v, (f[:, ::-1].copy() if volume < 0 else f)
+        return Surface(v, _without_copies(f), "the surface encloses no volume")
+    return Surface(v, f[:, ::-1].copy() if volume < 0 else f, "")
 
 
 def enclosed_volume(vertices: Array, faces: Faces) -> float:
@@ -100,37 +128,42 @@ def _merged(v: Array, f: Faces) -> tuple[Array, Faces]:
     return v[first], f
 
 
-def _consistent(f: Faces, v: Array) -> Faces:
-    """Return the faces with a consistent winding, or refuse a surface that is not closed."""
+def _edges(f: Faces, n: int) -> tuple[Faces, Faces]:
+    """Number of the edge that follows each corner, shape (3 m,), and faces at each edge."""
     start, end = f.reshape(-1), np.roll(f, -1, axis=1).reshape(-1)
-    key = np.minimum(start, end) * len(v) + np.maximum(start, end)
-    sign = np.where(start < end, 1, -1)
+    key = np.minimum(start, end) * n + np.maximum(start, end)
     _, edge, count = np.unique(key, return_inverse=True, return_counts=True)
-    balance = np.bincount(edge.reshape(-1), weights=sign)
-    if not balance.any():
-        return f
-    open_edges = int((count % 2 == 1).sum())
-    if open_edges or not np.all(count == 2):
-        raise SceneError(
-            f"TriMesh: the surface is not closed ({open_edges} of {len(count)} edges have a face "
-            f"on one side only), so it has no inside; fill the holes "
-            f"(trimesh.repair.fill_holes) or pass the convex hull (mesh.convex_hull)"
-        )
-    return _rewound(f, v, edge.reshape(-1), sign)
+    return edge.reshape(-1), count
 
 
-def _rewound(f: Faces, v: Array, edge: Faces, sign: NDArray[np.int64]) -> Faces:
+def _signs(f: Faces) -> Faces:
+    return np.where(f < np.roll(f, -1, axis=1), 1, -1).reshape(-1)
+
+
+def _is_balanced(f: Faces, edge: Faces) -> bool:
+    """Whether every edge is passed as often one way as the other: closed, and wound alike."""
+    return not np.bincount(edge, weights=_signs(f)).any()
+
+
+def _without_copies(f: Faces) -> Faces:
+    _, first = np.unique(np.sort(f, axis=1), axis=0, return_index=True)
+    return f[np.sort(first)]
+
+
+def _rewound(f: Faces, v: Array, edge: Faces, count: Faces) -> Faces | None:
     """Turn faces until neighbours agree, each connected part with its normals out.
 
-    Every face is split in two states, as given and turned; an edge joins equal states of two
-    faces that agree and unequal states of two that do not. Connected sets of states are then
-    consistent windings. A one-sided surface joins both states of one face.
+    Neighbours are faces at an edge that no third one shares. Every face is split in two states, as
+    given and turned; an edge joins equal states of two faces that agree and unequal states of two
+    that do not. Connected sets of states are then consistent windings. A one-sided surface joins
+    both states of one face: None.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    n = len(f)
-    order = np.argsort(edge, kind="stable").reshape(-1, 2)
+    n, sign = len(f), _signs(f)
+    order = np.argsort(edge, kind="stable")
+    order = order[count[edge[order]] == 2].reshape(-1, 2)
     a, b = order[:, 0] // 3, order[:, 1] // 3
     turned = np.where(sign[order[:, 0]] == sign[order[:, 1]], n, 0)
     row = np.concatenate([a, a + n])
@@ -138,7 +171,7 @@ def _rewound(f: Faces, v: Array, edge: Faces, sign: NDArray[np.int64]) -> Faces:
     graph = coo_matrix((np.ones(len(row)), (row, column)), shape=(2 * n, 2 * n))
     _, label = connected_components(graph, directed=False)
     if np.any(label[:n] == label[n:]):
-        raise SceneError("TriMesh: the surface is one-sided, so it has no inside; repair the mesh")
+        return None
     flip = label[:n] > label[n:]
     f = np.where(flip[:, None], f[:, ::-1], f)
     part = np.minimum(label[:n], label[n:])

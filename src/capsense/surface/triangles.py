@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from capsense.errors import SceneError
 from capsense.scene.surface import clean_surface
+from capsense.surface import collapse_kernels
+from capsense.surface.fitting import fitted
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -18,10 +20,14 @@ _WELD = 1e-6
 """Corners nearer than this part of the longest extent are one."""
 _WELD_MOST = 0.03
 """How far welding may go where a mesh falls into very many parts."""
-_LEAST = 40
-"""Triangles that every connected part keeps, if it has them."""
+_LEAST = 100
+"""Triangles that every connected part gets, where there are not too many parts."""
+_EVENLY = 0.7
+"""Share of the triangles that goes to the parts evenly at most."""
+_POWER = 0.35
+"""Triangles of a part go with this power of its area."""
 _LEAST_OF_MANY = 12
-"""The same for a mesh of very many parts."""
+"""No part is reduced to fewer triangles."""
 _SPARE = 1.25
 """Halving slivers may make this many times as many triangles as wanted."""
 _SLIVER = 12.0
@@ -29,8 +35,8 @@ _SLIVER = 12.0
 
 _BASE = 0.6
 """Part of the triangles before those at sharp edges are halved."""
-_FEW_SHARP = 0.02
-"""Share of sharp edges up to which none is heeded."""
+_FEW_SHARP = 0.1
+"""Share of triangles at sharp edges up to which none is heeded."""
 _BENT = 0.77
 """Cosine of the angle between normals below which an edge is sharp, 40 degrees."""
 _AT_EDGE = 3.0
@@ -52,7 +58,7 @@ def reduced_triangles(triangles: Array, count: int) -> Triangles:
     """Reduce a mesh, or halve its triangles, until it has about ``count``.
 
     Connected parts are reduced one by one by quadric error (Garland and Heckbert, *Surface
-    simplification using quadric error metrics*, SIGGRAPH 1997), each to its share of the area.
+    simplification using quadric error metrics*, SIGGRAPH 1997), each to its share.
     Triangles that coincide count once, those without area not at all.
 
     Args:
@@ -65,27 +71,17 @@ def reduced_triangles(triangles: Array, count: int) -> Triangles:
     _check(triangles)
     vertices, faces = _welded(triangles, count)
     extent = float(np.ptp(vertices, axis=0).max())
-    try:
-        unit, faces = clean_surface(vertices / extent, faces)
-        vertices, closed = extent * unit, True
-    except SceneError:
-        closed = False
+    unit, faces, flaw = clean_surface(vertices / extent, faces)
+    vertices, closed = extent * unit, not flaw
     label = _parts(faces, len(vertices))
-    area = np.bincount(label, _areas(vertices[faces]))
-    least = _LEAST if _LEAST * len(area) <= 2 * count else _LEAST_OF_MANY
-    share = np.maximum(least, np.rint(count * area / area.sum()).astype(np.int64))
-    corners, sharp, parts = [], [], []
-    for k in range(len(area)):
-        own = faces[label == k]
-        part, edges = _simplified(vertices, own, int(share[k]))
-        base = max(least, round(_BASE * share[k]))
-        if edges.mean() > _FEW_SHARP and len(own) > base:
-            part, edges = _simplified(vertices, own, base)
-        corners.append(part)
-        sharp.append(edges)
-        parts.append(np.full(len(part), k))
+    corners, parts = [], []
+    areas = np.zeros(label.max() + 1)
+    np.add.at(areas, label, _areas(vertices[faces]))
+    for k, wanted in enumerate(_shares(areas, count)):
+        own = _covered(vertices, faces[label == k], int(wanted))
+        corners.append(own)
+        parts.append(np.full(len(own), k))
     out, which = np.concatenate(corners), np.concatenate(parts)
-    out, which = _halved(out, which, np.concatenate(sharp), count)
     keep = _apart(out)
     out, which = out[keep], which[keep]
     _, which = np.unique(which, return_inverse=True)
@@ -155,26 +151,90 @@ def _parts(faces: Index, vertices: int) -> Index:
     return out.reshape(-1).astype(np.int64)
 
 
-def _simplified(vertices: Array, faces: Index, count: int) -> tuple[Array, Flags]:
+def _shares(areas: Array, count: int) -> Index:
+    """Triangles for parts of these areas [m²]: the smaller a part, the more for its area.
+
+    Sensors move along bodies, so that each part may be the one that counts.
+    """
+    least = min(_LEAST, _EVENLY * count / len(areas))
+    weight = areas**_POWER
+    low, high = 0.0, count / weight.sum()
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if np.maximum(least, middle * weight).sum() > count:
+            high = middle
+        else:
+            low = middle
+    return np.rint(np.maximum(least, low * weight)).astype(np.int64)
+
+
+def _covered(vertices: Array, faces: Index, count: int) -> Array:
+    """Corners of about ``count`` triangles that cover one part [m], shape (m, 3, 3)."""
+    edges = _sharp(vertices, faces)
+    surface = vertices[faces]
+    length = np.linalg.norm(np.roll(surface, -1, axis=1) - surface, axis=2)
+    reach = np.sqrt(_areas(surface).sum() / count)  # of a triangle from an edge
+    if reach * length[edges].sum() / 2 < _FEW_SHARP * reach**2 * count:
+        return _halved(*_simplified(vertices, faces, count, edges & False), count)
+    return _halved(*_simplified(vertices, faces, round(_BASE * count), edges), count)
+
+
+def _simplified(vertices: Array, faces: Index, count: int, sharp: Flags) -> tuple[Array, Flags]:
     """Corners of one part [m], reduced to ``count`` triangles where it has more, and sharp edges.
 
     Returns:
         Shapes (m, 3, 3) and (m, 3); edge k runs from corner k to the next.
     """
-    from fast_simplification import simplify
-
+    count = max(count, _LEAST_OF_MANY)
     if len(faces) <= count:
-        return vertices[faces], _sharp(vertices, faces)
+        return vertices[faces], sharp
     used, local = np.unique(faces, return_inverse=True)
-    points = vertices[used]
-    center, extent = points.mean(axis=0), np.ptp(points, axis=0).max()
-    reduced, triangles = simplify(
-        (points - center) / extent, local.reshape(-1, 3).astype(np.int32), target_count=count
+    moved, reduced = _collapsed(vertices[used], local.reshape(-1, 3), count)
+    if not len(reduced) or not _areas(moved[reduced]).max() > 0:
+        return vertices[faces], sharp
+    corners = fitted(moved, reduced, vertices[faces])[reduced]
+    return corners, _sharp(moved, reduced) & sharp.any()
+
+
+def _collapsed(vertices: Array, faces: Index, count: int) -> tuple[Array, Index]:
+    """Vertices and faces after collapses of edges until there are ``count`` triangles."""
+    middle, extent = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
+    points = (vertices - middle) / extent
+    reduced = np.ascontiguousarray(faces, dtype=np.int64).copy()
+    left = collapse_kernels.collapse(points, reduced, *_quadrics(points, reduced), count)
+    used, local = np.unique(reduced[left], return_inverse=True)
+    return middle + extent * points[used], local.reshape(-1, 3)
+
+
+def _quadrics(vertices: Array, faces: Index) -> tuple[Array, Index]:
+    """Quadric errors of the vertices, (n, 10), and edges, (e, 2), for the collapse.
+
+    Planes are those of the triangles round a vertex, weighted with their areas, and upright ones
+    along rims, weighted with the squares of their lengths.
+    """
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double = np.linalg.norm(cross, axis=1)
+    normal = cross / np.maximum(double, 1e-300)[:, None]
+    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    key, first, number = np.unique(
+        low * len(vertices) + high, return_index=True, return_counts=True
     )
-    moved = center + extent * np.asarray(reduced, dtype=float)
-    if not len(triangles) or not _areas(moved[triangles]).max() > 0:
-        return vertices[faces], _sharp(vertices, faces)
-    return moved[triangles], _sharp(moved, np.asarray(triangles, dtype=np.int64))
+    rim = first[number == 1]
+    way = vertices[end[rim]] - vertices[start[rim]]
+    upright = np.cross(way, normal[rim // 3])
+    length = np.linalg.norm(way, axis=1)
+    upright /= np.maximum(length, 1e-300)[:, None]
+
+    planes = np.concatenate([np.repeat(normal, 3, axis=0), np.repeat(upright, 2, axis=0)])
+    owner = np.concatenate([start, np.stack([start[rim], end[rim]], axis=1).reshape(-1)])
+    weight = np.concatenate([np.repeat(double / 2, 3), np.repeat(length**2, 2)])
+    d = -np.einsum("ij,ij->i", planes, vertices[owner])
+    x, y, z = planes.T
+    terms = (x * x, x * y, x * z, y * y, y * z, z * z, x * d, y * d, z * d, d * d)
+    sums = [np.bincount(owner, weight * term, len(vertices)) for term in terms]
+    return np.stack(sums, axis=1), np.stack([key // len(vertices), key % len(vertices)], axis=1)
 
 
 def _sharp(vertices: Array, faces: Index) -> Flags:
@@ -194,7 +254,7 @@ def _sharp(vertices: Array, faces: Index) -> Flags:
     return ((number != 2) | (cosine < _BENT))[edge].reshape(-1, 3)
 
 
-def _halved(corners: Array, parts: Index, sharp: Flags, count: int) -> tuple[Array, Index]:
+def _halved(corners: Array, sharp: Flags, count: int) -> Array:
     """Cut triangles in two across their longest edge: the longest first, then slivers.
 
     Triangles at sharp edges count as longer, as charge gathers there. Neighbours may stay whole:
@@ -203,6 +263,7 @@ def _halved(corners: Array, parts: Index, sharp: Flags, count: int) -> tuple[Arr
     most = round(_SPARE * count)
     for _ in range(40):
         edge = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        edge = edge.astype(np.float32)  # so that turning the mesh leaves the order as it is
         longest, area = edge.max(axis=1), _areas(corners)
         if len(corners) < count:
             wanted = longest * np.where(sharp.any(axis=1), _AT_EDGE, 1.0)
@@ -226,8 +287,7 @@ def _halved(corners: Array, parts: Index, sharp: Flags, count: int) -> tuple[Arr
         corners[chosen] = np.stack([a, middle, c], axis=1)
         sharp = np.concatenate([sharp, np.stack([cut, next_, inner], axis=1)])
         sharp[chosen] = np.stack([cut, inner, last], axis=1)
-        parts = np.concatenate([parts, parts[chosen]])
-    return corners, parts
+    return corners
 
 
 def _apart(corners: Array) -> NDArray[np.bool_]:
