@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,13 @@ from capsense.scene.depth import DepthFrame
 
 if TYPE_CHECKING:
     from capsense.readout.counts import Counts
+    from capsense.solve.perturbation import PerturbationSolver
+    from capsense.surface.potentials import PotentialMap
+    from capsense.surface.solve_kernels import Solution
 
 Array = NDArray[np.float64]
-Method = Literal["perturbation", "masked"]
+Method = Literal["surface", "perturbation", "masked"]
+PresetName = Literal["standard", "learning", "fine"]
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class StepStats:
     """What the error estimate was brought below [F]."""
     wall_time: float
     """Time the step took [s]."""
+    unknowns: int = 0
+    """Charge functions that were solved for; 0 where the lattice or the paper's scheme did."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +63,10 @@ class Reading:
     _shield_coupling: Array = field(repr=False)
     counts: Counts | None = None
     """What the chip has reported since the reading before, where a read-out is configured."""
+    jacobian: Array | None = None
+    """How ``capacitance`` changes as each body of the scene moves along the sensor frame's x, y, z
+    [F/m], then turns about axes parallel to these through its own origin [F/rad], where it was
+    asked for, shape (bodies, M, M, 6)."""
 
     @property
     def self_capacitance(self) -> Array:
@@ -83,14 +93,89 @@ class _Method(Protocol):
     def reset(self) -> None: ...
 
 
+class _SurfaceScenes:
+    """Solves scenes by charges on the bodies, and on the lattice what has no surface charges."""
+
+    def __init__(
+        self,
+        background: BackgroundField,
+        frequency: float,
+        preset: str,
+        lattice: Callable[[], PerturbationSolver],
+    ) -> None:
+        from capsense.surface.solver import PRESETS, SurfaceSolver
+
+        self.surface = SurfaceSolver(background, frequency=frequency, preset=PRESETS[preset])
+        self.unknowns = 0
+        self._background = background
+        self._make = lattice
+        self._lattice: PerturbationSolver | None = None
+        self._last: Callable[[], Array] = self._nothing
+        self._gradient: Callable[[], Array] | None = None
+        self._map: PotentialMap | None = None
+
+    def solve(self, scene: Scene, jacobian: bool = False) -> tuple[Array, int, float, float]:
+        """Return the change, iterations, error estimate [F] and tolerance [F]."""
+        self.unknowns = 0
+        self._last, self._gradient = self._nothing, None
+        if self.surface.unsupported(scene):
+            if self._lattice is None:
+                self._lattice = self._make()
+            self._lattice.reset()  # a reading does not depend on the one before it
+            self._last = self._lattice.potentials
+            return self._lattice.solve(scene)
+        bodies, solution = self.surface.solution(scene, jacobian=jacobian)
+        self._gradient = partial(self.surface.jacobian, scene, bodies, solution)
+        if solution is None:
+            return np.zeros((len(self._background.terminals),) * 2), 0, 0.0, 0.0
+        self._last = partial(self._around, solution)
+        self.unknowns = solution.size
+        change, error = self.surface.in_farads(solution)
+        return change, 0, error, error
+
+    def potentials(self) -> Array:
+        """Change of the potentials at the nodes in the last step [V], shape (n, terminals)."""
+        return self._last()
+
+    def jacobian(self) -> Array:
+        """How the matrix of all terminals changes with the poses of the last scene's bodies.
+
+        Raises:
+            SceneError: The lattice solved the last scene.
+        """
+        if self._gradient is None:
+            raise SceneError("a Jacobian needs surface charges, which the last scene has none of")
+        return self._gradient()
+
+    def reset(self) -> None:
+        """Forget the last scene; no reading depends on the one before."""
+        self._last, self._gradient = self._nothing, None
+
+    def _nothing(self) -> Array:
+        return np.zeros_like(self._background.potentials)
+
+    def _around(self, solution: Solution) -> Array:
+        from capsense.surface.potentials import PotentialMap
+
+        lattice = self._background.lattice
+        if self._map is None:
+            self._map = PotentialMap(self._background.green, lattice.points)
+        out = self._map.change(solution)
+        out[lattice.owner >= 0] = 0.0
+        return out
+
+
 class Simulator:
     """Reads the capacitances of a sensor, scene after scene.
 
     Args:
         design: A design, a packaged name, or the path of a design file.
-        method: ``"perturbation"`` (accurate, default) or ``"masked"``, the scheme of
-            Schöffmann et al. 2022: objects are staircases of tetrahedra, solved in full.
-        tolerance: Iterate until a capacitance is known to this [F] …
+        method: ``"surface"`` (default): charges on the surfaces of the bodies.
+            ``"perturbation"``: the change of the field on a lattice. ``"masked"``: the scheme of
+            Schöffmann et al. 2022, where objects are staircases of tetrahedra, solved in full.
+        preset: How finely surfaces are resolved: ``"standard"``, ``"learning"`` (faster, some
+            3 % rms) or ``"fine"``.
+        tolerance: On the lattice, iterate until a capacitance is known to this [F] …
         relative_tolerance: … or to this fraction of the largest change, whichever is larger.
         frequency: Excitation frequency [Hz]; decides which materials conduct.
         settings: Numerical settings of the background field; default from ``design.build``.
@@ -108,7 +193,8 @@ class Simulator:
         self,
         design: Design | str | Path,
         *,
-        method: Method = "perturbation",
+        method: Method = "surface",
+        preset: PresetName = "standard",
         tolerance: float = 1e-18,
         relative_tolerance: float = 1e-5,
         frequency: float = 250e3,
@@ -117,8 +203,13 @@ class Simulator:
         progress: Callable[[str, float], None] | None = None,
         background: BackgroundField | None = None,
     ) -> None:
-        if method not in ("perturbation", "masked"):
-            raise ValueError(f'method is {method!r}; choose "perturbation" or "masked"')
+        for what, chosen, known in (
+            ("method", method, get_args(Method)), ("preset", preset, get_args(PresetName)),
+        ):  # fmt: skip
+            if chosen not in known:
+                raise ValueError(
+                    f"{what} is {chosen!r}; choose one of {', '.join(map(repr, known))}"
+                )
         for name, value in (
             ("tolerance", tolerance), ("relative_tolerance", relative_tolerance),
             ("frequency", frequency),
@@ -127,6 +218,7 @@ class Simulator:
                 raise ValueError(f"{name} is {value!r}; give a positive number")
         self.design = design if isinstance(design, Design) else load_design(design)
         self.method: Method = method
+        self.preset: PresetName = preset
         self.tolerance, self.relative_tolerance = tolerance, relative_tolerance
         self.frequency = frequency
         self.settings = settings or default_settings(self.design)
@@ -150,13 +242,10 @@ class Simulator:
             self._solver: _Method = MaskedScenes(
                 self.design, self.background, self.settings, frequency
             )
+        elif method == "surface":
+            self._solver = _SurfaceScenes(self.background, frequency, preset, self._on_lattice)
         else:
-            from capsense.solve.perturbation import PerturbationSolver
-
-            self._solver = PerturbationSolver(
-                self.background, tolerance=tolerance, relative_tolerance=relative_tolerance,
-                frequency=frequency,
-            )  # fmt: skip
+            self._solver = self._on_lattice()
         self._batch: list[Simulator] = []  # a sensor for each thread
         self._worlds: list[Simulator] = []  # a sensor for each scene that follows another
         n = len(self.design.electrodes)
@@ -173,36 +262,72 @@ class Simulator:
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
         self.baseline.setflags(write=False)
 
+    def _on_lattice(self) -> PerturbationSolver:
+        from capsense.solve.perturbation import PerturbationSolver
+
+        return PerturbationSolver(
+            self.background, tolerance=self.tolerance, relative_tolerance=self.relative_tolerance,
+            frequency=self.frequency,
+        )  # fmt: skip
+
     @property
     def electrode_names(self) -> tuple[str, ...]:
         """Electrode names in matrix order."""
         return self._names
 
-    def step(self, scene: Scene | DepthFrame) -> Reading:
+    def step(self, scene: Scene | DepthFrame, *, jacobian: bool = False) -> Reading:
         """Return the reading of a scene or of a depth camera's view, given in the sensor frame.
 
-        The solution of the previous step is the starting point.
+        On the lattice, the solution of the previous step is the starting point.
+
+        Args:
+            scene: What stands around the sensor.
+            jacobian: Whether to work out ``reading.jacobian`` as well, for half a step's time.
 
         Raises:
-            SceneError: ``scene`` is neither a scene nor a depth frame.
+            SceneError: ``scene`` is neither a scene nor a depth frame, or has no Jacobian.
             SolveError: The solver did not reach its tolerance.
+            ValueError: A Jacobian is asked for of a method that has none.
         """
         start = time.perf_counter()
         _check_view("step takes", scene)
+        if jacobian and not isinstance(self._solver, _SurfaceScenes):
+            raise ValueError(f'method {self.method!r} has no Jacobian; use "surface"')
         if isinstance(scene, DepthFrame):
             scene = scene.scene()
         self.steps += 1
-        change, iterations, error, goal = self._solver.solve(scene)
+        if isinstance(self._solver, _SurfaceScenes):
+            change, iterations, error, goal = self._solver.solve(scene, jacobian)
+        else:
+            change, iterations, error, goal = self._solver.solve(scene)
+        whole = self.background.capacitance + change
         if len(self._floating):
-            change = self._without_floating(self.background.capacitance + change) - self._empty
+            change = self._without_floating(whole) - self._empty
         n = len(self._electrodes)
         total = self._empty + change
         delta = change[:n, :n]
-        stats = StepStats(iterations, error, goal, time.perf_counter() - start)
-        return Reading(
-            self.baseline + delta, delta.copy(), stats, self._names,
-            total[:n, n:].sum(axis=1),
+        stats = StepStats(
+            iterations, error, goal, time.perf_counter() - start,
+            getattr(self._solver, "unknowns", 0),
         )  # fmt: skip
+        slope = self._slope(whole) if jacobian else None
+        return Reading(
+            self.baseline + delta, delta.copy(), stats, self._names, total[:n, n:].sum(axis=1),
+            jacobian=slope,
+        )  # fmt: skip
+
+    def _slope(self, whole: Array) -> Array:
+        """Jacobian of the electrodes' matrix, the design's floating conductors eliminated."""
+        assert isinstance(self._solver, _SurfaceScenes)
+        slope = self._solver.jacobian()
+        n = len(self._electrodes)
+        if len(self._floating):
+            own = whole[np.ix_(self._floating, self._floating)]
+            follow = np.eye(len(whole))[:, self._electrodes]
+            cross = whole[np.ix_(self._floating, self._electrodes)]
+            follow[self._floating] = -np.linalg.solve(own, cross)
+            return np.einsum("ai,bacm,cj->bijm", follow, slope, follow)
+        return slope[:, :n, :n]
 
     def step_batch(
         self,
@@ -261,21 +386,22 @@ class Simulator:
 
         Returns:
             Shape (n, terminals), in the order of ``background.terminals``: each at 1 V in its own
-            column, all others and all conducting bodies, floating ones included, at 0.
+            column, all others at 0. Where charges on surfaces were solved for, floating bodies are
+            at the potential they take; on the lattice they are at 0, as all conducting bodies.
 
         Raises:
             ValueError: The method is ``"masked"``, which solves on another mesh.
         """
         from capsense.solve.perturbation import PerturbationSolver
 
-        if not isinstance(self._solver, PerturbationSolver):
-            raise ValueError('method "masked" gives no potentials; use "perturbation"')
-        return self.background.potentials + self._solver.potentials()
+        if isinstance(self._solver, _SurfaceScenes | PerturbationSolver):
+            return self.background.potentials + self._solver.potentials()
+        raise ValueError('method "masked" gives no potentials; use "surface" or "perturbation"')
 
     def sibling(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field."""
         return Simulator(
-            self.design, method=self.method, tolerance=self.tolerance,
+            self.design, method=self.method, preset=self.preset, tolerance=self.tolerance,
             relative_tolerance=self.relative_tolerance, frequency=self.frequency,
             settings=self.settings, background=self.background,
         )  # fmt: skip

@@ -26,7 +26,7 @@ class _Simulator:
         body = scene[0]
         bodies = pack(Placed(body.shape, body.pose.position))  # type: ignore[arg-type]
         bodies["rotation"][0] = body.pose.rotation
-        solution = solve(bodies, green_of(), 0.015, 2.5)
+        solution = solve(bodies, green_of(), 0.015, 2.5, True)
         return SimpleNamespace(delta=UNIT * solution.delta, jacobian=_jacobian(solution, bodies))
 
 

@@ -90,12 +90,13 @@ class ChangingBody:
         self._center[single], self._spread[single] = surface.centers[at], surface.moments[at]
         tree_kernels.moments(self._kids, self._panel, self._charge, self._center, self._spread)
         extent = np.sqrt(6.0 * np.trace(self._spread, axis1=1, axis2=2)) + 1e-9
+        self._extent = extent
         self._own = np.empty(n)
         self._own[0] = 0.5 * _OWN / extent[0]
         self._own[self._function[~single]] = _OWN / extent[~single]
         record = np.zeros(1, BODY)[0]
         record["n"], record["scale"] = n, 1.0
-        for name in ("kids", "function", "charge", "center", "spread", "own"):
+        for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
         self.record = record
 

@@ -66,12 +66,15 @@ class Solution(NamedTuple):
 
 
 @entry
-def solve(bodies, green, threshold, width):
-    """Solve a scene of bodies without losses."""
+def solve(bodies, green, threshold, width, adjoint):
+    """Solve a scene of bodies without losses.
+
+    ``adjoint`` asks for charges that the derivatives of the result follow from.
+    """
     cut, functions, phi, matrix, rest, own, points, extent, owner = _prepare(
         bodies, green, threshold, width
     )
-    delta, left, x = _reduce(cut, functions, phi, matrix, rest, own)
+    delta, left, x = _reduce(cut, functions, phi, matrix, rest, own, adjoint)
     charge = _leaf_charges(cut, functions, x, points.shape[0])
     m = green.terminals
     size = functions.solved if delta[0, 0] == delta[0, 0] else 0
@@ -249,7 +252,7 @@ def _add_matter(bodies, functions, matrix, rest, own):
 
 
 @fast
-def _reduce(cut, functions, phi, matrix, rest, own):
+def _reduce(cut, functions, phi, matrix, rest, own, adjoint):
     """ΔC, the part of it that was estimated, and the charges of all functions.
 
     Functions that fade in by t are taken as √t A √t with their own energy whole. What they lack,
@@ -266,13 +269,10 @@ def _reduce(cut, functions, phi, matrix, rest, own):
             lack[f] = GAIN * (1.0 - fade) * (1.0 - (1.0 - cut.above[a]) ** 4) / own[f]
     factor, x = np.empty((solved, solved)), np.zeros((total, m))
     for f in range(solved):
-        for e in range(f):
-            factor[f, e] = root[f] * matrix[f, e] * root[e]
-        factor[f, f] = matrix[f, f]
         for i in range(m):
             x[f, i] = root[f] * phi[f, i]
     delta, left = np.zeros((m, m)), np.zeros((m, m))
-    if not cholesky(factor):
+    if not _factorise(matrix, root, own, factor):
         delta[0, 0] = np.nan
         return delta, left, x
     substitute(factor, x[:solved])
@@ -299,6 +299,8 @@ def _reduce(cut, functions, phi, matrix, rest, own):
             if lack[f] == 0.0:
                 phi[f, i] = 0.0
     _add_products(phi, charge, left)
+    if adjoint:
+        _add_adjoint(matrix, rest, root, lack, factor, charge, x)
     for f in range(solved, total):
         for i in range(m):
             x[f, i] = charge[f, i]
@@ -312,6 +314,25 @@ def _reduce(cut, functions, phi, matrix, rest, own):
 
 
 @fast
+def _factorise(matrix, root, own, factor):
+    """Cholesky factor of √t A √t with A's own diagonal; False where there is none.
+
+    Where bodies lie within each other or within the sensor, approximate energies may leave no
+    definite matrix. The diagonal is then raised, by as little as it takes.
+    """
+    shift = 0.0
+    while shift < 1e3:
+        for f in range(root.shape[0]):
+            for e in range(f):
+                factor[f, e] = root[f] * matrix[f, e] * root[e]
+            factor[f, f] = matrix[f, f] + shift * abs(own[f])
+        if cholesky(factor):
+            return True
+        shift = max(1e-3, 2.0 * shift)
+    return False
+
+
+@fast
 def _add_products(left, right, out):
     """``out += left.T @ right``, shapes (n, m), (n, m) and (m, m); m a multiple of 8."""
     n, m = left.shape
@@ -321,6 +342,29 @@ def _add_products(left, right, out):
             for f in range(n):
                 total = madd(at(left, f * m + i), span(right, f * m + c), total)
             put_span(out, i * m + c, total)
+
+
+@fast
+def _add_adjoint(matrix, rest, root, lack, factor, charge, x):
+    """Add to the charges x of the functions solved for what the estimate asks of them.
+
+    The estimate is y · (φ - A x) with charges y: its derivative has the charges y - R A'⁻¹ R Aᵀ y
+    besides x, where R = √t and A' is the matrix that was factorised.
+    """
+    solved, m = root.shape[0], x.shape[1]
+    back = np.zeros((solved, m))
+    for f in range(lack.shape[0]):
+        if lack[f] > 0.0:
+            for e in range(solved):
+                value = at(matrix, f * solved + e) if f < solved else (
+                    at(rest, (f - solved) * solved + e))  # fmt: skip
+                for c in range(0, m, 8):
+                    o = e * m + c
+                    put_span(back, o, madd(root[e] * value, span(charge, f * m + c), span(back, o)))
+    substitute(factor, back)
+    for f in range(solved):
+        for i in range(m):
+            x[f, i] += charge[f, i] - root[f] * back[f, i]
 
 
 @fast

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.errors import SolveError
+from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene
@@ -77,28 +77,44 @@ class SurfaceSolver:
         low, top = background.lattice.storeys[0].axes, background.lattice.storeys[-1].axes[2]
         self._room = np.array([[a[0] for a in low], [low[0][-1], low[1][-1], top[-1]]])
 
-    def solve(self, scene: Scene) -> tuple[Array, int, float]:
-        """Solve a scene.
+    def in_farads(self, solution: Solution) -> tuple[Array, float]:
+        """Change of the Maxwell matrix of all terminals [F], (terminals, terminals), and its error.
+
+        The error is an estimate of that of the largest entry [F].
+        """
+        return UNIT * solution.delta, UNIT * float(np.abs(np.diag(solution.left)).max())
+
+    def jacobian(self, scene: Scene, bodies: PackedBodies, solution: Solution | None) -> Array:
+        """How the matrix of all terminals changes with the poses of a scene's bodies.
 
         Returns:
-            Change of the Maxwell matrix of all terminals [F], shape (terminals, terminals); the
-            number of charge functions; estimated error of the largest entry [F].
+            Shape (bodies, terminals, terminals, 6): as each body moves along the sensor frame's x,
+            y, z [F/m], and turns about axes parallel to these through its origin [F/rad].
+
+        Raises:
+            SceneError: A body is of matter with losses.
+        """
+        out = np.zeros((len(scene), self.green.terminals, self.green.terminals, 6))
+        if solution is None:
+            return out
+        if bodies.matter.lossy:
+            raise SceneError(
+                "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
+                "them a conductor's or a lossless material"
+            )
+        from capsense.surface.gradient_kernels import jacobian
+
+        out[bodies.chosen] = UNIT * jacobian(solution, bodies.records, self.green)
+        return out
+
+    def solution(
+        self, scene: Scene, *, jacobian: bool = False
+    ) -> tuple[PackedBodies, Solution | None]:
+        """Return the packed bodies of a scene and their charges; None where none is in the domain.
 
         Raises:
             SceneError: A dielectric has no inside, see :meth:`unsupported`.
             SolveError: Bodies lie within each other in a way that leaves no solution.
-        """
-        _, solution = self.solution(scene)
-        if solution is None:
-            return np.zeros((self.green.terminals,) * 2), 0, 0.0
-        error = UNIT * float(np.abs(np.diag(solution.left)).max())
-        return UNIT * solution.delta, solution.size, error
-
-    def solution(self, scene: Scene) -> tuple[PackedBodies, Solution | None]:
-        """Return the packed bodies and their charges; None where no body is in the domain.
-
-        Raises:
-            SceneError, SolveError: As :meth:`solve`.
         """
         bodies, preset = self.pack(scene), self.preset
         if not len(bodies.records):
@@ -115,7 +131,7 @@ class SurfaceSolver:
                 impedances, self.green, preset.threshold, preset.width,
             )  # fmt: skip
         else:
-            out = solve(bodies.records, self.green, preset.threshold, preset.width)
+            out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
         if not (out.size and np.isfinite(out.delta).all()):
             raise SolveError(
                 "the charges of the bodies cannot be told apart; look for bodies that coincide"

@@ -39,6 +39,15 @@ BODY = np.dtype(
 )  # fmt: skip
 """One body, as the kernels take it."""
 
+_NEAR_LEAST, _FAR_LEAST = 1e-3, 3e-3
+"""Distances from near and far sources [m] below which their potential grows no more. They lie
+deeper than that under the surfaces of the design."""
+_LINEAR = 0.3
+"""Clusters smaller than this part of their distance from the design see a linear potential."""
+_COARSE = 31
+"""So many clusters, the coarsest of a body, are looked into wherever they are."""
+_DECAY = 0.35
+"""Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 USED, FRONTIER, LEAF = 2, 1, 0
 """State of a cluster: its function is used; it is split for an estimate only; it is not split."""
 
@@ -94,89 +103,107 @@ def score(bodies, first, green, weight, scores):
     """Share of the electrodes' energies that each charge function takes up alone.
 
     Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
-    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster.
+    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. Clusters that
+    are small against their distance from the design are not looked into: φ⁰ is linear there, and
+    the scores of their parts follow from their own.
     """
-    terminals, lead = green.terminals, green.lead
-    means = np.empty((first[-1], lead), np.float32)
-    energy = np.zeros(terminals)
+    terminals, lead, total = green.terminals, green.lead, first[-1]
+    means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
+    met = np.zeros(total, np.bool_)
     for b in range(bodies.shape[0]):
-        body = bodies[b]
-        count = 2 * body.n - 1
-        kids = integers(body.kids)
-        function = integers(body.function)
-        charge = doubles(body.charge)
-        own = doubles(body.own)
-        _panel_potentials(body, kids, green, means[first[b] : first[b + 1]])
-        mean = means[first[b] : first[b + 1]]
-        for k in range(count - 1, -1, -1):
-            if kids[2 * k + 0] >= 0:
-                p = np.float32(charge[kids[2 * k + 0]] / charge[k])
-                q = np.float32(1.0) - p
+        body, o = bodies[b], first[b]
+        kids, function = integers(body.kids), integers(body.function)
+        charge, own = doubles(body.charge), doubles(body.own)
+        _mean_potentials(body, green, means[o : first[b + 1]], met[o : first[b + 1]])
+        for k in range(2 * body.n - 2, -1, -1):
+            x, y = kids[2 * k], kids[2 * k + 1]
+            if x >= 0 and met[o + x]:
+                p = np.float32(charge[x] / charge[k])
                 stiffness = body.scale / own[function[k]]
                 for i in range(lead):
-                    x, y = mean[kids[2 * k + 0], i], mean[kids[2 * k + 1], i]
-                    mean[k, i] = p * x + q * y
+                    means[o + k, i] = p * means[o + x, i] + (np.float32(1.0) - p) * means[o + y, i]
                 for i in range(terminals):
-                    d = float(mean[kids[2 * k + 0], i] - mean[kids[2 * k + 1], i])
+                    d = float(means[o + x, i] - means[o + y, i])
                     energy[i] += d * d * stiffness
         if not body.neutral:
             for i in range(terminals):
-                energy[i] += float(mean[0, i]) ** 2 / (own[0] / body.scale + body.tie)
+                energy[i] += float(means[o, i]) ** 2 / (own[0] / body.scale + body.tie)
     whole = 0.0
     for i in range(terminals):
         whole += energy[i] ** 2
     for i in range(terminals):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
     for b in range(bodies.shape[0]):
-        _raise_scores(
-            bodies[b], means[first[b] : first[b + 1]], weight, scores[first[b] : first[b + 1]]
-        )
+        span = slice(first[b], first[b + 1])
+        _raise_scores(bodies[b], means[span], met[span], weight, scores[span])
 
 
 @fast
-def _panel_potentials(body, kids, green, means):
-    """φ⁰ at the panels, from the far sources."""
-    count = 2 * body.n - 1
-    center = doubles(body.center)
-    rounded = 4 * ((body.n + 3) // 4)
-    places = np.empty(body.n, np.int64)
-    points = np.zeros((rounded, 3), np.float32)
+def _mean_potentials(body, green, means, met):
+    """φ⁰ in the middle of clusters that are not looked into, from the far sources."""
+    kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
+    places, points = np.empty(body.n, np.int64), np.empty((body.n + 3, 3), np.float32)
     found = 0
-    for k in range(count):
-        if kids[2 * k + 0] < 0:
+    met[0] = True
+    for k in range(2 * body.n - 1):
+        if not met[k]:
+            continue
+        square = 0.0
+        for i in range(3):
+            x = body.position[i] + body.scale * (
+                body.rotation[i, 0] * center[3 * k]
+                + body.rotation[i, 1] * center[3 * k + 1]
+                + body.rotation[i, 2] * center[3 * k + 2]
+            )
+            points[found, i] = x
+            off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
+            square += off * off
+        size = body.scale * extent[k]
+        small = k >= _COARSE and size * size < _LINEAR * _LINEAR * square
+        if small or kids[2 * k] < 0:
             places[found] = k
-            for i in range(3):
-                points[found, i] = body.position[i] + body.scale * (
-                    body.rotation[i, 0] * center[3 * k + 0] + body.rotation[i, 1] * center[3 * k + 1]
-                    + body.rotation[i, 2] * center[3 * k + 2])  # fmt: skip
             found += 1
+        else:
+            met[kids[2 * k]] = met[kids[2 * k + 1]] = True
+    rounded = 4 * ((found + 3) // 4)
+    for j in range(found, rounded):
+        for i in range(3):
+            points[j, i] = points[0, i]
     values = np.empty((rounded, green.far.shape[1]), np.float32)
-    point_potentials(points, green.far, np.float32(green.floor), values)
+    point_potentials(
+        points[:rounded], green.far, np.float32(green.floor), np.float32(_FAR_LEAST), values
+    )
     phi = np.empty((rounded, green.lead), np.float32)
     multiply_lanes(values, green.score_table, phi)
-    for j in range(body.n):
+    for j in range(found):
         for i in range(green.lead):
             means[places[j], i] = phi[j, i]
 
 
 @fast
-def _raise_scores(body, mean, weight, scores):
+def _raise_scores(body, mean, met, weight, scores):
+    kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     count = 2 * body.n - 1
-    kids = integers(body.kids)
-    function = integers(body.function)
-    own = doubles(body.own)
     for k in range(count - 1, -1, -1):
         scores[k] = 0.0
-        if kids[2 * k + 0] >= 0:
+        a = kids[2 * k]
+        if a >= 0 and met[a]:
             value = 0.0
             for i in range(weight.shape[0]):
-                d = float(mean[kids[2 * k + 0], i] - mean[kids[2 * k + 1], i])
+                d = float(mean[a, i] - mean[kids[2 * k + 1], i])
                 value += weight[i] * d * d
             value *= body.scale / own[function[k]]
             for c in range(2):
                 below = scores[kids[2 * k + c]]
                 value = max(value, below) + 0.5 * min(value, below)
             scores[k] = value
+    for k in range(count):
+        a = kids[2 * k]
+        if a >= 0:
+            for c in range(2):
+                part = kids[2 * k + c]
+                if kids[2 * part] >= 0 and not met[kids[2 * part]]:
+                    scores[part] = _DECAY * scores[k]
 
 
 @fast
@@ -369,16 +396,34 @@ def leaf_rows(points, distance, green):
         if count == 0:
             continue
         if far == 1:
-            _add_rows(some[:count], chosen, share, green.far, green.far_table, green.floor, out)
+            _add_rows(
+                some[:count],
+                chosen,
+                share,
+                green.far,
+                green.far_table,
+                green.floor,
+                _FAR_LEAST,
+                out,
+            )
         else:
-            _add_rows(some[:count], chosen, share, green.near, green.near_table, green.floor, out)
+            _add_rows(
+                some[:count],
+                chosen,
+                share,
+                green.near,
+                green.near_table,
+                green.floor,
+                _NEAR_LEAST,
+                out,
+            )
     return out
 
 
 @fast
-def _add_rows(points, chosen, share, sources, table, floor, out):
+def _add_rows(points, chosen, share, sources, table, floor, least, out):
     values = np.empty((points.shape[0], sources.shape[1]), np.float32)
-    source_potentials(points, sources, np.float32(floor), values)
+    source_potentials(points, sources, np.float32(floor), np.float32(least), values)
     rows = np.empty((points.shape[0], table.shape[1]), np.float32)
     multiply(values, table, rows)
     for c in range(points.shape[0]):

@@ -86,17 +86,19 @@ singles, doubles, integers = _pointer(types.float32), _pointer(types.float64), _
 
 
 @fast
-def source_potentials(points, sources, floor, out):
+def source_potentials(points, sources, floor, least, out):
     """Mean over four points of the potential of every unit source and its image in the floor.
 
     Args:
         points: [m], shape (k, 4, 3), single precision, as all that follows.
         sources: [m], shape (3, s).
         floor: Height of the floor [m].
+        least: No point counts as nearer to a source than this [m]; where bodies reach into the
+            sensor, they would meet sources that stand for charges elsewhere.
         out: Filled [1/m], shape (k, s).
     """
     quarter = np.float32(0.25)
-    two = np.float32(2.0) * floor
+    two, bound = np.float32(2.0) * floor, least * least
     for i in range(points.shape[0]):
         for q in range(points.shape[1]):
             x, y, z = points[i, q, 0], points[i, q, 1], points[i, q, 2]
@@ -106,7 +108,7 @@ def source_potentials(points, sources, floor, out):
                 dz = z - sources[2, s]
                 ez = z + sources[2, s] - two
                 across = dx * dx + dy * dy
-                value = quarter * (rsqrt(across + dz * dz) - rsqrt(across + ez * ez))
+                value = quarter * (rsqrt(max(across + dz * dz, bound)) - rsqrt(across + ez * ez))
                 if q == 0:
                     out[i, s] = value
                 else:
@@ -114,9 +116,9 @@ def source_potentials(points, sources, floor, out):
 
 
 @fast
-def point_potentials(points, sources, floor, out):
+def point_potentials(points, sources, floor, least, out):
     """The same at single points, shape (k, 3)."""
-    two = np.float32(2.0) * floor
+    two, bound = np.float32(2.0) * floor, least * least
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for s in range(sources.shape[1]):
@@ -125,7 +127,7 @@ def point_potentials(points, sources, floor, out):
             dz = z - sources[2, s]
             ez = z + sources[2, s] - two
             across = dx * dx + dy * dy
-            out[i, s] = rsqrt(across + dz * dz) - rsqrt(across + ez * ez)
+            out[i, s] = rsqrt(max(across + dz * dz, bound)) - rsqrt(across + ez * ez)
 
 
 @fast
