@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import inspect
 import json
 import sys
 from functools import partial
@@ -71,13 +72,13 @@ def parse_settings(text: str) -> dict[str, Any]:
 
 
 def configurations(methods: list[str], settings: list[str]) -> list[Configuration]:
-    """Every method with every settings; no method is the default one."""
+    """Every method, or the default one, with every settings."""
+    usual = inspect.signature(cs.Simulator).parameters["method"].default
     out = []
-    for method in methods or [""]:
+    for method in methods or [usual]:
         for text in settings or [""]:
-            chosen = {"method": method} if method else {}
-            label = " ".join(filter(None, (method or "default", text)))
-            out.append((label, {**chosen, **parse_settings(text)}))
+            label = " ".join(filter(None, (method, text)))
+            out.append((label, {"method": method, **parse_settings(text)}))
     return out
 
 

@@ -228,7 +228,7 @@ def compare(method: str, only: str) -> None:
         got, self_got = reading.delta / FEMTO, (reading.self_capacitance - rest)[0] / FEMTO
         other = (truth[0, 1], got[0, 1]) if len(truth) > 1 else (np.nan, np.nan)
         cells = "".join(
-            f" {t:10.3f} {100 * (g / t - 1):+7.2f}"
+            f" {t:10.3f} {100 * (g / t - 1):+7.2f}" if t == t else f"{'–':>11s} {'–':>7s}"
             for t, g in ((truth[0, 0], got[0, 0]), other, (self_truth, self_got))
         )
         print(f"{case['name']:50s}{cells} {100 * max(case['error']):7.2f}", flush=True)
