@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.scene.shape import Shape, ShapeKind, as_lines, as_points
-from capsense.scene.surface import clean_surface, enclosed_volume
+from capsense.scene.surface import clean_surface, connected_parts, enclosed_volume
 
 if TYPE_CHECKING:
     import trimesh
@@ -89,6 +89,11 @@ class TriMesh(Shape):
     def closed(self) -> bool:
         """Whether the mesh has an inside."""
         return not self.__dict__["_flaw"]
+
+    @cached_property
+    def parts(self) -> int:
+        """Number of connected parts; parts share no vertex."""
+        return int(connected_parts(self.faces, len(self.vertices)).max()) + 1
 
     @cached_property
     def params(self) -> Array:

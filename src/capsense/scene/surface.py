@@ -77,6 +77,19 @@ def enclosed_volume(vertices: Array, faces: Faces) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
+def connected_parts(faces: Faces, n: int) -> Faces:
+    """Number of the connected part of each face, shape (m,); parts share none of the n vertices."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    row = np.concatenate([faces[:, 0], faces[:, 1]])
+    column = np.concatenate([faces[:, 1], faces[:, 2]])
+    graph = coo_matrix((np.ones(len(row), dtype=bool), (row, column)), shape=(n, n))
+    label = connected_components(graph, directed=False)[1]
+    _, out = np.unique(label[faces[:, 0]], return_inverse=True)
+    return out.reshape(-1).astype(np.int64)
+
+
 def _checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, Faces]:
     try:
         v = np.array(vertices, dtype=float)

@@ -55,7 +55,7 @@ def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
     """Cover a rigid shape with about ``count`` flat panels.
 
     Panels of boxes and cylinders shrink towards edges. Triangle meshes are reduced, or their
-    triangles halved, to about ``count``; every connected part keeps 40 triangles or all it has.
+    triangles halved, to about ``count``, see :mod:`capsense.surface.triangles`.
 
     Args:
         shape: A primitive or a mesh, or the corners of triangles [m], shape (m, 3, 3), of an open
@@ -71,16 +71,16 @@ def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
     """
     match shape:
         case Box():
-            return _from_polygons(grids.box_polygons(shape.size, count))
+            return polygon_panels(grids.box_polygons(shape.size, count))
         case Sphere():
             radii = (shape.radius,) * 3
-            return _from_polygons(grids.ellipsoid_polygons(radii, count))
+            return polygon_panels(grids.ellipsoid_polygons(radii, count))
         case Ellipsoid():
-            return _from_polygons(grids.ellipsoid_polygons(shape.radii, count))
+            return polygon_panels(grids.ellipsoid_polygons(shape.radii, count))
         case Capsule():
-            return _from_polygons(grids.capsule_polygons(shape.radius, shape.length, count))
+            return polygon_panels(grids.capsule_polygons(shape.radius, shape.length, count))
         case Cylinder():
-            return _from_polygons(grids.cylinder_polygons(shape.radius, shape.length, count))
+            return polygon_panels(grids.cylinder_polygons(shape.radius, shape.length, count))
         case TriMesh():
             triangles = shape.vertices[shape.faces]
         case Shape():
@@ -89,7 +89,7 @@ def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
             triangles = np.asarray(shape, dtype=float)
     reduced = reduced_triangles(triangles, count)
     corners = reduced.corners[:, [0, 1, 2, 2]]
-    return _from_polygons(corners, reduced.parts, reduced.closed)
+    return polygon_panels(corners, reduced.parts, reduced.closed)
 
 
 def _read_only(values: Array) -> Array:
@@ -98,10 +98,10 @@ def _read_only(values: Array) -> Array:
     return out
 
 
-def _from_polygons(
+def polygon_panels(
     corners: Array, parts: NDArray[np.int64] | None = None, closed: bool = True
 ) -> SurfacePanels:
-    """Panels of planar polygons, corners [m] of shape (n, 4, 3), seen from the outside."""
+    """Panels that are planar polygons, corners [m] of shape (n, 4, 3), seen from the outside."""
     origin = corners[:, 0]
     u, v, w = (corners[:, k] - origin for k in (1, 2, 3))
     first, second = np.cross(u, v), np.cross(v, w)

@@ -7,18 +7,20 @@ charge. All but the first are without net charge.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from capsense.errors import SolveError
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
 from capsense.surface.panels import SurfacePanels
 from capsense.surface.step_kernels import BODY
+from capsense.surface.vector_kernels import cholesky, entry
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -72,10 +74,8 @@ class RigidShape:
 
     panels: SurfacePanels
     tree: Tree
-    free: Array
-    """Mean potential on one panel of unit charge on another, free space [1/m], shape (n, n)."""
     energy: Array32
-    """The same of the charge functions [1/m], shape (n, n)."""
+    """Mean potential of one charge function on another, free space [1/m], shape (n, n)."""
     capacitance: float
     """Capacitance in free space over 4π eps0 [m]."""
 
@@ -86,7 +86,7 @@ class RigidShape:
 
     @cached_property
     def record(self) -> np.void:
-        """What the kernels take of a body that is known of its shape; points to arrays held here."""
+        """What the kernels take of a body that its shape tells; points to arrays held here."""
         record = np.zeros(1, BODY)[0]
         record["n"] = len(self.panels)
         record["energy"], record["own"] = self.energy.ctypes.data, self.own.ctypes.data
@@ -103,7 +103,17 @@ class RigidShape:
         Raises:
             SceneError: The surface is open.
         """
-        return _of_functions(self.tree, impedance(self.panels, self.free))
+        return _of_functions(self.tree, impedance(self.panels, free_block(self.panels)))
+
+    @property
+    def nbytes(self) -> int:
+        """Room that the matrices take up [bytes]."""
+        z = self.__dict__.get("impedance")
+        return self.energy.nbytes + (0 if z is None else z.nbytes)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # a record is good only where its arrays stand
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def rigid_shape(panels: SurfacePanels) -> RigidShape:
@@ -113,25 +123,34 @@ def rigid_shape(panels: SurfacePanels) -> RigidShape:
         SolveError: The panels lie within each other, so that their block is not definite.
     """
     free = free_block(panels)
-    try:
-        factor = scipy.linalg.cho_factor(free, lower=True, check_finite=False)
-    except np.linalg.LinAlgError:
+    factor = free.copy()
+    if not _factored(factor):
         raise SolveError(
             f"the surface of {len(panels)} panels meets itself, so that no charge can be told; "
             "remove doubled faces"
-        ) from None
-    charge = scipy.linalg.cho_solve(factor, np.ones(len(panels)), check_finite=False)
+        )
+    charge = solve_triangular(factor, np.ones(len(panels)), lower=True, check_finite=False)
+    charge = solve_triangular(factor, charge, lower=True, trans=1, check_finite=False)
     tree = build_tree(panels, np.maximum(charge, _LEAST_CHARGE * charge.max()))
-    return RigidShape(panels, tree, free, _of_functions(tree, free), float(charge.sum()))
+    return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
+
+
+@entry
+def _factored(matrix: Array) -> bool:
+    """Cholesky on one core: several threads of LAPACK hinder each other on busy machines."""
+    return cholesky(matrix)
 
 
 def build_tree(panels: SurfacePanels, charge: Array) -> Tree:
     """Split panels into clusters; ``charge`` (n,) is their equilibrium charge, above zero."""
-    n = len(panels)
     extent = float(np.ptp(panels.centers, axis=0).max())
     features = np.concatenate([panels.centers, _NORMALS * extent * panels.normals], axis=1)
-    clusters = split(features, charge)
-    kids, panel = clusters.kids, clusters.panel
+    return charged_tree(panels, split(features, charge), charge)
+
+
+def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tree:
+    """Clusters of panels with their charges (n,) entered."""
+    n, kids, panel = len(panels), clusters.kids, clusters.panel
     single = panel >= 0
     share, center = np.empty(2 * n - 1), np.empty((2 * n - 1, 3))
     spread = np.empty((2 * n - 1, 3, 3))

@@ -1,22 +1,42 @@
-"""Rigid shapes that are at hand: each is worked out once, whatever its size, and kept."""
+"""Rigid shapes that are at hand: each is worked out once, whatever its size, and kept.
+
+Those of meshes are also kept as files beside the background fields, and found there by content.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import threading
 from collections import OrderedDict
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from capsense.scene import Shape
-from capsense.scene.shape import ShapeKind
-from capsense.surface.panels import panels_of
-from capsense.surface.rigid import RigidShape, rigid_shape
+from capsense.errors import FieldError
+from capsense.field.cache import default_cache_dir
+from capsense.field.store import read_arrays, write_arrays
+from capsense.scene import Shape, TriMesh
+from capsense.surface.panels import panels_of, polygon_panels
+from capsense.surface.rigid import Clusters, RigidShape, charged_tree, rigid_shape
+
+VERSION = 1
+"""Of stored shapes: to be raised when the same mesh would get other panels or functions."""
+
+_log = logging.getLogger(__name__)
 
 _KEPT = 512_000_000
 """Shapes are forgotten, the longest unused first, when they take up more than this [bytes]."""
+_FILES = 1_000_000_000
+"""The same of files [bytes], the oldest first."""
 _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
+_EACH = 140
+"""Panels for each part of a mesh of several parts."""
+_MOST = 2.8
+"""Meshes of several parts get up to so many times as many panels as other shapes."""
 
 _LOCK = threading.Lock()
 _SHAPES: OrderedDict[tuple[object, ...], RigidShape] = OrderedDict()
@@ -27,7 +47,7 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
 
     Args:
         shape: A primitive or a mesh.
-        count: About how many panels cover it.
+        count: About how many panels cover it; a mesh of several parts gets more.
 
     Raises:
         SceneError: The shape has no surface that can be covered with panels.
@@ -41,11 +61,13 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
         if found is not None:
             _SHAPES.move_to_end(key)
     if found is None:
-        panels = panels_of(shape, count)
-        found = rigid_shape(panels.scaled(1.0 / size))
+        if isinstance(shape, TriMesh):
+            found = _mesh_shape(shape, count, str(key[0]))
+        else:
+            found = rigid_shape(panels_of(shape, count).scaled(1.0 / size))
         with _LOCK:
-            _SHAPES[key] = found
-            while len(_SHAPES) > 1 and sum(s.energy.nbytes + s.free.nbytes for s in _SHAPES.values()) > _KEPT:
+            found = _SHAPES.setdefault(key, found)
+            while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
                 _SHAPES.popitem(last=False)
     shape.__dict__["_rigid"] = (count, found, size)
     return found, size
@@ -53,11 +75,82 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
 
 def _key(shape: Shape, count: int) -> tuple[float, tuple[object, ...]]:
     """A shape's size [m], and what tells its form from others."""
-    if shape.kind == ShapeKind.MESH:
-        digest = hashlib.sha256()
-        for name in ("vertices", "faces"):
-            digest.update(np.ascontiguousarray(getattr(shape, name)).tobytes())
-        return 1.0, (digest.hexdigest(), count)
+    if isinstance(shape, TriMesh):
+        digest = hashlib.sha256(repr((VERSION, count, shape.vertices.shape)).encode())
+        for values in (shape.vertices, shape.faces):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        return 1.0, (digest.hexdigest()[:32],)
     size = float(shape.params.max())
     form = tuple(round(x, _DIGITS) for x in (shape.params / size).tolist())
     return size, (int(shape.kind), form, count)
+
+
+# -- meshes ---------------------------------------------------------------------------------------
+
+
+def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
+    file = default_cache_dir() / "shapes" / f"{key}.npz"
+    try:
+        return _read(file, key)
+    except FileNotFoundError:
+        pass
+    except FieldError as error:
+        _log.warning("a stored shape is not used, it is made again: %s", error)
+    wanted = min(_MOST * count, max(count, _EACH * shape.parts))
+    made = rigid_shape(panels_of(shape, round(wanted)))
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        _write(made, file, key)
+        _make_room(file.parent)
+    except OSError as error:
+        _log.info("a shape cannot be kept in %s: %s", file.parent, error)
+    return made
+
+
+def _write(shape: RigidShape, file: Path, key: str) -> None:
+    panels, tree = shape.panels, shape.tree
+    single = tree.panel >= 0
+    charge = np.empty(len(panels))
+    charge[tree.panel[single]] = tree.charge[single]
+    arrays: dict[str, NDArray[Any]] = {
+        "corners": panels.corners[:, :3],  # of triangles
+        "parts": panels.parts.astype(np.int32), "kids": tree.kids.astype(np.int32),
+        "function": tree.function.astype(np.int32), "panel": tree.panel.astype(np.int32),
+        "charge": charge, "energy": shape.energy[np.tril_indices(len(panels))],
+    }  # fmt: skip
+    meta = {
+        "kind": "shape", "key": key, "closed": panels.closed, "capacitance": shape.capacitance,
+    }  # fmt: skip
+    write_arrays(file, arrays, meta)
+
+
+def _read(file: Path, key: str) -> RigidShape:
+    """Read a shape.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        FieldError: It is damaged, or something else.
+    """
+    arrays, meta = read_arrays(file, kind="shape", key=key)
+    corners = arrays["corners"][:, [0, 1, 2, 2]]
+    panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
+    clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))
+    energy = np.empty((len(panels),) * 2, np.float32)
+    rows, columns = np.tril_indices(len(panels))
+    energy[rows, columns] = arrays["energy"]
+    energy[columns, rows] = arrays["energy"]
+    return RigidShape(
+        panels, charged_tree(panels, clusters, arrays["charge"]), energy,
+        float(meta["capacitance"]),
+    )  # fmt: skip
+
+
+def _make_room(folder: Path) -> None:
+    """Remove the oldest files where there are too many."""
+    known = [(f.stat().st_mtime, f.stat().st_size, f) for f in folder.glob("*.npz")]
+    room = _FILES - sum(size for _, size, _ in known)
+    for _, size, file in sorted(known):
+        if room >= 0:
+            break
+        file.unlink(missing_ok=True)
+        room += size

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import SceneError
-from capsense.scene.surface import clean_surface
+from capsense.scene.surface import clean_surface, connected_parts
 from capsense.surface import collapse_kernels
 from capsense.surface.fitting import fitted
 
@@ -73,7 +73,7 @@ def reduced_triangles(triangles: Array, count: int) -> Triangles:
     extent = float(np.ptp(vertices, axis=0).max())
     unit, faces, flaw = clean_surface(vertices / extent, faces)
     vertices, closed = extent * unit, not flaw
-    label = _parts(faces, len(vertices))
+    label = connected_parts(faces, len(vertices))
     corners, parts = [], []
     areas = np.zeros(label.max() + 1)
     np.add.at(areas, label, _areas(vertices[faces]))
@@ -131,24 +131,11 @@ def _welded(triangles: Array, count: int) -> tuple[Array, Index]:
         else:
             raise SceneError("the surface has no triangle of an area above zero")
         many = len(faces) > 2 * count and (
-            _LEAST_OF_MANY * (1 + _parts(faces, len(vertices)).max()) > 2 * count
+            _LEAST_OF_MANY * (1 + connected_parts(faces, len(vertices)).max()) > 2 * count
         )
         if not many or tolerance > _WELD_MOST:
             return found
         tolerance *= 4
-
-
-def _parts(faces: Index, vertices: int) -> Index:
-    """Number of the connected part of each face; parts share no vertex."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    row = np.concatenate([faces[:, 0], faces[:, 1]])
-    column = np.concatenate([faces[:, 1], faces[:, 2]])
-    graph = coo_matrix((np.ones(len(row), dtype=bool), (row, column)), shape=(vertices,) * 2)
-    label = connected_components(graph, directed=False)[1]
-    _, out = np.unique(label[faces[:, 0]], return_inverse=True)
-    return out.reshape(-1).astype(np.int64)
 
 
 def _shares(areas: Array, count: int) -> Index:
@@ -174,7 +161,7 @@ def _covered(vertices: Array, faces: Index, count: int) -> Array:
     surface = vertices[faces]
     length = np.linalg.norm(np.roll(surface, -1, axis=1) - surface, axis=2)
     reach = np.sqrt(_areas(surface).sum() / count)  # of a triangle from an edge
-    if reach * length[edges].sum() / 2 < _FEW_SHARP * reach**2 * count:
+    if reach * length[edges].sum() < _FEW_SHARP * reach**2 * count:
         return _halved(*_simplified(vertices, faces, count, edges & False), count)
     return _halved(*_simplified(vertices, faces, round(_BASE * count), edges), count)
 
@@ -229,7 +216,7 @@ def _quadrics(vertices: Array, faces: Index) -> tuple[Array, Index]:
 
     planes = np.concatenate([np.repeat(normal, 3, axis=0), np.repeat(upright, 2, axis=0)])
     owner = np.concatenate([start, np.stack([start[rim], end[rim]], axis=1).reshape(-1)])
-    weight = np.concatenate([np.repeat(double / 2, 3), np.repeat(length**2, 2)])
+    weight = np.concatenate([np.repeat(double / 2, 3), np.repeat(30 * length**2, 2)])
     d = -np.einsum("ij,ij->i", planes, vertices[owner])
     x, y, z = planes.T
     terms = (x * x, x * y, x * z, y * y, y * z, z * z, x * d, y * d, z * d, d * d)
