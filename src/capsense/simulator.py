@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from capsense.solve.perturbation import PerturbationSolver
     from capsense.surface.potentials import PotentialMap
     from capsense.surface.solve_kernels import Solution
+    from capsense.surface.solver import View
 
 Array = NDArray[np.float64]
 Method = Literal["surface", "perturbation", "masked"]
@@ -115,23 +116,44 @@ class _SurfaceScenes:
         self._map: PotentialMap | None = None
 
     def solve(self, scene: Scene, jacobian: bool = False) -> tuple[Array, int, float, float]:
-        """Return the change, iterations, error estimate [F] and tolerance [F]."""
+        """Return the change, iterations, error estimate [F] and tolerance [F].
+
+        Raises:
+            SceneError: A Jacobian is asked for of what has no surface charges.
+        """
         self.unknowns = 0
         self._last, self._gradient = self._nothing, None
-        if self.surface.unsupported(scene):
+        view = self.surface.look(scene)
+        missing = self.surface.unsupported(view)
+        close = 1.0 if missing else self.surface.closeness(view)
+        if missing and jacobian:
+            raise SceneError(f"there is no Jacobian of {missing}; only surface charges have one")
+        change = np.zeros((len(self._background.terminals),) * 2)
+        iterations, error, goal = 0, 0.0, 0.0
+        if close < 1.0 or jacobian:
+            part, error = self._on_surfaces(view, jacobian)
+            change += (1.0 - close) * part
+            goal = error
+        if close > 0.0:
             if self._lattice is None:
                 self._lattice = self._make()
             self._lattice.reset()  # a reading does not depend on the one before it
-            self._last = self._lattice.potentials
-            return self._lattice.solve(scene)
-        bodies, solution = self.surface.solution(scene, jacobian=jacobian)
-        self._gradient = partial(self.surface.jacobian, scene, bodies, solution)
+            part, iterations, left, wanted = self._lattice.solve(scene)
+            change += close * part
+            error, goal = max(error, left), max(goal, wanted)
+            if close > 0.5:
+                self._last = self._lattice.potentials
+        return change, iterations, error, goal
+
+    def _on_surfaces(self, view: View, jacobian: bool) -> tuple[Array, float]:
+        """Change of the matrix of all terminals [F], and its estimated error [F]."""
+        bodies, solution = self.surface.solution(view, jacobian=jacobian)
+        self._gradient = partial(self.surface.jacobian, view, bodies, solution)
         if solution is None:
-            return np.zeros((len(self._background.terminals),) * 2), 0, 0.0, 0.0
+            return np.zeros((len(self._background.terminals),) * 2), 0.0
         self._last = partial(self._around, solution)
         self.unknowns = solution.size
-        change, error = self.surface.in_farads(solution)
-        return change, 0, error, error
+        return self.surface.in_farads(solution)
 
     def potentials(self) -> Array:
         """Change of the potentials at the nodes in the last step [V], shape (n, terminals)."""
@@ -140,11 +162,10 @@ class _SurfaceScenes:
     def jacobian(self) -> Array:
         """How the matrix of all terminals changes with the poses of the last scene's bodies.
 
-        Raises:
-            SceneError: The lattice solved the last scene.
+        Within some millimetres of the design, where the lattice has a share in the reading, it is
+        that of the surface charges alone.
         """
-        if self._gradient is None:
-            raise SceneError("a Jacobian needs surface charges, which the last scene has none of")
+        assert self._gradient is not None  # asked for in ``solve``
         return self._gradient()
 
     def reset(self) -> None:

@@ -8,9 +8,9 @@ from field_cases import COARSE
 from random_scenes import random_scene
 
 import capsense as cs
+from capsense._simd import LANES, aligned_zeros
 from capsense.solve.packed import packed_lattice
 from capsense.solve.pcg_kernels import Operator, Vectors, backward, finish, forward, start
-from capsense._simd import LANES, aligned_zeros
 
 Array = np.ndarray
 

@@ -1,4 +1,4 @@
-"""The step, compiled: the matrix of the chosen charge functions, its solution, what was left out."""
+"""The step, compiled: the matrix of the chosen charge functions, its solution, what is left."""
 
 from __future__ import annotations
 

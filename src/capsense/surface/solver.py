@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._patience import first_use
 from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene
 from capsense.scene.scene import PackedScene
+from capsense.scene.shape import ShapeKind
 from capsense.surface.changing import ChangingBody, layer_pieces
 from capsense.surface.lossy import solve_lossy
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
@@ -25,12 +28,21 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
+CONTACT = 2.5e-3, 4.5e-3
+"""Distances from the design [m] between which surface charges come to be trusted."""
+
+
+MARGIN = 0.015
+"""What lies nearer than this [m] to the ceiling and the side walls is left out: at ground, the
+walls take nearly all of what would meet it."""
+
+
 @dataclass(frozen=True)
 class Preset:
     """How finely a scene is resolved."""
 
     panels: int = 700
-    """About how many panels cover a shape."""
+    """About how many panels cover a round shape; one with edges has twice as many."""
     threshold: float = 0.015
     """Charge functions count that take up this part of an electrode's energy alone."""
     width: float = 2.5
@@ -43,6 +55,20 @@ PRESETS = {
     "fine": Preset(panels=1400, threshold=0.004),
 }
 """Presets by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scene, and the n bodies of it that reach into the domain."""
+
+    scene: Scene
+    packed: PackedScene
+    met: NDArray[np.intp]
+    """Their places in the scene, shape (n,)."""
+    within: Bools
+    """Which of them lie in the domain as a whole, shape (n,)."""
+    matter: Matter
+    """What they are made of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +101,75 @@ class SurfaceSolver:
         self.frequency = frequency
         self.preset = preset or Preset()
         low, top = background.lattice.storeys[0].axes, background.lattice.storeys[-1].axes[2]
-        self._room = np.array([[a[0] for a in low], [low[0][-1], low[1][-1], top[-1]]])
+        room = np.array([[a[0] for a in low], [low[0][-1], low[1][-1], top[-1]]])
+        self._room = room + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
+
+    def look(self, scene: Scene) -> View:
+        """Find the bodies of a scene that reach into the domain."""
+        packed = scene.pack()
+        low, high = packed.bounds[:, 0], packed.bounds[:, 1]
+        met = np.flatnonzero(((high > self._room[0]) & (low < self._room[1])).all(axis=1))
+        within = ((low[met] > self._room[0]) & (high[met] < self._room[1])).all(axis=1)
+        matter = matter_of([scene[k] for k in met.tolist()], self.frequency)
+        return View(scene, packed, met, within, matter)
+
+    def unsupported(self, view: View) -> str | None:
+        """Say what of a scene has no surface charges here, if anything."""
+        for place in np.flatnonzero(~view.matter.conducting).tolist():
+            shape = view.scene[int(view.met[place])].shape
+            if isinstance(shape, Layers):
+                return "a dielectric given by a depth image"
+            if not view.within[place]:
+                return "a dielectric that the walls of the domain cut off"
+            if not getattr(shape, "closed", True):
+                return "a dielectric whose surface is open"
+        return None
+
+    def closeness(self, view: View) -> float:
+        """How far bodies are within :data:`CONTACT` of the design: 1 at its near end, 0 beyond.
+
+        Taken from bounding boxes: it is smooth in every pose.
+        """
+        if not len(view.met):
+            return 0.0
+        low, high = view.packed.bounds[view.met, 0], view.packed.bounds[view.met, 1]
+        below = [0.0, 0.0, np.inf]  # what lies between the design and the floor is close
+        off = np.maximum(np.maximum(self.green.box[0] - below - high, low - self.green.box[1]), 0.0)
+        nearest = math.sqrt(float((off**2).sum(axis=1).min()))
+        x = min(1.0, max(0.0, (CONTACT[1] - nearest) / (CONTACT[1] - CONTACT[0])))
+        return x * x * (3 - 2 * x)
+
+    def solution(
+        self, view: View, *, jacobian: bool = False
+    ) -> tuple[PackedBodies, Solution | None]:
+        """Return the packed bodies of a scene and their charges; None where none is in the domain.
+
+        Raises:
+            SceneError: A dielectric has no inside, see :meth:`unsupported`.
+            SolveError: Bodies lie within each other in a way that leaves no solution.
+        """
+        with first_use():
+            bodies, preset = self.pack(view), self.preset
+            if not len(bodies.records):
+                return bodies, None
+            if bodies.matter.lossy:
+                matter = bodies.matter
+                softness = matter.softness()
+                impedances = [
+                    s.impedance if soft != 0 and isinstance(s, RigidShape) else None
+                    for s, soft in zip(bodies.shapes, softness, strict=True)
+                ]
+                out = solve_lossy(
+                    bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)), softness,
+                    impedances, self.green, preset.threshold, preset.width,
+                )  # fmt: skip
+            else:
+                out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
+        if not (out.size and np.isfinite(out.delta).all()):
+            raise SolveError(
+                "the charges of the bodies cannot be told apart; look for bodies that coincide"
+            )
+        return bodies, out
 
     def in_farads(self, solution: Solution) -> tuple[Array, float]:
         """Change of the Maxwell matrix of all terminals [F], (terminals, terminals), and its error.
@@ -84,7 +178,7 @@ class SurfaceSolver:
         """
         return UNIT * solution.delta, UNIT * float(np.abs(np.diag(solution.left)).max())
 
-    def jacobian(self, scene: Scene, bodies: PackedBodies, solution: Solution | None) -> Array:
+    def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
         """How the matrix of all terminals changes with the poses of a scene's bodies.
 
         Returns:
@@ -94,7 +188,7 @@ class SurfaceSolver:
         Raises:
             SceneError: A body is of matter with losses.
         """
-        out = np.zeros((len(scene), self.green.terminals, self.green.terminals, 6))
+        out = np.zeros((len(view.scene), self.green.terminals, self.green.terminals, 6))
         if solution is None:
             return out
         if bodies.matter.lossy:
@@ -107,71 +201,20 @@ class SurfaceSolver:
         out[bodies.chosen] = UNIT * jacobian(solution, bodies.records, self.green)
         return out
 
-    def solution(
-        self, scene: Scene, *, jacobian: bool = False
-    ) -> tuple[PackedBodies, Solution | None]:
-        """Return the packed bodies of a scene and their charges; None where none is in the domain.
-
-        Raises:
-            SceneError: A dielectric has no inside, see :meth:`unsupported`.
-            SolveError: Bodies lie within each other in a way that leaves no solution.
-        """
-        bodies, preset = self.pack(scene), self.preset
-        if not len(bodies.records):
-            return bodies, None
-        if bodies.matter.lossy:
-            matter = bodies.matter
-            softness = matter.softness()
-            impedances = [
-                s.impedance if soft != 0 and isinstance(s, RigidShape) else None
-                for s, soft in zip(bodies.shapes, softness, strict=True)
-            ]
-            out = solve_lossy(
-                bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)), softness,
-                impedances, self.green, preset.threshold, preset.width,
-            )  # fmt: skip
-        else:
-            out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
-        if not (out.size and np.isfinite(out.delta).all()):
-            raise SolveError(
-                "the charges of the bodies cannot be told apart; look for bodies that coincide"
-            )
-        return bodies, out
-
-    def unsupported(self, scene: Scene) -> str | None:
-        """Say what of a scene has no surface charges here, if anything."""
-        packed = scene.pack()
-        within = self._within(packed)
-        for k in np.flatnonzero(self._met(packed)).tolist():
-            body = scene[k]
-            if matter_of([body], self.frequency).conducting[0]:
-                continue
-            if isinstance(body.shape, Layers):
-                return "a dielectric given by a depth image"
-            if not within[k]:
-                return "a dielectric that the walls of the domain cut off"
-            if not getattr(body.shape, "closed", True):
-                return "a dielectric whose surface is open"
-        return None
-
-    def pack(self, scene: Scene) -> PackedBodies:
+    def pack(self, view: View) -> PackedBodies:
         """Lay out the bodies that reach into the domain."""
-        packed = scene.pack()
-        met, within = np.flatnonzero(self._met(packed)).tolist(), self._within(packed)
-        matter = matter_of([scene[k] for k in met], self.frequency)
         shapes: list[RigidShape | ChangingBody] = []
         sizes: list[float] = []
         kept: list[int] = []
-        for place, k in enumerate(met):
-            shape, size = self._shape(
-                scene, packed, k, bool(within[k] or not matter.conducting[place])
-            )
+        for place, k in enumerate(view.met.tolist()):
+            whole = bool(view.within[place] or not view.matter.conducting[place])
+            shape, size = self._shape(view, k, whole)
             if shape is not None:
                 shapes.append(shape)
                 sizes.append(size)
                 kept.append(place)
-        chosen = np.array(met, np.intp)[kept]
-        matter = matter[kept].joined(scene, packed, chosen)
+        chosen, packed = view.met[kept], view.packed
+        matter = view.matter[kept].joined(view.scene, packed, chosen)
         records = np.array([s.record for s in shapes], BODY)
         records["scale"] = sizes
         records["rotation"], records["position"] = packed.rotation[chosen], packed.position[chosen]
@@ -179,31 +222,22 @@ class SurfaceSolver:
         return PackedBodies(records, chosen, matter, shapes)
 
     def _shape(
-        self, scene: Scene, packed: PackedScene, k: int, whole: bool
+        self, view: View, k: int, whole: bool
     ) -> tuple[RigidShape | ChangingBody | None, float]:
         """Charge functions of a body and its size; None where nothing of it is in the domain."""
-        shape = scene[k].shape
+        shape, packed = view.scene[k].shape, view.packed
         if isinstance(shape, Layers):
             tree, pieces, wanted = layer_pieces(shape)
             inside = wanted & self._inside(pieces.centers, packed, k)
             return (ChangingBody(tree, pieces, inside) if inside.any() else None), 1.0
-        functions, size = rigid(shape, self.preset.panels)
+        edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
+        functions, size = rigid(shape, self.preset.panels * (2 if edged else 1))
         if whole:
             return functions, size
         inside = self._inside(size * functions.panels.centers, packed, k)
         return (
             ChangingBody(functions.tree, functions.panels, inside) if inside.any() else None
         ), size
-
-    def _met(self, packed: PackedScene) -> Bools:
-        """Which bodies reach into the domain."""
-        low, high = packed.bounds[:, 0], packed.bounds[:, 1]
-        return ((high > self._room[0]) & (low < self._room[1])).all(axis=1)
-
-    def _within(self, packed: PackedScene) -> Bools:
-        """Which bodies lie in the domain as a whole."""
-        low, high = packed.bounds[:, 0], packed.bounds[:, 1]
-        return ((low > self._room[0]) & (high < self._room[1])).all(axis=1)
 
     def _inside(self, points: Array, packed: PackedScene, k: int) -> Bools:
         """Which points of a body's frame lie in the domain."""

@@ -1,4 +1,4 @@
-"""Compiled kernels that split a surface into clusters and change to hierarchical charge functions."""
+"""Compiled kernels that split a surface into clusters, and change to their charge functions."""
 
 from __future__ import annotations
 

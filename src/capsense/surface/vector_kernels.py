@@ -19,16 +19,10 @@ WIDTH = 32
 """Tables have a multiple of so many columns."""
 
 _FAST = frozenset({"contract", "nsz", "reassoc", "arcp"})
-fast = njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    fastmath=set(_FAST),
-    no_cpython_wrapper=True,
-    no_cfunc_wrapper=True,
-)
-entry = njit(cache=True, nogil=True, error_model="numpy", fastmath=set(_FAST))
+fast = njit(cache=True, nogil=True, error_model="numpy", fastmath=set(_FAST))
 """Compiled with sums in any order; NaN and infinity keep their meaning."""
+entry = fast
+"""The same, for what Python calls."""
 
 
 @intrinsic

@@ -1,0 +1,291 @@
+"""The default method, charges on the bodies: what it reads, how smoothly, where it gives way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from field_cases import (
+    assert_physical,
+    ball,
+    bar,
+    body_of,
+    capsule,
+    capsule_reference,
+    delta_reference,
+    off_diagonal,
+)
+from random_scenes import random_scene
+from reference_scenes import MAP, MORE, diagonal_errors, other_errors, reference_scenes
+
+import capsense as cs
+from capsense.errors import SceneError
+from capsense.solve.perturbation import PerturbationSolver
+
+Array = np.ndarray
+
+
+@pytest.fixture
+def sim(simulators) -> cs.Simulator:
+    return simulators("six_patch_bare", method="surface")
+
+
+def test_it_is_the_default():
+    assert cs.Simulator("six_patch_bare").method == "surface"
+
+
+# -- accuracy ---------------------------------------------------------------------------------
+
+
+def test_the_map_of_references(sim):
+    """Measured against boundary elements: 89 scenes of fingers, limbs, balls, plates and boxes."""
+    readings = [(s, sim.step(s.scene)) for s in reference_scenes(MAP)]
+    diagonal = np.array([diagonal_errors(r.delta, s.delta) for s, r in readings])
+    others = np.concatenate([other_errors(r.delta, s.delta) for s, r in readings])
+    assert np.sqrt((diagonal**2).mean()) <= 0.008
+    assert np.percentile(np.abs(diagonal), 95) <= 0.02
+    assert np.abs(diagonal).max() <= 0.05
+    assert np.abs(others).max() <= 0.02
+    for _, reading in readings:
+        np.testing.assert_array_equal(reading.delta, reading.delta.T)
+        assert_physical(reading.capacitance)
+
+
+def test_more_references(sim):
+    """Measured against boundary elements of another make: 69 scenes, near contact and walls too."""
+    readings = [(s, sim.step(s.scene)) for s in reference_scenes(MORE)]
+    diagonal = np.array([diagonal_errors(r.delta, s.delta) for s, r in readings])
+    assert np.sqrt((diagonal**2).mean()) <= 0.02
+    assert np.percentile(np.abs(diagonal), 95) <= 0.04
+
+
+def test_the_error_estimate_tells_good_from_bad(sim):
+    """Measured: nine of ten scenes of the map have an error below five times the estimate."""
+    within = [
+        np.abs(r.delta - s.delta).max() <= 5 * r.stats.error_estimate + s.error * s.delta.max()
+        for s in reference_scenes(MAP)
+        for r in [sim.step(s.scene)]
+    ]
+    assert np.mean(within) >= 0.9
+
+
+def assert_close(got: Array, expected: Array, diagonal: float, other: float) -> None:
+    error = np.diag(got) / np.diag(expected) - 1
+    assert np.abs(error).max() <= diagonal, np.round(100 * error, 2)
+    least = np.maximum(other * np.abs(off_diagonal(expected)), 0.01 * np.abs(expected).max())
+    assert (np.abs(off_diagonal(got - expected)) <= least).all()
+
+
+@pytest.mark.parametrize("gap", [5, 10, 20, 50, 100, 200])
+@pytest.mark.parametrize("table", ["six_patch_bare", "six_patch"])
+def test_bars(simulators, table, gap):
+    """Measured against boundary and finite elements."""
+    case = f"bar {gap}" if table == "six_patch_bare" else f"bar_{gap}"
+    if (table, gap) != ("six_patch", 5):  # there is none
+        reading = simulators(table, method="surface").step(cs.Scene([body_of(case)]))
+        assert_close(reading.delta, delta_reference(table, case), 0.03, 0.05)
+
+
+@pytest.mark.parametrize("gap", [5, 10, 20, 50, 100])
+def test_limb_like_capsule(sim, gap):
+    """Measured against ``benchmarks/references.py``."""
+    reading = sim.step(cs.Scene([capsule(gap / 1e3)]))
+    assert_close(reading.delta, capsule_reference(gap), 0.02, 0.03)
+
+
+@pytest.mark.parametrize("kind", ["grounded 1.0", "floating 1.0", "diel 80.0", "diel 3.0"])
+def test_spheres(sim, kind):
+    """Measured against boundary elements with exact spheres."""
+    case = f"sphere {kind}"
+    reading = sim.step(cs.Scene([body_of(case)]))
+    assert_close(reading.delta, delta_reference("six_patch_bare", case), 0.02, 0.03)
+
+
+# -- what must hold ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_scenes(sim, seed):
+    """Invariant: symmetric matrices with physical signs, anywhere, contact included."""
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        scene = random_scene(rng)
+        assert_physical(sim.step(scene).capacitance, 2e-3)
+
+
+def test_a_reading_does_not_depend_on_those_before_it(sim):
+    """Invariant: to the last bit."""
+    scenes = [cs.Scene([ball(z)]) for z in (0.08, 0.045, 0.08)]
+    first, _, third = (sim.step(s).delta for s in scenes)
+    np.testing.assert_array_equal(first, third)
+
+
+def test_smooth_on_the_way_towards_the_sensor(sim):
+    """Measured: a finger in steps of 0.05 mm, where the lattice jumps by some per cent."""
+    turn = (0.1494, 0.2344, 0.1494, 0.9491)
+    heights = np.concatenate([np.arange(0.052, 0.050, -5e-5), np.arange(0.064, 0.062, -5e-5)])
+    read = [
+        np.diag(
+            sim.step(
+                cs.Scene([cs.Body(cs.Capsule(0.008, 0.06), cs.Pose((0.012, 0.007, z), turn))])
+            ).delta
+        )
+        for z in heights
+    ]
+    for part in np.split(np.log(read), 2):
+        large = part[-1] > np.log(0.03) + part[-1].max()
+        assert np.abs(np.diff(part[:, large], 2, axis=0)).max() <= 1e-3
+        assert (np.diff(part[:, part[-1] > np.log(0.1) + part[-1].max()], axis=0) > 0).all()
+
+
+def test_one_step_further_changes_little_down_to_contact(sim):
+    """Measured: no jump where the lattice takes over, some millimetres before contact."""
+    read = [np.diag(sim.step(cs.Scene([ball(0.04 + g)])).delta) for g in np.arange(0.006, 0, -1e-4)]
+    change = np.diff(np.log(np.array(read)[:, [1, 4]]), axis=0)
+    assert change.min() > 0
+    assert change.max() < 0.08
+
+
+@pytest.mark.parametrize(("one", "other"), [(999.0, 1001.0), (9_990.0, 10_010.0)])
+def test_no_permittivity_is_a_threshold(sim, one, other):
+    """Invariant: continuous from insulator to conductor."""
+    read = [
+        sim.step(cs.Scene([ball(0.06, 0.03, material=cs.Material("matter", eps))])).delta
+        for eps in (one, other)
+    ]
+    np.testing.assert_allclose(*read, rtol=2e-3, atol=1e-3 * read[0].max())
+
+
+def test_water_conducts_less_and_less(simulators):
+    """Invariant: tap water's reading falls smoothly with the frequency, from 250 kHz to 100 MHz."""
+    read = []
+    for f in np.geomspace(250e3, 100e6, 12):
+        sim = simulators("six_patch_bare", method="surface", frequency=float(f))
+        read.append(sim.step(cs.Scene([ball(0.06, 0.03, material="water")])).delta[1, 1])
+    steps = np.diff(np.log(read))
+    assert (steps <= 1e-4).all()
+    assert np.abs(steps).max() < 0.35
+
+
+@pytest.mark.parametrize("grounding", ["floating", 1e-12, "grounded"])
+def test_touching_bodies_are_one(sim, grounding):
+    """Measured: two halves equal their union."""
+    halves = [
+        cs.Body(cs.Box((0.03, 0.06, 0.06)), cs.Pose((x, 0, 0.06)), "steel",
+                0.5 * grounding if isinstance(grounding, float) else grounding)
+        for x in (-0.015, 0.015)
+    ]  # fmt: skip
+    whole = cs.Body(cs.Box((0.06, 0.06, 0.06)), cs.Pose((0, 0, 0.06)), "steel", grounding)
+    got, expected = sim.step(cs.Scene(halves)).delta, sim.step(cs.Scene([whole])).delta
+    np.testing.assert_allclose(got, expected, rtol=0, atol=0.01 * expected.max())
+
+
+def test_impedance_to_ground_is_a_divider(sim):
+    """Analytic: ΔC(C_g) = ΔC_float + (ΔC_ground − ΔC_float) C_g / (C_g + C_self)."""
+
+    def read(g):
+        return sim.step(cs.Scene([ball(grounding=g)])).delta
+
+    floating, step = read("floating"), read("grounded") - read("floating")
+    ties = np.array([1e-12, 3e-12, 10e-12])
+    share = np.array([(read(c) - floating)[0, 0] / step[0, 0] for c in ties])
+    own = ties * (1 / share - 1)
+    np.testing.assert_allclose(own, own.mean(), rtol=1e-2)
+
+
+def test_a_limb_that_leaves_the_domain_keeps_its_tie_to_ground(sim):
+    """Invariant: the wall does not ground what passes through it."""
+    arm = [
+        cs.Body(cs.Capsule(0.04, 0.6), cs.Pose((0, 0, 0.08), (0, 0.7071, 0, 0.7071)), "steel", g)
+        for g in ("floating", 1e-10, "grounded")
+    ]
+    floating, tied, grounded = (sim.step(cs.Scene([a])).delta[1, 1] for a in arm)
+    assert floating < 0.9 * grounded
+    assert 0.97 * grounded < tied < grounded
+
+
+def test_what_stands_outside_changes_nothing(sim):
+    """Invariant: to the last bit."""
+    alone = sim.step(cs.Scene([bar(0.02)])).delta
+    outside = cs.Body(cs.Sphere(0.05), cs.Pose((0, 0, 0.7)))
+    np.testing.assert_array_equal(sim.step(cs.Scene([bar(0.02), outside])).delta, alone)
+    np.testing.assert_array_equal(sim.step(cs.Scene([outside])).delta, 0.0)
+
+
+# -- other views ------------------------------------------------------------------------------
+
+
+def test_a_depth_frame_reads_as_what_it_shows(sim):
+    """Measured: a forearm, seen by 64 × 64 pixels and as a capsule."""
+    t = (np.arange(64) + 0.5) / 64 * 0.5 - 0.25
+    _, y = np.meshgrid(t, t)
+    depth = np.where(np.abs(y) < 0.04, 0.06 - np.sqrt(np.maximum(0.04**2 - y**2, 0)), np.nan)
+    seen = sim.step(cs.DepthFrame(depth, "human"))
+    assert seen.stats.unknowns > 0
+    pose = cs.Pose((0, 0, 0.06), (0, 0.7071068, 0, 0.7071068))
+    arm = sim.step(cs.Scene([cs.Body(cs.Capsule(0.04, 0.6), pose)])).delta
+    np.testing.assert_allclose(np.diag(seen.delta), np.diag(arm), rtol=0.02)
+
+
+def test_a_dielectric_depth_image_goes_to_the_lattice(sim, simulators):
+    """Invariant: to the last bit; and there is no Jacobian then."""
+    frame = cs.DepthFrame(np.full((16, 16), 0.05), 3.0, back=0.02)
+    reading = sim.step(frame)
+    assert reading.stats.unknowns == 0
+    expected = simulators("six_patch_bare").step(frame).delta
+    np.testing.assert_array_equal(reading.delta, expected)
+    with pytest.raises(SceneError, match="dielectric given by a depth image"):
+        sim.step(frame, jacobian=True)
+
+
+def test_in_contact_the_lattice_reads(sim):
+    """Invariant: to the last bit, from rest."""
+    scene = cs.Scene([ball(0.041)])
+    expected = PerturbationSolver(sim.background).solve(scene)[0]
+    np.testing.assert_allclose(sim.step(scene).delta, expected, rtol=1e-12)
+
+
+# -- Jacobian, potentials ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating"])
+def test_jacobian_is_the_derivative(sim, grounding):
+    """Measured against central differences."""
+    shape, turn = cs.Capsule(0.03, 0.1), (0.1, 0.6, 0.2, 0.7)
+
+    def read(offset):
+        pose = cs.Pose(np.add((0.01, 0.0, 0.09), offset), turn)
+        return sim.step(cs.Scene([cs.Body(shape, pose, "steel", grounding)]), jacobian=True)
+
+    slope = read((0, 0, 0)).jacobian
+    assert slope.shape == (1, 6, 6, 6)
+    np.testing.assert_allclose(slope, slope.swapaxes(1, 2), atol=1e-9 * np.abs(slope).max())
+    step = 2e-4
+    for k, e in enumerate(step * np.eye(3)):
+        difference = (read(e).delta - read(-e).delta) / (2 * step)
+        worst = np.abs(slope[0, :, :, k] - difference).max()
+        assert worst <= 0.015 * np.abs(slope[0, :, :, :3]).max()
+
+
+def test_jacobian_of_other_methods_is_refused(simulators):
+    with pytest.raises(ValueError, match='use "surface"'):
+        simulators("six_patch_bare").step(cs.Scene(), jacobian=True)
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating"])
+def test_potentials_in_a_conductor(sim, grounding):
+    """Invariant: zero in a grounded body, one value in a floating one."""
+    body = cs.Body(cs.Box((0.15, 0.15, 0.03)), cs.Pose((0, 0, 0.05)), "steel", grounding)
+    sim.step(cs.Scene([body]))
+    potentials, lattice = sim.potentials(), sim.background.lattice
+    held = lattice.owner >= 0
+    np.testing.assert_allclose(potentials[held], np.eye(6)[lattice.owner[held]], atol=1e-12)
+    inside = body.shape.signed_distance(body.pose.inverse().apply(lattice.points)) < -5e-3
+    assert inside.sum() > 20
+    expected = 0.0 if grounding == "grounded" else potentials[inside].mean(axis=0)
+    np.testing.assert_allclose(potentials[inside] - expected, 0.0, atol=0.01)
+
+
+@pytest.mark.parametrize(("name", "value"), [("method", "lattice"), ("preset", "fast")])
+def test_unknown_options(name, value):
+    with pytest.raises(ValueError, match=f"{name} is '{value}'; choose one of"):
+        cs.Simulator("six_patch_bare", **{name: value})
