@@ -42,13 +42,11 @@ def field_cache(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 def simulators(field_cache: Path) -> Simulators:
     """``simulators(design, **options)``: a simulator at rest, the same one for the same call.
 
-    It is reset, so that no test depends on the order of the others. The method is the lattice
-    unless another is asked for; ``test_simulator_surface.py`` is about the default one.
+    It is reset, so that no test depends on the order of the others.
     """
     made: dict[tuple[object, ...], cs.Simulator] = {}
 
     def get(design: cs.Design | str, **options: object) -> cs.Simulator:
-        options.setdefault("method", "perturbation")
         name = design if isinstance(design, str) else design.content_hash()
         key = (name, *sorted((k, repr(v)) for k, v in options.items()))
         if key not in made:

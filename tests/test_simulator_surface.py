@@ -1,4 +1,4 @@
-"""The default method, charges on the bodies: what it reads, how smoothly, where it gives way."""
+"""Charges on the bodies: what the method reads, how smoothly, and where it gives way."""
 
 from __future__ import annotations
 
@@ -27,10 +27,6 @@ Array = np.ndarray
 @pytest.fixture
 def sim(simulators) -> cs.Simulator:
     return simulators("six_patch_bare", method="surface")
-
-
-def test_it_is_the_default():
-    assert cs.Simulator("six_patch_bare").method == "surface"
 
 
 # -- accuracy ---------------------------------------------------------------------------------

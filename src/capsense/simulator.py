@@ -191,9 +191,10 @@ class Simulator:
 
     Args:
         design: A design, a packaged name, or the path of a design file.
-        method: ``"surface"`` (default): charges on the surfaces of the bodies.
-            ``"perturbation"``: the change of the field on a lattice. ``"masked"``: the scheme of
-            Schöffmann et al. 2022, where objects are staircases of tetrahedra, solved in full.
+        method: ``"perturbation"`` (default): the change of the field on a lattice.
+            ``"surface"``: charges on the surfaces of the bodies; more accurate from some
+            millimetres on, smooth, with gradients. ``"masked"``: the scheme of Schöffmann et al.
+            2022, where objects are staircases of tetrahedra, solved in full.
         preset: How finely surfaces are resolved: ``"standard"``, ``"learning"`` (faster, some
             3 % rms) or ``"fine"``.
         tolerance: On the lattice, iterate until a capacitance is known to this [F] …
@@ -214,7 +215,7 @@ class Simulator:
         self,
         design: Design | str | Path,
         *,
-        method: Method = "surface",
+        method: Method = "perturbation",
         preset: PresetName = "standard",
         tolerance: float = 1e-18,
         relative_tolerance: float = 1e-5,

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from capsense._jit import kernel
+from capsense._simd import LANES, load, madd, narrow, splat, store, vadd, vmadd, widen
 from capsense.solve.factor_kernels import factorise
 from capsense.solve.pcg_kernels import add_products, solve
-from capsense._simd import LANES, load, madd, narrow, splat, store, vadd, vmadd, widen
 
 _ZERO = np.float32(0.0)
 

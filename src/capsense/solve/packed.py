@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._simd import LANES, aligned_zeros
 from capsense.field.background import BackgroundField
 from capsense.scene import Scene, TriMesh
 from capsense.scene.layers import Layers
@@ -19,7 +20,6 @@ from capsense.solve.finding_kernels import COUPLE, CUT, ENERGY, LINK, NODE, STOR
 from capsense.solve.load_kernels import Setup
 from capsense.solve.matter_kernels import MATTER
 from capsense.solve.pcg_kernels import Operator
-from capsense._simd import LANES, aligned_zeros
 from capsense.solve.trace_kernels import ROOM
 
 Array = NDArray[np.float64]

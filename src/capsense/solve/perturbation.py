@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._simd import LANES, aligned_zeros
 from capsense.errors import SceneError, SolveError
 from capsense.field.background import BackgroundField
 from capsense.scene import Scene
@@ -20,7 +21,6 @@ from capsense.solve.column_kernels import MAX_STRETCHES, PART
 from capsense.solve.conductors import Conductors
 from capsense.solve.finding_kernels import UNIT
 from capsense.solve.packed import Workspace, pack_bodies, packed_lattice
-from capsense._simd import LANES, aligned_zeros
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
