@@ -148,8 +148,10 @@ def test_replay_is_the_same_to_the_last_bit(recorded: Recorded) -> None:
         {"tolerance": 1e-16, "relative_tolerance": 1e-2},
         {"frequency": 10e6},
         {"method": "masked"},
+        {"method": "surface"},
+        {"method": "surface", "preset": "fine"},
     ],
-    ids=lambda o: next(iter(o)),
+    ids=lambda o: "-".join(o),
 )
 def test_design_and_settings_are_taken_over(
     options: dict[str, object], tmp_path: Path, field_cache: Path
@@ -157,7 +159,8 @@ def test_design_and_settings_are_taken_over(
     """The file is all that a replay needs. With the simulator's defaults it would differ."""
     design, path = tiny_design(), tmp_path / "a.mcap"
     sim = cs.Simulator(design, settings=SETTINGS, cache_dir=field_cache, **options)  # type: ignore[arg-type]
-    plain = cs.Simulator(design, settings=SETTINGS, cache_dir=field_cache)
+    other = {} if "preset" not in options else {"method": "surface"}
+    plain = cs.Simulator(design, settings=SETTINGS, cache_dir=field_cache, **other)
     ball = cs.Body(cs.Sphere(0.012), material="cortical bone")
     differs = False
     with cs.record(path, sim, name="left_wrist") as run:

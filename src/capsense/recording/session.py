@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from capsense.readout.read_out import ReadOut
 from capsense.recording.versions import versions
 from capsense.scenario.channels import Channel, Excitation, channels_of
 from capsense.scenario.model import METHODS
-from capsense.simulator import Reading, Simulator, StepStats
+from capsense.simulator import Method, PresetName, Reading, Simulator, StepStats
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,9 @@ class Session:
     title: str
     """What was recorded, in words."""
     design: Design
-    method: str
+    method: Method
+    """The simulator's."""
+    preset: PresetName
     """The simulator's."""
     tolerance: float
     """The simulator's [F]."""
@@ -76,8 +78,7 @@ class Session:
             FieldError: The background field could not be built.
         """
         return Simulator(
-            self.design, method="masked" if self.method == "masked" else "perturbation",
-            tolerance=self.tolerance, relative_tolerance=self.relative_tolerance,
+            self.design, method=self.method, preset=self.preset, tolerance=self.tolerance, relative_tolerance=self.relative_tolerance,
             frequency=self.frequency, settings=self.settings, cache_dir=cache_dir,
             progress=progress,
         )  # fmt: skip
@@ -112,6 +113,7 @@ class Session:
                 "name": self.name,
                 "title": self.title,
                 "method": self.method,
+                "preset": self.preset,
                 "tolerance_F": self.tolerance,
                 "relative_tolerance": self.relative_tolerance,
                 "frequency_Hz": self.frequency,
@@ -141,7 +143,7 @@ def describe(
     """The session of a simulator as it is."""
     s = simulator
     return Session(
-        name, title, s.design, s.method, s.tolerance, s.relative_tolerance, s.frequency,
+        name, title, s.design, s.method, s.preset, s.tolerance, s.relative_tolerance, s.frequency,
         s.settings, empty, excitation, pairs, readout, versions(),
     )  # fmt: skip
 
@@ -161,13 +163,15 @@ def read_session(text: bytes, design: Design) -> Session:
             )
         given = dict(data["settings"])
         lattice = LatticeSettings(**given.pop("lattice"))
-        if data["method"] not in METHODS or tuple(data["electrodes"]) != design.electrode_names:
+        preset = data.get("preset", "standard")  # older files have none
+        known = data["method"] in METHODS and preset in get_args(PresetName)
+        if not known or tuple(data["electrodes"]) != design.electrode_names:
             raise RecordingError("the recording's settings do not fit its design; it is damaged")
         capacitance = np.array(data["empty_F"], dtype=float)
         coupling = np.array(data["empty_shield_coupling_F"], dtype=float)
         empty = reading_of(design, capacitance, np.zeros_like(capacitance), coupling)
         return Session(
-            data["name"], data["title"], design, data["method"], data["tolerance_F"],
+            data["name"], data["title"], design, data["method"], preset, data["tolerance_F"],
             data["relative_tolerance"], data["frequency_Hz"], BuildSettings(lattice, **given),
             empty, Excitation(data["excitation"]), tuple((a, b) for a, b in data["pairs"]),
             data["readout"], data["versions"],

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 MAX_SAMPLES = 1_000_000
 """A scenario of more samples is refused."""
-METHODS: tuple[Method, ...] = ("perturbation", "masked")
+METHODS: tuple[Method, ...] = ("perturbation", "surface", "masked")
 """The simulator's methods, the default first."""
 
 
