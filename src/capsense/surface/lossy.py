@@ -24,8 +24,9 @@ def solve_lossy(
     """Solve a scene whose energies are complex; what is returned is the part in phase.
 
     Args:
-        records: The bodies, whose real ties and softness are not looked at.
-        ties: Energy of the bodies' net charges [1/m], shape (n,).
+        records: The bodies, whose real softness is not looked at, nor are ties where ``ties`` are
+            finite.
+        ties: Energy of the bodies' net charges [1/m], infinite for floating ones, shape (n,).
         softness: 1 / (eps - 1), shape (n,).
         impedances: Interior impedance of each body, None for conductors.
         green, threshold, width: As in ``solve_kernels.solve``.
@@ -51,7 +52,7 @@ def solve_lossy(
             diagonal[mine] += factor * z[number[mine], number[mine]]
         root = np.flatnonzero((functions.body == b) & net)
         others = np.flatnonzero(net & (records["group"][functions.body] == records["group"][b]))
-        matrix[np.ix_(root, others)] += ties[b] if np.isfinite(ties[b]) else 0.0
+        matrix[np.ix_(root, others)] += ties[b] if np.isfinite(ties[b]) else records["tie"][b]
         diagonal[root] = matrix[root, root]
     clusters = np.where(net, 0, functions.cluster)
     fade = np.where(net, 1.0, cut.fade[clusters])
