@@ -1,0 +1,294 @@
+"""A slow twin of the surface step in NumPy, double precision: panels, matrices, dense algebra.
+
+Takes the free-space blocks of bodies and the design's Green's function as given, and shares no code
+with what comes after them. Metres, 4π eps0 = 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from capsense.field.green import GreenFunction
+from capsense.surface.blocks import free_block, impedance
+from capsense.surface.panels import SurfacePanels
+
+Array = np.ndarray
+SOFT = 0.15
+"""Points of different bodies see 1/r bounded at so many of the larger one's extent."""
+GAIN = 1.3
+"""What functions that are left out stand for, themselves and all below."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A body somewhere."""
+
+    panels: SurfacePanels
+    position: tuple[float, float, float]
+    turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation vector [rad]."""
+    scale: float = 1.0
+    tie: complex = 0.0
+    """Energy of its net charge beyond that of its field [1/m]; infinite if it can have none."""
+    eps_r: complex = np.inf
+    group: int | None = None
+    """Bodies of one group are one conductor, with the tie of each."""
+
+    @property
+    def neutral(self) -> bool:
+        return bool(np.isinf(self.tie))
+
+    @cached_property
+    def block(self) -> Array:
+        """Mean potentials of the panels on each other, of the inside too [1/m]."""
+        free = free_block(self.panels)
+        out = free / self.scale
+        if np.isfinite(self.eps_r):
+            out = out + impedance(self.panels, free) / (self.eps_r - 1.0) / self.scale
+        return out
+
+    @property
+    def rotation(self) -> Array:
+        return Rotation.from_rotvec(self.turned).as_matrix()
+
+
+class Clusters(NamedTuple):
+    """Charge on clusters of panels, each by the centre and the second moments of its charge."""
+
+    points: Array
+    """Shape (k, 4, 3)."""
+    extent: Array
+    owner: Array
+
+
+def galerkin(pieces: tuple[Piece, ...], green: GreenFunction) -> Array:
+    """ΔC with an unknown for every panel, shape (terminals, terminals) [m]."""
+    singles = [np.eye(len(p.panels)) for p in pieces]
+    found = clusters(pieces, singles)
+    matrix = interaction(found, green)
+    matrix = matrix.astype(np.result_type(*(p.block for p in pieces), *(p.tie for p in pieces)))
+    group = np.array([-1 - b if p.group is None else p.group for b, p in enumerate(pieces)])
+    for b, piece in enumerate(pieces):
+        own, joint = found.owner == b, group[found.owner] == group[b]
+        matrix[np.ix_(own, own)] += piece.block
+        matrix[np.ix_(own, joint)] += 0.0 if piece.neutral else piece.tie
+    phi = four_point_mean(found.points, green, "phi0")
+    free = np.unique([g for g, p in zip(group, pieces, strict=True) if p.neutral])
+    net = (group[found.owner][:, None] == free).astype(float)
+    saddle = np.block([[matrix, net], [net.T, np.zeros((len(free),) * 2)]])
+    x = np.linalg.solve(saddle, np.concatenate([phi, np.zeros((len(free), phi.shape[1]))]))
+    return phi.T @ x[: len(phi)]
+
+
+def interaction(found: Clusters, green: GreenFunction) -> Array:
+    """Mean potentials of clusters on each other but for those of a body on itself [1/m]."""
+    psi = four_point_mean(found.points, green, "psi")
+    image = found.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
+    other = found.owner[:, None] != found.owner
+    between = np.where(other, inverse_distances(found.points, found.points, found.extent), 0.0)
+    return between - inverse_distances(found.points, image, found.extent) - psi @ psi.T
+
+
+def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
+    """Means of ``green.psi`` or ``phi0``; near gives way to far by a cluster's centre."""
+    share = green.share(points.mean(axis=1))[:, None]
+    near, far = replace(green, blend=(1e8, 1e9)), replace(green, blend=(-2.0, -1.0))
+    each = [getattr(g, name)(points.reshape(-1, 3)) for g in (near, far)]
+    first, second = (values.reshape(len(points), 4, -1).mean(axis=1) for values in each)
+    return share * first + (1 - share) * second
+
+
+def inverse_distances(points: Array, others: Array, extent: Array) -> Array:
+    """Means over four points each of a bounded 1/r, shape (k, k)."""
+    square = ((points[:, None, :, None] - others[None, :, None]) ** 2).sum(axis=-1)
+    bound = (SOFT * np.maximum(extent[:, None], extent)) ** 4
+    return ((square**2 + bound[:, :, None, None]) ** -0.25).mean(axis=(2, 3))
+
+
+def clusters(pieces: tuple[Piece, ...], charges: list[Array]) -> Clusters:
+    """Place clusters; ``charges`` has, body by body, a column of panel charges for each."""
+    points, extent, owner = [], [], []
+    for b, (piece, columns) in enumerate(zip(pieces, charges, strict=True)):
+        for column in columns.T:
+            center, second = charge_moments(piece.panels, column)
+            local, size = rectangle(center, second)
+            points.append(piece.scale * local @ piece.rotation.T + piece.position)
+            extent.append(piece.scale * size)
+            owner.append(b)
+    return Clusters(np.array(points), np.array(extent), np.array(owner))
+
+
+def charge_moments(panels: SurfacePanels, charge: Array) -> tuple[Array, Array]:
+    """Centre [m] and second central moments [m²] of charge on panels, shapes (3,) and (3, 3)."""
+    weight = charge / charge.sum()
+    center = weight @ panels.centers
+    off = panels.centers - center
+    return center, np.einsum("n,nij->ij", weight, panels.moments) + (off.T * weight) @ off
+
+
+def rectangle(center: Array, second: Array) -> tuple[Array, float]:
+    """Four points with the two largest second moments, and the length of a rod with the first."""
+    size, axes = np.linalg.eigh(second)
+    arms = axes[:, 1:] * np.sqrt(np.maximum(size[1:], 0.0))
+    signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+    return center + signs @ arms.T, float(np.sqrt(12.0 * size[2]))
+
+
+# ---- charge functions ----
+
+
+def members(kids: Array, panel: Array) -> list[Array]:
+    """Panels in each cluster, sorted."""
+    out: list[Array] = [np.empty(0, int)] * len(kids)
+    for k in range(len(kids) - 1, -1, -1):
+        if kids[k, 0] < 0:
+            out[k] = np.array([panel[k]])
+        else:
+            out[k] = np.sort(np.concatenate([out[kids[k, 0]], out[kids[k, 1]]]))
+    return out
+
+
+def shares(kids: Array, panel: Array, charge: Array) -> Array:
+    """The equilibrium ``charge`` (n,) within each cluster, as a column of sum one, (n, 2 n - 1)."""
+    out = np.zeros((len(charge), len(kids)))
+    for k, own in enumerate(members(kids, panel)):
+        out[own, k] = charge[own] / charge[own].sum()
+    return out
+
+
+def haar(kids: Array, panel: Array, charge: Array) -> Array:
+    """Columns: equilibrium charge; then, cluster by cluster, one part minus the other, (n, n)."""
+    share = shares(kids, panel, charge)
+    split = kids[:, 0] >= 0
+    return np.column_stack([share[:, 0], share[:, kids[split, 0]] - share[:, kids[split, 1]]])
+
+
+class Chosen(NamedTuple):
+    """What is solved for, of one body."""
+
+    leaves: Array
+    """Clusters that are not split."""
+    functions: Array
+    """Clusters that are split."""
+    fade: Array
+    """How far the functions are faded in."""
+    above: Array
+    """The same of the cluster above."""
+
+
+def reduced(
+    pieces: tuple[Piece, ...],
+    trees: list[tuple[Array, Array, Array]],
+    chosen: list[Chosen],
+    green: GreenFunction,
+) -> tuple[Array, Array]:
+    """ΔC and the part of it that is estimated, from chosen functions (kids, panel, charge)."""
+    share = [shares(*tree) for tree in trees]
+    found = clusters(pieces, [s[:, c.leaves] for s, c in zip(share, chosen, strict=True)])
+    columns, blocks, fade, above = [], [], [], []
+    for b, (piece, tree, all_of, cut) in enumerate(zip(pieces, trees, share, chosen, strict=True)):
+        kids = tree[0]
+        haars = all_of[:, kids[cut.functions, 0]] - all_of[:, kids[cut.functions, 1]]
+        start = [] if piece.neutral else [0]
+        functions = np.column_stack([*(all_of[:, [k]] for k in start), haars])
+        # a function is a sum of the equilibrium charges of leaves
+        own = np.flatnonzero(found.owner == b)
+        spread = np.zeros((len(found.owner), functions.shape[1]))
+        spread[own] = [functions[all_of[:, leaf] > 0].sum(axis=0) for leaf in cut.leaves]
+        columns.append(spread)
+        block = functions.T @ piece.block @ functions
+        for k in start:
+            block[k, k] += piece.tie
+        blocks.append(block)
+        fade.append(np.concatenate([[1.0] * len(start), cut.fade]))
+        above.append(np.concatenate([[1.0] * len(start), cut.above]))
+    to_leaves = np.concatenate(columns, axis=1)
+    matrix = to_leaves.T @ interaction(found, green) @ to_leaves
+    at = np.cumsum([0, *(len(b) for b in blocks)])
+    for b, block in enumerate(blocks):
+        matrix[at[b] : at[b + 1], at[b] : at[b + 1]] += block
+    phi = to_leaves.T @ four_point_mean(found.points, green, "phi0")
+    t, parent = np.concatenate(fade), np.concatenate(above)
+    root = np.sqrt(t)
+    faded = root[:, None] * matrix * root
+    np.fill_diagonal(faded, np.diag(matrix))
+    x = root[:, None] * np.linalg.solve(faded, root[:, None] * phi)
+    lack = GAIN * (1 - t) * (1 - (1 - parent) ** 4) / np.diag(matrix)
+    residual = phi - matrix @ x
+    left = residual.T @ (lack[:, None] * residual)
+    return phi.T @ x + left, left
+
+
+# ---- scores ----
+
+COARSE, LINEAR, DECAY, LEAST = 31, 0.3, 0.35, 3e-3
+
+
+def scores(
+    pieces: tuple[Piece, ...], trees: list[tuple[Array, Array, Array]], green
+) -> list[Array]:
+    """Share of the electrodes' energies that each split takes up alone, raised from below."""
+    seen, stiff = [], []
+    energy = np.zeros(green.far_phi.shape[1])
+    for piece, (kids, panel, charge) in zip(pieces, trees, strict=True):
+        share = shares(kids, panel, charge)
+        block = free_block(piece.panels) / piece.scale
+        means = _means(piece, kids, share, green)
+        own = np.zeros(len(kids))
+        for k, value in means.items():
+            x, y = kids[k]
+            if x >= 0 and x in means:
+                function = share[:, x] - share[:, y]
+                own[k] = function @ block @ function
+                p = share[members_of(share, x), k].sum()
+                means[k] = p * means[x] + (1 - p) * means[y]
+                value = means[x] - means[y]
+                energy += value**2 / own[k]
+        if not piece.neutral:
+            energy += means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.tie)
+        seen.append(means)
+        stiff.append(own)
+    weight = 1 / (energy + 0.01 * np.linalg.norm(energy))
+    out = []
+    for means, own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
+        score = np.zeros(len(kids))
+        for k in means:
+            if own[k] > 0:
+                x, y = kids[k]
+                value = weight @ (means[x] - means[y]) ** 2 / own[k]
+                for below in (score[x], score[y]):
+                    value = max(value, below) + 0.5 * min(value, below)
+                score[k] = value
+        for k in range(len(kids)):
+            for part in kids[k]:
+                if part >= 0 and kids[part, 0] >= 0 and kids[part, 0] not in means:
+                    score[part] = DECAY * score[k]
+        out.append(score)
+    return out
+
+
+def members_of(share: Array, cluster: int) -> Array:
+    return np.flatnonzero(share[:, cluster])
+
+
+def _means(piece: Piece, kids: Array, share: Array, green: GreenFunction) -> dict[int, Array]:
+    """Potentials in the centres of the clusters that are looked into, finest first."""
+    sources = green.far_sources.astype(float)
+    image = sources * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
+    out = {}
+    wanted = [0]
+    for k in wanted:
+        center, second = charge_moments(piece.panels, share[:, k])
+        point = piece.scale * piece.rotation @ center + piece.position
+        size = piece.scale * np.sqrt(12.0 * max(np.linalg.eigvalsh(second)[2], 0.0))
+        near = 1 / np.maximum(np.linalg.norm(point - sources, axis=1), LEAST)
+        out[k] = (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
+        small = k >= COARSE and size < LINEAR * green.distance(point[None])[0]
+        if kids[k, 0] >= 0 and not small:
+            wanted += kids[k].tolist()
+    return {k: out[k] for k in sorted(out, reverse=True)}
