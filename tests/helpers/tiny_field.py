@@ -20,6 +20,7 @@ from capsense.design.loader import parse_design
 from capsense.field import background
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.cache import load_or_build
+from capsense.field.green import to_arrays
 from capsense.field.lattice import LatticeSettings
 
 SETTINGS = BuildSettings(LatticeSettings().refined(0.5), panel_scale=8.0)
@@ -53,6 +54,7 @@ def arrays(field: BackgroundField) -> dict[str, np.ndarray]:
         "weights": la.weights, "eps_r": la.eps_r, "owner": la.owner, "kink": la.kink,
         "half_weights": field.half_weights, "potentials": field.potentials,
         "capacitance": field.capacitance,
+        **{f"green {name}": values for name, values in to_arrays(field.green).items()},
     }  # fmt: skip
     return {**out, **{f"cut {k}": v for k, v in vars(la.cuts).items()}}
 

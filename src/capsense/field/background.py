@@ -21,12 +21,13 @@ from capsense.field.boundary import (
     terminals,
 )
 from capsense.field.calibration import calibrate, half_link_weights
+from capsense.field.green import GreenFunction, build_green, from_arrays, to_arrays
 from capsense.field.lattice import Lattice, LatticeSettings, build_lattice
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 5
+NUMERICS = 6
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 
@@ -63,6 +64,8 @@ class BackgroundField:
     """Names: electrodes in matrix order, then shields, then floating conductors."""
     n_panels: int
     """Size of the boundary-element system."""
+    green: GreenFunction
+    """Answer of the grounded design to charges anywhere, and the terminals' potentials."""
 
 
 class Checkpoint(Protocol):
@@ -115,7 +118,7 @@ def build_background(
     tell("done", 1.0)
     return BackgroundField(
         replace(lattice, weights=weights), half, potentials, charges.capacitance,
-        tuple(terminals(design)), len(charges.densities),
+        tuple(terminals(design)), len(charges.densities), charges.green,
     )  # fmt: skip
 
 
@@ -131,6 +134,7 @@ class _Charges:
     """Charge densities [C/m²] on the panels, a column for each terminal, (panels, terminals)."""
     capacitance: Array
     """Maxwell matrix [F] of the terminals."""
+    green: GreenFunction
 
 
 class _Evaluator(BoundarySolution):
@@ -150,18 +154,19 @@ def _solve_charges(
     found = kept.load("charges")
     if found is not None:
         model = build_model(design, accuracy)
-        densities, capacitance = found["densities"], found["capacitance"]
+        densities, capacitance = found.pop("densities"), found.pop("capacitance")
         if densities.shape == (len(model.panels), n) and capacitance.shape == (n, n):
-            return _Charges(_Evaluator(design, model), densities, capacitance)
-    fractions = iter((0.02, 0.10))  # at the start of the matrix and of its factorisation
-    solution = BoundarySolution(design, accuracy, lambda text: tell(text, next(fractions, 0.10)))
+            return _Charges(_Evaluator(design, model), densities, capacitance, from_arrays(found))
+    fractions = iter((0.02, 0.06))  # at the start of the matrix and of its factorisation
+    solution = BoundarySolution(design, accuracy, lambda text: tell(text, next(fractions, 0.06)))
     densities = solution.densities(np.eye(n))
     capacitance = solution.terminal_charges(densities)
     capacitance = 0.5 * (capacitance + capacitance.T)
     _require_finite(design, densities, capacitance)
-    kept.save("charges", densities=densities, capacitance=capacitance)
+    green = build_green(solution, densities, lambda text: tell(text, 0.12))
+    kept.save("charges", densities=densities, capacitance=capacitance, **to_arrays(green))
     # the factorised matrix is large, and no longer needed
-    return _Charges(_Evaluator(design, solution.model), densities, capacitance)
+    return _Charges(_Evaluator(design, solution.model), densities, capacitance, green)
 
 
 def _node_potentials(

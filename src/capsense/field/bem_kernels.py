@@ -317,3 +317,30 @@ def normal_gradient_matrix(rows, floor, edges, first, normals, centers, diameter
                 rows[k], j, floor, edges, first, normals, centers, diameters, quad, weights, grad
             )
     return out
+
+
+@njit(cache=True, parallel=True)
+def flux_matrix(points, rows, floor, edges, first, normals, centers, diameters, quad, weights):
+    """Return n · ∇ of 1 / |x − point| integrated over x on panels ``rows``, shape (points, rows).
+
+    The grounded plane z = ``floor`` is met by an image of each point.
+    """
+    n, m = points.shape[0], rows.shape[0]
+    out = np.empty((n, m))
+    for i in prange(n):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        grad = np.empty(3)
+        for k in range(m):
+            j, total = rows[k], 0.0
+            for image in range(2):
+                sign = 1.0 if image == 0 else -1.0
+                zs = z if image == 0 else 2.0 * floor - z
+                _panel_gradient(
+                    j, edges, first, normals, centers, diameters, quad, weights, x, y, zs, grad
+                )
+                # the gradient with respect to the point is minus that with respect to the panel
+                total -= sign * (
+                    grad[0] * normals[j, 0] + grad[1] * normals[j, 1] + grad[2] * normals[j, 2]
+                )
+            out[i, k] = total
+    return out

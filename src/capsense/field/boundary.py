@@ -286,12 +286,20 @@ class BoundarySolution:
         driven = owner >= 0
         rhs[driven] = potentials[owner[driven]]
         if sources is not None:
-            conductor = owner != INTERFACE
-            value, grad = _point_fields(self.model, sources)
-            rhs[conductor] -= value[conductor]
-            # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
-            rhs[~conductor] += self._contrast[~conductor, None] * grad[~conductor]
+            rhs += self._source_terms(sources)
         return 4 * math.pi * EPS0 * scipy.linalg.lu_solve(self._lu, rhs)
+
+    def _source_terms(self, sources: Array) -> Array:
+        """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
+        panels, floor = self.model.panels, self.model.floor
+        points = np.ascontiguousarray(sources)
+        rhs = -kernels.potential_matrix(points, floor, *panels.kernel_args).T
+        rows = np.flatnonzero(self.model.owner == INTERFACE)
+        if len(rows):
+            # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
+            flux = kernels.flux_matrix(points, rows, floor, *panels.kernel_args)
+            rhs[rows] = self._contrast[rows, None] * flux.T
+        return rhs / panels.areas[:, None]
 
     def terminal_charges(self, densities: Array) -> Array:
         """Free charge [C] on each terminal, shape (terminals, k)."""
@@ -321,18 +329,3 @@ class BoundarySolution:
             )
             out[start : start + chunk] = matrix @ scaled
         return out
-
-
-def _point_fields(model: BoundaryModel, sources: Array) -> tuple[Array, Array]:
-    """Potential and normal gradient at panel centres of unit 1/r sources and their images."""
-    centers, normals = model.panels.centers, model.panels.normals
-    images = sources.copy()
-    images[:, 2] = 2 * model.floor - images[:, 2]
-    value = np.zeros((len(centers), len(sources)))
-    grad = np.zeros_like(value)
-    for points, sign in ((sources, 1.0), (images, -1.0)):
-        d = centers[:, None] - points[None]
-        r = np.sqrt((d**2).sum(axis=2))
-        value += sign / r
-        grad -= sign * np.einsum("nkd,nd->nk", d, normals) / r**3
-    return value, grad

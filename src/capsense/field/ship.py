@@ -12,7 +12,8 @@ import logging
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from capsense.design.loader import available_designs, load_design, parse_design
 from capsense.errors import FieldError
 from capsense.field.background import BuildSettings, build_background
 from capsense.field.cache import cache_key, default_cache_dir, default_settings, load_or_build
+from capsense.field.green_points import GreenSettings
 from capsense.field.lattice import LatticeSettings
 from capsense.field.store import load_background, read_arrays, save_background
 
@@ -134,7 +136,8 @@ def fingerprint() -> list[float]:
     la = field.lattice
     whole = [la.n_nodes, la.weights.sum(), field.half_weights.sum(), la.eps_r.sum()]
     rough = (*field.capacitance.ravel(), *field.potentials.sum(axis=0), *whole)
-    return [float(f"{value:.8e}") for value in rough]
+    sizes = chain.from_iterable(np.atleast_1d(v) for v in astuple(GreenSettings()))
+    return [float(f"{value:.8e}") for value in (*rough, *sizes)]
 
 
 def _source_hash() -> str:

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from capsense.errors import FieldError
 from capsense.field.background import BackgroundField
+from capsense.field.green import TABLES, from_arrays, to_arrays
 from capsense.field.lattice import Cuts, Joints, Lattice, Storey
 
-FORMAT = 3
+FORMAT = 4
 """Version of the stored form; part of the cache key."""
 
 _DIGEST = hashlib.sha256().digest_size
@@ -135,7 +136,7 @@ def save_background(
         OSError: The file could not be written; nothing is left behind.
         FieldError: The field is not finite.
     """
-    la = field.lattice
+    la, green = field.lattice, to_arrays(field.green)
     real = np.dtype("<f4" if compact else "<f8")
     arrays = {
         **{
@@ -150,8 +151,13 @@ def save_background(
         "half_weights": field.half_weights, "capacitance": field.capacitance,
         "weights": _byte_planes(la.weights.astype(real)),
         "potentials": _byte_planes(field.potentials.T.astype(real)),
+        **{
+            f"green_{name}": _byte_planes(values.T) if name in TABLES else values
+            for name, values in green.items()
+        },
     }  # fmt: skip
-    if not (np.isfinite(la.weights).all() and np.isfinite(field.potentials).all()):
+    packed = (la.weights, field.potentials, *green.values())
+    if not all(np.isfinite(values).all() for values in packed):
         raise FieldError(f"the field is not finite; it is not stored in {path}")
     meta = {
         **(note or {}),
@@ -186,10 +192,17 @@ def to_background(arrays: Arrays, meta: Mapping[str, Any]) -> BackgroundField:
         arrays["owner"].astype(np.int64), arrays["kink"],
         Cuts(*(arrays[f"cut_{name}"] for name in _CUTS)),
     )  # fmt: skip
+    green = {
+        name.removeprefix("green_"): values
+        for name, values in arrays.items()
+        if name.startswith("green_")
+    }
+    green.update({name: _from_byte_planes(green[name]).T for name in TABLES})
     return BackgroundField(
         lattice, arrays["half_weights"],
         np.ascontiguousarray(_from_byte_planes(arrays["potentials"]).T),
         arrays["capacitance"], tuple(meta["terminals"]), int(meta["n_panels"]),
+        from_arrays(green),
     )  # fmt: skip
 
 

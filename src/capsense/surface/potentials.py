@@ -36,7 +36,7 @@ class PotentialMap:
             self._psi = np.concatenate(
                 [self._green.psi(self._points[k : k + _PART]).astype(np.float32) for k in parts]
             )
-        charge = solution.charge
+        charge = solution.charge[:, : self._green.near_phi.shape[1]]
         leaves = solution.points.reshape(-1, 3)
         spread = np.repeat(0.25 * charge, 4, axis=0)
         modes = self._green.psi(leaves).T @ spread

@@ -1,0 +1,287 @@
+"""Compact Green's function of a grounded design.
+
+With all terminals of a design at 0 V, a unit charge at q makes the potential G(p, q) =
+1/|p − q| + g(p, q) at p, in units where 4π eps0 = 1. g is the answer of the floor, which is that of
+the image q* of the charge in it, and of everything else, which lowers the potential further:
+
+  g(p, q) = −1/|p − q*| − ψ(p)·ψ(q)
+
+The modes ψ_k, and the potentials φ⁰_i of the terminals, are those of a few hundred point charges s,
+each with its image in the floor, where no body can be: behind the electrodes, inside of layers and
+housings, and outside of the walls. Farther from the sensor fewer charges and fewer modes do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from capsense.errors import FieldError
+from capsense.field.boundary import BoundarySolution
+from capsense.field.green_points import (
+    GreenSettings,
+    Surroundings,
+    design_box,
+    far_points,
+    outside,
+    training_points,
+    wall_sources,
+)
+
+Array = NDArray[np.float64]
+Table = NDArray[np.float32]
+
+TABLES = ("near_sources", "near_modes", "near_phi", "far_sources", "far_modes", "far_phi")
+"""Fields of a :class:`GreenFunction` in single precision."""
+
+_MIDDLE = 0.05
+"""Beyond this distance from the design [m], errors count less and less."""
+
+
+@dataclass(frozen=True, eq=False)
+class GreenFunction:
+    """The grounded Green's function of a design and the potentials of its terminals.
+
+    All tables are single precision and contiguous. With b_s(p) = 1/|p − s| − 1/|p − s*|, s* the
+    image of s in the floor, ψ_k(p) = Σ_s b_s(p) modes[s, k] and φ⁰_i(p) = Σ_s b_s(p) phi[s, i].
+    """
+
+    floor: float
+    """Height of the grounded floor [m]."""
+    near_sources: Table
+    """Point charges of the near representation [m], shape (s, 3)."""
+    near_modes: Table
+    """Coefficients of the modes ψ [m^½], those that reach farthest first, shape (s, modes)."""
+    near_phi: Table
+    """Coefficients of the potentials φ⁰ with a terminal at 1 V [V·m], shape (s, terminals)."""
+    far_sources: Table
+    """Point charges of the far representation [m], shape (f, 3)."""
+    far_modes: Table
+    """Coefficients of the first modes, shape (f, far modes); the others are zero far away."""
+    far_phi: Table
+    """Coefficients of the potentials φ⁰, shape (f, terminals)."""
+    box: Array
+    """Lower and upper corner of electrodes, conductors and layers [m], shape (2, 3)."""
+    blend: Array
+    """Distances from ``box`` where the far representation starts, the near one ends [m], (2,)."""
+    clearance: float
+    """Distance from the design's surfaces down to which the modes were fitted [m]."""
+    misfit: float
+    """Relative difference of ψ·ψ from the boundary elements, point by point, over all pairs.
+
+    It overstates by far what it costs a capacitance, which sees averages over bodies.
+    """
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes of the near representation."""
+        return self.near_modes.shape[1]
+
+    def distance(self, points: Array) -> Array:
+        """Distance from ``box`` [m], zero inside, shape (n, 3) -> (n,)."""
+        return outside(self.box, points)
+
+    def share(self, points: Array) -> Array:
+        """Share of the near representation: 1 near, 0 far, a smoothstep between, (n,)."""
+        start, end = self.blend
+        t = np.clip((end - self.distance(points)) / (end - start), 0.0, 1.0)
+        return t * t * (3 - 2 * t)
+
+    def psi(self, points: Array) -> Array:
+        """Modes at points [m], shape (n, 3) -> (n, modes)."""
+        share = self.share(points)[:, None]
+        out = share * (basis(points, self.near_sources, self.floor) @ self.near_modes)
+        far = basis(points, self.far_sources, self.floor) @ self.far_modes
+        out[:, : far.shape[1]] += (1 - share) * far
+        return out
+
+    def phi0(self, points: Array) -> Array:
+        """Potential [V] of each terminal at 1 V, others at 0, shape (n, 3) -> (n, terminals)."""
+        share = self.share(points)[:, None]
+        near = basis(points, self.near_sources, self.floor) @ self.near_phi
+        far = basis(points, self.far_sources, self.floor) @ self.far_phi
+        return share * near + (1 - share) * far
+
+    def g(self, p: Array, q: Array) -> Array:
+        """Potential at p of the design's answer to unit charges at q [1/m], (n, 3), (m, 3)."""
+        images = q * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * self.floor]
+        return -1 / _distances(p, images) - self.psi(p) @ self.psi(q).T
+
+
+def basis(points: Array, sources: NDArray[np.floating], floor: float) -> Array:
+    """Potential of unit charges and their images in the floor [1/m], (n, 3), (s, 3) -> (n, s)."""
+    s = sources.astype(np.float64)
+    images = s * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * floor]
+    return 1 / _distances(points, s) - 1 / _distances(points, images)
+
+
+_FINE = 1e-11
+"""Regularisation of the fit of φ⁰, whose errors count relative to itself."""
+
+
+def build_green(
+    solution: BoundarySolution,
+    densities: Array,
+    progress: Callable[[str], None] = lambda _: None,
+    settings: GreenSettings | None = None,
+) -> GreenFunction:
+    """Fit the compact Green's function of a design to its boundary elements.
+
+    Args:
+        solution: The factorised boundary elements.
+        densities: Their densities with each terminal at 1 V in turn, shape (panels, terminals).
+        progress: Called with what is being done.
+        settings: Sizes; default :class:`GreenSettings`.
+
+    Raises:
+        FieldError: The result is not finite.
+    """
+    settings = settings or GreenSettings()
+    model, design = solution.model, solution.design
+    floor = model.floor
+    progress("response to charges: where")
+    surface = Surroundings(design, model)
+    walls = wall_sources(design, settings)
+    near, far = (
+        np.concatenate([surface.sources(count, spacing, settings.depth), walls])
+        for count, spacing in (
+            (settings.near_sources, settings.near_spacing),
+            (settings.far_sources, settings.far_spacing),
+        )
+    )
+    points, distances = training_points(surface, near, settings)
+    progress("response to charges: boundary elements")
+    answer = solution.densities(np.zeros((model.n_terminals, len(points))), points)
+    response = -solution.potential(points, answer)
+    phi = solution.potential(points, densities)
+    progress("response to charges: fit")
+    weight = _weight(distances)
+    wanted = 0.5 * (response + response.T) * weight * weight.T
+    fit = _Fit(basis(points, near, floor) * weight, settings.regularisation)
+    modes = fit.factor(wanted, settings.modes)
+    near_phi = _fit_relative(points, near, floor, phi)
+
+    away, distances = far_points(surface, near, settings)
+    far_weight = _weight(distances)
+    there = basis(away, near, floor) * far_weight
+    psi = fit.matrix @ (modes * fit.scale[:, None])
+    n_far = min(settings.far_modes, modes.shape[1])
+    turn = _turn(there @ modes, psi, n_far)
+    modes, psi = modes @ turn, psi @ turn
+    misfit = float(np.linalg.norm(wanted - psi @ psi.T) / np.linalg.norm(wanted))
+    far_fit = _Fit(basis(away, far, floor) * far_weight, settings.regularisation)
+    far_modes = far_fit.solve(there @ modes[:, :n_far])
+    far_phi = _fit_relative(away, far, floor, basis(away, near, floor) @ near_phi)
+    tables = (
+        near, _rounded(modes), _rounded(near_phi),
+        far, _rounded(far_modes), _rounded(far_phi),
+    )  # fmt: skip
+    if not all(np.isfinite(t).all() for t in tables):
+        raise FieldError(f"the Green's function of design {design.name!r} is not finite")
+    numbers = {
+        "floor": floor, "box": design_box(design), "blend": settings.blend,
+        "clearance": settings.clearance, "misfit": misfit,
+    }  # fmt: skip
+    return from_arrays({**dict(zip(TABLES, tables, strict=True)), **numbers})
+
+
+def to_arrays(green: GreenFunction) -> dict[str, NDArray[Any]]:
+    """All of a Green's function by the names of its fields."""
+    return {name: np.asarray(value) for name, value in vars(green).items()}
+
+
+def from_arrays(arrays: Mapping[str, Any]) -> GreenFunction:
+    """Undo :func:`to_arrays`; tables of any precision become single precision.
+
+    Raises:
+        KeyError: A field is missing.
+    """
+
+    def table(name: str) -> Table:
+        return np.ascontiguousarray(arrays[name], dtype=np.float32)
+
+    return GreenFunction(
+        float(arrays["floor"]),
+        table("near_sources"), table("near_modes"), table("near_phi"),
+        table("far_sources"), table("far_modes"), table("far_phi"),
+        np.array(arrays["box"], dtype=float), np.array(arrays["blend"], dtype=float),
+        float(arrays["clearance"]), float(arrays["misfit"]),
+    )  # fmt: skip
+
+
+def _weight(distances: Array) -> Array:
+    """What errors count at distances from the design, shape (n, 1)."""
+    return (np.sqrt(distances + 2e-3) / (1 + distances / _MIDDLE))[:, None]
+
+
+def _rounded(table: Array) -> Table:
+    """Single precision with 11 binary digits, which pack well.
+
+    Capacitances change by up to 2e-4 with it, in all poses alike: nothing becomes less smooth.
+    """
+    bits = np.ascontiguousarray(table, dtype=np.float32).view(np.int32)
+    return ((bits + (1 << 11)) & ~((1 << 12) - 1)).view(np.float32)
+
+
+# -- fit ---------------------------------------------------------------------------------------
+
+
+class _Fit:
+    """Regularised least squares for the charges of given weighted potentials."""
+
+    def __init__(self, matrix: Array, regularisation: float) -> None:
+        self.scale = np.linalg.norm(matrix, axis=0)
+        self.matrix = matrix / self.scale
+        gram = self.matrix.T @ self.matrix
+        gram[np.diag_indices_from(gram)] += regularisation * np.linalg.norm(gram)
+        self.lower = np.linalg.cholesky(gram)
+
+    def solve(self, values: Array) -> Array:
+        """Charges that make weighted potentials, shape (points, k) -> (sources, k)."""
+        found = scipy.linalg.cho_solve((self.lower, True), self.matrix.T @ values)
+        return found / self.scale[:, None]
+
+    def factor(self, kernel: Array, rank: int) -> Array:
+        """Charges X of the leading modes of a symmetric kernel, near (B X) (B X)ᵀ."""
+        half = self.matrix.T @ (kernel @ self.matrix)
+        half = scipy.linalg.solve_triangular(self.lower, half, lower=True)
+        half = scipy.linalg.solve_triangular(self.lower, half.T, lower=True)
+        first = max(0, len(half) - rank)
+        value, vector = scipy.linalg.eigh(
+            0.5 * (half + half.T), subset_by_index=(first, len(half) - 1)
+        )
+        keep = value > 1e-9 * value[-1]
+        modes = vector[:, keep] * np.sqrt(value[keep])
+        found = scipy.linalg.solve_triangular(self.lower, modes, lower=True, trans="T")
+        return found / self.scale[:, None]
+
+
+def _fit_relative(points: Array, sources: Array, floor: float, phi: Array) -> Array:
+    """Charges that make potentials ``phi`` (points, k), errors counting relative to them."""
+    relative = 1 / (np.abs(phi).max(axis=1, keepdims=True) + 1e-4)
+    return _Fit(basis(points, sources, floor) * relative, _FINE).solve(phi * relative)
+
+
+def _turn(far: Array, near: Array, count: int) -> Array:
+    """Orthogonal matrix (modes, modes) that sorts modes by what they are worth.
+
+    The first ``count`` columns hold as much as can be of the values ``far`` (points, modes), the
+    others are sorted by the values ``near``.
+    """
+    turn = np.eye(far.shape[1])
+    for values, first in ((far, 0), (near, count)):
+        rest = values @ turn[:, first:]
+        vector = np.linalg.eigh(rest.T @ rest)[1][:, ::-1]
+        turn[:, first:] = turn[:, first:] @ vector
+    return turn
+
+
+def _distances(p: Array, q: Array) -> Array:
+    """Distances between points [m], (n, 3), (m, 3) -> (n, m)."""
+    square = sum((p[:, None, a] - q[None, :, a]) ** 2 for a in range(3))
+    return np.sqrt(square)

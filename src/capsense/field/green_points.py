@@ -1,0 +1,237 @@
+"""Where the point charges of a Green's function lie, and the points that they are fitted at.
+
+Charges lie where no body can be: behind sheets, on the side with less of a view, inside of layers
+and housings, and outside of the walls. Points of the fit lie where bodies can be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from capsense.design.model import Design
+from capsense.field.boundary import INTERFACE, BoundaryModel
+from capsense.field.openness import free_path, openness
+
+Array = NDArray[np.float64]
+
+_OPEN = 0.3
+"""Bodies can be where the openness is larger."""
+_RIM = 0.45
+CROWD = 1.0
+"""Behind free rims, which bodies can pass, the openness is larger."""
+
+
+@dataclass(frozen=True)
+class GreenSettings:
+    """Sizes of the representation; the defaults are those of all stored fields."""
+
+    near_sources: int = 800
+    """Largest number of point charges behind the sensor, near representation."""
+    near_spacing: float = 2.4e-3
+    """Smallest distance of neighbouring point charges, near representation [m]."""
+    far_sources: int = 220
+    """As ``near_sources``, far representation."""
+    far_spacing: float = 4.5e-3
+    """As ``near_spacing``, far representation [m]."""
+    depth: float = 0.9
+    """Depth of the point charges behind the surfaces, in spacings."""
+    modes: int = 180
+    """Largest number of modes."""
+    far_modes: int = 80
+    """Largest number of modes far away."""
+    wall_grid: int = 5
+    """Point charges along each edge of a wall."""
+    wall_offset: float = 0.04
+    """Distance of point charges from the walls [m]."""
+    training: int = 800
+    """Points that the modes are fitted at, besides three for each near source."""
+    wide: int = 1200
+    """How many more there are all over the domain, where potentials are small."""
+    far_training: int = 3000
+    """Points that the far representation is fitted at, to the near one."""
+    clearance: float = 2e-3
+    """Smallest distance of these points from the design [m]."""
+    blend: tuple[float, float] = (0.012, 0.018)
+    """Distances where the far representation starts and the near one ends [m]."""
+    regularisation: float = 4e-9
+    """Squared singular values below this share of the largest count for little."""
+
+
+class Surroundings:
+    """Points all over the surfaces that bodies see, and from which side."""
+
+    def __init__(self, design: Design, model: BoundaryModel) -> None:
+        self.design = design
+        panels = model.panels
+        lower, upper = design.domain.lower, design.domain.upper
+        edge = np.minimum(panels.centers - lower, upper - panels.centers)
+        inner = np.flatnonzero(edge.min(axis=1) > 1e-6)
+        up, down = (
+            openness(design, panels.centers[inner] + sign * 1e-3 * panels.normals[inner])
+            for sign in (1, -1)
+        )
+        up_front = (model.owner[inner] == INTERFACE) | (up >= down)
+        seen = np.where(up_front, up, down) > _OPEN  # others are met by no body
+        if seen.any():
+            inner, up_front = inner[seen], up_front[seen]
+        used = panels.weights[inner] > 0
+        self.points = panels.quad[inner][used]
+        self.normals = np.repeat(panels.normals[inner], used.sum(axis=1), axis=0)
+        self.normals *= np.repeat(np.where(up_front, 1.0, -1.0), used.sum(axis=1))[:, None]
+        """Unit normals towards the side from which bodies come, shape (points, 3)."""
+        self.areas = panels.weights[inner][used]
+        owner = np.repeat(model.owner[inner], used.sum(axis=1))
+        electrodes = (owner >= 0) & (owner < len(design.electrodes))
+        self.tree = cKDTree(self.points)
+        away = cKDTree(self.points[electrodes]).query(self.points)[0]
+        self.coarseness = np.clip(away / 0.015, 1.0, 5.0)
+        """How much coarser than at the electrodes things may be, shape (points,)."""
+
+    def sources(self, count: int, spacing: float, depth: float) -> Array:
+        """Up to ``count`` points evenly spread behind the surfaces [m], shape (s, 3)."""
+        weight = self.areas / self.coarseness**2
+        spacing = max(spacing, float(np.sqrt(weight.sum() / count)))
+        count = min(count, max(8, int(weight.sum() / spacing**2)))
+        chosen = spread(self.points, self.coarseness, count)
+        return self.behind(chosen, depth * spacing * self.coarseness[chosen])
+
+    def behind(self, chosen: NDArray[np.intp], depth: Array) -> Array:
+        """Points behind the chosen ones, (k,), (k,) -> (k, 3)."""
+        points = self.points[chosen]
+        back = -self.normals[chosen]
+        room = points[:, 2] - self.design.domain.lower[2]
+        depth = np.minimum(depth, 0.6 * room / np.maximum(-back[:, 2], 1e-9))
+        # not through another sheet and out again where bodies can be
+        path = free_path(self.design, points, back)
+        view = openness(self.design, points + depth[:, None] * back)
+        # bodies beside a rim come as close as those in front of it
+        depth = np.where(view > _RIM, 0.35 * depth, depth)
+        depth = np.where(view > _OPEN, np.minimum(0.6 * path, depth), depth)
+        return points + depth[:, None] * back
+
+
+def spread(points: Array, scale: Array, count: int) -> NDArray[np.intp]:
+    """Indices of ``count`` points, each as far as can be from those before, relative to scale."""
+    chosen = np.empty(count, dtype=np.intp)
+    nearest = np.full(len(points), np.inf)
+    pick = int(np.argmin(points @ [1.0, 1.1, 1.2]))
+    for k in range(count):
+        chosen[k] = pick
+        nearest = np.minimum(nearest, ((points - points[pick]) ** 2).sum(axis=1) / scale**2)
+        pick = int(np.argmax(nearest))
+    return chosen
+
+
+def training_points(
+    surface: Surroundings, sources: Array, settings: GreenSettings
+) -> tuple[Array, Array]:
+    """Points for the boundary elements, and their distances from the design [m], (n, 3), (n,).
+
+    Their spacing goes with the distance from the design.
+    """
+    count = settings.training + 3 * len(sources)
+    points = reachable_points(surface, sources, settings.clearance, count)
+    distance, nearest = surface.tree.query(points)
+    scale = (distance * surface.coarseness[nearest]) ** CROWD
+    kept = spread(points, scale, min(count, len(points)))
+    return _with_wide(surface, points[kept], settings)
+
+
+def _with_wide(
+    surface: Surroundings, points: Array, settings: GreenSettings
+) -> tuple[Array, Array]:
+    """Points and more of them all over the domain, with their distances from the design [m]."""
+    lower, upper = surface.design.domain.lower, surface.design.domain.upper
+    margin = 0.02 * (upper - lower)
+    wide = np.random.default_rng(1).uniform(lower + margin, upper - margin, (settings.wide, 3))
+    far = surface.tree.query(wide)[0] > 0.04 * float((upper - lower).max())
+    points = np.concatenate([points, wide[far]])
+    return points, surface.tree.query(points)[0]
+
+
+def reachable_points(surface: Surroundings, sources: Array, clearance: float, count: int) -> Array:
+    """Some five times ``count`` points that bodies can reach, at all distances [m], (n, 3).
+
+    They lie in front of the surfaces, around the rims, and anywhere in the box. None is within
+    layers, beyond walls, or closer to a source than bodies come.
+    """
+    design = surface.design
+    lower, upper = design.domain.lower, design.domain.upper
+    random = np.random.default_rng(0)
+    span = float((upper - lower).max()) / clearance
+
+    def offsets(directions: Array) -> Array:
+        lengths = clearance * span ** random.uniform(0, 0.95, len(directions))
+        return directions * (lengths / np.linalg.norm(directions, axis=1))[:, None]
+
+    chance = surface.areas / surface.coarseness**2
+    chosen = random.choice(len(chance), 4 * count, p=chance / chance.sum())
+    front = surface.normals[chosen] + 0.5 * random.normal(size=(4 * count, 3))
+    rims = np.concatenate([body.surface.rims for body in design.sheets])
+    length = np.linalg.norm(rims[:, 1] - rims[:, 0], axis=1)
+    ends = rims[random.choice(len(rims), 2 * count, p=length / length.sum())]
+    along = ends[:, 0] + random.uniform(size=(2 * count, 1)) * (ends[:, 1] - ends[:, 0])
+    points = np.concatenate(
+        [
+            surface.points[chosen] + offsets(front),
+            along + offsets(random.normal(size=along.shape)),
+            lower + (upper - lower) * random.uniform(0.0, 1.0, (count, 3)),
+        ]
+    )
+    margin = 0.02 * (upper - lower)
+    reached = ((points > lower + margin) & (points < upper - margin)).all(axis=1)
+    for layer in design.layers:
+        reached &= ((points < layer.lower) | (points > layer.upper)).any(axis=1)
+    points = points[reached]
+    distance, nearest = surface.tree.query(points)
+    apart = distance > clearance * surface.coarseness[nearest] ** 0.5
+    apart &= cKDTree(sources).query(points)[0] > 0.6 * distance
+    points = points[apart]
+    return points[openness(design, points) > _OPEN]
+
+
+def wall_sources(design: Design, settings: GreenSettings) -> Array:
+    """Points outside of the ceiling and the side walls [m], shape (n, 3)."""
+    lower, upper = design.domain.lower, design.domain.upper
+    off, k = settings.wall_offset, settings.wall_grid
+    low, high = lower - [off, off, 0.0], upper + off
+    x, y, z = (a + (np.arange(k) + 0.5) / k * (b - a) for a, b in zip(low, high, strict=True))
+    faces = []
+    for axis, sides in ((0, (low[0], high[0])), (1, (low[1], high[1])), (2, (high[2],))):
+        for side in sides:
+            lines = [x, y, z]
+            lines[axis] = np.array([side])
+            grid = np.meshgrid(*lines, indexing="ij")
+            faces.append(np.stack([a.ravel() for a in grid], axis=1))
+    return np.concatenate(faces)
+
+
+def far_points(
+    surface: Surroundings, sources: Array, settings: GreenSettings
+) -> tuple[Array, Array]:
+    """Points where the far representation is used, and their distances from the design [m]."""
+    count = settings.far_training
+    points = reachable_points(surface, sources, 0.5 * settings.blend[0], count // 2)
+    away = outside(design_box(surface.design), points) > 0.8 * settings.blend[0]
+    if away.sum() > len(sources):  # else the box ends near the sensor
+        points = points[away]
+    points = points[np.random.default_rng(1).permutation(len(points))[:count]]
+    return _with_wide(surface, points, settings)
+
+
+def design_box(design: Design) -> Array:
+    """Lower and upper corner of electrodes, conductors and layers [m], shape (2, 3)."""
+    corners = [body.surface.bounds for body in design.sheets]
+    corners += [np.array([layer.lower, layer.upper]) for layer in design.layers]
+    both = np.array(corners)
+    return np.array([both[:, 0].min(axis=0), both[:, 1].max(axis=0)])
+
+
+def outside(box: Array, points: Array) -> Array:
+    """Distance of points from a box [m], zero inside, shape (n, 3) -> (n,)."""
+    beyond = np.maximum(np.maximum(box[0] - points, points - box[1]), 0.0)
+    return np.sqrt((beyond**2).sum(axis=1))

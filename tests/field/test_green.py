@@ -1,0 +1,286 @@
+"""The compact Green's function against the boundary elements that it is fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_field import SETTINGS, tiny_data, tiny_design
+
+from capsense.design.loader import parse_design
+from capsense.design.model import Design
+from capsense.errors import FieldError
+from capsense.field.background import build_background
+from capsense.field.boundary import Accuracy, BoundarySolution, terminals
+from capsense.field.green import (
+    TABLES,
+    GreenFunction,
+    basis,
+    build_green,
+    from_arrays,
+    to_arrays,
+)
+from capsense.field.green_points import GreenSettings, Surroundings, spread, training_points
+from capsense.field.openness import openness
+from capsense.field.store import load_background, save_background
+
+Array = np.ndarray
+
+FEW = GreenSettings(near_sources=360, near_spacing=2.8e-3, far_sources=160, far_spacing=3.6e-3)
+"""Sizes for designs of a few centimetres."""
+
+
+def square(name: str, x: float, size: float = 0.024) -> dict[str, Any]:
+    return {"name": name, "shape": "rectangle", "size": [size, size], "center": [x, 0.0]}
+
+
+def flat(**changes: Any) -> Design:
+    """Two square electrodes 10 mm above the floor of a grounded box."""
+    return parse_design(
+        {
+            "name": "flat",
+            "domain": {"size": [0.2, 0.2, 0.2], "backplane": 0.01},
+            "electrode": [square("A", -0.016), square("B", 0.016)],
+            **changes,
+        }
+    )
+
+
+def guarded() -> Design:
+    """Pads in a pour 0.3 mm away, a driven back plane 1.6 mm behind, a cover in front."""
+    plate = {"shape": "rectangle", "size": [0.07, 0.04]}
+    return flat(
+        name="guarded",
+        conductor=[
+            {"name": "pour", "role": "ground", "clearance": 0.0003, **plate},
+            {"name": "back", "role": "shield", "z": -0.0016, **plate},
+        ],
+        layer=[
+            {"name": "board", "eps_r": 4.5, "size": [0.07, 0.04], "z": [-0.0016, 0.0]},
+            {"name": "cover", "eps_r": 3.0, "size": [0.07, 0.04], "z": [0.0, 0.001]},
+        ],
+    )
+
+
+def curved() -> Design:
+    """Two electrodes bent onto a driven cylinder."""
+    housing = {
+        "name": "housing", "role": "shield", "shape": "cylinder", "radius": 0.022,
+        "length": 0.03, "center": [0.0, 0.0, -0.025], "tilt": [90, 0, 0],
+    }  # fmt: skip
+    return flat(
+        name="curved", domain={"size": [0.2, 0.2, 0.2], "backplane": 0.07},
+        bend={"radius": 0.025}, conductor=[housing],
+    )  # fmt: skip
+
+
+DESIGNS = {"flat": flat, "guarded": guarded, "curved": curved}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    design: Design
+    solution: BoundarySolution
+    densities: Array
+    green: GreenFunction
+
+    def answer(self, points: Array) -> Array:
+        """Exact ψ·ψ between points, symmetric up to the error of the boundary elements."""
+        zero = np.zeros((self.densities.shape[1], len(points)))
+        exact = -self.solution.potential(points, self.solution.densities(zero, points))
+        return 0.5 * (exact + exact.T)
+
+
+@cache
+def case(name: str) -> Case:
+    design = DESIGNS[name]()
+    solution = BoundarySolution(design, Accuracy(1.6))
+    densities = solution.densities(np.eye(len(terminals(design))))
+    return Case(design, solution, densities, build_green(solution, densities, settings=FEW))
+
+
+def ball(center: Array, radius: float, n: int = 150) -> Array:
+    """Points evenly spread over a sphere, shape (n, 3)."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, k * np.pi * (3 - 5**0.5)
+    side = np.sqrt(1 - z * z)
+    return center + radius * np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
+
+
+def delta(points: Array, radius: float, answer: Array, phi: Array, floor: float) -> Array:
+    """Change of C [4π eps0 m] by a grounded ball: charges at points, own part from its size."""
+    n = len(points)
+    images = points * [1, 1, -1] + [0, 0, 2 * floor]
+    free = np.linalg.norm(points[:, None] - points, axis=2)
+    # the mean potential of the cap that belongs to a point, so that a free ball has 1/R
+    free[np.diag_indices(n)] = np.inf
+    own = n / radius - (1 / free).sum(axis=1).mean()
+    matrix = 1 / free - 1 / np.linalg.norm(points[:, None] - images, axis=2) - answer
+    matrix[np.diag_indices(n)] += own
+    return phi.T @ np.linalg.solve(matrix, phi)
+
+
+def somewhere(case: Case, n: int = 200) -> Array:
+    """Points that bodies can reach, none of which the modes were fitted at."""
+    surface = Surroundings(case.design, case.solution.model)
+    sources = case.green.near_sources.astype(float)
+    points = training_points(surface, sources, replace(FEW, clearance=3e-3, training=0))[0]
+    distance = surface.tree.query(points)[0]
+    behind = np.linalg.norm(points[:, None] - sources, axis=2).min(axis=1) < distance + 1e-3
+    box = case.green.box
+    under = (points[:, 2] < box[0, 2]) & (case.green.distance(points) < 0.011)
+    points = points[~behind & ~under & (distance > 3e-3)]
+    return points[np.random.default_rng(5).permutation(len(points))[:n]]
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed"), [("flat", 0.004), ("guarded", 0.004), ("curved", 0.006)]
+)
+@pytest.mark.parametrize("gap", [0.002, 0.005, 0.013, 0.03])
+def test_a_grounded_ball_changes_c_as_with_boundary_elements(
+    name: str, allowed: float, gap: float
+) -> None:
+    """Differential; the ball is coarse, but the same for both."""
+    it, radius = case(name), 0.012
+    points = ball(np.array([0.008, 0.003, it.green.box[1, 2] + gap + radius]), radius)
+    phi = it.solution.potential(points, it.densities)
+    exact = delta(points, radius, it.answer(points), phi, it.green.floor)
+    psi = it.green.psi(points)
+    got = delta(points, radius, psi @ psi.T, it.green.phi0(points), it.green.floor)
+    assert np.abs(got - exact).max() < (2 if gap < 0.005 else 1) * allowed * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_potentials_and_answer_at_points_of_all_kinds(name: str) -> None:
+    it = case(name)
+    points = somewhere(it)
+    phi = it.solution.potential(points, it.densities)
+    assert np.abs(it.green.phi0(points) - phi).max() < 0.12
+    assert np.sqrt(((it.green.phi0(points) - phi) ** 2).mean()) < 0.01
+    exact, psi = it.answer(points), it.green.psi(points)
+    scale = np.sqrt(np.diag(exact))
+    error = (psi @ psi.T - exact) / scale / scale[:, None]
+    assert np.sqrt((error**2).mean()) < 0.02
+    assert np.abs(error).max() < 0.4
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_reciprocity_and_grounding(name: str) -> None:
+    """Analytic: G is symmetric; whatever is grounded lowers it, and it stays positive."""
+    it = case(name)
+    points = somewhere(it, 120)
+    g = it.green.g(points, points)
+    np.testing.assert_allclose(g, g.T, rtol=1e-12, atol=0.0)
+    images = points * [1, 1, -1] + [0, 0, 2 * it.green.floor]
+    floor = -1 / np.linalg.norm(points[:, None] - images, axis=2)
+    assert (np.diag(g) < np.diag(floor)).all()
+    free = np.linalg.norm(points[:, None] - points, axis=2)
+    off = ~np.eye(len(points), dtype=bool)
+    total = (1 / free[off] + g[off]) * free[off]
+    exact = (1 / free[off] + (floor - it.answer(points))[off]) * free[off]
+    assert np.sqrt(((total - exact) ** 2).mean()) < 0.01
+    assert total.max() < 1.0
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("gap", [0.012, 0.018])
+def test_near_and_far_agree_where_they_meet(name: str, gap: float) -> None:
+    """No kink in a capacitance, whichever of the two the points of a ball use."""
+    it, radius = case(name), 0.012
+    points = ball(np.array([-0.01, 0.006, it.green.box[1, 2] + gap + radius]), radius)
+    found = []
+    for blend in ([1.0, 2.0], [-2.0, -1.0], [0.018, 0.030]):  # near, far, some of both
+        green = replace(it.green, blend=np.array(blend))
+        psi = green.psi(points)
+        found.append(delta(points, radius, psi @ psi.T, green.phi0(points), green.floor))
+    for other in found[1:]:
+        assert np.abs(other - found[0]).max() < 2e-3 * np.abs(found[0]).max()
+
+
+def test_share_falls_smoothly_from_one_to_zero() -> None:
+    it = case("flat").green
+    z = it.box[1, 2] + np.linspace(0.0, 0.03, 301)
+    share = it.share(np.stack([0 * z, 0 * z, z], axis=1))
+    assert share[z - it.box[1, 2] <= it.blend[0]].min() == 1.0
+    assert share[z - it.box[1, 2] >= it.blend[1]].max() == 0.0
+    assert (np.diff(share) <= 0.0).all()
+    assert np.abs(np.diff(share, 2)).max() < 6 * (1e-4 / 0.006) ** 2 * 1.01
+    inside = it.box.mean(axis=0)[None]
+    assert it.distance(inside)[0] == 0.0
+    outside = it.box[1] + np.array([[0.003, 0.004, 0.0], [0.0, 0.003, 0.004]])
+    np.testing.assert_allclose(it.distance(outside), 0.005)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_single_precision_is_enough(name: str) -> None:
+    """Sums of single precision are as good as those of double precision, to 1e-5 of ψ·ψ."""
+    it = case(name).green
+    points = somewhere(case(name), 100)
+    b = basis(points, it.near_sources, it.floor)
+    exact, single = b @ it.near_modes, b.astype(np.float32) @ it.near_modes
+    size = (exact**2).sum(axis=1)
+    assert (np.abs((single**2).sum(axis=1) - size) < 1e-5 * size).all()
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_charges_lie_where_no_body_can_be(name: str) -> None:
+    it = case(name)
+    lower, upper = it.design.domain.lower, it.design.domain.upper
+    for sources in (it.green.near_sources, it.green.far_sources):
+        inside = ((sources > lower) & (sources < upper)).all(axis=1)
+        assert (~inside).sum() == 125
+        if name == "curved":
+            assert openness(it.design, sources[inside].astype(float)).max() == 0.0
+        else:
+            assert sources[inside, 2].max() < (0.001 if name == "guarded" else 0.0)
+        assert (sources[:, 2] > it.green.floor).all()
+
+
+def test_openness_of_plates_and_housings() -> None:
+    """Analytic: one half in front of a wide sheet, nothing inside of a closed housing."""
+    plate, pipe = flat(electrode=[square("A", 0.0, 0.15)]), curved()
+    above, below = openness(plate, np.array([[0.0, 0.0, 1e-4], [0.0, 0.0, -1e-3]]))
+    assert above == pytest.approx(0.5, abs=0.03)
+    assert below < 0.25
+    middle, aside = openness(pipe, np.array([[0.0, 0.0, -0.025], [0.06, 0.0, 0.05]]))
+    assert middle == 0.0
+    assert aside > 0.7
+
+
+def test_spread_takes_the_farthest_point_every_time() -> None:
+    points = np.random.default_rng(2).uniform(size=(400, 3)) * [1.0, 1.0, 0.0]
+    chosen = spread(points, np.ones(400), 40)
+    assert len(set(chosen)) == 40
+    gaps = np.linalg.norm(points[chosen][:, None] - points[chosen], axis=2)
+    closest = np.where(np.eye(40, dtype=bool), np.inf, gaps).min()
+    reach = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
+    assert reach.max() <= closest
+
+
+def test_stored_to_the_last_bit(tmp_path: Path) -> None:
+    field = build_background(tiny_design(), SETTINGS)
+    for compact in (False, True):
+        save_background(field, tmp_path / "a.npz", compact=compact)
+        back = load_background(tmp_path / "a.npz").green
+        for name, values in to_arrays(field.green).items():
+            found = getattr(back, name)
+            assert np.array_equal(found, values), name
+            assert np.asarray(found).dtype == values.dtype, name
+            assert np.asarray(found).flags.c_contiguous, name
+    assert {getattr(field.green, name).dtype for name in TABLES} == {np.dtype(np.float32)}
+    again = from_arrays(to_arrays(field.green))
+    assert to_arrays(again).keys() == to_arrays(field.green).keys()
+
+
+@pytest.mark.parametrize("name", [*TABLES, "box"])
+def test_what_is_not_finite_is_never_stored(tmp_path: Path, name: str) -> None:
+    field = build_background(parse_design(tiny_data(electrode=[square("A", 0.0)])), SETTINGS)
+    bad = getattr(field.green, name).copy()
+    bad.flat[0] = np.nan
+    wrong = replace(field, green=replace(field.green, **{name: bad}))
+    with pytest.raises(FieldError, match="not finite"):
+        save_background(wrong, tmp_path / "a.npz", compact=True)
