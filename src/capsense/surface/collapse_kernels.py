@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_EVEN = 1e-3
+_EVEN = 1e-2
 """How much short edges go first, over the quadric error of a plane: keeps triangles alike."""
 _STAY = 1e-3
 """How much a joined vertex stays at the middle of its edge, over the same."""
+_MORE = 2
+"""More than so many times the triangles wanted are not left."""
 _TURN = 0.25
 """Least cosine between the normals of a triangle before and after."""
 
@@ -23,8 +25,9 @@ _TURN = 0.25
 def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count: int) -> Index:
     """Collapse edges, the cheapest first, until ``count`` triangles are left.
 
-    Collapses that turn a triangle over or pinch the surface are put off until no other is left, so
-    that meshes with cracks, slivers and edges of many triangles are reduced, too.
+    None turns a triangle over or pinches the surface, so that somewhat more may be left. Where very
+    many would be, as in meshes with cracks, slivers and edges of many triangles, those that turn
+    triangles over are next, and all others last.
 
     Args:
         vertices: Vertices [m], shape (n, 3); overwritten.
@@ -49,11 +52,12 @@ def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count
     alive, gone = np.ones(m, np.bool_), np.zeros(n, np.bool_)
     version, mark = np.zeros(n, np.int64), np.full(n, -1)
     place, number, left = np.empty(3), 0, m
-    for strict in (True, False):
-        if left <= count:
+    for care in (2, 1, 0):
+        goal = count if care == 2 else _MORE * count
+        if left <= goal:
             break
         heap = [(np.inf, -1, -1, -1)]
-        if strict:
+        if care == 2:
             for e in range(edges.shape[0]):
                 u, v = edges[e]
                 heap.append((_cost(vertices, quadrics, u, v, place), u, v, 0))
@@ -65,7 +69,7 @@ def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count
                         stamp = version[u] + version[v]
                         heap.append((_cost(vertices, quadrics, u, v, place), u, v, stamp))
         heapify(heap)
-        while left > count:
+        while left > goal:
             _, u, v, stamp = heappop(heap)
             if u < 0:
                 break
@@ -73,8 +77,8 @@ def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count
                 continue
             _cost(vertices, quadrics, u, v, place)
             number += 2
-            if strict and not _allowed(
-                vertices, faces, alive, head, follow, mark, number, u, v, place
+            if care > 0 and not _allowed(
+                vertices, faces, alive, head, follow, mark, number, u, v, place, care == 2
             ):
                 continue
             vertices[u] = place
@@ -144,15 +148,16 @@ def _cost(vertices: Array, quadrics: Array, u: int, v: int, place: Array) -> flo
         + 2.0 * (q[1] * x0 * x1 + q[2] * x0 * x2 + q[4] * x1 * x2)
         + 2.0 * (q[6] * x0 + q[7] * x1 + q[8] * x2) + q[9]
     )  # fmt: skip
-    return max(error, 0.0) + _EVEN * whole * square
+    # so that equal costs stay equal where the mesh is turned
+    return np.float64(np.float32(max(error, 0.0) + _EVEN * whole * square))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _allowed(
     vertices: Array, faces: Index, alive: NDArray[np.bool_], head: Index, follow: Index,
-    mark: Index, number: int, u: int, v: int, place: Array,
+    mark: Index, number: int, u: int, v: int, place: Array, facing: bool,
 ) -> bool:  # fmt: skip
-    """Whether joining two vertices turns no triangle over and leaves the surface as connected."""
+    """Whether joining two vertices leaves the surface as connected, and triangles facing alike."""
     shared = common = 0
     for side in range(2):
         own, other = (u, v) if side == 0 else (v, u)
@@ -164,7 +169,7 @@ def _allowed(
                 # within a face the corner's number modulo 3 is its place
                 if i == other or j == other:
                     shared += side
-                elif not _keeps_facing(vertices, own, i, j, place):
+                elif facing and not _keeps_facing(vertices, own, i, j, place):
                     return False
                 for w in (i, j):
                     if side == 0:

@@ -10,6 +10,9 @@ from capsense.scene.distance_kernels import triangle_distance2
 
 Array = NDArray[np.float64]
 
+_FACING = 0.5
+"""Least cosine between normals of a surface and of a triangle that stands for it."""
+
 
 @kernel
 def add_offsets(
@@ -23,7 +26,7 @@ def add_offsets(
         normals: The surface's unit normals there, shape (p, 3).
         weights: Weights, shape (p,).
         corners: Triangles [m], shape (n, 3, 3).
-        planes: Their unit normals, shape (n, 3). Triangles that face away from a point's surface
+        planes: Their unit normals, shape (n, 3). Triangles that do not face as a point's surface does
             are passed over.
         centers: Centroids [m], shape (n, 3).
         reach: Distances from centroid to the farthest corner [m], shape (n,).
@@ -43,7 +46,7 @@ def add_offsets(
                 normals[p, 0] * planes[k, 0] + normals[p, 1] * planes[k, 1]
                 + normals[p, 2] * planes[k, 2]
             )  # fmt: skip
-            if along <= 0.0:
+            if along <= _FACING:
                 continue
             distance = np.sqrt(triangle_distance2(corners[k], x, y, z))
             if distance < best:

@@ -33,10 +33,12 @@ _FILES = 1_000_000_000
 """The same of files [bytes], the oldest first."""
 _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
-_EACH = 140
-"""Panels for each part of a mesh of several parts."""
+_TRIANGLES = 1.6
+"""So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
+_EACH = 0.2
+"""Triangles for each part of a mesh of several parts, over the panels of a primitive."""
 _MOST = 2.8
-"""Meshes of several parts get up to so many times as many panels as other shapes."""
+"""No mesh has more triangles than so many times that."""
 
 _LOCK = threading.Lock()
 _SHAPES: OrderedDict[tuple[object, ...], RigidShape] = OrderedDict()
@@ -47,7 +49,7 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
 
     Args:
         shape: A primitive or a mesh.
-        count: About how many panels cover it; a mesh of several parts gets more.
+        count: About how many panels cover a primitive; meshes get more.
 
     Raises:
         SceneError: The shape has no surface that can be covered with panels.
@@ -96,7 +98,7 @@ def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
         pass
     except FieldError as error:
         _log.warning("a stored shape is not used, it is made again: %s", error)
-    wanted = min(_MOST * count, max(count, _EACH * shape.parts))
+    wanted = count * min(_MOST, max(_TRIANGLES, _EACH * shape.parts))
     made = rigid_shape(panels_of(shape, round(wanted)))
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -135,10 +137,12 @@ def _read(file: Path, key: str) -> RigidShape:
     corners = arrays["corners"][:, [0, 1, 2, 2]]
     panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
     clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))
-    energy = np.empty((len(panels),) * 2, np.float32)
-    rows, columns = np.tril_indices(len(panels))
-    energy[rows, columns] = arrays["energy"]
-    energy[columns, rows] = arrays["energy"]
+    energy = np.zeros((len(panels),) * 2, np.float32)
+    start = 0
+    for k in range(len(panels)):
+        energy[k, : k + 1] = arrays["energy"][start : start + k + 1]
+        start += k + 1
+    energy += np.tril(energy, -1).T
     return RigidShape(
         panels, charged_tree(panels, clusters, arrays["charge"]), energy,
         float(meta["capacitance"]),

@@ -33,6 +33,14 @@ _SPARE = 1.25
 _SLIVER = 12.0
 """Square of the longest edge over the area (2.3 if equilateral) above which it is halved."""
 
+_LONGEST = 1.5
+"""Edges are halved before the collapse where they are longer than so many of those wanted."""
+_ROUNDS, _CROWD = 12, 200_000
+"""At most so many times, and while there are fewer triangles."""
+
+_STIFF = 30.0
+"""How much rims and sharp edges keep their place, as charge gathers there."""
+
 _BASE = 0.6
 """Part of the triangles before those at sharp edges are halved."""
 _FEW_SHARP = 0.1
@@ -138,6 +146,15 @@ def _welded(triangles: Array, count: int) -> tuple[Array, Index]:
         tolerance *= 4
 
 
+def _as_met(vertices: Array, faces: Index) -> tuple[Array, Index]:
+    """Number vertices as faces meet them, which does not depend on how a mesh is turned."""
+    used, first, which = np.unique(faces, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.empty(len(used), np.int64)
+    place[order] = np.arange(len(used))
+    return vertices[used[order]], place[which.reshape(-1)].reshape(-1, 3)
+
+
 def _shares(areas: Array, count: int) -> Index:
     """Triangles for parts of these areas [m²]: the smaller a part, the more for its area.
 
@@ -173,14 +190,52 @@ def _simplified(vertices: Array, faces: Index, count: int, sharp: Flags) -> tupl
         Shapes (m, 3, 3) and (m, 3); edge k runs from corner k to the next.
     """
     count = max(count, _LEAST_OF_MANY)
-    if len(faces) <= count:
+    if len(faces) <= _LEAST_OF_MANY == count:
         return vertices[faces], sharp
+    surface = vertices[faces]
+    longest = _LONGEST * np.sqrt(2.3 * _areas(surface).sum() / count)
     used, local = np.unique(faces, return_inverse=True)
-    moved, reduced = _collapsed(vertices[used], local.reshape(-1, 3), count)
+    points, local = _divided(vertices[used], local.reshape(-1, 3), longest)
+    if len(local) <= count:
+        return points[local], _sharp(points, local) & sharp.any()
+    moved, reduced = _collapsed(points, local, count)
     if not len(reduced) or not _areas(moved[reduced]).max() > 0:
-        return vertices[faces], sharp
-    corners = fitted(moved, reduced, vertices[faces])[reduced]
-    return corners, _sharp(moved, reduced) & sharp.any()
+        return surface, sharp
+    return fitted(moved, reduced, points[local])[reduced], _sharp(moved, reduced) & sharp.any()
+
+
+def _divided(vertices: Array, faces: Index, longest: float) -> tuple[Array, Index]:
+    """Halve edges longer than ``longest`` [m], on both sides, until there are none.
+
+    Collapses of edges can only make triangles longer.
+    """
+    for _ in range(_ROUNDS):
+        start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        key, edge = np.unique(low * len(vertices) + high, return_inverse=True)
+        pairs = np.stack([key // len(vertices), key % len(vertices)], axis=1)
+        long = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1) > longest
+        if not long.any() or len(faces) > _CROWD:
+            break
+        middle = np.where(long, len(vertices) + np.cumsum(long) - 1, -1)
+        vertices = np.concatenate([vertices, vertices[pairs[long]].mean(axis=1)])
+        cut = middle[edge.reshape(-1)].reshape(-1, 3)
+        number = (cut >= 0).sum(axis=1)
+        parts = [faces[number == 0]]
+        for k, first in ((1, (cut >= 0).argmax(axis=1)), (2, (cut < 0).argmax(axis=1))):
+            which = np.flatnonzero(number == k)
+            turn = (first[which, None] + np.arange(3)) % 3
+            (a, b, c), (p, q, r) = (
+                np.take_along_axis(x[which], turn, axis=1).T for x in (faces, cut)
+            )
+            if k == 1:  # p halves ab
+                parts += [np.stack([a, p, c], axis=1), np.stack([p, b, c], axis=1)]
+            else:  # q halves bc, r halves ca
+                parts += [np.stack(t, axis=1) for t in ((a, b, q), (a, q, r), (r, q, c))]
+        (a, b, c), (p, q, r) = faces[number == 3].T, cut[number == 3].T
+        parts += [np.stack(t, axis=1) for t in ((a, p, r), (p, b, q), (r, q, c), (p, q, r))]
+        faces = np.concatenate(parts)
+    return vertices, faces
 
 
 def _collapsed(vertices: Array, faces: Index, count: int) -> tuple[Array, Index]:
@@ -188,16 +243,18 @@ def _collapsed(vertices: Array, faces: Index, count: int) -> tuple[Array, Index]
     middle, extent = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
     points = (vertices - middle) / extent
     reduced = np.ascontiguousarray(faces, dtype=np.int64).copy()
-    left = collapse_kernels.collapse(points, reduced, *_quadrics(points, reduced), count)
+    left = collapse_kernels.collapse(
+        points, reduced, *_quadrics(points, reduced, _sharp(points, reduced)), count
+    )
     used, local = np.unique(reduced[left], return_inverse=True)
     return middle + extent * points[used], local.reshape(-1, 3)
 
 
-def _quadrics(vertices: Array, faces: Index) -> tuple[Array, Index]:
+def _quadrics(vertices: Array, faces: Index, sharp: Flags) -> tuple[Array, Index]:
     """Quadric errors of the vertices, (n, 10), and edges, (e, 2), for the collapse.
 
-    Planes are those of the triangles round a vertex, weighted with their areas, and upright ones
-    along rims, weighted with the squares of their lengths.
+    Planes are those of the triangles round a vertex, weighted with their areas; upright ones along
+    rims, and those on both sides of sharp edges, weighted with the squares of their lengths.
     """
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -210,13 +267,19 @@ def _quadrics(vertices: Array, faces: Index) -> tuple[Array, Index]:
     )
     rim = first[number == 1]
     way = vertices[end[rim]] - vertices[start[rim]]
-    upright = np.cross(way, normal[rim // 3])
     length = np.linalg.norm(way, axis=1)
-    upright /= np.maximum(length, 1e-300)[:, None]
+    upright = np.cross(way, normal[rim // 3]) / np.maximum(length, 1e-300)[:, None]
+    bend = np.flatnonzero(sharp.reshape(-1))
+    bend_length = np.linalg.norm(vertices[end[bend]] - vertices[start[bend]], axis=1)
 
-    planes = np.concatenate([np.repeat(normal, 3, axis=0), np.repeat(upright, 2, axis=0)])
-    owner = np.concatenate([start, np.stack([start[rim], end[rim]], axis=1).reshape(-1)])
-    weight = np.concatenate([np.repeat(double / 2, 3), np.repeat(30 * length**2, 2)])
+    ends = [np.stack([start[some], end[some]], axis=1).reshape(-1) for some in (rim, bend)]
+    planes = np.concatenate(
+        [np.repeat(x, k, axis=0) for x, k in ((normal, 3), (upright, 2), (normal[bend // 3], 2))]
+    )
+    owner = np.concatenate([start, *ends])
+    weight = np.concatenate(
+        [np.repeat(double / 2, 3)] + [np.repeat(_STIFF * x**2, 2) for x in (length, bend_length)]
+    )
     d = -np.einsum("ij,ij->i", planes, vertices[owner])
     x, y, z = planes.T
     terms = (x * x, x * y, x * z, y * y, y * z, z * z, x * d, y * d, z * d, d * d)
