@@ -78,9 +78,9 @@ class Session:
             FieldError: The background field could not be built.
         """
         return Simulator(
-            self.design, method=self.method, preset=self.preset, tolerance=self.tolerance, relative_tolerance=self.relative_tolerance,
-            frequency=self.frequency, settings=self.settings, cache_dir=cache_dir,
-            progress=progress,
+            self.design, method=self.method, preset=self.preset, tolerance=self.tolerance,
+            relative_tolerance=self.relative_tolerance, frequency=self.frequency,
+            settings=self.settings, cache_dir=cache_dir, progress=progress,
         )  # fmt: skip
 
     def new_readout(self) -> ReadOut | None:

@@ -13,8 +13,9 @@ _FAR = 1.5
 _CLOSE = 0.6
 """Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
 _SOFT = 0.15
-"""Distance, as a part of the larger extent, below which 1/r of two points is bounded: clusters
-that coincide then have less energy between them than each has alone."""
+"""Distance, as a part of the larger extent, below which 1/r of two points is bounded: flat clusters
+that coincide then have less energy between them than each has alone. Coarse ones that are bent may
+not; ``solve_kernels`` raises the diagonal then."""
 
 
 @fast
