@@ -20,7 +20,7 @@ from capsense.errors import BatchError, FieldError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.scene import Scene
+from capsense.scene import Layers, Scene, TriMesh
 from capsense.scene.depth import DepthFrame
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ class _SurfaceScenes:
         self._gradient = partial(self.surface.jacobian, view, bodies, solution)
         if solution is None:
             return np.zeros((len(self._background.terminals),) * 2), 0.0
-        self._last = partial(self._around, solution)
+        self._last = partial(self._around, view, solution)
         self.unknowns = solution.size
         return self.surface.in_farads(solution)
 
@@ -175,7 +175,7 @@ class _SurfaceScenes:
     def _nothing(self) -> Array:
         return np.zeros_like(self._background.potentials)
 
-    def _around(self, solution: Solution) -> Array:
+    def _around(self, view: View, solution: Solution) -> Array:
         from capsense.surface.potentials import PotentialMap
 
         lattice = self._background.lattice
@@ -183,6 +183,16 @@ class _SurfaceScenes:
             self._map = PotentialMap(self._background.green, lattice.points)
         out = self._map.change(solution)
         out[lattice.owner >= 0] = 0.0
+        for place in np.flatnonzero(view.matter.conducting).tolist():
+            body = view.scene[int(view.met[place])]
+            if isinstance(body.shape, Layers | TriMesh):
+                continue
+            local = body.pose.inverse().apply(lattice.points)
+            inside = (body.shape.signed_distance(local) < 0) & (lattice.owner < 0)
+            if inside.any():
+                held = self._background.potentials[inside]
+                value = (held + out[inside]).mean(axis=0) if body.grounding != "grounded" else 0.0
+                out[inside] = value - held
         return out
 
 

@@ -30,7 +30,9 @@ from capsense.field.store import load_background, save_background
 
 Array = np.ndarray
 
-FEW = GreenSettings(near_sources=360, near_spacing=2.8e-3, far_sources=160, far_spacing=3.6e-3)
+FEW = GreenSettings(
+    near_sources=360, near_spacing=2.8e-3, far_sources=160, far_spacing=3.6e-3, wide=200
+)
 """Sizes for designs of a few centimetres."""
 
 

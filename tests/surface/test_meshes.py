@@ -66,8 +66,8 @@ def longest(panels: SurfacePanels) -> float:
 )
 @pytest.mark.parametrize("count", [700, 1120])
 def test_reduced_round_bodies_keep_their_capacitance(mesh, shape, count):
-    """Differential: a primitive of 1,500 panels, to 0.2 %; some meshes are shorter by 0.1 %."""
-    expected = rigid_shape(panels_of(shape, 1500)).capacitance
+    """Differential: a primitive of 900 panels, to 0.2 %; some meshes are shorter by 0.1 %."""
+    expected = rigid_shape(panels_of(shape, 900)).capacitance
     assert free(mesh, count) == pytest.approx(expected, rel=2e-3)
 
 
@@ -77,9 +77,9 @@ def test_a_few_triangles_make_a_ball():
 
 
 def test_crossing_parts():
-    """Differential: a hand of five parts, 500 triangles against all of 4,320."""
+    """Differential: a hand of five parts, 500 triangles against 2,000."""
     mesh = hand()
-    assert free(mesh, 500) == pytest.approx(free(mesh, 4320), rel=5e-3)
+    assert free(mesh, 500) == pytest.approx(free(mesh, 2000), rel=5e-3)
 
 
 def test_small_parts_have_triangles_of_their_own():
@@ -107,7 +107,7 @@ def test_long_triangles_are_divided():
     for mesh in (cylinder(0.02, 0.4, 32), cylinder(0.02, 0.4, 400), capsule(0.02, 0.4)):
         panels = panels_of(np.array(mesh.triangles), 500)
         assert panels.closed
-        assert longest(panels) < 9.0
+        assert longest(panels) < 4.0
         assert len(panels) < 1.3 * 500
 
 

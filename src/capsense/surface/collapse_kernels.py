@@ -15,6 +15,10 @@ _EVEN = 1e-2
 """How much short edges go first, over the quadric error of a plane: keeps triangles alike."""
 _STAY = 1e-3
 """How much a joined vertex stays at the middle of its edge, over the same."""
+_SLENDER = 1e-4
+"""Square of the height over the longest side below which no triangle may get more slender."""
+_WORSE = 0.25
+"""What counts as more slender, as a ratio of such squares."""
 _MORE = 2
 """More than so many times the triangles wanted are not left."""
 _TURN = 0.25
@@ -52,12 +56,16 @@ def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count
     alive, gone = np.ones(m, np.bool_), np.zeros(n, np.bool_)
     version, mark = np.zeros(n, np.int64), np.full(n, -1)
     place, number, left = np.empty(3), 0, m
-    for care in (2, 1, 0):
+    care, before_pass = 2, m + 1
+    while True:
+        if care < 2 or left == before_pass:  # nothing more can be done with so much care
+            care -= 1
+        before_pass = left
         goal = count if care == 2 else _MORE * count
-        if left <= goal:
+        if care < 0 or left <= goal:
             break
         heap = [(np.inf, -1, -1, -1)]
-        if care == 2:
+        if left == m:
             for e in range(edges.shape[0]):
                 u, v = edges[e]
                 heap.append((_cost(vertices, quadrics, u, v, place), u, v, 0))
@@ -184,13 +192,15 @@ def _allowed(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _keeps_facing(vertices: Array, own: int, i: int, j: int, place: Array) -> bool:
-    """Whether a triangle faces the same way once a corner is elsewhere, and is no sliver then."""
-    edge, to = vertices[j] - vertices[i], place - vertices[i]
-    before = np.cross(edge, vertices[own] - vertices[i])
-    after = np.cross(edge, to)
+    """Whether a triangle faces alike with a corner elsewhere, and does not become a sliver."""
+    edge, to, old = vertices[j] - vertices[i], place - vertices[i], vertices[own] - vertices[i]
+    before, after = np.cross(edge, old), np.cross(edge, to)
     first, second = np.dot(before, before), np.dot(after, after)
-    longest = max(np.dot(edge, edge), max(np.dot(to, to), np.dot(to - edge, to - edge)))
-    if second < 1e-4 * longest * longest and second < first:
+    base = np.dot(edge, edge)
+    long = max(base, max(np.dot(to, to), np.dot(to - edge, to - edge)))
+    was_long = max(base, max(np.dot(old, old), np.dot(old - edge, old - edge)))
+    slender = second < _SLENDER * long * long
+    if slender and second * was_long * was_long < _WORSE * first * long * long:
         return False
     along = np.dot(before, after)
     return first == 0.0 or (along > 0.0 and along * along > _TURN * _TURN * first * second)

@@ -26,8 +26,8 @@ def add_offsets(
         normals: The surface's unit normals there, shape (p, 3).
         weights: Weights, shape (p,).
         corners: Triangles [m], shape (n, 3, 3).
-        planes: Their unit normals, shape (n, 3). Triangles that do not face as a point's surface
-            does are passed over.
+        planes: Their unit normals, shape (n, 3). Triangles that face unlike a point's surface
+            are passed over.
         centers: Centroids [m], shape (n, 3).
         reach: Distances from centroid to the farthest corner [m], shape (n,).
         out: Sums of weights and of heights [m] times weights, shape (n, 2).

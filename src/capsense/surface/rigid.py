@@ -28,6 +28,8 @@ Ints = NDArray[np.int64]
 
 _NORMALS = 0.6
 """How far apart two opposite normals count, as a share of the shape's extent, in splitting."""
+_EXTRA = 0.0, 1e-3, 1e-2, 0.1
+"""What is added to the panels' own energies, relative, where some nearly coincide."""
 _LEAST_CHARGE = 1e-6
 """Smallest charge of a panel, as a part of the largest: those within a cavity have none."""
 
@@ -123,8 +125,13 @@ def rigid_shape(panels: SurfacePanels) -> RigidShape:
         SolveError: The panels lie within each other, so that their block is not definite.
     """
     free = free_block(panels)
-    factor = free.copy()
-    if not _factored(factor):
+    own = np.diag(free).copy()
+    for extra in _EXTRA:
+        np.fill_diagonal(free, (1.0 + extra) * own)
+        factor = free.copy()
+        if _factored(factor):
+            break
+    else:
         raise SolveError(
             f"the surface of {len(panels)} panels meets itself, so that no charge can be told; "
             "remove doubled faces"
