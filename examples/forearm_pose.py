@@ -1,9 +1,9 @@
 """Where is the forearm? Its pose, found from capacitances alone while it moves over the sensor.
 
-A person's forearm crosses six electrodes. Each sample gives one matrix of capacitances, with the
-noise of a converter. Gauss-Newton steps find the arm's lateral offset, its height and two angles
-from it, with the Jacobian that the simulator hands back beside the capacitances; each sample starts
-from the pose found last.
+A person's forearm crosses six electrodes. Each sample gives one matrix of capacitances, as the
+finest preset has it and with the noise of a converter. Gauss-Newton steps find the arm's lateral
+offset, its height and two angles from it, with the Jacobian that the simulator hands back beside
+the capacitances; each sample starts from the pose found last.
 """
 
 from __future__ import annotations
@@ -60,12 +60,13 @@ def path(count: int) -> np.ndarray:
 
 def main(samples: int = 60) -> None:
     """Follow the arm, and print how far off the pose is at every sample."""
-    sim = cs.Simulator("six_patch_bare")
+    sim = cs.Simulator("six_patch_bare", method="surface")
+    truth = cs.Simulator("six_patch_bare", method="surface", preset="fine")
     rng = np.random.default_rng(1)
     upper = np.triu_indices(6)
     found, errors = START, []
     for k, true in enumerate(path(samples)):
-        measured = sim.step(scene(true)).delta[upper] + NOISE * rng.standard_normal(21)
+        measured = truth.step(scene(true)).delta[upper] + NOISE * rng.standard_normal(21)
         for _ in range(STEPS):
             found = improve(sim, found, measured)
         error = (found - true) * [1e3, 1e3, 180 / np.pi, 180 / np.pi]
