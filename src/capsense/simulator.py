@@ -428,7 +428,7 @@ class Simulator:
 
         if isinstance(self._solver, _SurfaceScenes | PerturbationSolver):
             return self.background.potentials + self._solver.potentials()
-        raise ValueError('method "masked" gives no potentials; use "surface" or "perturbation"')
+        raise ValueError('method "masked" gives no potentials; use "perturbation" or "surface"')
 
     def sibling(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field."""
