@@ -235,7 +235,7 @@ def test_a_dielectric_depth_image_goes_to_the_lattice(sim, simulators):
 
 def test_in_contact_the_lattice_reads(sim):
     """Invariant: to the last bit, from rest."""
-    scene = cs.Scene([ball(0.041)])
+    scene = cs.Scene([ball(0.0401)])
     expected = PerturbationSolver(sim.background).solve(scene)[0]
     np.testing.assert_allclose(sim.step(scene).delta, expected, rtol=1e-12)
 

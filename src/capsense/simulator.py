@@ -162,8 +162,8 @@ class _SurfaceScenes:
     def jacobian(self) -> Array:
         """How the matrix of all terminals changes with the poses of the last scene's bodies.
 
-        Within some millimetres of the design, where the lattice has a share in the reading, it is
-        that of the surface charges alone.
+        In contact with the design, where the lattice has a share in the reading, it is that of the
+        surface charges alone.
         """
         assert self._gradient is not None  # asked for in ``solve``
         return self._gradient()
@@ -202,8 +202,8 @@ class Simulator:
     Args:
         design: A design, a packaged name, or the path of a design file.
         method: ``"perturbation"`` (default): the change of the field on a lattice.
-            ``"surface"``: charges on the surfaces of the bodies; more accurate from some
-            millimetres on, smooth, with gradients. ``"masked"``: the scheme of Schöffmann et al.
+            ``"surface"``: charges on the surfaces of the bodies; more accurate, smooth, with
+            gradients. ``"masked"``: the scheme of Schöffmann et al.
             2022, where objects are staircases of tetrahedra, solved in full.
         preset: How finely surfaces are resolved: ``"standard"``, ``"learning"`` (faster, some
             3 % rms) or ``"fine"``.

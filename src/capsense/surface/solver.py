@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
-CONTACT = 1e-3, 2e-3
+CONTACT = 2e-4, 6e-4
 """Distances from the design [m] between which surface charges come to be trusted."""
 
 
