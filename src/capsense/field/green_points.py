@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 _OPEN = 0.3
 """Bodies can be where the openness is larger."""
 _RIM = 0.45
-CROWD = 1.0
 """Behind free rims, which bodies can pass, the openness is larger."""
 
 
@@ -136,7 +135,7 @@ def training_points(
     count = settings.training + 3 * len(sources)
     points = reachable_points(surface, sources, settings.clearance, count)
     distance, nearest = surface.tree.query(points)
-    scale = (distance * surface.coarseness[nearest]) ** CROWD
+    scale = distance * surface.coarseness[nearest]
     kept = spread(points, scale, min(count, len(points)))
     return _with_wide(surface, points[kept], settings)
 

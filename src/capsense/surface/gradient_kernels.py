@@ -25,13 +25,13 @@ from capsense.surface.force_kernels import (
     wide_moments,
 )
 from capsense.surface.step_kernels import _share, distances
-from capsense.surface.vector_kernels import WIDTH, entry, fast, multiply, multiply_lanes
+from capsense.surface.vector_kernels import WIDTH, fast, multiply, multiply_lanes
 
 _BLOCK = 32
 """Leaves taken at a time, whose tables stay in the cache."""
 
 
-@entry
+@fast
 def jacobian(solution, bodies, green):
     """How the Maxwell matrix changes with the pose of each body.
 

@@ -20,7 +20,7 @@ from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
 from capsense.surface.panels import SurfacePanels
 from capsense.surface.step_kernels import BODY
-from capsense.surface.vector_kernels import cholesky, entry
+from capsense.surface.vector_kernels import cholesky, fast
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -142,7 +142,7 @@ def rigid_shape(panels: SurfacePanels) -> RigidShape:
     return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
 
 
-@entry
+@fast
 def _factored(matrix: Array) -> bool:
     """Cholesky on one core: several threads of LAPACK hinder each other on busy machines."""
     return cholesky(matrix)

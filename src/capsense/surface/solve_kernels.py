@@ -21,7 +21,6 @@ from capsense.surface.step_kernels import (
 from capsense.surface.vector_kernels import (
     WIDTH,
     cholesky,
-    entry,
     fast,
     integers,
     multiply,
@@ -65,7 +64,7 @@ class Solution(NamedTuple):
     """Functions solved for; 0 where the matrix was not definite."""
 
 
-@entry
+@fast
 def solve(bodies, green, threshold, width, adjoint):
     """Solve a scene of bodies without losses.
 
@@ -81,13 +80,13 @@ def solve(bodies, green, threshold, width, adjoint):
     return Solution(delta[:m, :m], left[:m, :m], charge, points, extent, owner, size)
 
 
-@entry
+@fast
 def prepared(bodies, green, threshold, width):
     """Return the cut, its functions, their φ⁰, matrix, rows below, diagonal, and the leaves."""
     return _prepare(bodies, green, threshold, width)
 
 
-@entry
+@fast
 def leaf_charges(cut, functions, x, leaves):
     """Return the charges on the leaves (l, m) of charges of the functions (f, m)."""
     return _leaf_charges(cut, functions, x, leaves)

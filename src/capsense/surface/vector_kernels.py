@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from capsense._simd import at, madd, put_span, span, splat
@@ -21,8 +20,6 @@ WIDTH = 32
 _FAST = frozenset({"contract", "nsz", "reassoc", "arcp"})
 fast = njit(cache=True, nogil=True, error_model="numpy", fastmath=set(_FAST))
 """Compiled with sums in any order; NaN and infinity keep their meaning."""
-entry = fast
-"""The same, for what Python calls."""
 
 
 @intrinsic
@@ -50,17 +47,6 @@ def rsqrt(typing: Any, value: Any) -> Any:
         return y
 
     return types.float32(types.float32), code
-
-
-@intrinsic
-def address_of(typing: Any, array: Any) -> Any:
-    """Where an array's elements begin in memory."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        return builder.ptrtoint(data, cgutils.intp_t)
-
-    return types.intp(array), code
 
 
 def _pointer(kind: Any) -> Any:
