@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.change import Change
 from capsense.field.held_nodes import WALL, hold_nodes
 from capsense.field.planes import plan_axes
 from capsense.mesh import TetMesh, kuhn_tets
@@ -48,7 +49,7 @@ class MaskedScenes:
         if missing:
             raise SceneError(
                 f"method 'masked' needs mesh nodes on every electrode; {missing[0]!r} has none: "
-                "raise [build] resolution, or use method 'perturbation'"
+                "raise [build] resolution, or use method 'surface'"
             )
         groups["ground"] = np.flatnonzero(owner == WALL).astype(np.int32)
         self._mesh = TetMesh(mesh.points, mesh.tets, node_groups=groups)
@@ -68,8 +69,17 @@ class MaskedScenes:
         """Forget the last solution."""
         self._solver.reset()
 
-    def solve(self, scene: Scene) -> tuple[Array, int, float, float]:
-        """Return the change of the terminals' matrix [F], iterations, and the tolerance twice."""
+    def potentials(self, points: Array) -> Array:
+        """Not offered.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError('method "masked" gives no potentials; use "surface"')
+
+    def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
+        """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
+        assert not jacobian
         inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)
         eps = np.ones(len(scene))
         for i, body in enumerate(scene):
@@ -92,4 +102,5 @@ class MaskedScenes:
         matrix = self._solver.step(inside, eps.tolist())
         stats = self._solver.stats
         goal = self._solver.tolerance * float(np.abs(matrix).max())
-        return matrix - self._empty, int(stats.iterations), goal, goal
+        free = self._mesh.n_nodes - stats.grounded_nodes
+        return Change(matrix - self._empty, goal, int(stats.iterations), free)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._patience import first_use
+from capsense.design.model import Design
 from capsense.errors import SceneError, SolveError
-from capsense.field.background import BackgroundField
+from capsense.field.change import Change
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene
 from capsense.scene.scene import PackedScene
@@ -18,6 +19,7 @@ from capsense.scene.shape import ShapeKind
 from capsense.surface.changing import ChangingBody, layer_pieces
 from capsense.surface.lossy import solve_lossy
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
+from capsense.surface.potentials import potential_change
 from capsense.surface.rigid import RigidShape
 from capsense.surface.solve_kernels import Solution, solve
 from capsense.surface.step_kernels import BODY, Green
@@ -89,20 +91,65 @@ class SurfaceSolver:
     """Solves scenes, each by itself.
 
     Args:
-        background: Field of the design.
+        green: Green's function of the design.
+        design: The design.
         frequency: Excitation frequency [Hz].
         preset: How finely scenes are resolved.
     """
 
     def __init__(
-        self, background: BackgroundField, *, frequency: float = 250e3, preset: Preset | None = None
+        self,
+        green: GreenFunction,
+        design: Design,
+        *,
+        frequency: float = 250e3,
+        preset: Preset | None = None,
     ) -> None:
-        self.green = pack_green(background.green)
+        self.green = pack_green(green)
         self.frequency = frequency
         self.preset = preset or Preset()
-        low, top = background.lattice.storeys[0].axes, background.lattice.storeys[-1].axes[2]
-        room = np.array([[a[0] for a in low], [low[0][-1], low[1][-1], top[-1]]])
+        room = np.array([design.domain.lower, design.domain.upper])
         self._room = room + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
+        self._function = green
+        self._last: tuple[View, Solution] | None = None
+
+    def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
+        """Return what a scene changes.
+
+        Raises:
+            SceneError: A Jacobian is asked for of what has none.
+            SolveError: Bodies lie within each other in a way that leaves no solution.
+        """
+        view = self.look(scene)
+        self._last = None
+        bodies, solution = self.solution(view, jacobian=jacobian)
+        slope = self.jacobian(view, bodies, solution) if jacobian else None
+        if solution is None:
+            nothing = np.zeros((self.green.terminals, self.green.terminals))
+            return Change(nothing, 0.0, jacobian=slope)
+        self._last = view, solution
+        matrix, error = self.in_farads(solution)
+        return Change(matrix, error, unknowns=solution.size, jacobian=slope)
+
+    def potentials(self, points: Array) -> Array:
+        """Potentials of the last scene at points [V], shape (n, 3) -> (n, terminals)."""
+        out = np.clip(self._function.phi0(points), 0.0, 1.0)
+        if self._last is None:
+            return out
+        view, solution = self._last
+        out += potential_change(self._function, solution, points)
+        for place in np.flatnonzero(view.matter.conducting).tolist():
+            body = view.scene[int(view.met[place])]
+            if body.shape.kind in (ShapeKind.MESH, ShapeKind.LAYERS):
+                continue
+            inside = body.shape.signed_distance(body.pose.inverse().apply(points)) < 0
+            if inside.any():
+                out[inside] = 0.0 if body.grounding == "grounded" else out[inside].mean(axis=0)
+        return out
+
+    def reset(self) -> None:
+        """Forget the last scene; no reading depends on the one before."""
+        self._last = None
 
     def look(self, scene: Scene) -> View:
         """Find the bodies of a scene that reach into the domain."""
