@@ -70,5 +70,5 @@ def solve_lossy(
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(points))
     return Solution(
         np.ascontiguousarray(0.5 * (delta + delta.T).real), np.ascontiguousarray(left.real),
-        charge, points, extent, owner, n,
+        charge, points, extent, owner, n, 0.0,
     )  # fmt: skip

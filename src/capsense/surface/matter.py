@@ -44,10 +44,6 @@ class Matter:
     group: Ints
     """First of the conductors that a body touches, directly or not; else itself, shape (n,)."""
 
-    def __getitem__(self, places: Sequence[int]) -> Matter:
-        """Some of the bodies, each by itself."""
-        return Matter(self.eps[places], self.ground[places], np.arange(len(places)))
-
     @property
     def conducting(self) -> NDArray[np.bool_]:
         """Which bodies hold no field inside, shape (n,)."""

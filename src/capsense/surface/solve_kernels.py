@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from capsense._simd import at, madd, put_span, span
 from capsense.surface.pair_kernels import leaf_pairs
 from capsense.surface.step_kernels import (
+    BARRIER,
     choose,
     climb,
-    distances,
     leaf_points,
     leaf_rows,
     score,
@@ -61,7 +61,9 @@ class Solution(NamedTuple):
     owner: NDArray[Any]
     """Body of each leaf, shape (l,)."""
     size: int
-    """Functions solved for; 0 where the matrix was not definite."""
+    """Functions solved for; 0 where there is no solution."""
+    shift: float
+    """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
 
 
 @fast
@@ -73,11 +75,11 @@ def solve(bodies, green, threshold, width, adjoint):
     cut, functions, phi, matrix, rest, own, points, extent, owner = _prepare(
         bodies, green, threshold, width
     )
-    delta, left, x = _reduce(cut, functions, phi, matrix, rest, own, adjoint)
+    delta, left, x, shift = _reduce(cut, functions, phi, matrix, rest, own, adjoint)
     charge = _leaf_charges(cut, functions, x, points.shape[0])
     m = green.terminals
     size = functions.solved if delta[0, 0] == delta[0, 0] else 0
-    return Solution(delta[:m, :m], left[:m, :m], charge, points, extent, owner, size)
+    return Solution(delta[:m, :m], left[:m, :m], charge, points, extent, owner, size, shift)
 
 
 @fast
@@ -101,8 +103,8 @@ def _prepare(bodies, green, threshold, width):
     weight, scores = np.empty(green.terminals), np.empty(first[-1])
     score(bodies, first, green, weight, scores)
     cut = choose(bodies, first, scores, threshold, width)
-    points, extent = leaf_points(bodies, cut)
-    rows = leaf_rows(points, distances(points, green), green)
+    points, extent, out = leaf_points(bodies, cut, green)
+    rows = leaf_rows(points, out, green)
     leaves = cut.leaves.shape[0]
     owner, changing = np.empty(leaves, np.int64), np.empty(leaves, np.bool_)
     for j in range(leaves):
@@ -110,6 +112,8 @@ def _prepare(bodies, green, threshold, width):
         changing[j] = bodies[owner[j]].spread != 0
     pairs = np.empty((leaves, leaves), np.float32)
     leaf_pairs(points, extent, owner, changing, green.floor, pairs)
+    for j in range(leaves):
+        pairs[j, j] += BARRIER * out[j] ** 3
     functions = _list_functions(bodies, cut)
     phi, matrix, rest, own = _assemble(bodies, cut, functions, rows, pairs, green)
     return cut, functions, phi, matrix, rest, own, points, extent, owner
@@ -252,7 +256,7 @@ def _add_matter(bodies, functions, matrix, rest, own):
 
 @fast
 def _reduce(cut, functions, phi, matrix, rest, own, adjoint):
-    """ΔC, the part of it that was estimated, and the charges of all functions.
+    """ΔC, the part of it that was estimated, the charges of all functions, a shift of the diagonal.
 
     Functions that fade in by t are taken as √t A √t with their own energy whole. What they lack,
     and functions not solved for, add the energy that the potential they leave has in them alone.
@@ -271,9 +275,10 @@ def _reduce(cut, functions, phi, matrix, rest, own, adjoint):
         for i in range(m):
             x[f, i] = root[f] * phi[f, i]
     delta, left = np.zeros((m, m)), np.zeros((m, m))
-    if not _factorise(matrix, root, own, factor):
+    shift = _factorise(matrix, root, own, factor)
+    if shift < 0.0:
         delta[0, 0] = np.nan
-        return delta, left, x
+        return delta, left, x, shift
     substitute(factor, x[:solved])
     for f in range(solved):
         for i in range(m):
@@ -309,15 +314,18 @@ def _reduce(cut, functions, phi, matrix, rest, own, adjoint):
     for i in range(m):
         for j in range(i):
             delta[i, j] = delta[j, i] = 0.5 * (delta[i, j] + delta[j, i])
-    return delta, left, x
+    return delta, left, x, shift
 
 
 @fast
 def _factorise(matrix, root, own, factor):
-    """Cholesky factor of √t A √t with A's own diagonal; False where there is none.
+    """Cholesky factor of √t A √t with A's own diagonal.
 
     Where bodies lie within each other or within the sensor, approximate energies may leave no
     definite matrix. The diagonal is then raised, by as little as it takes.
+
+    Returns:
+        By how much it was raised, relative to itself; -1 where there is no factor.
     """
     shift = 0.0
     while shift < 1e3:
@@ -326,9 +334,9 @@ def _factorise(matrix, root, own, factor):
                 factor[f, e] = root[f] * matrix[f, e] * root[e]
             factor[f, f] = matrix[f, f] + shift * abs(own[f])
         if cholesky(factor):
-            return True
+            return shift
         shift = max(1e-3, 2.0 * shift)
-    return False
+    return -1.0
 
 
 @fast

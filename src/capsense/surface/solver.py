@@ -15,7 +15,7 @@ from capsense.field.change import Change
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene
 from capsense.scene.scene import PackedScene
-from capsense.scene.shape import ShapeKind
+from capsense.scene.shape import Shape, ShapeKind
 from capsense.surface.changing import ChangingBody, layer_pieces
 from capsense.surface.lossy import solve_lossy
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
@@ -27,13 +27,12 @@ from capsense.surface.store import rigid
 from capsense.surface.vector_kernels import WIDTH
 
 Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
-CONTACT = 2e-4, 6e-4
-"""Distances from the design [m] between which surface charges come to be trusted."""
-
-
+_DOUBTFUL = 0.03
+"""Readings are in doubt where the matrix's diagonal was raised by more than this part of it."""
+_FLAT = 1e-4
+"""Sheets of a flat design rise by less than this [m]."""
 MARGIN = 0.015
 """What lies nearer than this [m] to the ceiling and the side walls is left out: at ground, the
 walls take nearly all of what would meet it."""
@@ -67,8 +66,6 @@ class View:
     packed: PackedScene
     met: NDArray[np.intp]
     """Their places in the scene, shape (n,)."""
-    within: Bools
-    """Which of them lie in the domain as a whole, shape (n,)."""
     matter: Matter
     """What they are made of."""
 
@@ -105,11 +102,11 @@ class SurfaceSolver:
         frequency: float = 250e3,
         preset: Preset | None = None,
     ) -> None:
-        self.green = pack_green(green)
         self.frequency = frequency
         self.preset = preset or Preset()
         room = np.array([design.domain.lower, design.domain.upper])
         self._room = room + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
+        self.green = pack_green(green, self._room, cover_of(design))
         self._function = green
         self._last: tuple[View, Solution] | None = None
 
@@ -156,35 +153,8 @@ class SurfaceSolver:
         packed = scene.pack()
         low, high = packed.bounds[:, 0], packed.bounds[:, 1]
         met = np.flatnonzero(((high > self._room[0]) & (low < self._room[1])).all(axis=1))
-        within = ((low[met] > self._room[0]) & (high[met] < self._room[1])).all(axis=1)
         matter = matter_of([scene[k] for k in met.tolist()], self.frequency)
-        return View(scene, packed, met, within, matter)
-
-    def unsupported(self, view: View) -> str | None:
-        """Say what of a scene has no surface charges here, if anything."""
-        for place in np.flatnonzero(~view.matter.conducting).tolist():
-            shape = view.scene[int(view.met[place])].shape
-            if isinstance(shape, Layers):
-                return "a dielectric given by a depth image"
-            if not view.within[place]:
-                return "a dielectric that the walls of the domain cut off"
-            if not getattr(shape, "closed", True):
-                return "a dielectric whose surface is open"
-        return None
-
-    def closeness(self, view: View) -> float:
-        """How far bodies are within :data:`CONTACT` of the design: 1 at its near end, 0 beyond.
-
-        Taken from bounding boxes: it is smooth in every pose.
-        """
-        if not len(view.met):
-            return 0.0
-        low, high = view.packed.bounds[view.met, 0], view.packed.bounds[view.met, 1]
-        below = [0.0, 0.0, np.inf]  # what lies between the design and the floor is close
-        off = np.maximum(np.maximum(self.green.box[0] - below - high, low - self.green.box[1]), 0.0)
-        nearest = math.sqrt(float((off**2).sum(axis=1).min()))
-        x = min(1.0, max(0.0, (CONTACT[1] - nearest) / (CONTACT[1] - CONTACT[0])))
-        return x * x * (3 - 2 * x)
+        return View(scene, packed, met, matter)
 
     def solution(
         self, view: View, *, jacobian: bool = False
@@ -221,9 +191,11 @@ class SurfaceSolver:
     def in_farads(self, solution: Solution) -> tuple[Array, float]:
         """Change of the Maxwell matrix of all terminals [F], (terminals, terminals), and its error.
 
-        The error is an estimate of that of the largest entry [F].
+        The error is an estimate of that of the largest entry [F]; where bodies lie within each
+        other or within the sensor so that the matrix had to be changed, it is all of that entry.
         """
-        return UNIT * solution.delta, UNIT * float(np.abs(np.diag(solution.left)).max())
+        doubt = solution.delta if solution.shift > _DOUBTFUL else solution.left
+        return UNIT * solution.delta, UNIT * float(np.abs(np.diag(doubt)).max())
 
     def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
         """How the matrix of all terminals changes with the poses of a scene's bodies.
@@ -252,47 +224,37 @@ class SurfaceSolver:
         """Lay out the bodies that reach into the domain."""
         shapes: list[RigidShape | ChangingBody] = []
         sizes: list[float] = []
-        kept: list[int] = []
-        for place, k in enumerate(view.met.tolist()):
-            whole = bool(view.within[place] or not view.matter.conducting[place])
-            shape, size = self._shape(view, k, whole)
-            if shape is not None:
-                shapes.append(shape)
-                sizes.append(size)
-                kept.append(place)
-        chosen, packed = view.met[kept], view.packed
-        matter = view.matter[kept].joined(view.scene, packed, chosen)
+        for k in view.met.tolist():
+            shape, size = self._shape(view.scene[k].shape)
+            shapes.append(shape)
+            sizes.append(size)
+        matter, packed = view.matter.joined(view.scene, view.packed, view.met), view.packed
         records = np.array([s.record for s in shapes], BODY)
         records["scale"] = sizes
-        records["rotation"], records["position"] = packed.rotation[chosen], packed.position[chosen]
+        records["rotation"] = packed.rotation[view.met]
+        records["position"] = packed.position[view.met]
         matter.write(records, shapes)
-        return PackedBodies(records, chosen, matter, shapes)
+        return PackedBodies(records, view.met, matter, shapes)
 
-    def _shape(
-        self, view: View, k: int, whole: bool
-    ) -> tuple[RigidShape | ChangingBody | None, float]:
-        """Charge functions of a body and its size; None where nothing of it is in the domain."""
-        shape, packed = view.scene[k].shape, view.packed
+    def _shape(self, shape: Shape) -> tuple[RigidShape | ChangingBody, float]:
+        """Charge functions of a body, and its size."""
         if isinstance(shape, Layers):
-            tree, pieces, wanted = layer_pieces(shape)
-            inside = wanted & self._inside(pieces.centers, packed, k)
-            return (ChangingBody(tree, pieces, inside) if inside.any() else None), 1.0
+            return ChangingBody(*layer_pieces(shape)), 1.0
         edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
-        functions, size = rigid(shape, self.preset.panels * (2 if edged else 1))
-        if whole:
-            return functions, size
-        inside = self._inside(size * functions.panels.centers, packed, k)
-        return (
-            ChangingBody(functions.tree, functions.panels, inside) if inside.any() else None
-        ), size
-
-    def _inside(self, points: Array, packed: PackedScene, k: int) -> Bools:
-        """Which points of a body's frame lie in the domain."""
-        world = points @ packed.rotation[k].T + packed.position[k]
-        return ((world > self._room[0]) & (world < self._room[1])).all(axis=1)
+        return rigid(shape, self.preset.panels * (2 if edged else 1))
 
 
-def pack_green(green: GreenFunction) -> Green:
+def cover_of(design: Design) -> float:
+    """Thickness of what covers the sheets of a flat design [m]; infinite for other designs."""
+    heights = np.concatenate([body.surface.bounds[:, 2] for body in design.sheets])
+    floors = [np.ptp(body.surface.bounds[:, 2]) for body in design.sheets]
+    if max(floors) > _FLAT:
+        return math.inf
+    top = max([float(heights.max()), *(float(layer.upper[2]) for layer in design.layers)])
+    return top - float(heights.max())
+
+
+def pack_green(green: GreenFunction, room: Array, cover: float) -> Green:
     """Lay a Green's function out for the kernels."""
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
@@ -309,5 +271,5 @@ def pack_green(green: GreenFunction) -> Green:
         np.ascontiguousarray(green.near_sources.T), table(green.near_phi, green.near_modes),
         np.ascontiguousarray(green.far_sources.T), far, np.ascontiguousarray(far[:, :lead]),
         lead, terminals, float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blend, float),
+        np.asarray(green.blend, float), room, cover,
     )  # fmt: skip

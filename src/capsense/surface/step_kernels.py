@@ -48,6 +48,17 @@ _COARSE = 31
 """So many clusters, the coarsest of a body, are looked into wherever they are."""
 _DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
+_SHORE = 5e-3
+"""Bodies fade out over this distance beyond the room, and behind the face of a flat design [m]."""
+BARRIER = 1e6
+"""Energy of charge that is farther out than that [1/m]."""
+_DEEP = 3e-3
+"""What is deeper behind the face of a flat design [m] comes to be screened by it."""
+_GAP = 1.5e-4, 7e-4, 0.18, 2e-5
+"""Least gap to a flat design [m]: the square of a cluster's extent over the third, at least the
+first, at most the second; less by the thickness of a cover, but not less than the fourth."""
+_NEAR_FACE = 2e-3
+"""Clusters farther from the design [m] keep their gap to it."""
 USED, FRONTIER, LEAF = 2, 1, 0
 """State of a cluster: its function is used; it is split for an estimate only; it is not split."""
 
@@ -75,6 +86,10 @@ class Green(NamedTuple):
     """Corners of the design [m], shape (2, 3)."""
     blend: NDArray[Any]
     """Distances [m] from ``box`` between which near sources give way to far ones, shape (2,)."""
+    room: NDArray[Any]
+    """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
+    cover: float
+    """Thickness of what covers the electrodes of a flat design [m]; infinite for other designs."""
 
 
 class Cut(NamedTuple):
@@ -96,6 +111,13 @@ class Cut(NamedTuple):
     """The same of the cluster above, 1 at the top, shape (k,)."""
     leaves: NDArray[Any]
     """The leaves in this list, shape (l,)."""
+
+
+@fast
+def smooth(x):
+    """Smoothstep: 0 up to 0, 1 from 1 on."""
+    x = min(1.0, max(0.0, x))
+    return x * x * (3.0 - 2.0 * x)
 
 
 @fast
@@ -143,12 +165,13 @@ def _mean_potentials(body, green, means, met):
     """φ⁰ in the middle of clusters that are not looked into, from the far sources."""
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
     places, points = np.empty(body.n, np.int64), np.empty((body.n + 3, 3), np.float32)
+    inner = np.empty(body.n)
     found = 0
     met[0] = True
     for k in range(2 * body.n - 1):
         if not met[k]:
             continue
-        square = 0.0
+        square = out = 0.0
         for i in range(3):
             x = body.position[i] + body.scale * (
                 body.rotation[i, 0] * center[3 * k]
@@ -158,10 +181,14 @@ def _mean_potentials(body, green, means, met):
             points[found, i] = x
             off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
             square += off * off
+            off = max(green.room[0, i] - x, x - green.room[1, i], 0.0)
+            out += off * off
         size = body.scale * extent[k]
         small = k >= _COARSE and size * size < _LINEAR * _LINEAR * square
+        if square < _NEAR_FACE * _NEAR_FACE and green.cover < 1.0:
+            _lift(points[found : found + 1], _gap(size, green.cover), green.box)
         if small or kids[2 * k] < 0:
-            places[found] = k
+            places[found], inner[found] = k, 1.0 - smooth(math.sqrt(out) / _SHORE)
             found += 1
         else:
             met[kids[2 * k]] = met[kids[2 * k + 1]] = True
@@ -177,7 +204,7 @@ def _mean_potentials(body, green, means, met):
     multiply_lanes(values, green.score_table, phi)
     for j in range(found):
         for i in range(green.lead):
-            means[places[j], i] = phi[j, i]
+            means[places[j], i] = inner[j] * phi[j, i]
 
 
 @fast
@@ -232,8 +259,7 @@ def choose(bodies, first, scores, threshold, width):
                 leaves += 1
                 continue
             x = math.log(max(scores[o + k], 1e-300) / threshold) / math.log(width)
-            x = min(1.0, max(0.0, x))
-            fades[o + k] = min(x * x * (3.0 - 2.0 * x), above[o + k])
+            fades[o + k] = min(smooth(x), above[o + k])
             state[o + k] = USED if fades[o + k] > 0.0 else FRONTIER
             for c in range(2):
                 state[o + kids[2 * k + c]] = LEAF if state[o + k] == FRONTIER else FRONTIER
@@ -274,10 +300,16 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
 
 
 @fast
-def leaf_points(bodies, cut):
-    """Four points of each leaf and its extent [m] in the sensor frame, (l, 4, 3) and (l,)."""
+def leaf_points(bodies, cut, green):
+    """Where the leaves are in the sensor frame.
+
+    Returns:
+        Four points of each [m], shape (l, 4, 3); its extent [m], shape (l,); how far it is out of
+        reach, from 0 to 1 (see :func:`beyond`), shape (l,).
+    """
     n = cut.leaves.shape[0]
     points, extent, corners = np.empty((n, 4, 3)), np.empty(n), np.empty((4, 3))
+    out = np.empty(n)
     moments, turn, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for j in range(n):
         a = cut.leaves[j]
@@ -301,7 +333,60 @@ def leaf_points(bodies, cut):
                 points[j, q, i] = body.position[i] + body.scale * (
                     body.rotation[i, 0] * corners[q, 0] + body.rotation[i, 1] * corners[q, 1]
                     + body.rotation[i, 2] * corners[q, 2])  # fmt: skip
-    return points, extent
+        out[j] = beyond(points[j], green)
+        if green.cover < 1.0:
+            _lift(points[j], _gap(extent[j], green.cover), green.box)
+    return points, extent, out
+
+
+@fast
+def beyond(points, green):
+    """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face."""
+    out, depth = 0.0, 1.0
+    for i in range(3):
+        c = 0.5 * (points[0, i] + points[3, i])
+        off = max(green.room[0, i] - c, c - green.room[1, i], 0.0)
+        out += off * off
+        below = 1.0 if i == 2 else c - green.box[0, i]
+        depth = min(depth, below, green.box[1, i] - c)
+    deep = depth - _DEEP if green.cover < 1.0 else 0.0
+    return smooth(max(math.sqrt(out), deep) / _SHORE)
+
+
+@fast
+def _gap(extent, cover):
+    """Least gap [m] between a cluster and a flat design, see :data:`_GAP`."""
+    return max(_GAP[3], min(_GAP[1], max(_GAP[0], extent * extent / _GAP[2])) - cover)
+
+
+@fast
+def _lift(points, gap, box):
+    """Keep points (k, 3) off a flat design: a distance d < 2 gap becomes gap + d² / (4 gap).
+
+    The space between the design and the floor counts as within it.
+    """
+    for q in range(points.shape[0]):
+        square, depth, axis, side = 0.0, 1.0, 2, 1
+        for i in range(3):
+            for k in range(2):
+                if i == 2 and k == 0:
+                    continue
+                off = points[q, i] - box[1, i] if k == 1 else box[0, i] - points[q, i]
+                square += max(off, 0.0) ** 2
+                if -off < depth:
+                    depth, axis, side = -off, i, k
+        way = math.sqrt(square)
+        if way >= 2.0 * gap:
+            continue
+        if way == 0.0:
+            points[q, axis] = box[1, axis] + gap if side == 1 else box[0, axis] - gap
+            continue
+        ratio = (gap + way * way / (4.0 * gap)) / way
+        for i in range(3):
+            edge = min(points[q, i], box[1, i])
+            if i < 2:
+                edge = max(edge, box[0, i])
+            points[q, i] = edge + ratio * (points[q, i] - edge)
 
 
 @fast
@@ -368,13 +453,13 @@ def distances(points, green):
 @fast
 def _share(distance, blend):
     """One below the first distance of a blend, zero above the second, smooth in between."""
-    x = min(1.0, max(0.0, (blend[1] - distance) / (blend[1] - blend[0])))
-    return x * x * (3.0 - 2.0 * x)
+    return smooth((blend[1] - distance) / (blend[1] - blend[0]))
 
 
 @fast
-def leaf_rows(points, distance, green):
+def leaf_rows(points, out_of_reach, green):
     """Rows of the leaves, shape (l, w); no wider than those of far points where none is near."""
+    distance = distances(points, green)
     n = points.shape[0]
     near = False
     for j in range(n):
@@ -386,7 +471,7 @@ def leaf_rows(points, distance, green):
         count = 0
         for j in range(n):
             part = _share(distance[j], green.blend)
-            part = 1.0 - part if far == 1 else part
+            part = (1.0 - part if far == 1 else part) * (1.0 - out_of_reach[j])
             if part > 0.0:
                 chosen[count], share[count] = j, part
                 for q in range(4):
