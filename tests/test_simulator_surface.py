@@ -1,4 +1,4 @@
-"""Charges on the bodies: what the method reads, how smoothly, and where it gives way."""
+"""Charges on the bodies: what they read, how smoothly, and what must hold everywhere."""
 
 from __future__ import annotations
 
@@ -18,15 +18,13 @@ from random_scenes import random_scene
 from reference_scenes import MAP, MORE, diagonal_errors, other_errors, reference_scenes
 
 import capsense as cs
-from capsense.errors import SceneError
-from capsense.solve.perturbation import PerturbationSolver
 
 Array = np.ndarray
 
 
 @pytest.fixture
 def sim(simulators) -> cs.Simulator:
-    return simulators("six_patch_bare", method="surface")
+    return simulators("six_patch_bare")
 
 
 # -- accuracy ---------------------------------------------------------------------------------
@@ -77,7 +75,7 @@ def test_bars(simulators, table, gap):
     """Measured against boundary and finite elements."""
     case = f"bar {gap}" if table == "six_patch_bare" else f"bar_{gap}"
     if (table, gap) != ("six_patch", 5):  # there is none
-        reading = simulators(table, method="surface").step(cs.Scene([body_of(case)]))
+        reading = simulators(table).step(cs.Scene([body_of(case)]))
         assert_close(reading.delta, delta_reference(table, case), 0.03, 0.05)
 
 
@@ -116,7 +114,7 @@ def test_a_reading_does_not_depend_on_those_before_it(sim):
 
 
 def test_smooth_on_the_way_towards_the_sensor(sim):
-    """Measured: a finger in steps of 0.05 mm, where the lattice jumps by some per cent."""
+    """Measured: a finger in steps of 0.05 mm."""
     turn = (0.1494, 0.2344, 0.1494, 0.9491)
     heights = np.concatenate([z + 5e-5 * np.arange(40, 0, -1) for z in (0.05, 0.062)])
     read = [
@@ -133,12 +131,44 @@ def test_smooth_on_the_way_towards_the_sensor(sim):
         assert (np.diff(part[:, part[-1] > np.log(0.1) + part[-1].max()], axis=0) > 0).all()
 
 
-def test_one_step_further_changes_little_down_to_contact(sim):
-    """Measured: no jump where the lattice takes over, some millimetres before contact."""
-    read = [np.diag(sim.step(cs.Scene([ball(0.04 + g)])).delta) for g in np.arange(0.006, 0, -1e-4)]
-    change = np.diff(np.log(np.array(read)[:, [1, 4]]), axis=0)
-    assert change.min() > 0
-    assert change.max() < 0.08
+CONTACT = {
+    "ball": (cs.Sphere(0.03), 0.03, (0.0, 0.025), (0, 0, 0, 1)),
+    "finger": (cs.Capsule(0.008, 0.06), 0.008, (-0.038, -0.025), (0, 0.5**0.5, 0, 0.5**0.5)),
+    "box": (cs.Box((0.04, 0.04, 0.02)), 0.01, (0.02, 0.01), (0, 0, 0, 1)),
+    "bar": (cs.Box((0.15, 0.15, 0.02)), 0.01, (0.0, 0.0), (0, 0, 0, 1)),
+}
+
+
+@pytest.mark.parametrize("name", CONTACT)
+@pytest.mark.parametrize("design", ["six_patch_bare", "six_patch"])
+def test_contact_is_finite_and_monotone(simulators, design, name):
+    """Invariant: from 3 mm to 0.5 mm into the face, every large entry grows, by small steps."""
+    shape, half, (x, y), turn = CONTACT[name]
+    gaps = np.concatenate([np.arange(3e-3, 1.2e-3, -1e-4), np.arange(1.2e-3, -5.1e-4, -2.5e-5)])
+    read = np.array([
+        np.diag(simulators(design).step(
+            cs.Scene([cs.Body(shape, cs.Pose((x, y, half + g), turn))])
+        ).delta)
+        for g in gaps
+    ])  # fmt: skip
+    read = read[:, read[-1] > 0.1 * read[-1].max()]
+    change = np.diff(np.log(read), axis=0)
+    assert change.min() > -1e-3
+    assert change.max() < 0.13
+    assert read[-1].max() < 50e-12
+
+
+def test_deep_in_the_sensor_a_reading_says_that_it_is_in_doubt(sim):
+    """Invariant: finite, and the estimate of the error is no smaller than the change itself."""
+    reading = sim.step(cs.Scene([bar(-0.001)]))
+    assert np.isfinite(reading.delta).all()
+    assert reading.stats.error_estimate >= 0.99 * np.abs(np.diag(reading.delta)).max()
+
+
+def test_what_lies_behind_the_sensor_is_screened(sim):
+    """Measured: a plate in the gap between sensor and floor reads 0.2 % of C at most."""
+    plate = cs.Body(cs.Box((0.1, 0.08, 0.001)), cs.Pose((0, 0, -0.0095)))
+    assert np.abs(sim.step(cs.Scene([plate])).delta).max() < 5e-15
 
 
 @pytest.mark.parametrize(("one", "other"), [(999.0, 1001.0), (9_990.0, 10_010.0)])
@@ -155,7 +185,7 @@ def test_water_conducts_less_and_less(simulators):
     """Invariant: tap water's reading falls smoothly with the frequency, from 250 kHz to 100 MHz."""
     read = []
     for f in np.geomspace(250e3, 100e6, 12):
-        sim = simulators("six_patch_bare", method="surface", frequency=float(f))
+        sim = simulators("six_patch_bare", frequency=float(f))
         read.append(sim.step(cs.Scene([ball(0.06, 0.03, material="water")])).delta[1, 1])
     steps = np.diff(np.log(read))
     assert (steps <= 1e-4).all()
@@ -222,22 +252,39 @@ def test_a_depth_frame_reads_as_what_it_shows(sim):
     np.testing.assert_allclose(np.diag(seen.delta), np.diag(arm), rtol=0.03)
 
 
-def test_a_dielectric_depth_image_goes_to_the_lattice(sim, simulators):
-    """Invariant: to the last bit; and there is no Jacobian then."""
-    frame = cs.DepthFrame(np.full((16, 16), 0.05), 3.0, back=0.02)
-    reading = sim.step(frame)
-    assert reading.stats.unknowns == 0
-    expected = simulators("six_patch_bare").step(frame).delta
-    np.testing.assert_array_equal(reading.delta, expected)
-    with pytest.raises(SceneError, match="dielectric given by a depth image"):
-        sim.step(frame, jacobian=True)
+@pytest.mark.parametrize("eps", [2.0, 20.0])
+def test_a_dielectric_depth_image_reads_nearly_as_what_it_shows(sim, eps):
+    """Measured: a limb of plastic, whose inside a depth image does not give; 13 % at most."""
+    t = (np.arange(64) + 0.5) / 64 * 0.5 - 0.25
+    _, y = np.meshgrid(t, t)
+    depth = np.where(np.abs(y) < 0.045, 0.065 - np.sqrt(np.maximum(0.045**2 - y**2, 0)), np.nan)
+    seen = sim.step(cs.DepthFrame(depth, cs.Material("plastic", eps))).delta
+    pose = cs.Pose((0, 0, 0.065), (0, 0.7071068, 0, 0.7071068))
+    limb = cs.Body(cs.Capsule(0.045, 0.7), pose, cs.Material("plastic", eps))
+    np.testing.assert_allclose(np.diag(seen), np.diag(sim.step(cs.Scene([limb])).delta), rtol=0.14)
 
 
-def test_in_contact_the_lattice_reads(sim):
-    """Invariant: to the last bit, from rest."""
-    scene = cs.Scene([ball(0.0401)])
-    expected = PerturbationSolver(sim.background).solve(scene)[0]
-    np.testing.assert_allclose(sim.step(scene).delta, expected, rtol=1e-12)
+def test_an_open_dielectric_mesh_reads_nearly_as_a_closed_one(sim):
+    """Measured: a ball of eps 5 without its cap on the far side."""
+    mesh = cs.Sphere(0.03).to_trimesh()
+    open_ = mesh.faces[mesh.triangles_center[:, 2] < 0.02]
+    plastic, pose = cs.Material("plastic", 5.0), cs.Pose((0.01, 0, 0.06))
+    got, whole = (
+        sim.step(cs.Scene([cs.Body(shape, pose, plastic)])).delta
+        for shape in (cs.TriMesh(mesh.vertices, open_), cs.Sphere(0.03))
+    )
+    np.testing.assert_allclose(np.diag(got), np.diag(whole), rtol=0.08)
+
+
+@pytest.mark.parametrize("material", ["steel", cs.Material("plastic", 4.0)])
+def test_walls_are_crossed_smoothly(sim, material):
+    """Invariant: a bar that leaves through a side wall changes by small steps, and to nothing."""
+    read = np.array([
+        sim.step(cs.Scene([bar(0.02, x, material=material)])).delta[1, 1]
+        for x in np.arange(0.15, 0.34, 1e-3)
+    ])  # fmt: skip
+    assert np.abs(np.diff(read)).max() < 2e-3 * sim.step(cs.Scene([bar(0.02)])).delta[1, 1]
+    assert read[-1] == 0.0
 
 
 # -- Jacobian, potentials ---------------------------------------------------------------------
@@ -262,26 +309,9 @@ def test_jacobian_is_the_derivative(sim, grounding):
         assert worst <= 0.015 * np.abs(slope[0, :, :, :3]).max()
 
 
-def test_jacobian_of_other_methods_is_refused(simulators):
+def test_jacobian_of_the_other_method_is_refused(simulators):
     with pytest.raises(ValueError, match='use "surface"'):
-        simulators("six_patch_bare").step(cs.Scene(), jacobian=True)
-
-
-@pytest.mark.parametrize("grounding", ["grounded", "floating"])
-def test_potentials_in_a_conductor(sim, grounding):
-    """Invariant: zero in a grounded body, one value in a floating one."""
-    body = cs.Body(cs.Box((0.15, 0.15, 0.03)), cs.Pose((0, 0, 0.05)), "steel", grounding)
-    sim.step(cs.Scene([body]))
-    potentials, lattice = sim.potentials(), sim.background.lattice
-    held = lattice.owner >= 0
-    np.testing.assert_allclose(potentials[held], np.eye(6)[lattice.owner[held]], atol=1e-12)
-    inside = body.shape.signed_distance(body.pose.inverse().apply(lattice.points)) < -5e-3
-    assert inside.sum() > 20
-    expected = 0.0 if grounding == "grounded" else potentials[inside].mean(axis=0)
-    np.testing.assert_allclose(potentials[inside] - expected, 0.0, atol=1e-12)
-    if grounding == "floating":  # between that of the nearest electrode and ground
-        assert (potentials[inside].min(), potentials[inside].max()) > (0.0, 0.0)
-        assert potentials[inside].max() < 0.3
+        simulators("six_patch_bare", method="masked").step(cs.Scene(), jacobian=True)
 
 
 @pytest.mark.parametrize(("name", "value"), [("method", "lattice"), ("preset", "fast")])

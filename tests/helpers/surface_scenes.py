@@ -37,7 +37,8 @@ def shape_of(shape: cs.Sphere | cs.Capsule | cs.Box) -> RigidShape:
 @cache
 def green_of(design: str = "six_patch_bare") -> Green:
     """The Green's function of a packaged design."""
-    return pack_green(cs.Simulator(design).background.green)
+    sim = cs.Simulator(design)
+    return pack_green(sim.background.green, sim.design)
 
 
 def pack(*bodies: Placed) -> Array:

@@ -60,17 +60,21 @@ def shape_of(shape: cs.Shape, count: int = 150) -> RigidShape:
 
 
 @cache
-def background():
-    return cs.Simulator("six_patch_bare").background
+def simulator() -> cs.Simulator:
+    return cs.Simulator("six_patch_bare")
 
 
 def exact() -> GreenFunction:
-    return background().green
+    return simulator().background.green
+
+
+def coarse_solver() -> SurfaceSolver:
+    return SurfaceSolver(exact(), simulator().design, preset=Preset(panels=150))
 
 
 @cache
 def packed_green() -> Green:
-    return pack_green(exact())
+    return pack_green(exact(), simulator().design)
 
 
 class Scene(tuple[tuple[Piece, RigidShape], ...]):
@@ -577,7 +581,7 @@ def pairs(shapes: list, owner: list[int], changing: bool, floor: float = DEEP) -
     points = np.array([flat(*s)[0] for s in shapes])
     extent = np.array([flat(*s)[1] for s in shapes])
     out = np.empty((len(shapes),) * 2, np.float32)
-    leaf_pairs(points, extent, np.array(owner), np.full(len(shapes), changing), floor, out)
+    leaf_pairs(points, extent, np.array(owner), np.full(len(shapes), float(changing)), floor, out)
     return out
 
 
@@ -703,7 +707,7 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
-    score(bodies, first, green, np.empty(green.terminals), scores)
+    score(bodies, first, green, 0.0375, np.empty(green.terminals), scores)
     return choose(bodies, first, scores, threshold, WIDTH), scores, first
 
 
@@ -848,7 +852,7 @@ def test_lossy_functions_together_are_the_panels(shape: cs.Shape, eps: complex) 
 
 def reading(*bodies: cs.Body) -> Array:
     """ΔC [F] of a scene, by the solver."""
-    solver = SurfaceSolver(background(), preset=Preset(panels=150))
+    solver = coarse_solver()
     _, solution = solver.solution(solver.look(cs.Scene(list(bodies))))
     assert solution is not None
     return solver.in_farads(solution)[0]
@@ -892,7 +896,7 @@ def test_conductors_are_the_limit_of_large_eps(grounding: str, lossy: bool) -> N
 
 def packed(*bodies: cs.Body) -> Array:
     """Records of a scene, by the solver."""
-    solver = SurfaceSolver(background(), preset=Preset(panels=150))
+    solver = coarse_solver()
     return solver.pack(solver.look(cs.Scene(list(bodies)))).records
 
 

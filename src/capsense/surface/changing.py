@@ -91,6 +91,8 @@ class ChangingBody:
         tree_kernels.moments(self._kids, self._panel, self._charge, self._center, self._spread)
         extent = np.sqrt(6.0 * np.trace(self._spread, axis1=1, axis2=2)) + 1e-9
         self._extent = extent
+        self.capacitance = 0.35 * float(extent[0])
+        """About that in free space over 4π eps0 [m]."""
         self._own = np.empty(n)
         self._own[0] = 0.5 * _OWN / extent[0]
         self._own[self._function[~single]] = _OWN / extent[~single]

@@ -28,11 +28,11 @@ def solve_lossy(
             finite.
         ties: Energy of the bodies' net charges [1/m], infinite for floating ones, shape (n,).
         softness: 1 / (eps - 1), shape (n,).
-        impedances: Interior impedance of each body, None for conductors.
+        impedances: Interior impedance of each body, None for conductors and changing surfaces.
         green, threshold, width: As in ``solve_kernels.solve``.
     """
     plain = records.copy()
-    plain["tie"] = plain["softness"] = 0.0
+    plain["tie"], plain["impedance"] = 0.0, 0
     cut, functions, phi, real, below, own, points, extent, owner = prepared(
         plain, green, threshold, width
     )
@@ -42,9 +42,8 @@ def solve_lossy(
     net = functions.cluster < 0
     for b in range(len(records)):
         mine = np.flatnonzero((functions.body == b) & ~net)
-        if softness[b] != 0:
-            z = impedances[b]
-            assert z is not None
+        z = impedances[b]
+        if z is not None:
             number = functions.number
             inside = mine[mine < n]
             factor = softness[b] / records["scale"][b]

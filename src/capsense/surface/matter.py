@@ -115,8 +115,7 @@ class Matter:
         records["tie"] = np.where(shared, _SHUT, np.where(none, 0.0, ties.real))
         records["group"], records["softness"] = self.group, softness.real
         for record, shape, soft in zip(records, shapes, softness, strict=True):
-            if soft != 0:
-                assert isinstance(shape, RigidShape)  # others are conductors
+            if soft != 0 and isinstance(shape, RigidShape):
                 record["impedance"] = shape.impedance.ctypes.data
 
 
@@ -130,9 +129,8 @@ def matter_of(bodies: Sequence[Body], frequency: float) -> Matter:
 
 
 def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> Array:
-    """Capacitances of bodies in free space over 4π eps0 [m]; 1 for surfaces that change."""
-    size = [s.capacitance if isinstance(s, RigidShape) else 1.0 for s in shapes]
-    return records["scale"] * np.array(size)
+    """Capacitances of bodies in free space over 4π eps0 [m], shape (n,)."""
+    return records["scale"] * np.array([s.capacitance for s in shapes])
 
 
 def _touch(first: Body, second: Body) -> bool:

@@ -19,6 +19,7 @@ from capsense.errors import SolveError
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
 from capsense.surface.panels import SurfacePanels
+from capsense.surface.solve_kernels import INSIDE
 from capsense.surface.step_kernels import BODY
 from capsense.surface.vector_kernels import cholesky, fast
 
@@ -100,11 +101,13 @@ class RigidShape:
     def impedance(self) -> Array32:
         """Interior impedance Z of the charge functions [1/m], shape (n, n).
 
-        A body of permittivity eps adds ``Z / (eps - 1)`` to ``energy``.
-
-        Raises:
-            SceneError: The surface is open.
+        A body of permittivity eps adds ``Z / (eps - 1)`` to ``energy``. That of an open surface is
+        not known; it is taken for :data:`~capsense.surface.solve_kernels.INSIDE` times ``energy``.
         """
+        if not self.panels.closed:
+            z = np.float32(INSIDE) * self.energy
+            z[0] = z[:, 0] = 0.0
+            return z
         return _of_functions(self.tree, impedance(self.panels, free_block(self.panels)))
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._simd import at, madd, put_span, span
-from capsense.surface.pair_kernels import leaf_pairs
+from capsense.surface.pair_kernels import add_lifted, leaf_pairs
 from capsense.surface.step_kernels import (
     BARRIER,
     choose,
@@ -28,6 +28,9 @@ from capsense.surface.vector_kernels import (
     substitute,
 )
 
+INSIDE = 2.5
+"""Interior impedance of a surface that is open or changes, over its energy in free space: it is 3
+for a ball in an even field, and 2 for the face of a half-space."""
 GAIN = 1.3
 """What the functions directly below the cut stand for: themselves, and all below them."""
 
@@ -101,17 +104,19 @@ def _prepare(bodies, green, threshold, width):
     for b in range(bodies.shape[0]):
         first[b + 1] = first[b] + 2 * bodies[b].n - 1
     weight, scores = np.empty(green.terminals), np.empty(first[-1])
-    score(bodies, first, green, weight, scores)
+    score(bodies, first, green, threshold * width, weight, scores)
     cut = choose(bodies, first, scores, threshold, width)
-    points, extent, out = leaf_points(bodies, cut, green)
+    points, true, extent, out = leaf_points(bodies, cut, green)
     rows = leaf_rows(points, out, green)
     leaves = cut.leaves.shape[0]
-    owner, changing = np.empty(leaves, np.int64), np.empty(leaves, np.bool_)
+    owner, within = np.empty(leaves, np.int64), np.zeros(leaves)
     for j in range(leaves):
         owner[j] = cut.body[cut.leaves[j]]
-        changing[j] = bodies[owner[j]].spread != 0
+        if bodies[owner[j]].spread != 0:
+            within[j] = 1.0 + INSIDE * bodies[owner[j]].softness
     pairs = np.empty((leaves, leaves), np.float32)
-    leaf_pairs(points, extent, owner, changing, green.floor, pairs)
+    leaf_pairs(points, extent, owner, within, green.floor, pairs)
+    add_lifted(points, true, extent, owner, within, pairs)
     for j in range(leaves):
         pairs[j, j] += BARRIER * out[j] ** 3
     functions = _list_functions(bodies, cut)
@@ -240,7 +245,7 @@ def _add_matter(bodies, functions, matrix, rest, own):
             for e in range(solved):
                 if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
                     matrix[f, e] += body.tie
-        if body.softness == 0.0 or functions.cluster[f] < 0:
+        if body.impedance == 0 or functions.cluster[f] < 0:
             continue
         inside = singles(body.impedance)
         factor = body.softness / body.scale

@@ -104,9 +104,7 @@ class SurfaceSolver:
     ) -> None:
         self.frequency = frequency
         self.preset = preset or Preset()
-        room = np.array([design.domain.lower, design.domain.upper])
-        self._room = room + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
-        self.green = pack_green(green, self._room, cover_of(design))
+        self.green = pack_green(green, design)
         self._function = green
         self._last: tuple[View, Solution] | None = None
 
@@ -152,7 +150,8 @@ class SurfaceSolver:
         """Find the bodies of a scene that reach into the domain."""
         packed = scene.pack()
         low, high = packed.bounds[:, 0], packed.bounds[:, 1]
-        met = np.flatnonzero(((high > self._room[0]) & (low < self._room[1])).all(axis=1))
+        room = self.green.room
+        met = np.flatnonzero(((high > room[0]) & (low < room[1])).all(axis=1))
         matter = matter_of([scene[k] for k in met.tolist()], self.frequency)
         return View(scene, packed, met, matter)
 
@@ -162,7 +161,6 @@ class SurfaceSolver:
         """Return the packed bodies of a scene and their charges; None where none is in the domain.
 
         Raises:
-            SceneError: A dielectric has no inside, see :meth:`unsupported`.
             SolveError: Bodies lie within each other in a way that leaves no solution.
         """
         with first_use():
@@ -254,8 +252,10 @@ def cover_of(design: Design) -> float:
     return top - float(heights.max())
 
 
-def pack_green(green: GreenFunction, room: Array, cover: float) -> Green:
-    """Lay a Green's function out for the kernels."""
+def pack_green(green: GreenFunction, design: Design) -> Green:
+    """Lay the Green's function of a design out for the kernels."""
+    walls = np.array([design.domain.lower, design.domain.upper])
+    room = walls + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
 
@@ -271,5 +271,5 @@ def pack_green(green: GreenFunction, room: Array, cover: float) -> Green:
         np.ascontiguousarray(green.near_sources.T), table(green.near_phi, green.near_modes),
         np.ascontiguousarray(green.far_sources.T), far, np.ascontiguousarray(far[:, :lead]),
         lead, terminals, float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blend, float), room, cover,
+        np.asarray(green.blend, float), room, cover_of(design),
     )  # fmt: skip

@@ -52,8 +52,11 @@ _SHORE = 5e-3
 """Bodies fade out over this distance beyond the room, and behind the face of a flat design [m]."""
 BARRIER = 1e6
 """Energy of charge that is farther out than that [1/m]."""
-_DEEP = 3e-3
-"""What is deeper behind the face of a flat design [m] comes to be screened by it."""
+_DEEP, _STEEP = 3e-3, 4.0
+"""What is deeper behind the face of a flat design [m] comes to be screened by it; depth from the
+sides counts so many times."""
+_LONG = 0.03, 0.06
+"""Clusters that cross a wall come to be split where they are longer than this [m]."""
 _GAP = 1.5e-4, 7e-4, 0.18, 2e-5
 """Least gap to a flat design [m]: the square of a cluster's extent over the third, at least the
 first, at most the second; less by the thickness of a cover, but not less than the fourth."""
@@ -121,22 +124,24 @@ def smooth(x):
 
 
 @fast
-def score(bodies, first, green, weight, scores):
+def score(bodies, first, green, enough, weight, scores):
     """Share of the electrodes' energies that each charge function takes up alone.
 
     Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
-    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. Clusters that
+    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. A score of
+    ``enough`` has a cluster split for certain, as those that cross a wall must be. Clusters that
     are small against their distance from the design are not looked into: φ⁰ is linear there, and
     the scores of their parts follow from their own.
     """
     terminals, lead, total = green.terminals, green.lead, first[-1]
     means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
-    met = np.zeros(total, np.bool_)
+    met, crossing = np.zeros(total, np.bool_), np.zeros(total)
     for b in range(bodies.shape[0]):
         body, o = bodies[b], first[b]
         kids, function = integers(body.kids), integers(body.function)
         charge, own = doubles(body.charge), doubles(body.own)
-        _mean_potentials(body, green, means[o : first[b + 1]], met[o : first[b + 1]])
+        span = slice(o, first[b + 1])
+        _mean_potentials(body, green, means[span], met[span], crossing[span])
         for k in range(2 * body.n - 2, -1, -1):
             x, y = kids[2 * k], kids[2 * k + 1]
             if x >= 0 and met[o + x]:
@@ -157,12 +162,16 @@ def score(bodies, first, green, weight, scores):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
     for b in range(bodies.shape[0]):
         span = slice(first[b], first[b + 1])
+        scores[span] = enough * crossing[span]
         _raise_scores(bodies[b], means[span], met[span], weight, scores[span])
 
 
 @fast
-def _mean_potentials(body, green, means, met):
-    """φ⁰ in the middle of clusters that are not looked into, from the far sources."""
+def _mean_potentials(body, green, means, met, crossing):
+    """φ⁰ in the middle of clusters that are not looked into, from the far sources.
+
+    ``crossing`` is filled with how much each cluster crosses a wall, 0 to 1.
+    """
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
     places, points = np.empty(body.n, np.int64), np.empty((body.n + 3, 3), np.float32)
     inner = np.empty(body.n)
@@ -172,6 +181,7 @@ def _mean_potentials(body, green, means, met):
         if not met[k]:
             continue
         square = out = 0.0
+        room = 1.0
         for i in range(3):
             x = body.position[i] + body.scale * (
                 body.rotation[i, 0] * center[3 * k]
@@ -181,9 +191,12 @@ def _mean_potentials(body, green, means, met):
             points[found, i] = x
             off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
             square += off * off
-            off = max(green.room[0, i] - x, x - green.room[1, i], 0.0)
-            out += off * off
+            room = min(room, x - green.room[0, i], green.room[1, i] - x)
+            out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
         size = body.scale * extent[k]
+        crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
+            (size - _LONG[0]) / (_LONG[1] - _LONG[0])
+        )
         small = k >= _COARSE and size * size < _LINEAR * _LINEAR * square
         if square < _NEAR_FACE * _NEAR_FACE and green.cover < 1.0:
             _lift(points[found : found + 1], _gap(size, green.cover), green.box)
@@ -212,7 +225,6 @@ def _raise_scores(body, mean, met, weight, scores):
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     count = 2 * body.n - 1
     for k in range(count - 1, -1, -1):
-        scores[k] = 0.0
         a = kids[2 * k]
         if a >= 0 and met[a]:
             value = 0.0
@@ -223,7 +235,7 @@ def _raise_scores(body, mean, met, weight, scores):
             for c in range(2):
                 below = scores[kids[2 * k + c]]
                 value = max(value, below) + 0.5 * min(value, below)
-            scores[k] = value
+            scores[k] = max(scores[k], value)
     for k in range(count):
         a = kids[2 * k]
         if a >= 0:
@@ -304,12 +316,12 @@ def leaf_points(bodies, cut, green):
     """Where the leaves are in the sensor frame.
 
     Returns:
-        Four points of each [m], shape (l, 4, 3); its extent [m], shape (l,); how far it is out of
-        reach, from 0 to 1 (see :func:`beyond`), shape (l,).
+        Four points of each [m], shape (l, 4, 3); the same before they were lifted off the design;
+        its extent [m], shape (l,); how far it is out of reach, 0 to 1 (see :func:`beyond`), (l,).
     """
     n = cut.leaves.shape[0]
     points, extent, corners = np.empty((n, 4, 3)), np.empty(n), np.empty((4, 3))
-    out = np.empty(n)
+    true, out = np.empty((n, 4, 3)), np.empty(n)
     moments, turn, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for j in range(n):
         a = cut.leaves[j]
@@ -333,10 +345,13 @@ def leaf_points(bodies, cut, green):
                 points[j, q, i] = body.position[i] + body.scale * (
                     body.rotation[i, 0] * corners[q, 0] + body.rotation[i, 1] * corners[q, 1]
                     + body.rotation[i, 2] * corners[q, 2])  # fmt: skip
+        for q in range(4):
+            for i in range(3):
+                true[j, q, i] = points[j, q, i]
         out[j] = beyond(points[j], green)
         if green.cover < 1.0:
             _lift(points[j], _gap(extent[j], green.cover), green.box)
-    return points, extent, out
+    return points, true, extent, out
 
 
 @fast
@@ -347,8 +362,10 @@ def beyond(points, green):
         c = 0.5 * (points[0, i] + points[3, i])
         off = max(green.room[0, i] - c, c - green.room[1, i], 0.0)
         out += off * off
-        below = 1.0 if i == 2 else c - green.box[0, i]
-        depth = min(depth, below, green.box[1, i] - c)
+        if i < 2:
+            depth = min(depth, _STEEP * (c - green.box[0, i]), _STEEP * (green.box[1, i] - c))
+        else:
+            depth = min(depth, green.box[1, 2] - c)
     deep = depth - _DEEP if green.cover < 1.0 else 0.0
     return smooth(max(math.sqrt(out), deep) / _SHORE)
 
