@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from capsense.surface.pair_kernels import _FAR, _SOFT
-from capsense.surface.solve_kernels import Solution
-from capsense.surface.step_kernels import Green
+from capsense.surface.place_kernels import Green
+from capsense.surface.step import Solution
 
 Array = np.ndarray
 STEP = 1e-5

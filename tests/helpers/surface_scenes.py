@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import capsense as cs
 from capsense.surface.panels import panels_of
+from capsense.surface.place_kernels import BODY, Green
 from capsense.surface.rigid import RigidShape, rigid_shape
 from capsense.surface.solver import pack_green
-from capsense.surface.step_kernels import BODY, Green
 
 Array = np.ndarray
 

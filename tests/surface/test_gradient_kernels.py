@@ -9,7 +9,7 @@ from surface_scenes import Placed, green_of, moved, pack
 
 import capsense as cs
 from capsense.surface.gradient_kernels import jacobian
-from capsense.surface.solve_kernels import Solution, solve
+from capsense.surface.step import Solution, solve
 
 Array = np.ndarray
 FINGER, ARM, BALL = cs.Capsule(0.008, 0.06), cs.Capsule(0.04, 0.25), cs.Sphere(0.03)

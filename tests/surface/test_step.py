@@ -18,28 +18,22 @@ from capsense.field.green import GreenFunction
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block
 from capsense.surface.changing import ChangingBody
-from capsense.surface.lossy import solve_lossy
+from capsense.surface.choose_kernels import Cut, choose, score
+from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.matter import CONDUCTING, UNIT
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
 from capsense.surface.panels import panels_of
+from capsense.surface.place_kernels import BODY, Green
 from capsense.surface.rigid import Clusters, RigidShape, rigid_shape, split
-from capsense.surface.solve_kernels import Solution, prepared, solve
 from capsense.surface.solver import Preset, SurfaceSolver, pack_green
-from capsense.surface.step_kernels import (
-    BODY,
-    Cut,
-    Green,
-    choose,
-    four_points,
-    point_potentials,
-    score,
-    source_potentials,
-)
+from capsense.surface.step import Solution, prepared, solve, solve_lossy
 from capsense.surface.vector_kernels import (
     cholesky,
     multiply,
     multiply_lanes,
+    point_potentials,
     rsqrt,
+    source_potentials,
     substitute,
 )
 
@@ -580,9 +574,9 @@ def spread(center: Array, turn: Rotation, sides: tuple[float, float], n: int) ->
 def pairs(shapes: list, owner: list[int], changing: bool, floor: float = DEEP) -> Array:
     points = np.array([flat(*s)[0] for s in shapes])
     extent = np.array([flat(*s)[1] for s in shapes])
-    out = np.empty((len(shapes),) * 2, np.float32)
-    leaf_pairs(points, extent, np.array(owner), np.full(len(shapes), float(changing)), floor, out)
-    return out
+    within = np.full(len(shapes), float(changing))
+    leaves = Leaves(points, points, extent, np.zeros(len(shapes)), np.array(owner), within)
+    return leaf_pairs(leaves, floor)
 
 
 def brute(first: tuple, second: tuple, n: int = 10) -> float:
@@ -691,7 +685,7 @@ def test_bounded_inverse_distance() -> None:
 def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold: float) -> None:
     """Invariant: before anything is added to its diagonal."""
     twice = Scene([body(shape, (0.0, 0.01, 0.07), TILTED)] * 2)
-    matrix = prepared(twice.packed(), packed_green(), threshold, WIDTH)[3]
+    matrix = prepared(twice.packed(), packed_green(), threshold, WIDTH)[3].matrix
     assert np.linalg.eigvalsh(matrix).min() > 0
     one = Scene([twice[0]]).solved(threshold)
     both = twice.solved(threshold)

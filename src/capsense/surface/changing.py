@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from capsense.scene import Layers
 from capsense.scene.layers import STEP_SLOPE
 from capsense.surface import tree_kernels
+from capsense.surface.place_kernels import BODY
 from capsense.surface.rigid import Clusters, split
-from capsense.surface.step_kernels import BODY
 
 Array = NDArray[np.float64]
 

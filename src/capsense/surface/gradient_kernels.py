@@ -24,7 +24,7 @@ from capsense.surface.force_kernels import (
     weigh,
     wide_moments,
 )
-from capsense.surface.step_kernels import _share, distances
+from capsense.surface.place_kernels import distances, near_share
 from capsense.surface.vector_kernels import WIDTH, fast, multiply, multiply_lanes
 
 _BLOCK = 32
@@ -36,7 +36,7 @@ def jacobian(solution, bodies, green):
     """How the Maxwell matrix changes with the pose of each body.
 
     Args:
-        solution: What :func:`capsense.surface.solve_kernels.solve` returned.
+        solution: What :func:`capsense.surface.step.solve` returned.
         bodies: The bodies it was given.
         green: The Green's function it was given.
 
@@ -74,13 +74,13 @@ def _add_design(points, charge, bounds, green, work):
     """Add forces and torques by the design's sources, (b, 6, lead, lead)."""
     n, lead, floor = points.shape[0], charge.shape[1], np.float32(green.floor)
     distance = distances(points, green)
-    near_share, far_share = np.empty(n), np.empty(n)
+    near_part, far_part = np.empty(n), np.empty(n)
     for j in range(n):
-        near_share[j] = _share(distance[j], green.blend)
-        far_share[j] = 1.0 - near_share[j]
+        near_part[j] = near_share(distance[j], green.blend)
+        far_part[j] = 1.0 - near_part[j]
     sources, far_sources = _padded(green.near), _padded(green.far)
-    near = _source_sums(points, charge, near_share, bounds, sources, floor)
-    far = _source_sums(points, charge, far_share, bounds, far_sources, floor)
+    near = _source_sums(points, charge, near_part, bounds, sources, floor)
+    far = _source_sums(points, charge, far_part, bounds, far_sources, floor)
     modes = np.zeros((lead, green.near_table.shape[1]), np.float32)
     _add_modes(near, green.near_table, modes)
     _add_modes(far, green.far_table, modes)

@@ -106,7 +106,7 @@ class Matter:
         return replace(self, ground=total[group], group=group)
 
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
-        """Enter what the kernels need to know; losses are left to :mod:`capsense.surface.lossy`."""
+        """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
         ties, softness = self.ties(sizes_of(records, shapes)), self.softness()
         members = np.bincount(self.group, minlength=len(records))[self.group]
         none = np.isinf(ties.real)

@@ -12,6 +12,8 @@ _FAR = 1.5
 """Clusters farther apart than so many of their joint extents are met by their moments."""
 _CLOSE = 0.6
 """Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
+_BARRIER = 1e6
+"""Energy of charge that is out of reach [1/m]."""
 _LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
 _SOFT = 0.15
@@ -21,19 +23,19 @@ not; ``solve_kernels`` raises the diagonal then."""
 
 
 @fast
-def leaf_pairs(points, extent, owner, within, floor, out):
+def leaf_pairs(leaves, floor):
     """Mean of 1/r between bodies and within changing ones, and of -1/r to all images in the floor.
 
     Args:
-        points: Four points of each cluster [m], shape (l, 4, 3).
-        extent: Extents [m], shape (l,).
-        owner: Body of each cluster, ascending, shape (l,).
-        within: How much a changing body's clusters meet each other, 1 for a conductor; 0 for rigid
-            bodies, which have energies of their own; shape (l,).
+        leaves: The clusters.
         floor: Height of the floor [m].
-        out: Filled [1/m], shape (l, l).
+
+    Returns:
+        Shape (l, l) [1/m].
     """
+    points, extent, owner = leaves.points, leaves.extent, leaves.owner
     n = points.shape[0]
+    out = np.empty((n, n), np.float32)
     image = np.empty((n, 4, 3))
     for j in range(n):
         for q in range(4):
@@ -56,43 +58,36 @@ def leaf_pairs(points, extent, owner, within, floor, out):
                 if line[j] < 0.0:
                     line[j] = mean_inverse(points[i], points[j], max(extent[i], extent[j]))
                 out[i, j] += line[j]
-        if within[i] > 0.0:
+        if leaves.within[i] > 0.0:
             _far_means(shapes, i, shapes, line[: i + 1])
             for j in range(behind, i + 1):
                 if line[j] < 0.0 or j == i:
                     line[j] = _near_mean(points[i], points[j], extent[i], extent[j], j == i)
-                out[i, j] += within[i] * line[j]
+                out[i, j] += leaves.within[i] * line[j]
         for j in range(i):
             out[j, i] = out[i, j]
+        out[i, i] += _BARRIER * leaves.beyond[i] ** 3
+    _add_lifted(leaves, out)
+    return out
 
 
 @fast
-def add_lifted(points, true, extent, owner, within, out):
-    """Add to pairs of a rigid body what they meet each other more for being lifted off the design.
-
-    Args:
-        points: Four points of each cluster [m], shape (l, 4, 3).
-        true: The same as the body has them, shape (l, 4, 3).
-        extent, owner, within, out: As in :func:`leaf_pairs`.
-    """
+def _add_lifted(leaves, out):
+    """Add to pairs of a rigid body what they meet each other more for being lifted."""
+    points, true = leaves.points, leaves.true
     n = points.shape[0]
+    lifted = np.zeros(n, np.bool_)
     for i in range(n):
-        most = 0.0
         for q in range(4):
             for k in range(3):
-                most = max(most, abs(points[i, q, k] - true[i, q, k]))
-        if most < _LIFTED or within[i] > 0.0:
-            continue
-        for j in range(n):
-            if owner[j] != owner[i] or j == i:
-                continue
-            size = max(extent[i], extent[j])
-            more = mean_inverse(points[i], points[j], size) - mean_inverse(true[i], true[j], size)
-            other = 0.0
-            for q in range(4):
-                for k in range(3):
-                    other = max(other, abs(points[j, q, k] - true[j, q, k]))
-            if other < _LIFTED or j < i:
+                if abs(points[i, q, k] - true[i, q, k]) > _LIFTED:
+                    lifted[i] = leaves.within[i] == 0.0
+    for i in range(n):
+        for j in range(i):
+            if (lifted[i] or lifted[j]) and leaves.owner[i] == leaves.owner[j]:
+                size = max(leaves.extent[i], leaves.extent[j])
+                more = mean_inverse(points[i], points[j], size)
+                more -= mean_inverse(true[i], true[j], size)
                 out[i, j] += more
                 out[j, i] += more
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.field.green import GreenFunction
-from capsense.surface.solve_kernels import Solution
+from capsense.surface.step import Solution
 
 Array = NDArray[np.float64]
 

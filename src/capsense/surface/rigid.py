@@ -19,14 +19,16 @@ from capsense.errors import SolveError
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
 from capsense.surface.panels import SurfacePanels
-from capsense.surface.solve_kernels import INSIDE
-from capsense.surface.step_kernels import BODY
+from capsense.surface.place_kernels import BODY
 from capsense.surface.vector_kernels import cholesky, fast
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
+INSIDE = 2.5
+"""Interior impedance of a surface that is open or changes, over its energy in free space: it is 3
+for a ball in an even field, and 2 for the face of a half-space."""
 _NORMALS = 0.6
 """How far apart two opposite normals count, as a share of the shape's extent, in splitting."""
 _EXTRA = 0.0, 1e-3, 1e-2, 0.1
@@ -102,7 +104,7 @@ class RigidShape:
         """Interior impedance Z of the charge functions [1/m], shape (n, n).
 
         A body of permittivity eps adds ``Z / (eps - 1)`` to ``energy``. That of an open surface is
-        not known; it is taken for :data:`~capsense.surface.solve_kernels.INSIDE` times ``energy``.
+        not known; it is taken for :data:`INSIDE` times ``energy``.
         """
         if not self.panels.closed:
             z = np.float32(INSIDE) * self.energy

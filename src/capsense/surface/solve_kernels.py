@@ -1,4 +1,4 @@
-"""The step, compiled: the matrix of the chosen charge functions, its solution, what is left."""
+"""The step, compiled: the system of the chosen charge functions, its solution, what is left."""
 
 from __future__ import annotations
 
@@ -9,15 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._simd import at, madd, put_span, span
-from capsense.surface.pair_kernels import add_lifted, leaf_pairs
-from capsense.surface.step_kernels import (
-    BARRIER,
-    choose,
-    climb,
-    leaf_points,
-    leaf_rows,
-    score,
-)
 from capsense.surface.vector_kernels import (
     WIDTH,
     cholesky,
@@ -28,9 +19,6 @@ from capsense.surface.vector_kernels import (
     substitute,
 )
 
-INSIDE = 2.5
-"""Interior impedance of a surface that is open or changes, over its energy in free space: it is 3
-for a ball in an even field, and 2 for the face of a half-space."""
 GAIN = 1.3
 """What the functions directly below the cut stand for: themselves, and all below them."""
 
@@ -48,84 +36,22 @@ class Functions(NamedTuple):
     """How many are solved for."""
 
 
-class Solution(NamedTuple):
-    """What a scene does to a design; 4π eps0 = 1."""
+class System(NamedTuple):
+    """What the charges of the functions follow from; f functions, n of them solved for."""
 
-    delta: NDArray[Any]
-    """Change of the Maxwell matrix [m], shape (m, m)."""
-    left: NDArray[Any]
-    """The part of it that functions outside the system stand for [m], shape (m, m)."""
-    charge: NDArray[Any]
-    """Charge on each leaf for each terminal at 1 V [m], shape (l, m)."""
-    points: NDArray[Any]
-    """Four points of each leaf [m], shape (l, 4, 3)."""
-    extent: NDArray[Any]
-    """Extent of each leaf [m], shape (l,)."""
-    owner: NDArray[Any]
-    """Body of each leaf, shape (l,)."""
-    size: int
-    """Functions solved for; 0 where there is no solution."""
-    shift: float
-    """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
+    phi: NDArray[Any]
+    """φ⁰ of the functions, shape (f, lead)."""
+    matrix: NDArray[Any]
+    """Energies of those solved for [1/m], shape (n, n)."""
+    rest: NDArray[Any]
+    """The same of the others with those, shape (f - n, n)."""
+    own: NDArray[Any]
+    """Energies of all functions by themselves [1/m], shape (f,)."""
 
 
 @fast
-def solve(bodies, green, threshold, width, adjoint):
-    """Solve a scene of bodies without losses.
-
-    ``adjoint`` asks for charges that the derivatives of the result follow from.
-    """
-    cut, functions, phi, matrix, rest, own, points, extent, owner = _prepare(
-        bodies, green, threshold, width
-    )
-    delta, left, x, shift = _reduce(cut, functions, phi, matrix, rest, own, adjoint)
-    charge = _leaf_charges(cut, functions, x, points.shape[0])
-    m = green.terminals
-    size = functions.solved if delta[0, 0] == delta[0, 0] else 0
-    return Solution(delta[:m, :m], left[:m, :m], charge, points, extent, owner, size, shift)
-
-
-@fast
-def prepared(bodies, green, threshold, width):
-    """Return the cut, its functions, their φ⁰, matrix, rows below, diagonal, and the leaves."""
-    return _prepare(bodies, green, threshold, width)
-
-
-@fast
-def leaf_charges(cut, functions, x, leaves):
-    """Return the charges on the leaves (l, m) of charges of the functions (f, m)."""
-    return _leaf_charges(cut, functions, x, leaves)
-
-
-@fast
-def _prepare(bodies, green, threshold, width):
-    """Choose charge functions, and set up their system."""
-    first = np.zeros(bodies.shape[0] + 1, np.int64)
-    for b in range(bodies.shape[0]):
-        first[b + 1] = first[b] + 2 * bodies[b].n - 1
-    weight, scores = np.empty(green.terminals), np.empty(first[-1])
-    score(bodies, first, green, threshold * width, weight, scores)
-    cut = choose(bodies, first, scores, threshold, width)
-    points, true, extent, out = leaf_points(bodies, cut, green)
-    rows = leaf_rows(points, out, green)
-    leaves = cut.leaves.shape[0]
-    owner, within = np.empty(leaves, np.int64), np.zeros(leaves)
-    for j in range(leaves):
-        owner[j] = cut.body[cut.leaves[j]]
-        if bodies[owner[j]].spread != 0:
-            within[j] = 1.0 + INSIDE * bodies[owner[j]].softness
-    pairs = np.empty((leaves, leaves), np.float32)
-    leaf_pairs(points, extent, owner, within, green.floor, pairs)
-    add_lifted(points, true, extent, owner, within, pairs)
-    for j in range(leaves):
-        pairs[j, j] += BARRIER * out[j] ** 3
-    functions = _list_functions(bodies, cut)
-    phi, matrix, rest, own = _assemble(bodies, cut, functions, rows, pairs, green)
-    return cut, functions, phi, matrix, rest, own, points, extent, owner
-
-
-@fast
-def _list_functions(bodies, cut):
+def functions_of(bodies, cut):
+    """List the charge functions of a cut, those to be solved for first."""
     count = bodies.shape[0]
     for a in range(cut.node.shape[0]):
         if cut.kids[a, 0] >= 0:
@@ -171,11 +97,24 @@ def _differences(cut, functions, values, out):
 
 
 @fast
-def _assemble(bodies, cut, functions, rows, pairs, green):
-    """φ⁰ of the functions, their matrix, the rows below it, and the diagonal of all of them."""
+def _climb(cut, values):
+    """Fill the means (k, m) of all clusters of a cut from those of its leaves."""
+    for a in range(cut.node.shape[0] - 1, -1, -1):
+        if cut.kids[a, 0] >= 0:
+            p = np.float32(cut.share[a])
+            q = np.float32(1.0) - p
+            x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
+            row = values[a]
+            for i in range(values.shape[1]):
+                row[i] = p * x[i] + q * y[i]
+
+
+@fast
+def assembled(bodies, cut, functions, rows, pairs, lead):
+    """Set up the system of a cut from the rows (l, w) and pairs (l, l) of its leaves."""
     clusters, leaves = cut.node.shape[0], cut.leaves.shape[0]
     total, solved = functions.cluster.shape[0], functions.solved
-    lead, width = green.lead, rows.shape[1]
+    width = rows.shape[1]
     values = np.empty((clusters, width + leaves), np.float32)
     for j in range(leaves):
         a = cut.leaves[j]
@@ -183,14 +122,14 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
             values[a, i] = rows[j, i]
         for i in range(leaves):
             values[a, width + i] = pairs[j, i]
-    climb(cut, values)
+    _climb(cut, values)
     wide = np.empty((total, width + leaves), np.float32)
     _differences(cut, functions, values, wide)
     columns = np.empty((clusters, total), np.float32)
     for j in range(leaves):
         for f in range(total):
             columns[cut.leaves[j], f] = wide[f, width + j]
-    climb(cut, columns)
+    _climb(cut, columns)
     outer = np.empty((total, total), np.float32)
     _differences(cut, functions, columns, outer)
     psi = np.empty((total, width - lead), np.float32)
@@ -231,7 +170,7 @@ def _assemble(bodies, cut, functions, rows, pairs, green):
             if body.energy != 0:
                 own[f] += float(energy[at_f * body.n + at_f]) / body.scale
     _add_matter(bodies, functions, matrix, rest, own)
-    return phi, matrix, rest, own
+    return System(phi, matrix, rest, own)
 
 
 @fast
@@ -260,12 +199,13 @@ def _add_matter(bodies, functions, matrix, rest, own):
 
 
 @fast
-def _reduce(cut, functions, phi, matrix, rest, own, adjoint):
+def reduced(cut, functions, system, adjoint):
     """ΔC, the part of it that was estimated, the charges of all functions, a shift of the diagonal.
 
     Functions that fade in by t are taken as √t A √t with their own energy whole. What they lack,
     and functions not solved for, add the energy that the potential they leave has in them alone.
     """
+    phi, matrix, rest, own = system
     total, solved, m = functions.cluster.shape[0], functions.solved, phi.shape[1]
     root, lack = np.empty(solved), np.zeros(total)
     for f in range(total):
@@ -380,7 +320,7 @@ def _add_adjoint(matrix, rest, root, lack, factor, charge, x):
 
 
 @fast
-def _leaf_charges(cut, functions, x, leaves):
+def leaf_charges(cut, functions, x, leaves):
     """Charges on the leaves (l, m) of charges of the functions (f, m)."""
     clusters, m = cut.node.shape[0], x.shape[1]
     charge = np.zeros((clusters, m))

@@ -17,12 +17,11 @@ from capsense.scene import Layers, Scene
 from capsense.scene.scene import PackedScene
 from capsense.scene.shape import Shape, ShapeKind
 from capsense.surface.changing import ChangingBody, layer_pieces
-from capsense.surface.lossy import solve_lossy
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
+from capsense.surface.place_kernels import BODY, Green
 from capsense.surface.potentials import potential_change
 from capsense.surface.rigid import RigidShape
-from capsense.surface.solve_kernels import Solution, solve
-from capsense.surface.step_kernels import BODY, Green
+from capsense.surface.step import Solution, solve, solve_lossy
 from capsense.surface.store import rigid
 from capsense.surface.vector_kernels import WIDTH
 

@@ -1,0 +1,256 @@
+"""The step, compiled: which charge functions a scene needs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.surface.place_kernels import (
+    FAR_LEAST,
+    NEAR_FACE,
+    SHORE,
+    least_gap,
+    lift,
+    smooth,
+)
+from capsense.surface.vector_kernels import (
+    doubles,
+    fast,
+    integers,
+    multiply_lanes,
+    point_potentials,
+)
+
+_LINEAR = 0.3
+"""Clusters smaller than this part of their distance from the design see a linear potential."""
+_COARSE = 31
+"""So many clusters, the coarsest of a body, are looked into wherever they are."""
+_DECAY = 0.35
+"""Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
+_LONG = 0.03, 0.06
+"""Clusters that cross a wall come to be split where they are longer than this [m]."""
+USED, FRONTIER, LEAF = 2, 1, 0
+"""State of a cluster: its function is used; it is split for an estimate only; it is not split."""
+
+
+class Cut(NamedTuple):
+    """The clusters that a scene needs, parts behind wholes, body after body."""
+
+    body: NDArray[Any]
+    """Body of a cluster, shape (k,)."""
+    node: NDArray[Any]
+    """Its place in the body's tree, shape (k,)."""
+    kids: NDArray[Any]
+    """Its parts in this list, -1 for a leaf, shape (k, 2)."""
+    share: NDArray[Any]
+    """Share of the first part in its charge, shape (k,)."""
+    leaf: NDArray[Any]
+    """Its number among the leaves, else -1, shape (k,)."""
+    fade: NDArray[Any]
+    """How far its function is faded in, 0 to 1, shape (k,)."""
+    above: NDArray[Any]
+    """The same of the cluster above, 1 at the top, shape (k,)."""
+    leaves: NDArray[Any]
+    """The leaves in this list, shape (l,)."""
+
+
+@fast
+def chosen(bodies, green, threshold, width):
+    """Return the cut of a scene: see :func:`score` and :func:`choose`."""
+    first = np.zeros(bodies.shape[0] + 1, np.int64)
+    for b in range(bodies.shape[0]):
+        first[b + 1] = first[b] + 2 * bodies[b].n - 1
+    weight, scores = np.empty(green.terminals), np.empty(first[-1])
+    score(bodies, first, green, threshold * width, weight, scores)
+    return choose(bodies, first, scores, threshold, width)
+
+
+@fast
+def score(bodies, first, green, enough, weight, scores):
+    """Share of the electrodes' energies that each charge function takes up alone.
+
+    Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
+    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. A score of
+    ``enough`` has a cluster split for certain, as those that cross a wall must be. Clusters that
+    are small against their distance from the design are not looked into: φ⁰ is linear there, and
+    the scores of their parts follow from their own.
+    """
+    terminals, lead, total = green.terminals, green.lead, first[-1]
+    means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
+    met, crossing = np.zeros(total, np.bool_), np.zeros(total)
+    for b in range(bodies.shape[0]):
+        body, o = bodies[b], first[b]
+        kids, function = integers(body.kids), integers(body.function)
+        charge, own = doubles(body.charge), doubles(body.own)
+        span = slice(o, first[b + 1])
+        _mean_potentials(body, green, means[span], met[span], crossing[span])
+        for k in range(2 * body.n - 2, -1, -1):
+            x, y = kids[2 * k], kids[2 * k + 1]
+            if x >= 0 and met[o + x]:
+                p = np.float32(charge[x] / charge[k])
+                stiffness = body.scale / own[function[k]]
+                for i in range(lead):
+                    means[o + k, i] = p * means[o + x, i] + (np.float32(1.0) - p) * means[o + y, i]
+                for i in range(terminals):
+                    d = float(means[o + x, i] - means[o + y, i])
+                    energy[i] += d * d * stiffness
+        if not body.neutral:
+            for i in range(terminals):
+                energy[i] += float(means[o, i]) ** 2 / (own[0] / body.scale + body.tie)
+    whole = 0.0
+    for i in range(terminals):
+        whole += energy[i] ** 2
+    for i in range(terminals):
+        weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
+    for b in range(bodies.shape[0]):
+        span = slice(first[b], first[b + 1])
+        scores[span] = enough * crossing[span]
+        _raise_scores(bodies[b], means[span], met[span], weight, scores[span])
+
+
+@fast
+def _mean_potentials(body, green, means, met, crossing):
+    """φ⁰ in the middle of clusters that are not looked into, from the far sources.
+
+    ``crossing`` is filled with how much each cluster crosses a wall, 0 to 1.
+    """
+    kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
+    places, points = np.empty(body.n, np.int64), np.empty((body.n + 3, 3), np.float32)
+    inner = np.empty(body.n)
+    found = 0
+    met[0] = True
+    for k in range(2 * body.n - 1):
+        if not met[k]:
+            continue
+        square = out = 0.0
+        room = 1.0
+        for i in range(3):
+            x = body.position[i] + body.scale * (
+                body.rotation[i, 0] * center[3 * k]
+                + body.rotation[i, 1] * center[3 * k + 1]
+                + body.rotation[i, 2] * center[3 * k + 2]
+            )
+            points[found, i] = x
+            off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
+            square += off * off
+            room = min(room, x - green.room[0, i], green.room[1, i] - x)
+            out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
+        size = body.scale * extent[k]
+        crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
+            (size - _LONG[0]) / (_LONG[1] - _LONG[0])
+        )
+        small = k >= _COARSE and size * size < _LINEAR * _LINEAR * square
+        if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
+            lift(points[found : found + 1], least_gap(size, green.cover), green.box)
+        if small or kids[2 * k] < 0:
+            places[found], inner[found] = k, 1.0 - smooth(math.sqrt(out) / SHORE)
+            found += 1
+        else:
+            met[kids[2 * k]] = met[kids[2 * k + 1]] = True
+    rounded = 4 * ((found + 3) // 4)
+    for j in range(found, rounded):
+        for i in range(3):
+            points[j, i] = points[0, i]
+    values = np.empty((rounded, green.far.shape[1]), np.float32)
+    point_potentials(
+        points[:rounded], green.far, np.float32(green.floor), np.float32(FAR_LEAST), values
+    )
+    phi = np.empty((rounded, green.lead), np.float32)
+    multiply_lanes(values, green.score_table, phi)
+    for j in range(found):
+        for i in range(green.lead):
+            means[places[j], i] = inner[j] * phi[j, i]
+
+
+@fast
+def _raise_scores(body, mean, met, weight, scores):
+    kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
+    count = 2 * body.n - 1
+    for k in range(count - 1, -1, -1):
+        a = kids[2 * k]
+        if a >= 0 and met[a]:
+            value = 0.0
+            for i in range(weight.shape[0]):
+                d = float(mean[a, i] - mean[kids[2 * k + 1], i])
+                value += weight[i] * d * d
+            value *= body.scale / own[function[k]]
+            for c in range(2):
+                below = scores[kids[2 * k + c]]
+                value = max(value, below) + 0.5 * min(value, below)
+            scores[k] = max(scores[k], value)
+    for k in range(count):
+        a = kids[2 * k]
+        if a >= 0:
+            for c in range(2):
+                part = kids[2 * k + c]
+                if kids[2 * part] >= 0 and not met[kids[2 * part]]:
+                    scores[part] = _DECAY * scores[k]
+
+
+@fast
+def choose(bodies, first, scores, threshold, width):
+    """Return the clusters whose score is above a threshold, and those directly below them.
+
+    A function fades in while its score grows from ``threshold`` to ``width`` times that.
+    """
+    total = first[-1]
+    state, place = np.empty(total, np.int64), np.empty(total, np.int64)
+    fades, above = np.zeros(total), np.zeros(total)
+    for k in range(total):
+        state[k] = place[k] = -1
+    count = leaves = 0
+    for b in range(bodies.shape[0]):
+        kids = integers(bodies[b].kids)
+        o = first[b]
+        state[o], above[o] = FRONTIER, 1.0
+        for k in range(2 * bodies[b].n - 1):
+            if state[o + k] < 0:
+                continue
+            place[o + k] = count
+            count += 1
+            if state[o + k] == LEAF or kids[2 * k + 0] < 0:
+                state[o + k] = LEAF
+                leaves += 1
+                continue
+            x = math.log(max(scores[o + k], 1e-300) / threshold) / math.log(width)
+            fades[o + k] = min(smooth(x), above[o + k])
+            state[o + k] = USED if fades[o + k] > 0.0 else FRONTIER
+            for c in range(2):
+                state[o + kids[2 * k + c]] = LEAF if state[o + k] == FRONTIER else FRONTIER
+                above[o + kids[2 * k + c]] = fades[o + k]
+    return _collect(bodies, first, state, place, fades, above, count, leaves)
+
+
+@fast
+def _collect(bodies, first, state, place, fades, above, count, leaves):
+    cut = Cut(
+        np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),
+        np.zeros(count), np.empty(count, np.int64), np.empty(count), np.empty(count),
+        np.empty(leaves, np.int64),
+    )  # fmt: skip
+    leaf = 0
+    for b in range(bodies.shape[0]):
+        nodes = 2 * bodies[b].n - 1
+        kids = integers(bodies[b].kids)
+        charge = doubles(bodies[b].charge)
+        o = first[b]
+        for k in range(nodes):
+            a = place[o + k]
+            if a < 0:
+                continue
+            cut.body[a], cut.node[a] = b, k
+            cut.fade[a], cut.above[a] = fades[o + k], above[o + k]
+            cut.leaf[a] = cut.kids[a, 0] = cut.kids[a, 1] = -1
+            if state[o + k] == LEAF:
+                cut.leaf[a], cut.leaves[leaf] = leaf, a
+                leaf += 1
+            else:
+                cut.kids[a, 0], cut.kids[a, 1] = (
+                    place[o + kids[2 * k + 0]],
+                    place[o + kids[2 * k + 1]],
+                )
+                cut.share[a] = charge[kids[2 * k + 0]] / charge[k]
+    return cut

@@ -1,0 +1,146 @@
+"""The step: from bodies to the change of the matrix and the charges behind it; 4π eps0 = 1."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from capsense.surface.choose_kernels import Cut, chosen
+from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
+from capsense.surface.pair_kernels import leaf_pairs
+from capsense.surface.place_kernels import Green
+from capsense.surface.rigid import INSIDE
+from capsense.surface.solve_kernels import (
+    GAIN,
+    Functions,
+    System,
+    assembled,
+    functions_of,
+    leaf_charges,
+    reduced,
+)
+
+
+class Solution(NamedTuple):
+    """What a scene does to a design; 4π eps0 = 1."""
+
+    delta: NDArray[Any]
+    """Change of the Maxwell matrix [m], shape (m, m)."""
+    left: NDArray[Any]
+    """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    charge: NDArray[Any]
+    """Charge on each leaf for each terminal at 1 V [m], shape (l, m)."""
+    points: NDArray[Any]
+    """Four points of each leaf [m], shape (l, 4, 3)."""
+    extent: NDArray[Any]
+    """Extent of each leaf [m], shape (l,)."""
+    owner: NDArray[Any]
+    """Body of each leaf, shape (l,)."""
+    size: int
+    """Functions solved for; 0 where there is no solution."""
+    shift: float
+    """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
+
+
+def prepared(
+    bodies: NDArray[np.void], green: Green, threshold: float, width: float
+) -> tuple[Cut, Leaves, Functions, System]:
+    """Choose charge functions, and set up their system.
+
+    Args:
+        bodies: Records of :data:`~capsense.surface.place_kernels.BODY`, shape (b,).
+        green: Green's function of the design.
+        threshold: Functions count that take up this part of an electrode's energy alone.
+        width: They fade in up to so many times that.
+
+    Returns:
+        The cut, its leaves, its functions and their system.
+    """
+    cut = chosen(bodies, green, threshold, width)
+    leaves = placed(bodies, cut, green, INSIDE)
+    rows = leaf_rows(leaves.points, leaves.beyond, green)
+    pairs = leaf_pairs(leaves, green.floor)
+    functions = functions_of(bodies, cut)
+    return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
+
+
+def solve(
+    bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
+) -> Solution:
+    """Solve a scene of bodies without losses.
+
+    ``adjoint`` asks for charges that the derivatives of the result follow from; else as
+    :func:`prepared`.
+    """
+    cut, leaves, functions, system = prepared(bodies, green, threshold, width)
+    delta, left, x, shift = reduced(cut, functions, system, adjoint)
+    charge = leaf_charges(cut, functions, x, len(leaves.points))
+    m = green.terminals
+    size = functions.solved if shift >= 0.0 else 0
+    return Solution(
+        delta[:m, :m], left[:m, :m], charge, leaves.points, leaves.extent, leaves.owner, size, shift
+    )
+
+
+def solve_lossy(
+    records: NDArray[np.void],
+    ties: NDArray[np.complex128],
+    softness: NDArray[np.complex128],
+    impedances: Sequence[NDArray[np.float32] | None],
+    green: Green,
+    threshold: float,
+    width: float,
+) -> Solution:
+    """Solve a scene whose energies are complex; what is returned is the part in phase.
+
+    Args:
+        records: The bodies, whose real softness is not looked at, nor are ties where ``ties`` are
+            finite.
+        ties: Energy of the bodies' net charges [1/m], infinite for floating ones, shape (n,).
+        softness: 1 / (eps - 1), shape (n,).
+        impedances: Interior impedance of each body, None for conductors and changing surfaces.
+        green, threshold, width: As in :func:`prepared`.
+    """
+    plain = records.copy()
+    plain["tie"], plain["impedance"] = 0.0, 0
+    cut, leaves, functions, system = prepared(plain, green, threshold, width)
+    phi, real, below, own = system
+    n, m = functions.solved, green.terminals
+    matrix = np.concatenate([real, below]).astype(complex)
+    diagonal = own.astype(complex)
+    net = functions.cluster < 0
+    for b in range(len(records)):
+        mine = np.flatnonzero((functions.body == b) & ~net)
+        z = impedances[b]
+        if z is not None:
+            number = functions.number
+            inside = mine[mine < n]
+            factor = softness[b] / records["scale"][b]
+            matrix[np.ix_(mine, inside)] += factor * z[np.ix_(number[mine], number[inside])]
+            diagonal[mine] += factor * z[number[mine], number[mine]]
+        root = np.flatnonzero((functions.body == b) & net)
+        others = np.flatnonzero(net & (records["group"][functions.body] == records["group"][b]))
+        matrix[np.ix_(root, others)] += ties[b] if np.isfinite(ties[b]) else records["tie"][b]
+        diagonal[root] = matrix[root, root]
+    clusters = np.where(net, 0, functions.cluster)
+    fade = np.where(net, 1.0, cut.fade[clusters])
+    root = np.sqrt(fade[:n])
+    faded = root[:, None] * matrix[:n] * root
+    np.fill_diagonal(faded, np.diag(matrix[:n]))
+    solved = root[:, None] * scipy.linalg.solve(faded, root[:, None] * phi[:n, :m], assume_a="sym")
+    lack = GAIN * (1 - fade) * (1 - (1 - np.where(net, 1.0, cut.above[clusters])) ** 4) / diagonal
+    residual = phi[:, :m] - matrix @ solved
+    extra = lack[:, None] * residual
+    left = residual.T @ extra
+    x = np.zeros((len(fade), m), complex)
+    x[:n], x[n:] = solved, extra[n:]
+    delta = phi[:n, :m].T @ solved + left
+    charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
+    return Solution(
+        np.ascontiguousarray(0.5 * (delta + delta.T).real), np.ascontiguousarray(left.real),
+        charge, leaves.points, leaves.extent, leaves.owner, n, 0.0,
+    )  # fmt: skip

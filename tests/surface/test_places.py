@@ -1,0 +1,135 @@
+"""Where clusters stand to a flat design and to the walls: lifted off, faded out, split."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_scenes import Placed, green_of, pack
+
+import capsense as cs
+from capsense.surface.choose_kernels import chosen
+from capsense.surface.leaf_kernels import Leaves, placed
+from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
+from capsense.surface.place_kernels import beyond, least_gap, lift
+
+Array = np.ndarray
+BOX = np.array([[-0.05, -0.04, -0.001], [0.05, 0.04, 0.0]])
+
+
+def lifted(points: Array, gap: float) -> Array:
+    out = np.array(points, float)
+    lift(out, gap, BOX)
+    return out
+
+
+def distance(points: Array) -> Array:
+    """From the design and all that is between it and the floor."""
+    low = np.array([*BOX[0, :2], -np.inf])
+    return np.linalg.norm(points - np.clip(points, low, BOX[1]), axis=1)
+
+
+def test_far_points_stay() -> None:
+    """Invariant: from twice the gap on, nothing moves, to the last bit."""
+    points = np.random.default_rng(1).uniform(-0.1, 0.1, (400, 3))
+    far = points[distance(points) >= 6e-4]
+    np.testing.assert_array_equal(lifted(far, 3e-4), far)
+
+
+def test_near_points_keep_a_gap() -> None:
+    """Analytic: a distance d below 2 m becomes m + d² / 4 m, in the same direction."""
+    random = np.random.default_rng(2)
+    on_top = random.uniform([-0.05, -0.04, 0.0], [0.05, 0.04, 6e-4], (200, 3))
+    beside = random.uniform([0.05, -0.04, -0.01], [0.0506, 0.04, -0.002], (200, 3))
+    corner = random.uniform([0.05, 0.04, 0.0], [0.0503, 0.0403, 3e-4], (200, 3))
+    for points in (on_top, beside, corner):
+        d = distance(points)
+        assert (d < 6e-4).all()
+        moved = lifted(points, 3e-4)
+        np.testing.assert_allclose(distance(moved), 3e-4 + d**2 / 1.2e-3, rtol=1e-9)
+        nearest = np.clip(points, [*BOX[0, :2], -np.inf], BOX[1])
+        way, old = moved - nearest, points - nearest
+        np.testing.assert_allclose(np.cross(way, old), 0.0, atol=1e-14)
+
+
+def test_points_within_come_out_at_the_nearest_face() -> None:
+    """Analytic: above, or at a side; a point between the design and the floor counts as within."""
+    within = [[0.0, 0.0, -0.001], [0.049, 0.0, -0.005], [0.01, -0.039, -0.004]]
+    wanted = [[0.0, 0.0, 3e-4], [0.0503, 0.0, -0.005], [0.01, -0.0403, -0.004]]
+    np.testing.assert_allclose(lifted(np.array(within), 3e-4), wanted, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("extent", "cover", "gap"),
+    [(1e-3, 0.0, 1.5e-4), (0.01, 0.0, 1e-4 / 0.18), (0.1, 0.0, 7e-4), (0.1, 3e-4, 4e-4),
+     (0.1, 3e-3, 2e-5)],
+)  # fmt: skip
+def test_gap_grows_with_the_square_of_the_extent(extent: float, cover: float, gap: float) -> None:
+    """Analytic: within bounds, less by what covers the electrodes."""
+    assert least_gap(extent, cover) == pytest.approx(gap)
+
+
+@pytest.mark.parametrize(
+    ("center", "expected"),
+    [((0.0, 0.0, 0.1), 0.0), ((0.235, 0.0, 0.1), 0.0), ((0.2375, 0.0, 0.1), 0.5),
+     ((0.0, -0.24, 0.1), 1.0), ((0.0, 0.0, 0.48), 1.0), ((0.2, 0.0, -0.01), 0.0),
+     ((0.2, 0.0, -0.0125), 0.5), ((0.0, 0.0, -0.002), 0.0), ((0.0, 0.0, -0.0055), 0.5),
+     ((0.0, 0.0, -0.009), 1.0), ((0.2, 0.0, -0.009), 0.0)],
+)  # fmt: skip
+def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) -> None:
+    """Analytic: a smoothstep over 5 mm, from 15 mm before walls and from 3 mm behind the face."""
+    green = green_of()
+    np.testing.assert_allclose(green.room, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]])
+    assert green.cover == 0.0
+    assert beyond(np.array([center] * 4), green) == pytest.approx(expected, abs=1e-9)
+
+
+def test_curved_designs_lift_nothing() -> None:
+    """Invariant: only of flat designs the space behind is known."""
+    green = green_of()._replace(cover=np.inf)
+    bodies = pack(Placed(cs.Sphere(0.03), (0.0, 0.0, 0.0299)))
+    leaves = placed(bodies, chosen(bodies, green, 0.015, 2.5), green, 2.5)
+    np.testing.assert_array_equal(leaves.points, leaves.true)
+    assert beyond(np.array([(0.0, 0.0, -0.009)] * 4), green) == 0.0
+
+
+def test_what_crosses_a_wall_is_split_there() -> None:
+    """Invariant: no long cluster stays in one piece across the wall, none far outside is split."""
+    bodies = pack(Placed(cs.Capsule(0.03, 0.4), (0.15, 0.0, 0.08), (0.0, np.pi / 2, 0.0)))
+    green = green_of()
+    leaves = placed(bodies, chosen(bodies, green, 0.015, 2.5), green, 2.5)
+    middle, half = leaves.points.mean(axis=1)[:, 0], 0.5 * leaves.extent
+    across = np.abs(middle - 0.235) < 0.4 * half
+    assert leaves.extent[across].max(initial=0.0) < 0.061
+    assert (leaves.beyond[middle > 0.24] == 1.0).all()
+    assert (leaves.beyond[middle < 0.235] == 0.0).all()
+
+
+def test_lifted_clusters_of_a_body_meet_where_they_are() -> None:
+    """Differential: a rigid body's pairs change by the means of 1/r after less those before."""
+    random = np.random.default_rng(3)
+    true = random.uniform(-0.01, 0.01, (5, 4, 3))
+    points = true.copy()
+    points[1:3, :, 2] += 2e-3
+    extent, owner, none = np.full(5, 4e-3), np.array([0, 0, 0, 0, 1]), np.zeros(5)
+    before, after = (
+        leaf_pairs(Leaves(points, t, extent, none, owner, none), -1e5) for t in (points, true)
+    )
+    wanted = np.zeros((5, 5))
+    for i in range(4):
+        for j in range(4):
+            if i != j and ({i, j} & {1, 2}):
+                wanted[i, j] = mean_inverse(points[i], points[j], 4e-3)
+                wanted[i, j] -= mean_inverse(true[i], true[j], 4e-3)
+    np.testing.assert_allclose(after - before, wanted, atol=1e-4 * np.abs(wanted).max())
+
+
+def test_charge_out_of_reach_has_a_large_energy() -> None:
+    """Analytic: a million per metre times the third power of how far it is beyond."""
+    points = np.random.default_rng(4).uniform(-0.01, 0.01, (3, 4, 3))
+    none, owner = np.zeros(3), np.zeros(3, int)
+    reach = np.array([0.0, 0.5, 1.0])
+    first, second = (
+        leaf_pairs(Leaves(points, points, np.full(3, 4e-3), r, owner, none), -1e5)
+        for r in (none, reach)
+    )
+    np.testing.assert_allclose(second - first, np.diag(1e6 * reach**3), rtol=1e-6, atol=0.1)
