@@ -13,12 +13,13 @@ from capsense.design.model import Design
 from capsense.errors import SceneError, SolveError
 from capsense.field.change import Change
 from capsense.field.green import GreenFunction
-from capsense.scene import Layers, Scene
+from capsense.scene import Layers, Scene, SurfaceMesh
 from capsense.scene.scene import PackedScene
 from capsense.scene.shape import ShapeKind
-from capsense.surface.changing import ChangingBody, layer_pieces
+from capsense.surface.changing import ChangingBody
 from capsense.surface.lossy import solve_lossy
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
+from capsense.surface.pieces import layer_pieces, mesh_pieces
 from capsense.surface.potentials import potential_change
 from capsense.surface.rigid import RigidShape
 from capsense.surface.solve_kernels import Solution, solve
@@ -276,6 +277,10 @@ class SurfaceSolver:
         if isinstance(shape, Layers):
             tree, pieces, wanted = layer_pieces(shape)
             inside = wanted & self._inside(pieces.centers, packed, k)
+            return (ChangingBody(tree, pieces, inside) if inside.any() else None), 1.0
+        if isinstance(shape, SurfaceMesh):
+            tree, pieces = mesh_pieces(shape)
+            inside = self._inside(pieces.centers, packed, k)
             return (ChangingBody(tree, pieces, inside) if inside.any() else None), 1.0
         edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
         functions, size = rigid(shape, self.preset.panels * (2 if edged else 1))
