@@ -106,7 +106,6 @@ class ModelReader:
         return SoftSolid(
             label=label,
             faces=faces.reshape(-1, 3).astype(np.int64),
-            thickness=2 * float(m.flex_radius[flex]) if kind == 2 else None,
             vertices=lambda: data.flexvert_xpos[own],
             material=material,
             tie=tie,

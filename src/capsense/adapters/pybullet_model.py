@@ -160,20 +160,16 @@ class WorldReader:
         links: The links; their order is that of the frames.
         rules: What is seen, and what it is made of.
         shapes: ``"collision"`` or ``"visual"``.
-        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
 
     Raises:
         SceneError: A pattern fits nothing.
     """
 
-    def __init__(
-        self, client: int, links: Sequence[Link], rules: Rules, shapes: str, sheet_thickness: float
-    ) -> None:
+    def __init__(self, client: int, links: Sequence[Link], rules: Rules, shapes: str) -> None:
         self.client = client
         self.links = links
         self.rules = rules
         self.shapes = shapes
-        self.sheet_thickness = sheet_thickness
         self._meshes: dict[tuple[object, ...], Shape] = {}
         rules.check([k.names for k in links])
 
@@ -208,8 +204,7 @@ class WorldReader:
             return []
         mesh = SoftMesh(self.client, link)
         material, tie = matter_of(self.client, link, self.rules)
-        thickness = None if mesh.closed else self.sheet_thickness
-        return [SoftSolid(link.names[-1], mesh.faces, thickness, mesh.vertices, material, tie)]
+        return [SoftSolid(link.names[-1], mesh.faces, mesh.vertices, material, tie)]
 
     def _shapes_of(self, link: Link) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
         """Shapes, and their poses in the frame of the link's centre of mass."""
@@ -295,15 +290,14 @@ class ClientSource(WorldSource):
         client: Number of the physics client.
         rules: What is seen, and what it is made of.
         shapes: ``"collision"`` or ``"visual"``.
-        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
 
     Raises:
         SceneError: A pattern fits nothing.
     """
 
-    def __init__(self, client: int, rules: Rules, shapes: str, sheet_thickness: float) -> None:
+    def __init__(self, client: int, rules: Rules, shapes: str) -> None:
         self.client = client
-        self._rules, self._shapes, self._sheet_thickness = rules, shapes, sheet_thickness
+        self._rules, self._shapes = rules, shapes
         super().__init__()
 
     def refresh(self) -> None:
@@ -314,9 +308,7 @@ class ClientSource(WorldSource):
             (body, [k.link for k in self._links if k.body == body and k.link >= 0])
             for body in self._bodies
         ]
-        self._reader = WorldReader(
-            self.client, self._links, self._rules, self._shapes, self._sheet_thickness
-        )
+        self._reader = WorldReader(self.client, self._links, self._rules, self._shapes)
         self._made: dict[int, list[Solid]] = {}
 
     def index(self, body: int, link: int) -> int:

@@ -49,8 +49,6 @@ class SoftSolid:
     """What it is called in scenes and messages."""
     faces: NDArray[np.int64]
     """Vertex indices, shape (m, 3)."""
-    thickness: float | None
-    """Thickness of a sheet [m]; None for a closed surface."""
     vertices: Callable[[], Array]
     """Gives the vertices [m] in the simulator's world at present, shape (n, 3)."""
     material: Material
@@ -167,7 +165,7 @@ class World:
             try:
                 if surface is None:
                     surface = self._surfaces[k] = DeformableSurface(
-                        vertices, soft.faces, thickness=soft.thickness, material=soft.material,
+                        vertices, soft.faces, material=soft.material,
                         grounding=soft.tie.grounding, name=soft.label,
                     )  # fmt: skip
                 else:

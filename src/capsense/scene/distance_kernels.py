@@ -10,89 +10,67 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+
+_LEAF = 4
+"""Triangles in a box without parts, at most."""
 
 
-class Bins(NamedTuple):
-    """Triangles of a surface, sorted into the square cells of a grid in x and y."""
+class Boxes(NamedTuple):
+    """Triangles in a balanced tree of boxes, each of which has two parts."""
 
     triangles: Array
-    """Corners [m], shape (m, 3, 3)."""
-    origin: Array
-    """Lower corner of the grid (x, y) [m], shape (2,)."""
-    width: float
-    """Width of a cell [m]."""
-    first: Ints
-    """Where the triangles of each cell begin in ``items``, shape (columns, rows)."""
-    last: Ints
-    """Where they end."""
-    items: Ints
-    """Numbers of the triangles whose bounding box meets each cell."""
-    heights: Array
-    """Least and largest z of the triangles of each cell [m], shape (columns, rows, 2)."""
+    """Corners [m], in the order of the tree, shape (m, 3, 3)."""
+    levels: int
+    """Box q of level l holds triangles q m / 2^l to (q + 1) m / 2^l; so many levels."""
+    corners: Array
+    """Lower and upper corners of the boxes, level by level [m], shape (2^levels - 1, 2, 3)."""
 
 
-def sort_into_bins(triangles: Array) -> Bins:
-    """Sort triangles, corners [m] of shape (m, 3, 3), into about as many cells."""
-    low, high = triangles.min(axis=(0, 1))[:2], triangles.max(axis=(0, 1))[:2]
-    extent = high - low
-    width = max(math.sqrt(float(extent.prod()) / len(triangles)), float(extent.max()) / 256, 1e-12)
-    shape = (extent / width).astype(np.int64) + 1
-    first, last = np.zeros((2, *shape), np.int64)
-    heights = np.empty((*shape, 2))
-    heights[..., 0], heights[..., 1] = np.inf, -np.inf
-    items = np.empty(_count(triangles, low, width, last), np.int64)
-    bins = Bins(triangles, low, width, first, last, items, heights)
-    _fill(bins)
-    return bins
+def boxed(triangles: Array) -> Boxes:
+    """Put triangles, corners [m] of shape (m, 3, 3), into a tree of boxes."""
+    levels = 1 + max(0, math.ceil(math.log2(len(triangles) / _LEAF)))
+    order = np.arange(len(triangles))
+    _sort(triangles.mean(axis=1), levels, order)
+    boxes = Boxes(np.ascontiguousarray(triangles[order]), levels, np.empty((2**levels - 1, 2, 3)))
+    _enclose(boxes)
+    return boxes
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cell(x: float, origin: float, width: float, count: int) -> int:
-    """Cell that a coordinate lies in, or the nearest one; never falls as ``x`` grows."""
-    return int(min(max((x - origin) / width, 0.0), count - 1.0))
+def _sort(centers: Array, levels: int, order: NDArray[np.int64]) -> None:
+    """Order triangles so that every box is split across its longest side."""
+    count = len(order)
+    for level in range(levels - 1):
+        for q in range(1 << level):
+            part = order[(q * count) >> level : ((q + 1) * count) >> level]
+            wide, longest = 0, -1.0
+            for axis in range(3):
+                along = centers[part, axis]
+                if along.max() - along.min() > longest:
+                    wide, longest = axis, along.max() - along.min()
+            part[:] = part[np.argsort(centers[part, wide])]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _reach(tri: Array, axis: int, origin: float, width: float, count: int) -> tuple[int, int]:
-    """First and last cell along an axis that the bounding box of a triangle meets."""
-    low = min(tri[0, axis], min(tri[1, axis], tri[2, axis]))
-    high = max(tri[0, axis], max(tri[1, axis], tri[2, axis]))
-    return _cell(low, origin, width, count), _cell(high, origin, width, count)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _count(triangles: Array, origin: Array, width: float, count: Ints) -> int:
-    """Count the triangles of every cell; returns the sum."""
-    for m in range(triangles.shape[0]):
-        i0, i1 = _reach(triangles[m], 0, origin[0], width, count.shape[0])
-        j0, j1 = _reach(triangles[m], 1, origin[1], width, count.shape[1])
-        count[i0 : i1 + 1, j0 : j1 + 1] += 1
-    return count.sum()
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill(bins: Bins) -> None:
-    """Enter the triangles; ``bins.last`` holds their numbers in every cell."""
-    columns, rows = bins.first.shape
-    at = 0
-    for i in range(columns):
-        for j in range(rows):
-            count = bins.last[i, j]
-            bins.first[i, j] = bins.last[i, j] = at
-            at += count
-    for m in range(bins.triangles.shape[0]):
-        tri = bins.triangles[m]
-        i0, i1 = _reach(tri, 0, bins.origin[0], bins.width, columns)
-        j0, j1 = _reach(tri, 1, bins.origin[1], bins.width, rows)
-        low = min(tri[0, 2], min(tri[1, 2], tri[2, 2]))
-        high = max(tri[0, 2], max(tri[1, 2], tri[2, 2]))
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                bins.items[bins.last[i, j]] = m
-                bins.last[i, j] += 1
-                bins.heights[i, j, 0] = min(bins.heights[i, j, 0], low)
-                bins.heights[i, j, 1] = max(bins.heights[i, j, 1], high)
+def _enclose(boxes: Boxes) -> None:
+    """Fill in the corners of the boxes."""
+    count, levels = len(boxes.triangles), boxes.levels
+    leaves = 1 << (levels - 1)
+    for k in range(2 * leaves - 2, -1, -1):
+        low, high = boxes.corners[k, 0], boxes.corners[k, 1]
+        low[:], high[:] = math.inf, -math.inf
+        if k < leaves - 1:
+            for part in range(2 * k + 1, 2 * k + 3):
+                for axis in range(3):
+                    low[axis] = min(low[axis], boxes.corners[part, 0, axis])
+                    high[axis] = max(high[axis], boxes.corners[part, 1, axis])
+            continue
+        q = k - leaves + 1
+        for m in range((q * count) >> (levels - 1), ((q + 1) * count) >> (levels - 1)):
+            for corner in range(3):
+                for axis in range(3):
+                    low[axis] = min(low[axis], boxes.triangles[m, corner, axis])
+                    high[axis] = max(high[axis], boxes.triangles[m, corner, axis])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -133,81 +111,97 @@ def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def signed_distances(bins: Bins, points: Array, out: Array) -> None:
+def signed_distances(boxes: Boxes, points: Array, out: Array) -> None:
     """Distances [m] to a closed surface, negative inside, at points of shape (n, 3)."""
+    stack, least = np.empty(2 * boxes.levels, np.int64), np.empty(2 * boxes.levels)
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        distance = math.sqrt(_distance2(bins, x, y, z))
-        out[n] = -distance if _winding(bins, x, y, z) != 0 else distance
+        distance = math.sqrt(_distance2(boxes, x, y, z, stack, least))
+        out[n] = -distance if _winding(boxes, x, y, z, stack) != 0 else distance
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _distance2(bins: Bins, x: float, y: float, z: float) -> float:
-    """Squared distance to the nearest triangle: cells are searched in growing squares."""
-    columns, rows = bins.first.shape
-    ci = _cell(x, bins.origin[0], bins.width, columns)
-    cj = _cell(y, bins.origin[1], bins.width, rows)
-    best = math.inf
-    for ring in range(max(columns, rows)):
-        least = max(0.0, (ring - 1) * bins.width)
-        if least * least >= best:
-            break
-        for i in range(max(0, ci - ring), min(columns, ci + ring + 1)):
-            step = 1 if abs(i - ci) == ring else max(1, 2 * ring)
-            for j in range(cj - ring, cj + ring + 1, step):
-                if 0 <= j < rows:
-                    best = _nearest_in_cell(bins, i, j, x, y, z, best)
+def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
+    """Squared distance to a box, zero inside."""
+    dx = max(0.0, max(box[0, 0] - x, x - box[1, 0]))
+    dy = max(0.0, max(box[0, 1] - y, y - box[1, 1]))
+    dz = max(0.0, max(box[0, 2] - z, z - box[1, 2]))
+    return dx * dx + dy * dy + dz * dz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distance2(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64],
+               least: Array) -> float:  # fmt: skip
+    """Squared distance to the nearest triangle; ``stack`` and ``least`` are room to work in."""
+    count, levels = len(boxes.triangles), boxes.levels
+    leaves = 1 << (levels - 1)
+    best, top = math.inf, 1
+    stack[0], least[0] = 0, 0.0
+    while top > 0:
+        top -= 1
+        k = stack[top]
+        if least[top] >= best:
+            continue
+        if k >= leaves - 1:
+            q = k - leaves + 1
+            for m in range((q * count) >> (levels - 1), ((q + 1) * count) >> (levels - 1)):
+                best = min(best, triangle_distance2(boxes.triangles[m], x, y, z))
+            continue
+        near, far = 2 * k + 1, 2 * k + 2
+        to_near = _box_distance2(boxes.corners[near], x, y, z)
+        to_far = _box_distance2(boxes.corners[far], x, y, z)
+        if to_far < to_near:
+            near, far, to_near, to_far = far, near, to_far, to_near
+        stack[top], least[top] = far, to_far
+        stack[top + 1], least[top + 1] = near, to_near
+        top += 2
     return best
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _nearest_in_cell(bins: Bins, i: int, j: int, x: float, y: float, z: float,
-                     best: float) -> float:  # fmt: skip
-    """``best``, or the squared distance to a triangle of a cell if that is less."""
-    left, low = bins.origin[0] + i * bins.width, bins.origin[1] + j * bins.width
-    dx = max(0.0, max(left - x, x - left - bins.width))
-    dy = max(0.0, max(low - y, y - low - bins.width))
-    dz = max(0.0, max(bins.heights[i, j, 0] - z, z - bins.heights[i, j, 1]))
-    # what lies in the cell is no nearer; a triangle's other parts count in their own cells
-    if (dx * dx + dy * dy + dz * dz) * (1.0 - 1e-9) >= best:
-        return best
-    for k in range(bins.first[i, j], bins.last[i, j]):
-        tri = bins.triangles[bins.items[k]]
-        away = 0.0
-        for axis, at in enumerate((x, y, z)):
-            a, b, c = tri[0, axis], tri[1, axis], tri[2, axis]
-            off = max(0.0, max(min(a, min(b, c)) - at, at - max(a, max(b, c))))
-            away += off * off
-        if away < best:
-            best = min(best, triangle_distance2(tri, x, y, z))
-    return best
+def _winding(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64]) -> int:
+    """How often the surface winds around a point, from its crossings of a ray along z."""
+    count, levels = len(boxes.triangles), boxes.levels
+    leaves = 1 << (levels - 1)
+    total, top = 0, 1
+    stack[0] = 0
+    while top > 0:
+        top -= 1
+        k = stack[top]
+        low, high = boxes.corners[k, 0], boxes.corners[k, 1]
+        if z > high[2] or x < low[0] or x > high[0] or y < low[1] or y > high[1]:
+            continue
+        if k < leaves - 1:
+            stack[top], stack[top + 1] = 2 * k + 1, 2 * k + 2
+            top += 2
+            continue
+        q = k - leaves + 1
+        for m in range((q * count) >> (levels - 1), ((q + 1) * count) >> (levels - 1)):
+            tri = boxes.triangles[m]
+            around = _around(tri, x, y)
+            if around != 0 and _height(tri, x, y) > z:
+                total += around
+    return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _winding(bins: Bins, x: float, y: float, z: float) -> int:
-    """How often the surface winds around a point, from its crossings of a ray along z.
+def _around(tri: Array, x: float, y: float) -> int:
+    """Whether a triangle, seen along z, lies around a point: 1, -1 from behind, else 0.
 
     Every edge is cut in one and the same order of its ends and with half-open comparisons, so
-    a ray through an edge or a vertex counts each crossing of a closed surface exactly once.
+    a ray through an edge or a vertex meets a closed surface exactly once.
     """
-    i = _cell(x, bins.origin[0], bins.width, bins.first.shape[0])
-    j = _cell(y, bins.origin[1], bins.width, bins.first.shape[1])
-    total = 0
-    for k in range(bins.first[i, j], bins.last[i, j]):
-        tri = bins.triangles[bins.items[k]]
-        around = 0
-        for e in range(3):
-            f = (e + 1) % 3
-            upward = tri[e, 1] <= y
-            if upward == (tri[f, 1] <= y):
-                continue
-            a, b = (e, f) if upward else (f, e)
-            s = (y - tri[a, 1]) / (tri[b, 1] - tri[a, 1])
-            if tri[a, 0] + s * (tri[b, 0] - tri[a, 0]) > x:
-                around += 1 if upward else -1
-        if around != 0 and _height(tri, x, y) > z:
-            total += around
-    return total
+    out = 0
+    for e in range(3):
+        f = (e + 1) % 3
+        upward = tri[e, 1] <= y
+        if upward == (tri[f, 1] <= y):
+            continue
+        a, b = (e, f) if upward else (f, e)
+        s = (y - tri[a, 1]) / (tri[b, 1] - tri[a, 1])
+        if tri[a, 0] + s * (tri[b, 0] - tri[a, 0]) > x:
+            out += 1 if upward else -1
+    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

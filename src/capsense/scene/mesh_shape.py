@@ -16,7 +16,7 @@ from capsense.scene.surface import clean_surface, connected_parts, enclosed_volu
 if TYPE_CHECKING:
     import trimesh
 
-    from capsense.scene.distance_kernels import Bins
+    from capsense.scene.distance_kernels import Boxes
 
 Array = NDArray[np.float64]
 
@@ -92,13 +92,13 @@ class TriMesh(Shape):
         """
         p = as_points(points)
         self._require_inside("signed distances")
-        return distances_to(self._bins, p)
+        return distances_to(self._boxes, p)
 
     @cached_property
-    def _bins(self) -> Bins:
-        from capsense.scene.distance_kernels import sort_into_bins
+    def _boxes(self) -> Boxes:
+        from capsense.scene.distance_kernels import boxed
 
-        return sort_into_bins(self.vertices[self.faces])
+        return boxed(self.vertices[self.faces])
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
@@ -115,10 +115,10 @@ class TriMesh(Shape):
             )
 
 
-def distances_to(bins: Bins, points: Array) -> Array:
+def distances_to(boxes: Boxes, points: Array) -> Array:
     """Signed distances [m] of points (n, 3) from a closed surface, shape (n,)."""
     from capsense.scene.distance_kernels import signed_distances
 
     out = np.empty(len(points))
-    signed_distances(bins, np.ascontiguousarray(points), out)
+    signed_distances(boxes, np.ascontiguousarray(points), out)
     return out

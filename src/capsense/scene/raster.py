@@ -124,7 +124,8 @@ def _checked_resolution(resolution: object) -> tuple[int, int]:
         whole, rows, columns = False, 0, 0
     if not (whole and rows > 0 and columns > 0 and rows * columns <= 4_000_000):
         raise SceneError(
-            f"rasterise: resolution is {resolution!r}; give (rows, columns), at most 4,000,000 pixels"
+            f"rasterise: resolution is {resolution!r}; give (rows, columns), at most 4,000,000 "
+            "pixels"
         )
     return rows, columns
 

@@ -18,7 +18,7 @@ from capsense.scene.surface import enclosed_volume, is_closed
 if TYPE_CHECKING:
     import trimesh
 
-    from capsense.scene.distance_kernels import Bins
+    from capsense.scene.distance_kernels import Boxes
 
 Array = NDArray[np.float64]
 
@@ -115,13 +115,13 @@ class SurfaceMesh(Shape):
     def signed_distance(self, points: ArrayLike) -> Array:
         p = as_points(points)
         self._require_inside("signed distances")
-        return distances_to(self._bins, p)
+        return distances_to(self._boxes, p)
 
     @cached_property
-    def _bins(self) -> Bins:
-        from capsense.scene.distance_kernels import sort_into_bins
+    def _boxes(self) -> Boxes:
+        from capsense.scene.distance_kernels import boxed
 
-        return sort_into_bins(self.vertices[self.faces])
+        return boxed(self.vertices[self.faces])
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
