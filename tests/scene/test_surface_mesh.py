@@ -70,7 +70,7 @@ def test_open_surfaces_have_no_inside():
         shape = SurfaceMesh(rest.vertices, rest)
         assert not shape.closed
         for ask in (lambda s: s.volume, lambda s: s.signed_distance([(0, 0, 0)])):
-            with pytest.raises(SceneError, match="no inside, and no .*wind its faces alike"):
+            with pytest.raises(SceneError, match=r"no inside, and no .*wind its faces alike"):
                 ask(shape)
         assert len(shape.to_trimesh().faces) == len(rest.faces)
 
