@@ -106,7 +106,6 @@ def test_mesh_body(tmp_path: Path, suffix: str) -> None:
         "shape": "mesh",
         "file": f"brick.{suffix}",
         "unit": "mm",
-        "cell": 0.002,
         "material": "steel",
         "pose": {"position": [0, 0, 0.2]},
     }
@@ -463,6 +462,6 @@ def test_reference_page() -> None:
             if body.get("shape") != "mesh":
                 continue
             body.update(shape="sphere", radius=0.01)
-            for key in ("file", "unit", "cell"):
+            for key in ("file", "unit"):
                 body.pop(key, None)
         assert parse_scenario(data).count >= 1

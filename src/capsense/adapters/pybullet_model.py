@@ -117,10 +117,6 @@ class SoftMesh:
         )
         self.faces: NDArray[np.int64] = corner.reshape(-1, 3)
         """Indices of merged vertices, shape (m, 3)."""
-        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        _, count = np.unique(edges, axis=0, return_counts=True)
-        self.closed = bool(np.all(count % 2 == 0))
-        """Whether the surface has an inside."""
 
     def vertices(self) -> Array:
         """The merged vertices [m] at present, shape (n, 3).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from weakref import WeakKeyDictionary
@@ -20,6 +21,8 @@ _FILLED = 10.0
 """Backs farther than this [m] are not known: the image is filled from the front on."""
 _NORMALS = 0.6
 """How far apart two opposite normals count, as a share of the surface's extent, in splitting."""
+_PIECES = 500
+"""Surfaces of fewer triangles are cut into at least so many pieces."""
 _LEAST_AREA = 1e-9
 """Smallest area of a piece, as a part of the mean: those that shrink to a line have none."""
 
@@ -36,33 +39,48 @@ class Surface:
 
 
 def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, Surface]:
-    """The triangles of a deforming surface, a piece each.
+    """The triangles of a deforming surface, a piece each; few large ones are cut into equal parts.
 
     Returns:
-        Clusters of all triangles, the same ones at every instant; and the pieces.
+        Clusters of all pieces, the same ones at every instant; and the pieces.
     """
-    pieces, _ = _triangles(shape.vertices, shape.faces)
     tree = _TREES.get(shape.rest)
     if tree is None:
         first, normals = _triangles(shape.rest.vertices, shape.faces)
         extent = float(np.ptp(first.centers, axis=0).max())
         features = np.concatenate([first.centers, _NORMALS * extent * normals], axis=1)
         tree = _TREES[shape.rest] = split(features, first.areas)
-    return tree, pieces
+    return tree, _triangles(shape.vertices, shape.faces)[0]
 
 
 def _triangles(vertices: Array, faces: NDArray[np.int64]) -> tuple[Surface, Array]:
-    """Triangles as pieces, and their normals, shape (m, 3)."""
+    """Pieces of triangles, and their normals, shape (n, 3)."""
     corners = vertices[faces]
-    centers = corners.mean(axis=1)
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normals = np.cross(u, v)
+    places = _places(math.ceil(math.sqrt(_PIECES / len(faces))))
+    parts = len(places)
+    centers = (places @ corners).reshape(-1, 3)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(double, 1e-300)[:, None]
-    areas = np.maximum(0.5 * double, max(0.5 * _LEAST_AREA * float(double.mean()), 1e-300))
-    arms = corners - centers[:, None]
-    moments = np.matmul(arms.transpose(0, 2, 1), arms) / 12
-    return Surface(centers, areas, moments), normals
+    areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / (2 * parts)
+    arms = corners - corners.mean(axis=1, keepdims=True)
+    moments = arms.transpose(0, 2, 1) @ arms / (12 * parts)
+    return (
+        Surface(centers, np.repeat(areas, parts), np.repeat(moments, parts, axis=0)),
+        np.repeat(normals, parts, axis=0),
+    )
+
+
+@lru_cache(maxsize=16)
+def _places(cuts: int) -> Array:
+    """Centres of the equal parts of a triangle, as shares of its corners, shape (cuts², 3)."""
+    row, column = np.indices((cuts, cuts)).reshape(2, -1)
+    upright, other = row + column < cuts, row + column < cuts - 1
+    thirds = np.concatenate([
+        np.column_stack([row, column])[upright] + 1 / 3,
+        np.column_stack([row, column])[other] + 2 / 3,
+    ]) / cuts  # fmt: skip
+    return np.column_stack([1 - thirds.sum(axis=1), thirds])
 
 
 def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_]]:
