@@ -14,6 +14,7 @@ from capsense.scene import Layers, RestSurface, SurfaceMesh
 from capsense.surface.rigid import Clusters, split
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 STEP_SLOPE = 3.0
 """Slope of a surface, depth over width, from which a jump between two pixels is a step."""
@@ -22,11 +23,11 @@ _FILLED = 10.0
 _NORMALS = 0.6
 """How far apart two opposite normals count, as a share of the surface's extent, in splitting."""
 _PIECES = 500
-"""Surfaces of fewer triangles are cut into at least so many pieces."""
+"""Triangles are cut until no edge is longer than those of so many equal ones."""
+_HALVINGS = 60
+"""Triangles are halved at most so often."""
 _LEAST_AREA = 1e-9
 """Smallest area of a piece, as a part of the mean: those that shrink to a line have none."""
-
-_TREES: WeakKeyDictionary[RestSurface, Clusters] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,49 +39,70 @@ class Surface:
     moments: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """How the n pieces of a deforming surface lie in its triangles."""
+
+    face: Ints
+    """Triangle that a piece belongs to, shape (n,)."""
+    shares: Array
+    """Corners of the pieces as shares of the triangle's corners, shape (n, 3, 3)."""
+    tree: Clusters
+    """Clusters of all pieces, from the form that the surface had first."""
+
+
+_CUTS: WeakKeyDictionary[RestSurface, Cut] = WeakKeyDictionary()
+
+
 def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, Surface]:
-    """The triangles of a deforming surface, a piece each; few large ones are cut into equal parts.
+    """The triangles of a deforming surface, long and large ones cut into parts, a piece each.
 
     Returns:
         Clusters of all pieces, the same ones at every instant; and the pieces.
     """
-    tree = _TREES.get(shape.rest)
-    if tree is None:
-        first, normals = _triangles(shape.rest.vertices, shape.faces)
-        extent = float(np.ptp(first.centers, axis=0).max())
-        features = np.concatenate([first.centers, _NORMALS * extent * normals], axis=1)
-        tree = _TREES[shape.rest] = split(features, first.areas)
-    return tree, _triangles(shape.vertices, shape.faces)[0]
+    cut = _CUTS.get(shape.rest)
+    if cut is None:
+        cut = _CUTS[shape.rest] = _cut(shape.rest)
+    return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)[0]
 
 
-def _triangles(vertices: Array, faces: NDArray[np.int64]) -> tuple[Surface, Array]:
-    """Pieces of triangles, and their normals, shape (n, 3)."""
-    corners = vertices[faces]
-    places = _places(math.ceil(math.sqrt(_PIECES / len(faces))))
-    parts = len(places)
-    centers = (places @ corners).reshape(-1, 3)
+def _cut(rest: RestSurface) -> Cut:
+    """Halve triangles at their longest edges until all edges are short; make clusters."""
+    corners = rest.vertices[rest.faces]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    ).sum() / 2  # fmt: skip
+    limit = 2 * math.sqrt(area / _PIECES)
+    face, shares = np.arange(len(corners)), np.tile(np.eye(3), (len(corners), 1, 1))
+    for _ in range(_HALVINGS):
+        points = shares @ corners[face]
+        length = np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2)
+        long = np.flatnonzero(length.max(axis=1) > limit * (1 + 1e-9))
+        if not len(long):
+            break
+        start = length[long].argmax(axis=1)
+        end, row = (start + 1) % 3, np.arange(len(long))
+        other = shares[long]
+        middle = (other[row, start] + other[row, end]) / 2
+        other[row, start] = middle
+        shares[long, end] = middle
+        face, shares = np.concatenate([face, face[long]]), np.concatenate([shares, other])
+    first, normals = _pieces(rest.vertices, rest.faces, face, shares)
+    extent = float(np.ptp(first.centers, axis=0).max())
+    features = np.concatenate([first.centers, _NORMALS * extent * normals], axis=1)
+    return Cut(face, shares, split(features, first.areas))
+
+
+def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Surface, Array]:
+    """Pieces, see :class:`Cut`, and their normals, shape (n, 3)."""
+    corners = shares @ vertices[faces[face]]
+    centers = corners.mean(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(double, 1e-300)[:, None]
-    areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / (2 * parts)
-    arms = corners - corners.mean(axis=1, keepdims=True)
-    moments = arms.transpose(0, 2, 1) @ arms / (12 * parts)
-    return (
-        Surface(centers, np.repeat(areas, parts), np.repeat(moments, parts, axis=0)),
-        np.repeat(normals, parts, axis=0),
-    )
-
-
-@lru_cache(maxsize=16)
-def _places(cuts: int) -> Array:
-    """Centres of the equal parts of a triangle, as shares of its corners, shape (cuts², 3)."""
-    row, column = np.indices((cuts, cuts)).reshape(2, -1)
-    upright, other = row + column < cuts, row + column < cuts - 1
-    thirds = np.concatenate([
-        np.column_stack([row, column])[upright] + 1 / 3,
-        np.column_stack([row, column])[other] + 2 / 3,
-    ]) / cuts  # fmt: skip
-    return np.column_stack([1 - thirds.sum(axis=1), thirds])
+    areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / 2
+    arms = corners - centers[:, None]
+    return Surface(centers, areas, arms.transpose(0, 2, 1) @ arms / 12), normals
 
 
 def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_]]:
