@@ -76,7 +76,7 @@ def test_base() -> None:
 
 
 def test_bodies_share_their_shapes() -> None:
-    """A step makes no new shapes: a mesh's distance grid is built once."""
+    """A step makes no new shapes: what a shape keeps is made once."""
     scenario = parse_scenario(BASE)
     assert scenario.scene_at(0.1)["bar"].shape is scenario.scene_at(0.7)["bar"].shape
 

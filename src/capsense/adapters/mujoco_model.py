@@ -178,7 +178,7 @@ class ModelReader:
         )
 
     def _mesh(self, mesh: int, names: Names) -> TriMesh:
-        """Geoms share the distance grid of a mesh. MuJoCo keeps meshes in the geom's frame."""
+        """Geoms share the shape of a mesh. MuJoCo keeps meshes in the geom's frame."""
         hull = self.rules.takes_hull(names)
         if (mesh, hull) not in self._meshes:
             m = self.model

@@ -140,11 +140,11 @@ def _old_layers(sizes: list[float], values: NDArray[np.float32]) -> Layers:
     front, back = fields[slot, row, column, :2].T
     row = row + round((y + 0.5 * height) / height * rows - 0.5)
     column = column + round((x + 0.5 * width) / width * columns - 0.5)
-    if len(row) and (min(row.min(), column.min()) < 0):
+    if len(row) and min(row.min(), column.min()) < 0:
         raise ValueError("a pixel lies outside the image")
     out = np.full((2, slots, rows, columns), np.nan, np.float32)
     out[:, slot, row, column] = front, back
-    return Layers(*out, (width, height))
+    return Layers(out[0], out[1], (width, height))
 
 
 def body_fields(body: Body) -> Fields:
