@@ -1,4 +1,4 @@
-"""Depth frames: convergence, agreement with the geometry path, times.
+"""Depth frames and deforming surfaces: agreement with the geometry path, times.
 
 ``python benchmarks/depth_path.py`` prints the tables of ``docs/depth.md``. Times are of this
 machine, one process, as found.
@@ -19,19 +19,9 @@ import capsense as cs
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
+from layered_views import view
 from sheet_theory import first_order
 
-SIZES = (32, 64, 128, 256)
-SOLIDS = {
-    "sphere": (cs.Sphere(0.06), cs.Pose((0.004, 0.003, 0.15))),
-    "capsule": (
-        cs.Capsule(0.04, 0.1), cs.Pose.from_euler((0.004, 0.003, 0.15), (0.4, 1.2, 0.3)),
-    ),
-    "box, upright": (cs.Box((0.12, 0.1, 0.06)), cs.Pose((0.004, 0.003, 0.15))),
-    "box, tilted": (
-        cs.Box((0.12, 0.1, 0.06)), cs.Pose.from_euler((0.004, 0.003, 0.15), (0.5, 0.4, 0.3)),
-    ),
-}  # fmt: skip
 BODIES = {
     "bar": (cs.Box((0.15, 0.15, 0.02)), (0, 0, 0), 0.01),
     "turned bar": (cs.Box((0.15, 0.1, 0.02)), (0, 0, 0.4), 0.01),
@@ -40,59 +30,34 @@ BODIES = {
 }
 
 
-def view(shape: cs.Box, pose: cs.Pose, n: int, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Front and back [m] of a convex solid along z at the middles of n × n pixels."""
-    c = (np.arange(n) + 0.5) / n * size - size / 2
-    x, y = np.meshgrid(c, c)
-    o = np.column_stack([x.ravel(), y.ravel(), np.zeros(n * n)])
-    inverse = pose.inverse()
-    t = shape.line_intervals(inverse.apply(o), inverse.rotation @ (0.0, 0.0, 1.0))
-    t = np.where(t[:, 1:] > t[:, :1], t, np.nan).reshape(n, n, 2)
-    return t[..., 0], t[..., 1]
+def mesh_of(shape: cs.Shape) -> trimesh.Trimesh:
+    """A mesh of a shape: twelve triangles of a box, about 1000 of others."""
+    if isinstance(shape, cs.Sphere):
+        return trimesh.creation.icosphere(3, shape.radius)
+    if isinstance(shape, cs.Capsule):
+        mesh = trimesh.creation.capsule(shape.length, shape.radius, count=(24, 24))
+        mesh.apply_translation(-mesh.bounds.mean(axis=0))
+        return mesh
+    return shape.to_trimesh()
 
 
-def chords(shape: cs.Box, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Length of lines inside a shape."""
-    t = shape.line_intervals(o, d).reshape(len(o), -1, 2)
-    return np.where(t[..., 1] > t[..., 0], t[..., 1] - t[..., 0], 0.0).sum(axis=1)
-
-
-def mesh_of(name: str, shape: cs.Box) -> trimesh.Trimesh:
-    """A fine mesh of a shape."""
-    return trimesh.creation.icosphere(5, shape.radius) if name == "sphere" else shape.to_trimesh()
-
-
-def convergence() -> None:
-    """Mean error of chords of random lines against the exact shape."""
-    print("\nmean error of chords [mm] at 32, 64, 128, 256 pixels over 0.3 m, mean order")
-    rng = np.random.default_rng(1)
-    for name, (shape, pose) in SOLIDS.items():
-        o = np.array(pose.position) + rng.uniform(-0.08, 0.08, (6000, 3))
-        d = rng.normal(size=(6000, 3))
-        d[:2000], d[2000:4000] = (0, 0, 1), (1, 0, 0)
-        d /= np.linalg.norm(d, axis=1)[:, None]
-        inverse = pose.inverse()
-        exact = chords(shape, inverse.apply(o), d @ inverse.rotation.T)
-        mesh = mesh_of(name, shape)
-        for kind in ("faces by rays", "own rasteriser"):
-            errors = []
-            for n in SIZES:
-                if kind == "faces by rays":
-                    layers = cs.Layers(*view(shape, pose, n, 0.3), (0.3, 0.3))
-                else:
-                    vertices = pose.apply(mesh.vertices)
-                    layers = cs.rasterise(vertices, mesh.faces, (0.3, 0.3), (n, n)).layers()
-                errors.append(1e3 * np.abs(chords(layers, o, d) - exact).mean())
-            order = np.log2(errors[0] / errors[-1]) / 3
-            figures = "  ".join(f"{e:.3f}" for e in errors)
-            print(f"  {name:13s} {kind:15s} {figures}   {order:.1f}")
+def sheet(n: int, width: float, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """A flat sheet of n × n quads at z = 0, two triangles each."""
+    u, v = (np.linspace(-0.5, 0.5, n + 1) * side for side in (width, height))
+    x, y = np.meshgrid(u, v)
+    first = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    faces = np.concatenate([
+        np.column_stack([first, first + 1, first + n + 2]),
+        np.column_stack([first, first + n + 2, first + n + 1]),
+    ])  # fmt: skip
+    return np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()]), faces
 
 
 def agreement() -> None:
     """Depth path against geometry path: six_patch, bodies of steel at random places."""
     sim = cs.Simulator("six_patch")
     print("\nlargest error of delta, % of the largest entry, over six places: front filled; front")
-    print("and back; each at 64, 128, 256 pixels over 0.5 m; own rasteriser at 64")
+    print("and back; each at 64, 128, 256 pixels over 0.5 m; a deforming surface of its triangles")
     rng = np.random.default_rng(0)
     for name, (shape, angles, low) in BODIES.items():
         for gap in (0.002, 0.005, 0.01, 0.02, 0.05):
@@ -107,7 +72,7 @@ def agreement() -> None:
                     front, back = view(shape, pose, n, 0.5)
                     found.append(sim.step(cs.DepthFrame(front)).delta)
                     found.append(sim.step(cs.DepthFrame(front, back=back)).delta)
-                mesh = mesh_of("sphere" if name == "ball" else name, shape)
+                mesh = mesh_of(shape)
                 surface = cs.DeformableSurface(
                     pose.apply(mesh.vertices), mesh.faces, material="steel"
                 )
@@ -117,6 +82,25 @@ def agreement() -> None:
             w = 100 * worst
             print(f"  {name:10s} {1e3 * gap:3.0f} mm   {w[0]:5.2f} {w[2]:5.2f} {w[4]:5.2f}   "
                   f"{w[1]:5.2f} {w[3]:5.2f} {w[5]:5.2f}   {w[6]:5.2f}")  # fmt: skip
+
+
+def foils() -> None:
+    """Conducting sheets at ground against thin boxes of fine panels."""
+    sim, fine = (cs.Simulator("six_patch_bare", preset=p) for p in ("standard", "fine"))
+    print("\nsheet of 0.12 x 0.1 m against a box of 0.2 mm with the fine preset, largest error of")
+    print("delta, % of the largest entry: quads 4 x 4, 8 x 8, 20 x 20, 40 x 40; box of 0.2 mm")
+    for z in (0.005, 0.01, 0.02, 0.03, 0.05, 0.08):
+        pose = cs.Pose((0.007, -0.004, z))
+        plate = cs.Scene([cs.Body(cs.Box((0.12, 0.1, 0.0002)), pose, "steel")])
+        exact = fine.step(plate).delta
+        found = []
+        for n in (4, 8, 20, 40):
+            vertices, faces = sheet(n, 0.12, 0.1)
+            foil = cs.DeformableSurface(pose.apply(vertices), faces, material="steel")
+            found.append(sim.step(cs.Scene([foil.body()])).delta)
+        found.append(sim.step(plate).delta)
+        error = [100 * np.abs(f - exact).max() / np.abs(exact).max() for f in found]
+        print(f"  {1e3 * z:3.0f} mm   {'  '.join(f'{e:.2f}' for e in error)}")
 
 
 def sheets() -> None:
@@ -165,11 +149,9 @@ def times() -> None:
         vertices, f = mesh.vertices + np.array([0, 0, 0.2]), np.array(mesh.faces)
         for n in (64, 128):
             raster = cs.rasterise(vertices, f, (0.21, 0.21), (n, n))
-            surface = cs.DeformableSurface(vertices, f, resolution=n)
             run = median(lambda v=vertices, f=f, n=n: cs.rasterise(v, f, (0.21, 0.21), (n, n)))
-            layers, body = median(raster.layers), median(surface.body)
-            print(f"  {faces} triangles at {n} x {n}: rasterise {run:.3f}, layers {layers:.3f}, "
-                  f"deformable body {body:.3f}")  # fmt: skip
+            layers = median(raster.layers)
+            print(f"  {faces} triangles at {n} x {n}: rasterise {run:.3f}, layers {layers:.3f}")
     sim = cs.Simulator("six_patch")
     capsule = cs.Capsule(0.045, 0.2)
     frames = {}
@@ -187,6 +169,18 @@ def times() -> None:
                 spent.append(time.process_time() - start)
             print(f"  step, forearm at 0.2 m/s and 100 Hz, {n} x {n}, back {back}: "
                   f"{1e3 * np.median(spent[5:]):.2f}")  # fmt: skip
+    for quads in (8, 20, 28):
+        vertices, faces = sheet(quads, 0.2, 0.1)
+        foil = cs.DeformableSurface(vertices, faces, material="steel")
+        spent = []
+        for k in range(100):
+            pose = cs.Pose.from_euler((-0.1 + 0.002 * k, 0, 0.03), (0, 0, 0.3))
+            moved = pose.apply(vertices) + np.array([0, 0, 0.005 * np.sin(0.1 * k)])
+            start = time.process_time()
+            foil.vertices = moved
+            sim.step(cs.Scene([foil.body()]))
+            spent.append(time.process_time() - start)
+        print(f"  step, sheet of {2 * quads**2} triangles: {1e3 * np.median(spent[5:]):.2f}")
     sim.reset()
     spent = []
     for k in range(100):
@@ -199,7 +193,7 @@ def times() -> None:
 
 if __name__ == "__main__":
     print(f"{platform.platform()}, Python {platform.python_version()}, numpy {np.__version__}")
-    convergence()
     agreement()
+    foils()
     sheets()
     times()

@@ -1,8 +1,8 @@
-"""An arm is felt through its sleeve: a cotton surface that moves at every step.
+"""An arm in a sleeve of conducting cloth: a surface that moves at every step.
 
-Run it: ``python examples/sleeve.py [FOLDER]``. A forearm in a loose, fluttering sleeve of 1 mm of
-cotton goes by in front of six electrodes, then the bare arm, then the sleeve alone. A plot goes to
-the folder (``out`` by default).
+Run it: ``python examples/sleeve.py [FOLDER]``. A forearm in a loose, fluttering sleeve of silvered
+cloth goes by in front of six electrodes, then the bare arm, then the sleeve alone; all are at
+ground. A plot goes to the folder (``out`` by default).
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from capsense.humans import Build, arm
 from capsense.scene.deformable import DeformableSurface
 
 STEPS = 80
-THICKNESS = 1e-3
-"""Thickness of the cotton [m]."""
+CLOTH = cs.Material("silvered cloth", 1.0, 1e5)
 ALONG, AROUND = 24, 32
 """Vertices of the sleeve along the arm and around it."""
 
@@ -66,8 +65,7 @@ def main(folder: Path) -> dict[str, np.ndarray]:
     """Sense the arm with and without its sleeve, check, and draw."""
     sim = cs.Simulator("six_patch")
     sleeve = DeformableSurface(
-        sleeve_vertices(0, where(0)), sleeve_faces(), thickness=THICKNESS, material="cotton",
-        resolution=96, name="sleeve",
+        sleeve_vertices(0, where(0)), sleeve_faces(), material=CLOTH, name="sleeve"
     )  # fmt: skip
     curves: dict[str, np.ndarray] = {}
     for title in ("arm in a sleeve", "bare arm", "sleeve alone"):
@@ -89,13 +87,15 @@ def main(folder: Path) -> dict[str, np.ndarray]:
 
 
 def check(curves: dict[str, np.ndarray]) -> None:
-    """The arm is felt through the sleeve, which itself hardly changes anything."""
+    """The sleeve is nearer than the arm, and hides it."""
     covered, bare, alone = (curves[k] for k in ("arm in a sleeve", "bare arm", "sleeve alone"))
-    assert np.all(np.abs(covered - bare).max(axis=0) < 0.15 * bare.max(axis=0))
-    assert np.all(np.abs(alone).max(axis=0) < 0.15 * bare.max(axis=0))
-    assert np.all(covered >= bare), "a dielectric between raises the capacitance"
+    peak = covered.max(axis=0)
+    print("sleeve over arm: peaks", np.round(peak / bare.max(axis=0), 2))
+    print("arm in the sleeve:", np.round(np.abs(covered - alone).max(axis=0) / peak, 3))
+    assert np.all(peak > bare.max(axis=0)), "a conductor in front of another raises the signal"
+    assert np.all(np.abs(covered - alone).max(axis=0) < 0.05 * peak), "a conductor is a screen"
     for k in range(6):
-        assert np.corrcoef(covered[:, k], bare[:, k])[0, 1] > 0.999
+        assert np.corrcoef(covered[:, k], bare[:, k])[0, 1] > 0.95
 
 
 def draw(curves: dict[str, np.ndarray], folder: Path) -> None:

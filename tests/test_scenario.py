@@ -76,7 +76,7 @@ def test_base() -> None:
 
 
 def test_bodies_share_their_shapes() -> None:
-    """A step makes no new shapes: a mesh's distance grid is built once."""
+    """A step makes no new shapes: what a shape keeps is made once."""
     scenario = parse_scenario(BASE)
     assert scenario.scene_at(0.1)["bar"].shape is scenario.scene_at(0.7)["bar"].shape
 
@@ -106,7 +106,6 @@ def test_mesh_body(tmp_path: Path, suffix: str) -> None:
         "shape": "mesh",
         "file": f"brick.{suffix}",
         "unit": "mm",
-        "cell": 0.002,
         "material": "steel",
         "pose": {"position": [0, 0, 0.2]},
     }
@@ -463,6 +462,6 @@ def test_reference_page() -> None:
             if body.get("shape") != "mesh":
                 continue
             body.update(shape="sphere", radius=0.01)
-            for key in ("file", "unit", "cell"):
+            for key in ("file", "unit"):
                 body.pop(key, None)
         assert parse_scenario(data).count >= 1

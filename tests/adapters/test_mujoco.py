@@ -82,12 +82,12 @@ def test_a_terrain_stands_where_mujoco_has_it(tiny_simulator: cs.Simulator) -> N
             depth = mujoco.mj_ray(sensor.model, sensor.data, point, down, only, 1, 1, geom, None)
         hit = point + depth * down
         assert body.shape.signed_distance(body.pose.inverse().apply([hit]))[0] == pytest.approx(
-            0.0, abs=0.5 * body.shape.cell
+            0.0, abs=1e-8
         )
 
 
 def test_signed_distance_geoms_and_shared_meshes(tiny_simulator: cs.Simulator) -> None:
-    """An SDF plugin's surface is taken; geoms of one mesh share one distance grid."""
+    """An SDF plugin's surface is taken; geoms of one mesh share one shape."""
     top = (
         '<asset><mesh name="m" vertex="0 0 0 .03 0 0 0 .03 0 0 0 .03"/></asset>'
         if not _has_torus()

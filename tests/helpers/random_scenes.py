@@ -23,7 +23,7 @@ def wedge() -> cs.TriMesh:
     f = [
         (0, 2, 1), (0, 3, 2), (0, 1, 4), (1, 2, 5), (1, 5, 4), (2, 3, 5), (0, 4, 5), (0, 5, 3),
     ]  # fmt: skip
-    return cs.TriMesh(np.array(v) * 1e-3 - [0.03, 0.02, 0.015], f, cell=0.003)
+    return cs.TriMesh(np.array(v) * 1e-3 - [0.03, 0.02, 0.015], f)
 
 
 def random_shape(rng: Generator, kind: str, size: float) -> cs.Box:

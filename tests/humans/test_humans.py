@@ -295,7 +295,7 @@ def test_smplx_with_a_stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
 
     monkeypatch.setitem(sys.modules, "smplx", types.SimpleNamespace(create=create))
     monkeypatch.setitem(sys.modules, "torch", types.SimpleNamespace(from_numpy=Tensor))
-    shape = load_smplx(tmp_path, gender="female", cell=0.05, betas=np.zeros(10))
+    shape = load_smplx(tmp_path, gender="female", betas=np.zeros(10))
     assert asked == {"path": str(tmp_path), "model_type": "smplx", "gender": "female"}
     assert shape.volume == pytest.approx(0.12, rel=1e-5)
     with pytest.raises(cs.SceneError, match="betas holds a number"):

@@ -1,22 +1,56 @@
-"""The orthographic rasteriser against trying every triangle; outlines; deforming surfaces."""
+"""The orthographic rasteriser against trying every triangle; refusals."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import trimesh
+from layered_views import unite
 
 from capsense.errors import SceneError
 from capsense.scene import (
     Box,
     Capsule,
-    DeformableSurface,
     Layers,
     Pose,
-    Sphere,
     rasterise,
 )
-from capsense.scene.layer_reference import rasterise_slowly, unite
+from capsense.scene.raster_kernels import LEAST_COSINE
+
+
+def rasterise_slowly(vertices, faces, size, resolution, thickness=0.0):
+    """Intervals that the rays through all pixels meet, ``[row][column]``, by trying every triangle.
+
+    Rays that meet an edge within rounding may count it twice or not at all.
+    """
+    rows, columns = resolution
+    xs = ((np.arange(columns) + 0.5) / columns - 0.5) * size[0]
+    ys = ((np.arange(rows) + 0.5) / rows - 0.5) * size[1]
+    a, e1, e2 = vertices[faces[:, 0]], *(vertices[faces[:, k]] - vertices[faces[:, 0]]
+                                         for k in (1, 2))  # fmt: skip
+    normal = np.cross(e1, e2)
+    facing = normal[:, 2] != 0
+    a, e1, e2, normal = a[facing], e1[facing], e2[facing], normal[facing]
+    cosine = np.abs(normal[:, 2]) / np.linalg.norm(normal, axis=1)
+    out = []
+    for y in ys:
+        out.append([])
+        for x in xs:
+            s = np.array([x, y]) - a[:, :2]
+            u = (s[:, 0] * e2[:, 1] - s[:, 1] * e2[:, 0]) / normal[:, 2]
+            v = (e1[:, 0] * s[:, 1] - e1[:, 1] * s[:, 0]) / normal[:, 2]
+            met = (u >= 0) & (v >= 0) & (u + v <= 1)
+            z = (a[:, 2] + u * e1[:, 2] + v * e2[:, 2])[met]
+            if thickness > 0:
+                half = thickness / 2 / np.maximum(cosine[met], LEAST_COSINE)
+                out[-1].append(unite(list(zip(z - half, z + half, strict=True))))
+            else:
+                order = np.argsort(z)
+                winding = np.cumsum(np.sign(normal[met, 2])[order])
+                ends = z[order].tolist()
+                out[-1].append(unite([(ends[k], ends[k + 1]) for k in range(len(ends) - 1)
+                                      if winding[k] != 0]))  # fmt: skip
+    return out
 
 
 def intervals(raster, j, i):
@@ -109,59 +143,6 @@ def test_closed_meshes_on_rays_are_met_in_pairs():
         box.apply_translation((0.005, 0.005, 0))
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3, 0.7])
-def test_straight_outlines_are_exact(angle):
-    """Analytic: sides of a turned plate are met to a hundredth of a pixel, corners apart."""
-    plate, pose = Box((0.13, 0.11, 0.02)), Pose.from_euler((0.003, 0.002, 0.1), (0, 0, angle))
-    mesh = plate.to_trimesh()
-    layers = rasterise(pose.apply(mesh.vertices), mesh.faces, (0.3, 0.3), (40, 40)).layers()
-    pixel = 0.3 / 40
-    rng = np.random.default_rng(0)
-    inverse = pose.inverse()
-    compared = 0
-    for axis in (0, 1):
-        d = np.eye(3)[axis]
-        o = np.column_stack([rng.uniform(-0.1, 0.1, (500, 2)), rng.uniform(0.0905, 0.1095, 500)])
-        t = layers.line_intervals(o, d)[:, 0]
-        exact = np.nan_to_num(
-            plate.line_intervals(inverse.apply(o), inverse.rotation @ d), posinf=1.0, neginf=-1.0
-        )
-        ends = np.abs(inverse.apply(o[:, None] + exact[..., None] * d))
-        # both ends two pixels away from all corners
-        side = np.sort((plate.params - ends)[..., :2], axis=-1)[..., 1]
-        clear = (exact[:, 0] < exact[:, 1]) & np.all(side > 2 * pixel, axis=1)
-        np.testing.assert_allclose(t[clear], exact[clear], atol=0.01 * pixel)
-        compared += clear.sum()
-    assert compared > 100
-
-
-@pytest.mark.parametrize("name", ["sphere", "capsule", "tilted box", "box"])
-def test_volume_converges(name):
-    """Analytic: the enclosed volume, by chords through fine meshes. Measured orders: 1.2 and up;
-    1 % or better at 32 pixels across 0.16 m."""
-    shape, pose = {
-        "sphere": (Sphere(0.06), Pose((0.004, 0.003, 0.15))),
-        "capsule": (Capsule(0.03, 0.06), Pose.from_euler((0.004, 0.003, 0.15), (0.4, 1.2, 0.3))),
-        "tilted box": (Box((0.1, 0.08, 0.05)), Pose.from_euler((0, 0, 0.15), (0.5, 0.4, 0.3))),
-        "box": (Box((0.1, 0.08, 0.05)), Pose((0.004, 0.003, 0.15))),
-    }[name]
-    mesh = trimesh.creation.icosphere(5, 0.06) if name == "sphere" else shape.to_trimesh()
-    c = (np.arange(80) + 0.5) / 80 * 0.17 - 0.085
-    y, z = np.meshgrid(c, c + 0.15)
-    o = np.column_stack([0 * y.ravel(), y.ravel(), z.ravel()])
-    errors = []
-    for n in (32, 128):
-        layers = rasterise(pose.apply(mesh.vertices), mesh.faces, (0.16, 0.16), (n, n)).layers()
-        t = layers.line_intervals(o, (1, 0, 0))
-        volume = np.where(t[..., 1] > t[..., 0], t[..., 1] - t[..., 0], 0).sum() * (0.17 / 80) ** 2
-        inverse = pose.inverse()
-        exact = shape.line_intervals(inverse.apply(o), inverse.rotation @ (1.0, 0, 0))
-        exact = np.where(exact[:, 1] > exact[:, 0], np.ptp(exact, axis=1), 0).sum()
-        errors.append(abs(volume / (exact * (0.17 / 80) ** 2) - 1))
-    assert errors[0] < 0.02
-    assert errors[1] < 0.004
-
-
 def test_mixed_winding_counts_every_second_stretch():
     """Analytic: a box with one side turned is the same box."""
     box = Box((0.08, 0.06, 0.04)).to_trimesh()
@@ -185,99 +166,22 @@ def test_many_layers():
     np.testing.assert_allclose(raster.front[:, 4, 4], 0.098 + 0.01 * np.arange(9), atol=1e-8)
     np.testing.assert_allclose(raster.depth[4, 4], 0.098, atol=1e-8)
     assert raster.depth[0, 0] == np.inf
-    assert raster.layers().grid.shape[0] == 9
+    assert len(raster.layers().front) == 9
 
 
-# ---- deforming surfaces ----
-
-
-def test_a_moved_surface_is_the_same_one_elsewhere():
-    """Invariant: the view follows the surface, so that a rigid shift changes nothing else."""
-    mesh = trimesh.creation.icosphere(3, 0.05)
-    surface = DeformableSurface(mesh.vertices + np.array([0, 0, 0.2]), mesh.faces)
-    first, pose = surface.view()
-    surface.vertices = mesh.vertices + np.array([0.0123, -0.0456, 0.3])
-    second, moved = surface.view()
-    np.testing.assert_allclose(first.fields, second.fields, atol=2e-6)
-    np.testing.assert_allclose(np.subtract(moved.position, pose.position),
-                               (0.0123, -0.0456, 0.1), atol=1e-12)  # fmt: skip
-
-
-def test_a_pad_that_is_pressed_shrinks():
-    """Analytic: a box squeezed to half its height, step by step."""
-    box = Box((0.06, 0.04, 0.02)).to_trimesh()
-    pad = DeformableSurface(box.vertices, box.faces, material="silicone rubber", name="pad")
-    for height in (1.0, 0.8, 0.5):
-        pad.vertices = box.vertices * (1, 1, height) + (0.01, 0.02, 0.05)
-        body = pad.body()
-        assert body.name == "pad"
-        assert body.material.eps_r == 3.5
-        o = body.pose.inverse().apply([[0.013, 0.022, 0.0]])
-        t = body.shape.line_intervals(o, (0, 0, 1))[0, 0]
-        np.testing.assert_allclose(t, (0.05 - 0.01 * height, 0.05 + 0.01 * height), atol=1e-8)
-        o = body.pose.inverse().apply([[0.0, 0.022, 0.052]])
-        t = body.shape.line_intervals(o, (1, 0, 0))[0, 0]
-        np.testing.assert_allclose(t, (-0.02, 0.04), atol=1e-5)
-
-
-def test_cloth_keeps_its_thickness():
-    """Analytic: the volume of waves of cloth is area times thickness, to 2 %."""
-    vertices, faces = cloth(40, 0.2)
-    sheet = DeformableSurface(vertices, faces, thickness=0.002, material="cotton", resolution=100)
-    for height in (0.0, 0.01, 0.02):
-        moved = vertices + np.column_stack([0 * vertices[:, :2], height * np.sin(
-            2 * np.pi * vertices[:, 0] / 0.1)])  # fmt: skip
-        sheet.vertices = moved
-        layers, _ = sheet.view()
-        area = trimesh.Trimesh(moved, faces, process=False).area
-        assert abs(layers.volume / (0.002 * area) - 1) < 0.02
-
-
-def test_a_covered_surface_is_seen():
-    """Analytic: front and back of a ball inside a larger open sleeve, on one line."""
-    ball = trimesh.creation.icosphere(4, 0.03)
-    sleeve = trimesh.creation.cylinder(0.05, 0.2, sections=96)
-    sleeve.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0)))
-    inner = DeformableSurface(ball.vertices + np.array([0, 0, 0.1]), ball.faces).body()
-    sides = np.abs(sleeve.face_normals[:, 0]) < 0.5  # an open tube
-    outer = DeformableSurface(
-        sleeve.vertices + np.array([0, 0, 0.1]), sleeve.faces[sides], thickness=0.001,
-        material="cotton", resolution=128,
-    ).body()  # fmt: skip
-    found = []
-    for body in (outer, inner):
-        o = body.pose.inverse().apply([[0.0, 0.0, 0.0]])
-        t = body.shape.line_intervals(o, (0, 0, 1))[0]
-        found.extend(t[t[:, 0] <= t[:, 1]].mean(axis=1).tolist())
-    np.testing.assert_allclose(found, [0.05, 0.15, 0.1], atol=3e-4)
-
-
-def test_bad_surfaces_are_refused():
+def test_bad_views_are_refused():
     vertices, faces = cloth(2, 0.1)
-    box = Box((0.1, 0.1, 0.1)).to_trimesh()
     for arguments, options, message in [
-        ((vertices, faces), {}, r"the surface is open \(8 of 16 edges"),
         ((vertices, faces), {"thickness": 0}, "thickness is 0; give a positive length"),
         ((vertices, faces), {"thickness": np.nan}, "thickness is nan"),
-        ((vertices, faces), {"thickness": 1e-3, "resolution": 1}, "resolution is 1"),
-        ((vertices, faces + 5), {"thickness": 1e-3}, "faces name vertices 5 to 13"),
-        ((vertices, faces.astype(float)), {"thickness": 1e-3}, "faces have type float64"),
-        ((vertices[:, :2], faces), {"thickness": 1e-3}, r"vertices have shape \(9, 2\)"),
-        ((np.full_like(vertices, np.nan), faces), {"thickness": 1e-3}, "vertex 0 is"),
-        ((vertices, faces[:0]), {"thickness": 1e-3}, "faces have shape"),
-        ((box.vertices, box.faces), {"grounding": "grouned"}, "grounding is 'grouned'"),
-        ((box.vertices, box.faces), {"material": "stel"}, "unknown material 'stel'"),
+        ((vertices, faces + 5), {}, "faces name vertices 5 to 13"),
+        ((vertices, faces.astype(float)), {}, "faces have type float64"),
+        ((vertices[:, :2], faces), {}, r"vertices have shape \(9, 2\)"),
+        ((np.full_like(vertices, np.nan), faces), {}, "vertex 0 is"),
+        ((vertices, faces[:0]), {}, "faces have shape"),
     ]:
         with pytest.raises(SceneError, match=message):
-            DeformableSurface(*arguments, **options)
-    sheet = DeformableSurface(vertices, faces, thickness=1e-3)
-    with pytest.raises(SceneError, match=r"vertices have shape \(8, 3\)"):
-        sheet.vertices = vertices[:8]
-    with pytest.raises(SceneError, match="vertex 0"):
-        sheet.vertices = vertices * np.nan
-    sheet.vertices = vertices * 0
-    with pytest.raises(SceneError, match="no extent along x or y"):
-        sheet.body()
+            rasterise(*arguments, (0.1, 0.1), (4, 4), **options)
     for size, resolution, message in [
         ((0.1, -1), (4, 4), "size is"),
         ((0.1, 0.1), (0, 4), "resolution is"),
@@ -292,11 +196,18 @@ def test_bad_surfaces_are_refused():
         empty.layers()
 
 
-def test_layers_of_a_raster_are_layers():
-    mesh = Capsule(0.03, 0.06).to_trimesh()
-    raster = rasterise(mesh.vertices + np.array([0, 0, 0.2]), mesh.faces, (0.1, 0.1), (30, 30))
-    layers = raster.layers()
-    assert isinstance(layers, Layers)
-    np.testing.assert_allclose(
-        layers.volume, np.nansum(raster.back - raster.front) * (0.1 / 30) ** 2, rtol=0.05
-    )
+def test_volumes_converge():
+    """Analytic: a capsule, through its layers; measured 0.3 % at 128 pixels."""
+    shape, pose = Capsule(0.03, 0.06), Pose.from_euler((0, 0, 0.2), (0.4, 1.2, 0.3))
+    mesh = shape.to_trimesh()
+    errors = []
+    for n in (32, 128):
+        raster = rasterise(pose.apply(mesh.vertices), mesh.faces, (0.16, 0.16), (n, n))
+        layers = raster.layers()
+        assert isinstance(layers, Layers)
+        assert layers.volume == pytest.approx(
+            np.nansum(raster.back - raster.front) * (0.16 / n) ** 2, rel=1e-5
+        )
+        errors.append(abs(layers.volume / mesh.volume - 1))
+    assert errors[0] < 0.02
+    assert errors[1] < 0.004

@@ -91,6 +91,19 @@ def test_depth_images(server: Any) -> None:
     assert len(server.scene._handle_from_node_name["/bodies/0"].points) == 48
 
 
+def test_deforming_surfaces(server: Any) -> None:
+    """Triangles, from both sides, where they are now."""
+    server.scene.reset()
+    stage = Stage(server, cs.load_design("six_patch"))
+    foil = cs.DeformableSurface(0.1 * np.eye(3), [[0, 1, 2]], material="steel")
+    for k in range(2):
+        foil.vertices = np.eye(3) * (0.1 + 0.1 * k)
+        stage.show_bodies(cs.Scene([foil.body()]))
+        handle = server.scene._handle_from_node_name["/bodies/0"]
+        np.testing.assert_allclose(handle.vertices, foil.vertices, rtol=1e-6)
+        assert handle.side == "double"
+
+
 def test_signals(server: Any) -> None:
     """From quiet to loud, and no further."""
     server.scene.reset()

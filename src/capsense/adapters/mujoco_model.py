@@ -34,6 +34,9 @@ _SCALAR_LAST = [1, 2, 3, 0]
 MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
+_THINNEST = 1e-4
+"""Flexes are no thinner than this [m], whatever their radius."""
+
 
 class ModelReader:
     """Reads the geoms of one model.
@@ -106,10 +109,10 @@ class ModelReader:
         return SoftSolid(
             label=label,
             faces=faces.reshape(-1, 3).astype(np.int64),
-            thickness=2 * float(m.flex_radius[flex]) if kind == 2 else None,
             vertices=lambda: data.flexvert_xpos[own],
             material=material,
             tie=tie,
+            thickness=max(2 * float(m.flex_radius[flex]), _THINNEST),
         )
 
     def _matter(self, names: Names) -> tuple[Material, Tie]:
@@ -179,7 +182,7 @@ class ModelReader:
         )
 
     def _mesh(self, mesh: int, names: Names) -> TriMesh:
-        """Geoms share the distance grid of a mesh. MuJoCo keeps meshes in the geom's frame."""
+        """Geoms share the shape of a mesh. MuJoCo keeps meshes in the geom's frame."""
         hull = self.rules.takes_hull(names)
         if (mesh, hull) not in self._meshes:
             m = self.model

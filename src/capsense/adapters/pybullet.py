@@ -53,7 +53,6 @@ def attach(
     exclude: Sequence[str] = (),
     exclude_own: bool = True,
     hull: Sequence[str] = (),
-    sheet_thickness: float = 1e-3,
     size: float | None = None,
     resolution: int = 64,
     back: str | float = "fill",
@@ -94,7 +93,6 @@ def attach(
             describes.
         hull: Name patterns of links whose visual meshes are taken as their convex hulls.
             Geometry only.
-        sheet_thickness: Thickness [m] of soft bodies that are open surfaces, such as cloth.
         size: Width and height of the image [m]; by default the width of the domain. Depth only.
         resolution: Pixels along each side of the image. Depth only.
         back: Where what is drawn ends: ``"fill"``, at the end of the domain, or after an assumed
@@ -132,7 +130,7 @@ def attach(
         )  # fmt: skip
         sensor.use_readout(readout)
         return sensor
-    source = ClientSource(number, rules, shapes, sheet_thickness)
+    source = ClientSource(number, rules, shapes)
     sensor = PybulletSensor(source, body, index, pose_in_link, simulator, exclude_own=exclude_own)
     sensor.use_readout(readout)
     return sensor
@@ -152,7 +150,6 @@ def attach_skin(
     exclude: Sequence[str] = (),
     exclude_own: bool = True,
     hull: Sequence[str] = (),
-    sheet_thickness: float = 1e-3,
     readout: str | Path | None = None,
     threads: int | None = None,
 ) -> AttachedSkin:
@@ -167,7 +164,7 @@ def attach_skin(
         mounts: Name → link, by index or name, and the sensor frame in the link's frame.
         design: What :func:`attach` takes, for all sensors, or name → design. A simulator that is
             given for several sensors stands for its own design.
-        shapes: As for :func:`attach`, like all that follow up to ``sheet_thickness``.
+        shapes: As for :func:`attach`, like all that follow up to ``hull``.
         materials: Name pattern → material.
         grounding: Name pattern → grounding.
         default_material: Material of everything else.
@@ -175,7 +172,6 @@ def attach_skin(
         exclude: Name patterns of links that no sensor sees.
         exclude_own: Leave out the link that carries a sensor, for that sensor.
         hull: Name patterns of links whose visual meshes are taken as their convex hulls.
-        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
         readout: Name of the chip behind every sensor, or the path of a read-out file.
         threads: How many threads read; by default as many as the process may use processors.
 
@@ -197,7 +193,7 @@ def attach_skin(
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
     )
-    source = ClientSource(number, rules, shapes, sheet_thickness)
+    source = ClientSource(number, rules, shapes)
     simulators = simulators_of(links, design)
     sensors = {
         name: PybulletSensor(source, body, *mount, simulators[name], exclude_own=exclude_own)

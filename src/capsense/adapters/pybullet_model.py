@@ -117,10 +117,6 @@ class SoftMesh:
         )
         self.faces: NDArray[np.int64] = corner.reshape(-1, 3)
         """Indices of merged vertices, shape (m, 3)."""
-        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        _, count = np.unique(edges, axis=0, return_counts=True)
-        self.closed = bool(np.all(count % 2 == 0))
-        """Whether the surface has an inside."""
 
     def vertices(self) -> Array:
         """The merged vertices [m] at present, shape (n, 3).
@@ -160,20 +156,16 @@ class WorldReader:
         links: The links; their order is that of the frames.
         rules: What is seen, and what it is made of.
         shapes: ``"collision"`` or ``"visual"``.
-        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
 
     Raises:
         SceneError: A pattern fits nothing.
     """
 
-    def __init__(
-        self, client: int, links: Sequence[Link], rules: Rules, shapes: str, sheet_thickness: float
-    ) -> None:
+    def __init__(self, client: int, links: Sequence[Link], rules: Rules, shapes: str) -> None:
         self.client = client
         self.links = links
         self.rules = rules
         self.shapes = shapes
-        self.sheet_thickness = sheet_thickness
         self._meshes: dict[tuple[object, ...], Shape] = {}
         rules.check([k.names for k in links])
 
@@ -208,8 +200,7 @@ class WorldReader:
             return []
         mesh = SoftMesh(self.client, link)
         material, tie = matter_of(self.client, link, self.rules)
-        thickness = None if mesh.closed else self.sheet_thickness
-        return [SoftSolid(link.names[-1], mesh.faces, thickness, mesh.vertices, material, tie)]
+        return [SoftSolid(link.names[-1], mesh.faces, mesh.vertices, material, tie)]
 
     def _shapes_of(self, link: Link) -> Iterator[tuple[Shape | HalfSpace, Pose]]:
         """Shapes, and their poses in the frame of the link's centre of mass."""
@@ -295,15 +286,14 @@ class ClientSource(WorldSource):
         client: Number of the physics client.
         rules: What is seen, and what it is made of.
         shapes: ``"collision"`` or ``"visual"``.
-        sheet_thickness: Thickness [m] of soft bodies that are open surfaces.
 
     Raises:
         SceneError: A pattern fits nothing.
     """
 
-    def __init__(self, client: int, rules: Rules, shapes: str, sheet_thickness: float) -> None:
+    def __init__(self, client: int, rules: Rules, shapes: str) -> None:
         self.client = client
-        self._rules, self._shapes, self._sheet_thickness = rules, shapes, sheet_thickness
+        self._rules, self._shapes = rules, shapes
         super().__init__()
 
     def refresh(self) -> None:
@@ -314,9 +304,7 @@ class ClientSource(WorldSource):
             (body, [k.link for k in self._links if k.body == body and k.link >= 0])
             for body in self._bodies
         ]
-        self._reader = WorldReader(
-            self.client, self._links, self._rules, self._shapes, self._sheet_thickness
-        )
+        self._reader = WorldReader(self.client, self._links, self._rules, self._shapes)
         self._made: dict[int, list[Solid]] = {}
 
     def index(self, body: int, link: int) -> int:

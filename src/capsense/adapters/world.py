@@ -13,6 +13,7 @@ from capsense.adapters.rules import Tie
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
+from capsense.scene.surface_mesh import SHEET_THICKNESS
 
 if TYPE_CHECKING:
     from capsense.scene.deformable import DeformableSurface
@@ -49,13 +50,13 @@ class SoftSolid:
     """What it is called in scenes and messages."""
     faces: NDArray[np.int64]
     """Vertex indices, shape (m, 3)."""
-    thickness: float | None
-    """Thickness of a sheet [m]; None for a closed surface."""
     vertices: Callable[[], Array]
     """Gives the vertices [m] in the simulator's world at present, shape (n, 3)."""
     material: Material
     tie: Tie
     """What ties it to ground."""
+    thickness: float = SHEET_THICKNESS
+    """That of a sheet [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,8 +168,8 @@ class World:
             try:
                 if surface is None:
                     surface = self._surfaces[k] = DeformableSurface(
-                        vertices, soft.faces, thickness=soft.thickness, material=soft.material,
-                        grounding=soft.tie.grounding, name=soft.label,
+                        vertices, soft.faces, thickness=soft.thickness,
+                        material=soft.material, grounding=soft.tie.grounding, name=soft.label,
                     )  # fmt: skip
                 else:
                     surface.vertices = vertices

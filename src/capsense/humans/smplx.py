@@ -24,7 +24,6 @@ def load_smplx(
     *,
     model_type: str = "smplx",
     gender: str = "neutral",
-    cell: float = 0.01,
     **parameters: ArrayLike,
 ) -> TriMesh:
     """A body of the SMPL family as a solid.
@@ -36,7 +35,6 @@ def load_smplx(
         model_path: A model file, or the folder that holds the models, as ``smplx.create`` takes.
         model_type: ``"smplx"``, ``"smplh"``, ``"smpl"``, ``"mano"`` …, as ``smplx.create`` takes.
         gender: ``"neutral"``, ``"female"`` or ``"male"``.
-        cell: Spacing of the mesh's distance grid [m].
         **parameters: What the model is called with: ``betas``, ``body_pose``, ``global_orient``,
             ``transl`` …; each of the shape that the model wants, without the batch axis.
 
@@ -78,7 +76,7 @@ def load_smplx(
         raise SceneError(f"the {model_type} model refuses {sorted(tensors)}: {error}") from None
     vertices = np.asarray(output.vertices.detach().cpu().numpy(), dtype=float)[0]
     faces = np.asarray(model.faces, dtype=np.int64)
-    return TriMesh(*close_openings(vertices, faces), cell=cell)
+    return TriMesh(*close_openings(vertices, faces))
 
 
 def close_openings(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArray[np.int64]]:

@@ -13,9 +13,9 @@ from capsense.errors import RecordingError, SceneError
 from capsense.readout.counts import Counts
 from capsense.recording.design_json import design_from_json
 from capsense.recording.messages import PACKAGE, Messages, require
-from capsense.recording.parts import read_body, read_shape
+from capsense.recording.parts import CHANGING, read_body, read_rest, read_shape
 from capsense.recording.session import DESIGN, NAME, SESSION, Session, read_session, reading_of
-from capsense.scene import Body, Pose, Scene, Shape, ShapeKind
+from capsense.scene import Body, Pose, RestSurface, Scene, Shape
 from capsense.simulator import Reading, StepStats
 
 
@@ -121,6 +121,7 @@ class _Builder:
         self._session = session
         self._messages = Messages()
         self._shapes: dict[int, Shape] = {}
+        self._rests: dict[int, RestSurface] = {}
         self._bodies: dict[int, Body] = {}
         self._counts: Counts | None = None
         self._next = 0
@@ -130,7 +131,10 @@ class _Builder:
         m = self._messages.decode(record.data, type_name)
         match type_name.rpartition("/")[2]:
             case "Shape":
-                self._shapes[m.id] = read_shape(m)
+                if m.kind == "rest":
+                    self._rests[m.id] = read_rest(m)
+                else:
+                    self._shapes[m.id] = read_shape(m, self._rests)
             case "Body":
                 self._bodies[m.id] = read_body(m, self._shapes)
             case "Counts":
@@ -170,8 +174,8 @@ class _Builder:
         return scene
 
     def _forget(self, used: set[int]) -> None:
-        """Let go of layered images, which are in one step only."""
-        for number in [n for n in used if self._bodies[n].shape.kind == ShapeKind.LAYERS]:
+        """Let go of shapes that are in one step only."""
+        for number in [n for n in used if isinstance(self._bodies[n].shape, CHANGING)]:
             shape = self._bodies.pop(number).shape
             self._shapes = {n: s for n, s in self._shapes.items() if s is not shape}
 

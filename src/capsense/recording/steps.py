@@ -10,10 +10,10 @@ import numpy as np
 from capsense.design.model import Design
 from capsense.readout.counts import Counts
 from capsense.recording.messages import PACKAGE, Messages
-from capsense.recording.parts import body_fields, shape_fields
+from capsense.recording.parts import CHANGING, body_fields, shape_fields
 from capsense.recording.ros import WORLD, Composer
 from capsense.recording.session import shield_coupling
-from capsense.scene import Body, DepthFrame, Layers, Pose, Scene, Shape
+from capsense.scene import Body, DepthFrame, Pose, RestSurface, Scene, Shape, SurfaceMesh
 from capsense.simulator import Reading
 
 Topics = list[tuple[str, Any]]
@@ -44,7 +44,7 @@ class StepMessages:
     def __init__(self, messages: Messages, name: str, design: Design) -> None:
         self._make, self._name, self._design = messages.make, name, design
         self._compose = Composer(messages, name)
-        self._shapes: dict[Shape, int] = {}
+        self._shapes: dict[Shape | RestSurface, int] = {}
         self._bodies: dict[tuple[Any, ...], int] = {}
         self._ids = 0
         self._drawn: list[tuple[str, int]] | None = None
@@ -71,7 +71,7 @@ class StepMessages:
         frames = [] if pose is None else [(WORLD, self._name, pose)]
         solid: list[tuple[str, int, Body]] = []
         for k, (body, number) in enumerate(zip(scene, ids, strict=True)):
-            if not isinstance(body.shape, Layers):
+            if not isinstance(body.shape, CHANGING):
                 solid.append((f"{self._name}/{body.name or f'body{k}'}", number, body))
         frames += [(self._name, child, body.pose) for child, _, body in solid]
         if frame is not None:
@@ -95,23 +95,29 @@ class StepMessages:
 
     def _introduce(self, scene: Scene, out: Topics) -> list[int]:
         """Ids of the bodies; messages of those that are new, and of new shapes, are put out."""
-        shapes, bodies, ids = dict[Shape, int](), dict[tuple[Any, ...], int](), []
+        shapes, bodies = dict[Shape | RestSurface, int](), dict[tuple[Any, ...], int]()
+        ids = []
+
+        def known(shape: Shape | RestSurface) -> int:
+            number = self._shapes.get(shape, shapes.get(shape))
+            if number is None:
+                rest = known(shape.rest) if isinstance(shape, SurfaceMesh) else None
+                fields = shape_fields(shape, rest)
+                number = shapes[shape] = self._new_id()
+                self._add(out, "shapes", self._make(f"{PACKAGE}/Shape", id=number, **fields))
+            return number
+
         for body in scene:
             key = (body.shape, body.material, body.grounding, body.name)
             number = self._bodies.get(key)
             if number is None:
-                shape = self._shapes.get(body.shape, shapes.get(body.shape))
-                if shape is None:
-                    shape = shapes[body.shape] = self._new_id()
-                    fields = shape_fields(body.shape)
-                    self._add(out, "shapes", self._make(f"{PACKAGE}/Shape", id=shape, **fields))
+                shape = known(body.shape)
                 number = bodies[key] = self._new_id()
                 fields = {"id": number, "shape": shape, **body_fields(body)}
                 self._add(out, "bodies", self._make(f"{PACKAGE}/Body", **fields))
             ids.append(number)
-        # Layered images are new in every step and large, so they are not kept.
-        self._shapes.update((s, n) for s, n in shapes.items() if not isinstance(s, Layers))
-        self._bodies.update((k, n) for k, n in bodies.items() if not isinstance(k[0], Layers))
+        self._shapes.update((s, n) for s, n in shapes.items() if not isinstance(s, CHANGING))
+        self._bodies.update((k, n) for k, n in bodies.items() if not isinstance(k[0], CHANGING))
         return ids
 
     def _new_id(self) -> int:

@@ -33,7 +33,7 @@ SHAPE_KEYS = {
     "capsule": ("radius", "length"),
     "cylinder": ("radius", "length"),
     "ellipsoid": ("radii",),
-    "mesh": ("file", "unit", "cell"),
+    "mesh": ("file", "unit"),
 }
 """Shapes, and the keys of each."""
 BODY_KEYS = ("name", "shape", "material", "grounding", "pose", "trajectory")
@@ -104,8 +104,7 @@ def _read_mesh(table: Table, folder: Path) -> TriMesh:
             f'file = {file!r} is {extent:g} m across with unit = "{table.data["unit"]}", larger '
             f"than {MAX_LENGTH:g} m; give the unit that the file is in"
         )
-    cell = table.length("cell") if "cell" in table else None
-    return TriMesh(vertices * scale, faces, cell=cell)
+    return TriMesh(vertices * scale, faces)
 
 
 def _triangles(table: Table, path: Path) -> tuple[Any, Any]:

@@ -4,14 +4,15 @@ from capsense.scene.body import Body
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.deformable import DeformableSurface
 from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
-from capsense.scene.layers import LayerGrid, Layers
+from capsense.scene.layers import Layers
 from capsense.scene.materials import MATERIALS, Material, material
-from capsense.scene.mesh_shape import DistanceGrid, TriMesh
+from capsense.scene.mesh_shape import TriMesh
 from capsense.scene.pose import Pose
 from capsense.scene.raster import Raster, rasterise
 from capsense.scene.scene import PackedScene, Scene
 from capsense.scene.shape import Shape, ShapeKind
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
+from capsense.scene.surface_mesh import RestSurface, SurfaceMesh
 
 __all__ = [
     "MATERIALS",
@@ -21,19 +22,19 @@ __all__ = [
     "Cylinder",
     "DeformableSurface",
     "DepthFrame",
-    "DistanceGrid",
     "Ellipsoid",
-    "LayerGrid",
     "Layers",
     "Material",
     "OrthographicCamera",
     "PackedScene",
     "Pose",
     "Raster",
+    "RestSurface",
     "Scene",
     "Shape",
     "ShapeKind",
     "Sphere",
+    "SurfaceMesh",
     "TriMesh",
     "decode_permittivity",
     "encode_permittivity",

@@ -1,14 +1,76 @@
-"""Compiled construction of signed-distance grids from closed triangle surfaces."""
+"""Compiled signed distances from triangle surfaces, exact."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+_LEAF = 4
+"""Triangles in a box without parts, at most."""
+
+
+class Boxes(NamedTuple):
+    """Triangles in a balanced tree of boxes, each of which has two parts."""
+
+    triangles: Array
+    """Corners [m], in the order of the tree, shape (m, 3, 3)."""
+    levels: int
+    """Box q of level l holds triangles q m / 2^l to (q + 1) m / 2^l; so many levels."""
+    corners: Array
+    """Lower and upper corners of the boxes, level by level [m], shape (2^levels - 1, 2, 3)."""
+
+
+def boxed(triangles: Array) -> Boxes:
+    """Put triangles, corners [m] of shape (m, 3, 3), into a tree of boxes."""
+    levels = 1 + max(0, math.ceil(math.log2(len(triangles) / _LEAF)))
+    order = np.arange(len(triangles))
+    _sort(triangles.mean(axis=1), levels, order)
+    boxes = Boxes(np.ascontiguousarray(triangles[order]), levels, np.empty((2**levels - 1, 2, 3)))
+    _enclose(boxes)
+    return boxes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sort(centers: Array, levels: int, order: NDArray[np.int64]) -> None:
+    """Order triangles so that every box is split across its longest side."""
+    count = len(order)
+    for level in range(levels - 1):
+        for q in range(1 << level):
+            part = order[(q * count) >> level : ((q + 1) * count) >> level]
+            wide, longest = 0, -1.0
+            for axis in range(3):
+                along = centers[part, axis]
+                if along.max() - along.min() > longest:
+                    wide, longest = axis, along.max() - along.min()
+            part[:] = part[np.argsort(centers[part, wide])]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _enclose(boxes: Boxes) -> None:
+    """Fill in the corners of the boxes."""
+    count, levels = len(boxes.triangles), boxes.levels
+    leaves = 1 << (levels - 1)
+    for k in range(2 * leaves - 2, -1, -1):
+        low, high = boxes.corners[k, 0], boxes.corners[k, 1]
+        low[:], high[:] = math.inf, -math.inf
+        if k < leaves - 1:
+            for part in range(2 * k + 1, 2 * k + 3):
+                for axis in range(3):
+                    low[axis] = min(low[axis], boxes.corners[part, 0, axis])
+                    high[axis] = max(high[axis], boxes.corners[part, 1, axis])
+            continue
+        q = k - leaves + 1
+        for m in range((q * count) >> (levels - 1), ((q + 1) * count) >> (levels - 1)):
+            for corner in range(3):
+                for axis in range(3):
+                    low[axis] = min(low[axis], boxes.triangles[m, corner, axis])
+                    high[axis] = max(high[axis], boxes.triangles[m, corner, axis])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -49,157 +111,107 @@ def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_band(
-    triangles: Array,
-    origin: Array,
-    h: float,
-    band: float,
-    distance: NDArray[np.float32],
-    nearest: NDArray[np.int32],
-) -> None:
-    """Set the exact distance at every grid node closer to the surface than ``band``.
-
-    Args:
-        triangles: Corners [m], shape (m, 3, 3).
-        origin: First node [m], shape (3,).
-        h: Node spacing [m].
-        band: Half width of the band [m].
-        distance: Distances [m], shape (nx, ny, nz); holds large numbers on entry.
-        nearest: Receives the nearest triangle, -1 outside the band.
-    """
-    nearest[:] = -1
-    shape = distance.shape
-    low = np.zeros(3, dtype=np.int64)
-    high = np.zeros(3, dtype=np.int64)
-    for m in range(triangles.shape[0]):
-        tri = triangles[m]
-        for k in range(3):
-            least = min(tri[0, k], min(tri[1, k], tri[2, k])) - band - origin[k]
-            most = max(tri[0, k], max(tri[1, k], tri[2, k])) + band - origin[k]
-            low[k] = max(0, int(math.ceil(least / h)))
-            high[k] = min(shape[k] - 1, int(math.floor(most / h)))
-        ux, uy, uz = tri[1, 0] - tri[0, 0], tri[1, 1] - tri[0, 1], tri[1, 2] - tri[0, 2]
-        vx, vy, vz = tri[2, 0] - tri[0, 0], tri[2, 1] - tri[0, 1], tri[2, 2] - tri[0, 2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-        if norm > 0.0:
-            nx, ny, nz = nx / norm, ny / norm, nz / norm
-        for i in range(low[0], high[0] + 1):
-            x = origin[0] + h * i
-            for j in range(low[1], high[1] + 1):
-                y = origin[1] + h * j
-                for k in range(low[2], high[2] + 1):
-                    z = origin[2] + h * k
-                    off = nx * (x - tri[0, 0]) + ny * (y - tri[0, 1]) + nz * (z - tri[0, 2])
-                    if abs(off) > min(band, distance[i, j, k]):
-                        continue
-                    d = math.sqrt(triangle_distance2(tri, x, y, z))
-                    if d <= band and d < distance[i, j, k]:
-                        distance[i, j, k] = d
-                        nearest[i, j, k] = m
+def signed_distances(boxes: Boxes, points: Array, out: Array) -> None:
+    """Distances [m] to a closed surface, negative inside, at points of shape (n, 3)."""
+    stack, least = np.empty(2 * boxes.levels, np.int64), np.empty(2 * boxes.levels)
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        distance = math.sqrt(_distance2(boxes, x, y, z, stack, least))
+        out[n] = -distance if _winding(boxes, x, y, z, stack) != 0 else distance
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_far(
-    triangles: Array,
-    origin: Array,
-    h: float,
-    source: NDArray[np.int32],
-    distance: NDArray[np.float32],
-    nearest: NDArray[np.int32],
-) -> None:
-    """Set the distance beyond the band: to the triangle of the nearest node of the band.
-
-    Args:
-        triangles: Corners [m], shape (m, 3, 3).
-        origin: First node [m], shape (3,).
-        h: Node spacing [m].
-        source: Indices of the nearest node of the band, shape (3, nx, ny, nz).
-        distance: Distances [m], shape (nx, ny, nz), right within the band.
-        nearest: Nearest triangles, -1 outside the band.
-    """
-    nx, ny, nz = distance.shape
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if nearest[i, j, k] < 0:
-                    m = nearest[source[0, i, j, k], source[1, i, j, k], source[2, i, j, k]]
-                    x, y, z = origin[0] + h * i, origin[1] + h * j, origin[2] + h * k
-                    distance[i, j, k] = math.sqrt(triangle_distance2(triangles[m], x, y, z))
+def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
+    """Squared distance to a box, zero inside."""
+    dx = max(0.0, max(box[0, 0] - x, x - box[1, 0]))
+    dy = max(0.0, max(box[0, 1] - y, y - box[1, 1]))
+    dz = max(0.0, max(box[0, 2] - z, z - box[1, 2]))
+    return dx * dx + dy * dy + dz * dz
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def set_signs(
-    triangles: Array,
-    origin: Array,
-    h: float,
-    winding: NDArray[np.int32],
-    distance: NDArray[np.float32],
-) -> None:
-    """Negate the distance at nodes that the surface winds around, by rays along x.
+def _distance2(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64],
+               least: Array) -> float:  # fmt: skip
+    """Squared distance to the nearest triangle; ``stack`` and ``least`` are room to work in."""
+    count, levels = len(boxes.triangles), boxes.levels
+    leaves = 1 << (levels - 1)
+    best, top = math.inf, 1
+    stack[0], least[0] = 0, 0.0
+    while top > 0:
+        top -= 1
+        k = stack[top]
+        if least[top] >= best:
+            continue
+        if k >= leaves - 1:
+            q = k - leaves + 1
+            for m in range((q * count) >> (levels - 1), ((q + 1) * count) >> (levels - 1)):
+                best = min(best, triangle_distance2(boxes.triangles[m], x, y, z))
+            continue
+        near, far = 2 * k + 1, 2 * k + 2
+        to_near = _box_distance2(boxes.corners[near], x, y, z)
+        to_far = _box_distance2(boxes.corners[far], x, y, z)
+        if to_far < to_near:
+            near, far, to_near, to_far = far, near, to_far, to_near
+        stack[top], least[top] = far, to_far
+        stack[top + 1], least[top + 1] = near, to_near
+        top += 2
+    return best
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _winding(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64]) -> int:
+    """How often the surface winds around a point, from its crossings of a ray along z."""
+    count, levels = len(boxes.triangles), boxes.levels
+    leaves = 1 << (levels - 1)
+    total, top = 0, 1
+    stack[0] = 0
+    while top > 0:
+        top -= 1
+        k = stack[top]
+        low, high = boxes.corners[k, 0], boxes.corners[k, 1]
+        if z > high[2] or x < low[0] or x > high[0] or y < low[1] or y > high[1]:
+            continue
+        if k < leaves - 1:
+            stack[top], stack[top + 1] = 2 * k + 1, 2 * k + 2
+            top += 2
+            continue
+        q = k - leaves + 1
+        for m in range((q * count) >> (levels - 1), ((q + 1) * count) >> (levels - 1)):
+            tri = boxes.triangles[m]
+            around = _around(tri, x, y)
+            if around != 0 and _height(tri, x, y) > z:
+                total += around
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _around(tri: Array, x: float, y: float) -> int:
+    """Whether a triangle, seen along z, lies around a point: 1, -1 from behind, else 0.
 
     Every edge is cut in one and the same order of its ends and with half-open comparisons, so
-    a ray through an edge or a vertex counts each crossing of a closed surface exactly once.
-    Overlapping closed parts act as their union.
-
-    Args:
-        triangles: Corners [m] of a closed, consistently wound surface, shape (m, 3, 3).
-        origin: First node [m], shape (3,).
-        h: Node spacing [m].
-        winding: Zeros on entry, shape (nx, ny, nz); receives winding numbers.
-        distance: Distances [m], shape (nx, ny, nz).
+    a ray through an edge or a vertex meets a closed surface exactly once.
     """
-    nx, ny, nz = distance.shape
-    for m in range(triangles.shape[0]):
-        tri = triangles[m]
-        z_low = min(tri[0, 2], min(tri[1, 2], tri[2, 2]))
-        z_high = max(tri[0, 2], max(tri[1, 2], tri[2, 2]))
-        y_low = min(tri[0, 1], min(tri[1, 1], tri[2, 1]))
-        y_high = max(tri[0, 1], max(tri[1, 1], tri[2, 1]))
-        x_low = min(tri[0, 0], min(tri[1, 0], tri[2, 0]))
-        x_high = max(tri[0, 0], max(tri[1, 0], tri[2, 0]))
-        # One node more on either side: the comparisons below decide, not this rounding.
-        j0 = max(0, int(math.floor((y_low - origin[1]) / h)))
-        j1 = min(ny - 1, int(math.ceil((y_high - origin[1]) / h)))
-        k0 = max(0, int(math.floor((z_low - origin[2]) / h)))
-        k1 = min(nz - 1, int(math.ceil((z_high - origin[2]) / h)))
-        for k in range(k0, k1 + 1):
-            z = origin[2] + h * k
-            # The plane cuts no edge or two, one on its way up and one on its way down.
-            up_x, up_y, down_x, down_y = 0.0, 0.0, 0.0, 0.0
-            cut = False
-            for e in range(3):
-                f = (e + 1) % 3
-                starts_below = tri[e, 2] <= z
-                ends_below = tri[f, 2] <= z
-                if starts_below == ends_below:
-                    continue
-                cut = True
-                a, b = (e, f) if starts_below else (f, e)
-                s = (z - tri[a, 2]) / (tri[b, 2] - tri[a, 2])
-                ex = tri[a, 0] + s * (tri[b, 0] - tri[a, 0])
-                ey = tri[a, 1] + s * (tri[b, 1] - tri[a, 1])
-                if starts_below:
-                    up_x, up_y = ex, ey
-                else:
-                    down_x, down_y = ex, ey
-            if not cut:
-                continue
-            for j in range(j0, j1 + 1):
-                y = origin[1] + h * j
-                hit = int(up_y <= y) - int(down_y <= y)
-                if hit == 0:
-                    continue
-                x = up_x + (y - up_y) / (down_y - up_y) * (down_x - up_x)
-                x = min(x_high, max(x_low, x))
-                i = max(0, int(math.ceil((x - origin[0]) / h)))
-                if i < nx:
-                    winding[i, j, k] += hit
-    for j in range(ny):
-        for k in range(nz):
-            around = 0
-            for i in range(nx):
-                around += winding[i, j, k]
-                winding[i, j, k] = around
-                if around != 0:
-                    distance[i, j, k] = -distance[i, j, k]
+    out = 0
+    for e in range(3):
+        f = (e + 1) % 3
+        upward = tri[e, 1] <= y
+        if upward == (tri[f, 1] <= y):
+            continue
+        a, b = (e, f) if upward else (f, e)
+        s = (y - tri[a, 1]) / (tri[b, 1] - tri[a, 1])
+        if tri[a, 0] + s * (tri[b, 0] - tri[a, 0]) > x:
+            out += 1 if upward else -1
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _height(tri: Array, x: float, y: float) -> float:
+    """Height of a triangle's plane at (x, y), within its own [m]."""
+    ux, uy, uz = tri[1, 0] - tri[0, 0], tri[1, 1] - tri[0, 1], tri[1, 2] - tri[0, 2]
+    vx, vy, vz = tri[2, 0] - tri[0, 0], tri[2, 1] - tri[0, 1], tri[2, 2] - tri[0, 2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    z = tri[0, 2]
+    if nz != 0.0:
+        z -= (nx * (x - tri[0, 0]) + ny * (y - tri[0, 1])) / nz
+    low = min(tri[0, 2], min(tri[1, 2], tri[2, 2]))
+    return min(max(z, low), max(tri[0, 2], max(tri[1, 2], tri[2, 2])))

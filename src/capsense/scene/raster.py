@@ -11,7 +11,6 @@ from capsense.errors import SceneError
 from capsense.scene.layers import Layers
 
 Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 _ROOM = 4
@@ -27,11 +26,6 @@ class Raster:
     """Depth [m] at which each layer ends, same shape."""
     size: tuple[float, float]
     """Width and height of the view [m]."""
-    row_outlines: Array32
-    """Where outlines cross the links between the pixels of a row, see
-    :meth:`~capsense.scene.layers.Layers.from_outlines`, shape (rows, columns + 1, 2)."""
-    column_outlines: Array32
-    """The same along columns, shape (rows + 1, columns, 2)."""
 
     @property
     def depth(self) -> Array:
@@ -44,9 +38,7 @@ class Raster:
         Raises:
             SceneError: No pixel's ray meets the mesh.
         """
-        return Layers.from_outlines(
-            self.front, self.back, self.size, self.row_outlines, self.column_outlines
-        )
+        return Layers(self.front, self.back, self.size)
 
 
 def rasterise(
@@ -75,41 +67,31 @@ def rasterise(
     Raises:
         SceneError: Wrong shapes, types or sizes, or a vertex that is not finite.
     """
+    from capsense.scene.raster_kernels import pair, scan
+
     v, f = checked_mesh(vertices, faces)
     wide = tuple(float(s) for s in size)
     if len(wide) != 2 or not all(np.isfinite(s) and s > 0 for s in wide):
         raise SceneError(f"rasterise: size is {size!r}; give (width, height) in metres")
-    rows, columns = checked_resolution(resolution, "rasterise")
-    return scan_mesh(v, f, (wide[0], wide[1]), (rows, columns), checked_thickness(thickness))
-
-
-def scan_mesh(
-    vertices: Array, faces: Ints, size: tuple[float, float], resolution: tuple[int, int],
-    thickness: float,
-) -> Raster:  # fmt: skip
-    """:func:`rasterise` without its checks; ``thickness`` is 0 for closed surfaces."""
-    from capsense.scene.raster_kernels import pair, scan
-
-    rows, columns = resolution
-    dx, dy = size[0] / columns, size[1] / rows
-    p = vertices * (1.0 / dx, 1.0 / dy, 1.0) + (0.5 * columns - 0.5, 0.5 * rows - 0.5, 0.0)
-    cut_x = np.empty((rows, columns + 1, 2), np.float32)
-    cut_y = np.empty((rows + 1, columns, 2), np.float32)
+    rows, columns = _checked_resolution(resolution)
+    sheet = _checked_thickness(thickness)
+    dx, dy = wide[0] / columns, wide[1] / rows
+    p = v * (1.0 / dx, 1.0 / dy, 1.0) + (0.5 * columns - 0.5, 0.5 * rows - 0.5, 0.0)
     room = _ROOM
     while True:
         met = np.empty((rows, columns, room, 2), np.float32)
         count = np.zeros((rows, columns), np.int64)
-        most = scan(p, faces, dx, dy, thickness, met, count, cut_x, cut_y)
+        most = scan(p, f, dx, dy, sheet, met, count)
         if most <= room:
             break
         room = most
-    layers = max(1, most if thickness > 0.0 else (most + 1) // 2)
+    layers = max(1, most if sheet > 0.0 else (most + 1) // 2)
     front, back = np.empty((layers, rows, columns)), np.empty((layers, rows, columns))
-    pair(met, count, thickness > 0.0, front, back)
-    return Raster(front, back, size, cut_x, cut_y)
+    pair(met, count, sheet > 0.0, front, back)
+    return Raster(front, back, (wide[0], wide[1]))
 
 
-def checked_thickness(thickness: float | None) -> float:
+def _checked_thickness(thickness: float | None) -> float:
     """Check the thickness of a sheet [m]; 0 for None.
 
     Raises:
@@ -129,7 +111,7 @@ def checked_thickness(thickness: float | None) -> float:
     return number
 
 
-def checked_resolution(resolution: object, what: str) -> tuple[int, int]:
+def _checked_resolution(resolution: object) -> tuple[int, int]:
     """Check rows and columns.
 
     Raises:
@@ -142,7 +124,8 @@ def checked_resolution(resolution: object, what: str) -> tuple[int, int]:
         whole, rows, columns = False, 0, 0
     if not (whole and rows > 0 and columns > 0 and rows * columns <= 4_000_000):
         raise SceneError(
-            f"{what}: resolution is {resolution!r}; give (rows, columns), at most 4,000,000 pixels"
+            f"rasterise: resolution is {resolution!r}; give (rows, columns), at most 4,000,000 "
+            "pixels"
         )
     return rows, columns
 

@@ -2,8 +2,7 @@
 
 Rays run along z through pixel centres, which lie at whole numbers of (u, v). A pixel belongs to a
 triangle by half-open spans whose ends are computed per edge, so that triangles that share an edge
-leave neither gaps nor overlaps: a closed surface is met an even number of times everywhere. The
-readable twin is :mod:`capsense.scene.layer_reference`.
+leave neither gaps nor overlaps: a closed surface is met an even number of times everywhere.
 """
 
 from __future__ import annotations
@@ -60,30 +59,8 @@ def _whole(x: float, last: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _note(cuts: Array32, j: int, i: int, way: int, x0: float, x1: float, last: int) -> None:
-    """Note the ends of a span on a row (way 0, line j) or column (way 1, line i) of pixels.
-
-    An end at a whole number belongs to the link before it, as spans are closed below.
-    """
-    if -1.0 < x0 <= last:
-        link = int(math.ceil(x0))
-        s = np.float32(x0 - link + 1.0)
-        if way == 0:
-            cuts[j, link, 0] = min(cuts[j, link, 0], s)
-        else:
-            cuts[link, i, 0] = min(cuts[link, i, 0], s)
-    if -1.0 < x1 <= last:
-        link = int(math.ceil(x1))
-        s = np.float32(x1 - link + 1.0)
-        if way == 0:
-            cuts[j, link, 1] = max(cuts[j, link, 1], s)
-        else:
-            cuts[link, i, 1] = max(cuts[link, i, 1], s)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Array32, count: Ints,
-         cut_x: Array32, cut_y: Array32) -> int:  # fmt: skip
+def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Array32,
+         count: Ints) -> int:  # fmt: skip
     """Meet every pixel's ray with every triangle.
 
     Args:
@@ -94,16 +71,11 @@ def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Arr
         met: Receives for every triangle met, in no order, its depth [m], and half its thickness
             along z [m] or the side it was met from, ±1; shape (rows, columns, room, 2).
         count: Receives how many there are, shape (rows, columns); must be zero.
-        cut_x, cut_y: Receive the outlines, see :func:`~capsense.scene.layer_build.build_values`.
 
     Returns:
         The largest number met by a pixel; if above the room, some were dropped.
     """
     ny, nx, room, _ = met.shape
-    cut_x[:, :, 0] = 2.0
-    cut_x[:, :, 1] = -1.0
-    cut_y[:, :, 0] = 2.0
-    cut_y[:, :, 1] = -1.0
     most = 0
     for face in range(faces.shape[0]):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
@@ -113,10 +85,6 @@ def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Arr
         normal = (xb - xa) * (yc - ya) - (yb - ya) * (xc - xa)
         if normal == 0.0:
             continue
-        x0, y0, x1, y1, x2, y2 = _order(ya, xa, yb, xb, yc, xc)
-        for i in range(_whole(y0, nx), _whole(y2, nx)):
-            low, high = _span(x0, y0, x1, y1, x2, y2, float(i))
-            _note(cut_y, 0, i, 1, low, high, ny)
         x0, y0, x1, y1, x2, y2 = _order(xa, ya, xb, yb, xc, yc)
         first, last = _whole(y0, ny), _whole(y2, ny)
         if first == last:
@@ -130,7 +98,6 @@ def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Arr
             value = 0.5 * thickness * min(slope, 1.0 / LEAST_COSINE)
         for j in range(first, last):
             low, high = _span(x0, y0, x1, y1, x2, y2, float(j))
-            _note(cut_x, j, 0, 0, low, high, nx)
             for i in range(_whole(low, nx), _whole(high, nx)):
                 n = count[j, i]
                 count[j, i] = n + 1

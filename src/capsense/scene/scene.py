@@ -30,7 +30,7 @@ class PackedScene:
     bounds: Array
     """Lower and upper corners of the bounding boxes [m] in the sensor frame, shape (n, 2, 3)."""
     shapes: tuple[Shape, ...]
-    """The shapes themselves; meshes carry their distance grids."""
+    """The shapes themselves."""
 
     def __len__(self) -> int:
         return len(self.shapes)
@@ -90,7 +90,7 @@ class Scene:
 
     def pack(self) -> PackedScene:
         """Lay the geometry out as flat arrays for the solver's kernels."""
-        from capsense.scene.batch_kernels import place_bodies
+        from capsense.scene.place_kernels import place_bodies
 
         n = len(self.bodies)
         shapes = tuple([b.shape for b in self.bodies])

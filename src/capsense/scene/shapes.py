@@ -1,8 +1,6 @@
-"""Convex primitives: exact signed distance and line intersection, in the body's own frame.
+"""Convex primitives with exact signed distances, in the body's own frame.
 
-Full sizes, metres; capsule and cylinder lie along local z. Shapes are closed sets: a line that
-only touches a shape, or lies in one of its faces, meets it. The methods here are the readable
-reference; :mod:`capsense.scene.kernels` holds the compiled counterparts.
+Full sizes, metres; capsule and cylinder lie along local z.
 """
 
 from __future__ import annotations
@@ -17,15 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.scene.pose import Vec3, checked_floats
-from capsense.scene.shape import Shape, ShapeKind, as_lines, as_points
+from capsense.scene.shape import Shape, ShapeKind, as_points
 
 if TYPE_CHECKING:
     import trimesh
 
 Array = NDArray[np.float64]
-
-PARALLEL = 1e-24
-"""Squared slope to the axis below which a line counts as parallel to it."""
 
 
 def _size(shape: str, name: str, value: object) -> float:
@@ -48,51 +43,6 @@ def _frozen(*values: float) -> Array:
     out = np.array(values)
     out.setflags(write=False)
     return out
-
-
-# ---- line intersections; all return (lower, upper), with lower > upper for a miss ----
-
-
-def _slab(o: Array, d: Array, half: float) -> tuple[Array, Array]:
-    """Lines against −half <= x <= half, one coordinate, shapes (n,)."""
-    moving = d != 0
-    step = np.where(moving, d, 1.0)
-    with np.errstate(over="ignore"):
-        t0, t1 = (-half - o) / step, (half - o) / step
-    always = np.where(np.abs(o) <= half, -np.inf, np.inf)
-    lower = np.where(moving, np.minimum(t0, t1), always)
-    return lower, np.where(moving, np.maximum(t0, t1), -always)
-
-
-def _ball(o: Array, d: Array, radius: float) -> tuple[Array, Array]:
-    """Lines against a ball, or a disc: shapes (n, dim).
-
-    The discriminant is taken at the foot of the perpendicular, where nothing cancels.
-    """
-    a = np.einsum("ij,ij->i", d, d)
-    middle = -np.einsum("ij,ij->i", o, d) / a
-    foot = o + middle[:, None] * d
-    square = radius**2 - np.einsum("ij,ij->i", foot, foot)
-    half = np.sqrt(np.maximum(square, 0.0) / a)
-    hit = square >= 0
-    return np.where(hit, middle - half, np.inf), np.where(hit, middle + half, -np.inf)
-
-
-def _tube(o: Array, d: Array, radius: float) -> tuple[Array, Array]:
-    """Lines against an infinite cylinder along z, shapes (n, 3)."""
-    d2 = d[:, 0] ** 2 + d[:, 1] ** 2
-    along = d2 <= PARALLEL * (d2 + d[:, 2] ** 2)
-    lower, upper = _ball(o[:, :2], np.where(along[:, None], 1.0, d[:, :2]), radius)
-    always = np.where(np.hypot(o[:, 0], o[:, 1]) <= radius, -np.inf, np.inf)
-    return np.where(along, always, lower), np.where(along, -always, upper)
-
-
-def _meet(*intervals: tuple[Array, Array]) -> Array:
-    """Intersect intervals; shape (n, 2), misses as [inf, −inf]."""
-    lower = np.maximum.reduce([i[0] for i in intervals])
-    upper = np.minimum.reduce([i[1] for i in intervals])
-    hit = lower <= upper
-    return np.stack([np.where(hit, lower, np.inf), np.where(hit, upper, -np.inf)], axis=1)
 
 
 class _Primitive(Shape):
@@ -123,10 +73,6 @@ class Box(_Primitive):
         return _frozen(*(0.5 * s for s in self.size))
 
     @property
-    def breadth(self) -> float:
-        return min(self.size)
-
-    @property
     def volume(self) -> float:
         return math.prod(self.size)
 
@@ -136,10 +82,6 @@ class Box(_Primitive):
     def signed_distance(self, points: ArrayLike) -> Array:
         q = np.abs(as_points(points)) - self.params
         return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
-
-    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
-        o, d = as_lines(origins, direction)
-        return _meet(*(_slab(o[:, k], d[:, k], self.params[k]) for k in range(3)))
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
@@ -167,10 +109,6 @@ class Sphere(_Primitive):
         return _frozen(self.radius, 0.0, 0.0)
 
     @property
-    def breadth(self) -> float:
-        return 2.0 * self.radius
-
-    @property
     def volume(self) -> float:
         return 4 / 3 * math.pi * self.radius**3
 
@@ -179,9 +117,6 @@ class Sphere(_Primitive):
 
     def signed_distance(self, points: ArrayLike) -> Array:
         return np.linalg.norm(as_points(points), axis=1) - self.radius
-
-    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
-        return _meet(_ball(*as_lines(origins, direction), self.radius))
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
@@ -211,10 +146,6 @@ class Capsule(_Primitive):
         return _frozen(self.radius, 0.5 * self.length, 0.0)
 
     @property
-    def breadth(self) -> float:
-        return 2.0 * self.radius
-
-    @property
     def volume(self) -> float:
         return math.pi * self.radius**2 * (self.length + 4 / 3 * self.radius)
 
@@ -227,21 +158,6 @@ class Capsule(_Primitive):
         half = 0.5 * self.length
         p[:, 2] -= np.clip(p[:, 2], -half, half)
         return np.linalg.norm(p, axis=1) - self.radius
-
-    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
-        o, d = as_lines(origins, direction)
-        half = 0.5 * self.length
-        # The capsule is the union of three convex sets and convex itself, so the line's stretch
-        # inside it is the hull of the three stretches.
-        cap = np.array([0.0, 0.0, half])
-        parts = np.stack(
-            [
-                _meet(_tube(o, d, self.radius), _slab(o[:, 2], d[:, 2], half)),
-                _meet(_ball(o - cap, d, self.radius)),
-                _meet(_ball(o + cap, d, self.radius)),
-            ]
-        )
-        return np.stack([parts[..., 0].min(axis=0), parts[..., 1].max(axis=0)], axis=1)
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
@@ -275,10 +191,6 @@ class Cylinder(_Primitive):
         return _frozen(self.radius, 0.5 * self.length, 0.0)
 
     @property
-    def breadth(self) -> float:
-        return min(2.0 * self.radius, self.length)
-
-    @property
     def volume(self) -> float:
         return math.pi * self.radius**2 * self.length
 
@@ -292,10 +204,6 @@ class Cylinder(_Primitive):
         end = np.abs(p[:, 2]) - 0.5 * self.length
         outside = np.hypot(np.maximum(side, 0.0), np.maximum(end, 0.0))
         return outside + np.minimum(np.maximum(side, end), 0.0)
-
-    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
-        o, d = as_lines(origins, direction)
-        return _meet(_tube(o, d, self.radius), _slab(o[:, 2], d[:, 2], 0.5 * self.length))
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
@@ -323,10 +231,6 @@ class Ellipsoid(_Primitive):
     @cached_property
     def params(self) -> Array:
         return _frozen(*self.radii)
-
-    @property
-    def breadth(self) -> float:
-        return 2.0 * min(self.radii)
 
     @property
     def volume(self) -> float:
@@ -359,10 +263,6 @@ class Ellipsoid(_Primitive):
                 break
         distance = np.linalg.norm(y - r**2 * y / (s + gap), axis=1)
         return np.where(((y / r) ** 2).sum(axis=1) < 1.0, -distance, distance)
-
-    def line_intervals(self, origins: ArrayLike, direction: ArrayLike) -> Array:
-        o, d = as_lines(origins, direction)
-        return _meet(_ball(o / self.params, d / self.params, 1.0))
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh

@@ -77,6 +77,11 @@ def enclosed_volume(vertices: Array, faces: Faces) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
+def is_closed(faces: Faces, n: int) -> bool:
+    """Whether faces of n vertices leave no rim and wind alike."""
+    return _is_balanced(faces, _edges(faces, n)[0])
+
+
 def connected_parts(faces: Faces, n: int) -> Faces:
     """Number of the connected part of each face, shape (m,); parts share none of the n vertices."""
     from scipy.sparse import coo_matrix

@@ -58,7 +58,7 @@ def placed(bodies, cut, green, inside):
         body = bodies[cut.body[a]]
         owner[j], k = cut.body[a], cut.node[a]
         if body.spread != 0:
-            within[j] = 1.0 + inside * body.softness
+            within[j] = 1.0 if body.sheet > 0.0 else 1.0 + inside * body.softness
             spread, center = doubles(body.spread), doubles(body.center)
             for i in range(3):
                 middle[i] = center[3 * k + i]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.constants import EPS0
-from capsense.scene import Body, Layers, Scene, TriMesh
+from capsense.scene import Body, Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.scene import PackedScene
 from capsense.surface.changing import ChangingBody
 from capsense.surface.rigid import RigidShape
@@ -29,6 +29,8 @@ _CONTACT = 6.0
 """Size of a body over that of the contact that ties it to ground."""
 _SHUT = 1e8
 """Energy [1/m] of the net charge of conductors that touch each other and float together."""
+_UNSEEN = TriMesh | Layers | SurfaceMesh
+"""Shapes that are not looked at when it is asked which conductors touch."""
 _TOUCH = 1e-6
 """Conductors nearer than this [m] touch."""
 
@@ -115,8 +117,12 @@ class Matter:
         records["tie"] = np.where(shared, _SHUT, np.where(none, 0.0, ties.real))
         records["group"], records["softness"] = self.group, softness.real
         for record, shape, soft in zip(records, shapes, softness, strict=True):
-            if soft != 0 and isinstance(shape, RigidShape):
+            if soft == 0:
+                continue
+            if isinstance(shape, RigidShape):
                 record["impedance"] = shape.impedance.ctypes.data
+            else:
+                record["sheet"] = shape.sheet
 
 
 def matter_of(bodies: Sequence[Body], frequency: float) -> Matter:
@@ -135,9 +141,9 @@ def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBo
 
 def _touch(first: Body, second: Body) -> bool:
     """Whether two solids meet, as far as the corners of one tell about the other."""
+    if isinstance(first.shape, _UNSEEN) or isinstance(second.shape, _UNSEEN):
+        return False
     for one, other in ((first, second), (second, first)):
-        if isinstance(one.shape, TriMesh | Layers) or isinstance(other.shape, TriMesh | Layers):
-            return False
         points = other.pose.inverse().apply(one.pose.apply(_surface_points(one)))
         if (other.shape.signed_distance(points) <= _TOUCH).any():
             return True

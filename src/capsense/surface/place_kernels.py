@@ -25,6 +25,7 @@ BODY = np.dtype(
         ("neutral", np.int64),  # whether it carries no net charge
         ("group", np.int64),  # bodies that touch are one conductor, named by its first body
         ("tie", np.float64),  # energy of a group's net charge beyond that of its field [1/m]
+        ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
         ("softness", np.float64),  # 1 / (eps - 1), 0 for a conductor
     ]
 )  # fmt: skip

@@ -19,6 +19,11 @@ from capsense.surface.vector_kernels import (
     substitute,
 )
 
+SHEET = 6.0
+"""Impedance of a thin sheet to charge that moves from one part of a cluster to the other, times its
+thickness. It is the same for clusters of any size: with wave number k along a sheet it is 2 / (k t)
+times the energy in free space, which goes with k. The figure makes square sheets of eps 3 to 80 and
+1 to 3 mm read within 30 % of boxes of that thickness, mostly within 15 %."""
 GAIN = 1.3
 """What the functions directly below the cut stand for: themselves, and all below them."""
 
@@ -184,7 +189,14 @@ def _add_matter(bodies, functions, matrix, rest, own):
             for e in range(solved):
                 if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
                     matrix[f, e] += body.tie
-        if body.impedance == 0 or functions.cluster[f] < 0:
+        if functions.cluster[f] < 0:
+            continue
+        if body.sheet > 0.0:
+            along = SHEET * body.softness / body.sheet
+            own[f] += along
+            if f < solved:
+                matrix[f, f] += along
+        if body.impedance == 0:
             continue
         inside = singles(body.impedance)
         factor = body.softness / body.scale

@@ -13,11 +13,12 @@ from capsense.design.model import Design
 from capsense.errors import SceneError, SolveError
 from capsense.field.change import Change
 from capsense.field.green import GreenFunction
-from capsense.scene import Layers, Scene
+from capsense.scene import Layers, Scene, SurfaceMesh
 from capsense.scene.scene import PackedScene
 from capsense.scene.shape import Shape, ShapeKind
-from capsense.surface.changing import ChangingBody, layer_pieces
+from capsense.surface.changing import ChangingBody
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
+from capsense.surface.pieces import layer_pieces, mesh_pieces
 from capsense.surface.place_kernels import BODY, Green
 from capsense.surface.potentials import potential_change
 from capsense.surface.rigid import RigidShape
@@ -237,6 +238,9 @@ class SurfaceSolver:
         """Charge functions of a body, and its size."""
         if isinstance(shape, Layers):
             return ChangingBody(*layer_pieces(shape)), 1.0
+        if isinstance(shape, SurfaceMesh):
+            sheet = 0.0 if shape.closed else shape.rest.thickness
+            return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
         edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
         return rigid(shape, self.preset.panels * (2 if edged else 1))
 

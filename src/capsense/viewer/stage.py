@@ -145,15 +145,16 @@ class Stage:
         return self._scene.add_mesh_simple(
             name, mesh.vertices, mesh.faces, color=colour, opacity=0.4, cast_shadow=False,
             flat_shading=body.shape.kind in _FACETED, receive_shadow=False,
+            side="double" if body.shape.kind == ShapeKind.SURFACE else "front",
         )  # fmt: skip
 
     def _dots(self, name: str, layers: Layers, colour: Colour) -> Any:
         """What a depth camera saw: a dot for every pixel, with gaps to look through."""
         slot, row, column = np.nonzero(layers.hit)
-        x, y, _ = layers.grid.origin
         width, height = layers.pixel
-        front = layers.fields[slot, row, column, 0]
-        points = np.column_stack([x + column * width, y + row * height, front])
+        x, y = (column + 0.5) * width, (row + 0.5) * height
+        front = layers.front[slot, row, column]
+        points = np.column_stack([x - 0.5 * layers.size[0], y - 0.5 * layers.size[1], front])
         return self._scene.add_point_cloud(
             name, points, colour, point_size=0.2 * min(width, height), point_shape="circle",
             point_shading="flat",

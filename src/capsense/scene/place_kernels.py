@@ -1,4 +1,4 @@
-"""Compiled loops over bodies, lines and points, around :mod:`capsense.scene.kernels`."""
+"""Compiled placing of bodies."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from capsense.scene.kernels import grid_value, mesh_line_intervals
 from capsense.scene.shape import ShapeKind
 
 Array = NDArray[np.float64]
@@ -17,7 +16,6 @@ _SPHERE = int(ShapeKind.SPHERE)
 _CAPSULE = int(ShapeKind.CAPSULE)
 _CYLINDER = int(ShapeKind.CYLINDER)
 _ELLIPSOID = int(ShapeKind.ELLIPSOID)
-_INF = math.inf
 
 
 @njit(cache=True, error_model="numpy")  # too short to let other threads in
@@ -58,42 +56,3 @@ def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
             middle = position[k] + r[k, 0] * centre[0] + r[k, 1] * centre[1] + r[k, 2] * centre[2]
             bounds[i, 0, k] = middle - half
             bounds[i, 1, k] = middle + half
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def mesh_intervals_of_lines(
-    grid: NDArray[np.float32], origin: Array, inv_h: float, o: Array, d: Array, out: Array
-) -> None:
-    """Apply :func:`mesh_line_intervals` to lines of shape (n, 3); ``out`` has shape (n, K, 2)."""
-    for i in range(o.shape[0]):
-        for row in range(out.shape[1]):
-            out[i, row, 0] = _INF
-            out[i, row, 1] = -_INF
-        mesh_line_intervals(
-            grid,
-            origin,
-            inv_h,
-            o[i, 0],
-            o[i, 1],
-            o[i, 2],
-            d[i, 0],
-            d[i, 1],
-            d[i, 2],
-            -np.inf,
-            np.inf,
-            out[i],
-        )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def grid_distances(
-    grid: NDArray[np.float32], origin: Array, inv_h: float, points: Array, out: Array
-) -> None:
-    """Interpolate distances [m] at points [m] of shape (n, 3); ``out`` has shape (n,)."""
-    for i in range(points.shape[0]):
-        out[i] = grid_value(
-            grid,
-            (points[i, 0] - origin[0]) * inv_h,
-            (points[i, 1] - origin[1]) * inv_h,
-            (points[i, 2] - origin[2]) * inv_h,
-        )

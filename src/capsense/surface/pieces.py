@@ -1,0 +1,156 @@
+"""Pieces of surfaces that change from step to step: depth images and deforming meshes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.scene import Layers, RestSurface, SurfaceMesh
+from capsense.surface.rigid import Clusters, split
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+STEP_SLOPE = 3.0
+"""Slope of a surface, depth over width, from which a jump between two pixels is a step."""
+_FILLED = 10.0
+"""Backs farther than this [m] are not known: the image is filled from the front on."""
+_NORMALS = 0.6
+"""How far apart two opposite normals count, as a share of the surface's extent, in splitting."""
+_PIECES = 500
+"""Triangles are cut until no edge is longer than those of so many equal ones."""
+_HALVINGS = 60
+"""Triangles are halved at most so often."""
+_LEAST_AREA = 1e-9
+"""Smallest area of a piece, as a part of the mean: those that shrink to a line have none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Pieces of a surface as arrays, see :class:`~capsense.surface.changing.Pieces`."""
+
+    centers: Array
+    areas: Array
+    moments: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """How the n pieces of a deforming surface lie in its triangles."""
+
+    face: Ints
+    """Triangle that a piece belongs to, shape (n,)."""
+    shares: Array
+    """Corners of the pieces as shares of the triangle's corners, shape (n, 3, 3)."""
+    tree: Clusters
+    """Clusters of all pieces, from the form that the surface had first."""
+
+
+_CUTS: WeakKeyDictionary[RestSurface, Cut] = WeakKeyDictionary()
+
+
+def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, Surface]:
+    """The triangles of a deforming surface, long and large ones cut into parts, a piece each.
+
+    Returns:
+        Clusters of all pieces, the same ones at every instant; and the pieces.
+    """
+    cut = _CUTS.get(shape.rest)
+    if cut is None:
+        cut = _CUTS[shape.rest] = _cut(shape.rest)
+    return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)[0]
+
+
+def _cut(rest: RestSurface) -> Cut:
+    """Halve triangles at their longest edges until all edges are short; make clusters."""
+    corners = rest.vertices[rest.faces]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    ).sum() / 2  # fmt: skip
+    limit = 2 * math.sqrt(area / _PIECES)
+    face, shares = np.arange(len(corners)), np.tile(np.eye(3), (len(corners), 1, 1))
+    for _ in range(_HALVINGS):
+        points = shares @ corners[face]
+        length = np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2)
+        long = np.flatnonzero(length.max(axis=1) > limit * (1 + 1e-9))
+        if not len(long):
+            break
+        start = length[long].argmax(axis=1)
+        end, row = (start + 1) % 3, np.arange(len(long))
+        other = shares[long]
+        middle = (other[row, start] + other[row, end]) / 2
+        other[row, start] = middle
+        shares[long, end] = middle
+        face, shares = np.concatenate([face, face[long]]), np.concatenate([shares, other])
+    first, normals = _pieces(rest.vertices, rest.faces, face, shares)
+    extent = float(np.ptp(first.centers, axis=0).max())
+    features = np.concatenate([first.centers, _NORMALS * extent * normals], axis=1)
+    return Cut(face, shares, split(features, first.areas))
+
+
+def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Surface, Array]:
+    """Pieces, see :class:`Cut`, and their normals, shape (n, 3)."""
+    corners = shares @ vertices[faces[face]]
+    centers = corners.mean(axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double = np.linalg.norm(normals, axis=1)
+    normals /= np.maximum(double, 1e-300)[:, None]
+    areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / 2
+    arms = corners - centers[:, None]
+    return Surface(centers, areas, arms.transpose(0, 2, 1) @ arms / 12), normals
+
+
+def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_]]:
+    """The surfaces that a layered image shows, a piece a pixel.
+
+    Backs count where they lie farther behind than two pixels are wide, and before 10 m.
+
+    Returns:
+        Clusters of all pixels; the pieces; and which of them there are.
+    """
+    dx, dy = layers.pixel
+    front, back = layers.front.astype(float), layers.back.astype(float)
+    behind = (back - front > 2 * max(dx, dy)) & (back < _FILLED)
+    back = np.where(behind, back, np.nan)[behind.any(axis=(1, 2))]
+    depth = np.concatenate([front, back])
+    wanted = ~np.isnan(depth)
+    slope_x, slope_y = _slopes(depth, 2, dx), _slopes(depth, 1, dy)
+    _, rows, columns = depth.shape
+    centers, moments = np.empty((*depth.shape, 3)), np.zeros((*depth.shape, 3, 3))
+    centers[..., 0] = (np.arange(columns) + 0.5) * dx - 0.5 * layers.size[0]
+    centers[..., 1] = ((np.arange(rows) + 0.5) * dy - 0.5 * layers.size[1])[:, None]
+    centers[..., 2] = np.where(wanted, depth, 0.0)
+    areas = dx * dy * np.sqrt(1 + slope_x**2 + slope_y**2)
+    moments[..., 0, 0], moments[..., 1, 1] = dx * dx / 12, dy * dy / 12
+    moments[..., 0, 2] = moments[..., 2, 0] = dx * dx / 12 * slope_x
+    moments[..., 1, 2] = moments[..., 2, 1] = dy * dy / 12 * slope_y
+    moments[..., 2, 2] = (dx * slope_x) ** 2 / 12 + (dy * slope_y) ** 2 / 12
+    pieces = Surface(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
+    return _pixel_tree(*depth.shape, dx / dy), pieces, wanted.ravel()
+
+
+def _slopes(depth: Array, axis: int, pitch: float) -> Array:
+    """Slope of depth images, NaN where nothing is; beside a step, that on the near side."""
+    step = np.diff(depth, axis=axis) / pitch
+    none = np.full_like(depth.take([0], axis), np.nan)
+    before, after = np.concatenate([none, step], axis), np.concatenate([step, none], axis)
+    steep = (np.abs(before) > STEP_SLOPE) | (np.abs(after) > STEP_SLOPE)
+    smaller = np.where(np.abs(before) < np.abs(after), before, after)
+    out = np.where(steep, smaller, 0.5 * (before + after))
+    out = np.where(np.isnan(before), after, np.where(np.isnan(after), before, out))
+    return np.clip(np.nan_to_num(out), -STEP_SLOPE, STEP_SLOPE)
+
+
+@lru_cache(maxsize=16)
+def _pixel_tree(views: int, rows: int, columns: int, ratio: float) -> Clusters:
+    """Clusters of the pixels of images that lie behind each other."""
+    view, row, column = np.indices((views, rows, columns)).reshape(3, -1).astype(float)
+    far = 2.0 * max(rows, columns * ratio)
+    features = np.zeros((len(view), 6))
+    features[:, :3] = np.stack([column * ratio, row, far * view], axis=1)
+    return split(features, np.ones(len(view)))
