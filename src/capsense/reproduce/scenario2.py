@@ -47,7 +47,7 @@ class Run:
     title: str
     simulator: str = "mujoco"
     view: View = "geometry"
-    method: Method = "perturbation"
+    method: Method = "surface"
     resolution: float = 1.0
     grounding: Grounding = "grounded"
     rides: int = RIDES
@@ -141,7 +141,7 @@ def _codes(changes: Array, ways: list[Ride], person: str, run_name: str) -> Arra
     sample it has the last finished conversion of each channel. Every ride of every run has noise
     of its own.
     """
-    sim = _simulator("perturbation", 1.0)
+    sim = _simulator("surface", 1.0)
     level = sim.baseline.diagonal()
     names = (*RUNS, AGAIN)
     out = np.empty_like(changes)
@@ -320,7 +320,7 @@ NOTES = (
     "the scale is the regression on the accurate method through zero.",
     "PyBullet's renderer draws capsules without their round ends, and limbs are made of capsules: "
     "its depth camera sees less of them.",
-    f"The paper's scheme has about 30,000 tetrahedra here, on our graded lattice and not on the "
+    f"The paper's scheme has about 30,000 tetrahedra here, on our graded mesh and not on the "
     f"authors' meshes; its camera has {PIXELS} × {PIXELS} pixels over 0.5 m, a choice, as theirs "
     "is not stated.",
 )
