@@ -64,8 +64,9 @@ def parse_settings(text: str) -> dict[str, Any]:
         except (SyntaxError, ValueError):
             out[name.strip()] = value
     if "refine" in out:
-        from capsense.field.background import BuildSettings
         from capsense.field.lattice import LatticeSettings
+
+        from capsense.field.background import BuildSettings
 
         out["settings"] = BuildSettings(LatticeSettings().refined(float(out.pop("refine"))))
     return out

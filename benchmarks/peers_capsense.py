@@ -8,10 +8,10 @@ from peers_task import DESIGN, SIZE, Array, bar_corners, design, within
 
 import capsense as cs
 from capsense.field.background import BuildSettings
-from capsense.field.planes import LatticeSettings, plan_axes
+from capsense.masked.planes import LatticeSettings, plan_axes
+from capsense.masked.scenes import MaskedScenes
+from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh
-from capsense.solve.masked import GROUNDED, MaskedSolver
-from capsense.solve.scene_masks import MaskedScenes
 
 PUBLISHED_TOLERANCE = 1e-5
 """SciPy's default, with which the published code calls its conjugate gradients."""

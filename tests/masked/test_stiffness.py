@@ -7,7 +7,7 @@ import pytest
 
 from capsense.constants import EPS0
 from capsense.errors import FieldError, MeshError
-from capsense.field.stiffness import (
+from capsense.masked.stiffness import (
     StiffnessMap,
     capacitance_p1,
     gradients,

@@ -65,7 +65,10 @@ def execute(args: argparse.Namespace) -> int:
         BuildProgress(shown=shown) as progress,
     ):
         found = replay(
-            recording, method=args.method, tolerance=args.tolerance, progress=progress,
+            recording,
+            method=args.method,
+            tolerance=args.tolerance,
+            progress=progress,
             each=lambda _: bar.update(),
         )
     if not args.quiet:

@@ -102,5 +102,5 @@ class MaskedScenes:
         matrix = self._solver.step(inside, eps.tolist())
         stats = self._solver.stats
         goal = self._solver.tolerance * float(np.abs(matrix).max())
-        free = self._mesh.n_nodes - stats.grounded_nodes
+        free = self._mesh.n_points - stats.grounded_nodes
         return Change(matrix - self._empty, goal, int(stats.iterations), free)

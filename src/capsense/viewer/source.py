@@ -144,9 +144,7 @@ class RecordingSource:
         self.times = np.array([step.clock for step in self._steps])
         self.channels, self.empty = session.channels, session.empty
         gone = session.method in GONE
-        self._simulator = session.simulator(
-            method="surface" if gone else None, progress=progress
-        )
+        self._simulator = session.simulator(method="surface" if gone else None, progress=progress)
         self.green = green_of(self._simulator)
 
     def shot(self, index: int, plane: Plane | None = None) -> Shot:

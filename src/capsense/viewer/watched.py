@@ -164,9 +164,7 @@ class Watched:
             bodies = read_scene(Table(self._seen, "message", "scene"), len(self._seen["body"]))
             self._scene = _alike(self._scene, Scene(bodies.bodies))
         coupling = answer.self_capacitance - np.diag(answer.capacitance)
-        stats = StepStats(
-            answer.error_estimate, answer.wall_time, iterations=answer.iterations
-        )
+        stats = StepStats(answer.error_estimate, answer.wall_time, iterations=answer.iterations)
         reading: Reading = reading_of(
             self.design, answer.capacitance, answer.delta, coupling, stats
         )
