@@ -19,14 +19,24 @@ def test_plane(simulator: cs.Simulator, axis: int) -> None:
     """Its points lie on it, in the region, evenly; nothing of a flat sensor is left out."""
     bounds = region(simulator.design)
     plane = Plane(simulator.background.green, bounds, axis, 0.02)
-    points = plane.points
-    assert set(points[:, axis]) == {0.02}
-    assert (points >= bounds[:, 0] - 1e-12).all()
-    assert (points <= bounds[:, 1] + 1e-12).all()
-    lines = [np.unique(points[:, k]) for k in range(3) if k != axis]
-    assert len(points) == len(lines[0]) * len(lines[1])
-    for line in lines:
-        np.testing.assert_allclose(np.diff(line), plane.pitch)
+    for points, pitch in ((plane.drawn, plane.pitch), (plane.points, None)):
+        assert set(points[:, axis]) == {0.02}
+        assert (points >= bounds[:, 0] - 1e-12).all()
+        assert (points <= bounds[:, 1] + 1e-12).all()
+        lines = [np.unique(points[:, k]) for k in range(3) if k != axis]
+        assert len(points) == len(lines[0]) * len(lines[1])
+        for line in lines:
+            steps = np.diff(line)
+            np.testing.assert_allclose(steps, pitch or steps[0])
+    assert len(plane.points) < 0.08 * len(plane.drawn)
+
+
+def test_carrying_keeps_linear_functions(simulator: cs.Simulator) -> None:
+    """To any point that is drawn, the ends of the region included."""
+    slope = np.array([1.0, -2.0, 3.0])
+    for axis in range(3):
+        plane = Plane(simulator.background.green, region(simulator.design), axis, 0.03)
+        np.testing.assert_allclose(plane.carried(plane.points @ slope), plane.drawn @ slope)
 
 
 def test_plane_outside_is_taken_in(simulator: cs.Simulator) -> None:
@@ -58,7 +68,7 @@ def test_points_close_to_charges_are_left_out() -> None:
     green, bounds = simulator.background.green, region(simulator.design)
     middle = green.near_sources[np.argmin(np.abs(green.near_sources[:, 1]))]
     plane = Plane(green, bounds, 1, float(middle[1]))
-    away = np.linalg.norm(plane.points[:, None] - green.near_sources, axis=2).min(axis=1)
+    away = np.linalg.norm(plane.drawn[:, None] - green.near_sources, axis=2).min(axis=1)
     assert NEAR <= away.min() < NEAR + plane.pitch
 
 
@@ -67,14 +77,14 @@ def test_potentials_on_a_plane(simulator: cs.Simulator) -> None:
     centre = simulator.design.electrodes[1].surface.bounds.mean(axis=0)
     plane = Plane(simulator.background.green, region(simulator.design), 1, float(centre[1]))
     ball = cs.Body(cs.Sphere(0.02), cs.Pose((centre[0], centre[1], 0.06)), "steel")
-    x, _, z = plane.points.T
+    x, _, z = plane.drawn.T
     above = np.abs(x - centre[0]) < 0.6 * plane.pitch
     lowest = above & (z < z.min() + 0.5 * plane.pitch)
-    inside = np.linalg.norm(plane.points - ball.pose.position, axis=1) < 0.015
+    inside = np.linalg.norm(plane.drawn - ball.pose.position, axis=1) < 0.012
     simulator.step(cs.Scene())
-    empty = simulator.potentials(plane.points)[:, 1]
+    empty = plane.carried(simulator.potentials(plane.points)[:, 1])
     simulator.step(cs.Scene([ball]))
-    found = simulator.potentials(plane.points)[:, 1]
+    found = plane.carried(simulator.potentials(plane.points)[:, 1])
     assert (empty[lowest] > 0.8).all()
     line = empty[above & (x == x[above][0])]
     assert (np.diff(line) < 0).all()

@@ -111,7 +111,7 @@ def test_plane(server: Any) -> None:
     simulator.step(cs.Scene())
     stage.show_plane(plane, simulator.potentials(plane.points)[:, 1])
     cloud = server.scene._handle_from_node_name["/potential"]
-    assert 1000 < len(cloud.points) < len(plane.points)
+    assert 1000 < len(cloud.points) < len(plane.drawn)
     assert np.abs(cloud.points[:, 1].astype(float)).max() == 0
     stage.hide_plane()
     assert "/potential" not in server.scene._handle_from_node_name

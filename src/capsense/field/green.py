@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from numba import njit
 from numpy.typing import NDArray
 
 from capsense.errors import FieldError
@@ -94,18 +95,23 @@ class GreenFunction:
 
     def psi(self, points: Array) -> Array:
         """Modes at points [m], shape (n, 3) -> (n, modes)."""
-        share = self.share(points)[:, None]
-        out = share * (basis(points, self.near_sources, self.floor) @ self.near_modes)
-        far = basis(points, self.far_sources, self.floor) @ self.far_modes
-        out[:, : far.shape[1]] += (1 - share) * far
-        return out
+        return self._sum(points, self.near_modes, self.far_modes)
 
     def phi0(self, points: Array) -> Array:
         """Potential [V] of each terminal at 1 V, others at 0, shape (n, 3) -> (n, terminals)."""
-        share = self.share(points)[:, None]
-        near = basis(points, self.near_sources, self.floor) @ self.near_phi
-        far = basis(points, self.far_sources, self.floor) @ self.far_phi
-        return share * near + (1 - share) * far
+        return self._sum(points, self.near_phi, self.far_phi)
+
+    def _sum(self, points: Array, near: Table, far: Table) -> Array:
+        """Potentials of both representations' charges, each where it has a share, (n, k)."""
+        share = self.share(points)
+        out = np.zeros((len(points), near.shape[1]))
+        for sources, table, part in (
+            (self.near_sources, near, share), (self.far_sources, far, 1 - share),
+        ):  # fmt: skip
+            here = np.flatnonzero(part)
+            values = basis(points[here], sources, self.floor) @ table.astype(np.float64)
+            out[here, : table.shape[1]] += part[here, None] * values
+        return out
 
     def g(self, p: Array, q: Array) -> Array:
         """Potential at p of the design's answer to unit charges at q [1/m], (n, 3), (m, 3)."""
@@ -115,9 +121,21 @@ class GreenFunction:
 
 def basis(points: Array, sources: NDArray[np.floating], floor: float) -> Array:
     """Potential of unit charges and their images in the floor [1/m], (n, 3), (s, 3) -> (n, s)."""
-    s = sources.astype(np.float64)
-    images = s * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * floor]
-    return 1 / _distances(points, s) - 1 / _distances(points, images)
+    return _basis(np.ascontiguousarray(points.T), np.ascontiguousarray(sources.T, np.float64), floor)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _basis(points: Array, sources: Array, floor: float) -> Array:
+    """As :func:`basis`, of coordinates in rows, (3, n), (3, s) -> (n, s)."""
+    x, y, z = sources
+    out = np.empty((points.shape[1], sources.shape[1]))
+    for i in range(len(out)):
+        a, b, c = points[0, i], points[1, i], points[2, i]
+        for k in range(len(x)):
+            across = (a - x[k]) ** 2 + (b - y[k]) ** 2
+            up, down = c - z[k], c + z[k] - 2 * floor
+            out[i, k] = 1 / np.sqrt(across + up * up) - 1 / np.sqrt(across + down * down)
+    return out
 
 
 _FINE = 1e-11

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -15,8 +16,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-POINTS = 120
-"""Points along the longer side."""
+POINTS = 240
+"""Points that are drawn along the longer side."""
+SAMPLES = 48
+"""Points along the longer side where potentials are taken; between these they are linear."""
 REACH = 0.12
 """Planes end so far from the electrodes [m]; twice as far along z."""
 OCTAVES = 8
@@ -57,10 +60,13 @@ def region(design: Design) -> Array:
 
 
 class Plane:
-    """A plane across a region, at a coordinate along one axis, as a grid of points.
+    """A plane across a region, at a coordinate along one axis.
+
+    Potentials take a few microseconds a point, so they are taken on a coarse grid and carried to a
+    fine one.
 
     Args:
-        green: Of the sensor; points close to its charges are left out.
+        green: Of the sensor; points close to its charges are not drawn.
         bounds: Ends of the region that planes cross [m], shape (3, 2); within the domain.
         axis: Which coordinate is fixed: 0, 1 or 2.
         at: Its value [m]; taken into the region.
@@ -70,17 +76,34 @@ class Plane:
         self.axis = axis
         self.at = float(np.clip(at, *bounds[axis]))
         sides = [k for k in range(3) if k != axis]
-        self.pitch = float(np.ptp(bounds[sides], axis=1).max()) / POINTS
-        """Distance of neighbouring points [m]."""
-        u, v = (np.arange(low + self.pitch / 2, high, self.pitch) for low, high in bounds[sides])
-        grid = np.empty((len(u), len(v), 3))
-        grid[..., axis] = self.at
-        grid[..., sides[0]] = u[:, None]
-        grid[..., sides[1]] = v[None, :]
-        points = grid.reshape(-1, 3)
-        away = cKDTree(green.near_sources).query(points, distance_upper_bound=NEAR)[0]
-        self.points = points[~(away < NEAR)]
+        longest = float(np.ptp(bounds[sides], axis=1).max())
+        self.pitch = longest / POINTS
+        """Distance of neighbouring points that are drawn [m]."""
+        coarse, fine, self._carry = [], [], []
+        for low, high in bounds[sides]:
+            coarse.append(np.linspace(low, high, 1 + math.ceil(SAMPLES * (high - low) / longest)))
+            fine.append(np.arange(low + self.pitch / 2, high, self.pitch))
+            unit = np.eye(len(coarse[-1]))
+            self._carry.append(np.stack([np.interp(fine[-1], coarse[-1], e) for e in unit], axis=1))
+        self.points = self._grid(*coarse)
         """Where potentials are taken [m], shape (n, 3)."""
+        points = self._grid(*fine)
+        away = cKDTree(green.near_sources).query(points, distance_upper_bound=NEAR)[0]
+        self._drawn = ~(away < NEAR)
+        self.drawn = points[self._drawn]
+        """Where they are drawn [m], shape (m, 3)."""
+
+    def carried(self, potential: Array) -> Array:
+        """Potentials [V] where they are drawn, shape (m,), from those at ``points``, (n,)."""
+        rows, columns = self._carry
+        grid = potential.reshape(rows.shape[1], columns.shape[1])
+        return (rows @ grid @ columns.T).ravel()[self._drawn]
+
+    def _grid(self, u: Array, v: Array) -> Array:
+        """Points of the plane, shape (len(u) · len(v), 3)."""
+        lines = [u, v]
+        lines.insert(self.axis, np.array([self.at]))
+        return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def paint(potential: Array) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:

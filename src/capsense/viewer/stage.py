@@ -98,9 +98,9 @@ class Stage:
         As points, which hide and are hidden as they should be: an image would be sorted as a whole
         among the bodies that light passes through.
         """
-        shown, colours = paint(potential)
+        shown, colours = paint(plane.carried(potential))
         self._scene.add_point_cloud(
-            "/potential", plane.points[shown], colours, point_size=0.6 * plane.pitch,
+            "/potential", plane.drawn[shown], colours, point_size=0.6 * plane.pitch,
             point_shape="square", point_shading="flat",
         )  # fmt: skip
 
