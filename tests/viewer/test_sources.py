@@ -115,7 +115,7 @@ class TestWatched:
         from capsense.viewer.watched import Watched
 
         with RunningServer("six_patch", watch=True) as server, server.client() as client:
-            sensor = client.open(material="wood", back=0.02)
+            sensor = client.open(material="steel", back=0.02)
             source = Watched(server.url)
             np.testing.assert_array_equal(source.empty.capacitance, sensor.baseline)
             assert source.next(0.01) is None
@@ -144,11 +144,11 @@ class TestWatched:
             answer = sensor.step(depth)
             three = self.next_of(source)
             expected = cs.Simulator("six_patch").step(
-                cs.DepthFrame(np.float32(depth), "wood", back=0.02)
+                cs.DepthFrame(np.float32(depth), "steel", back=0.02)
             )
             np.testing.assert_array_equal(three.reading.delta, answer.delta)
             np.testing.assert_allclose(answer.delta, expected.delta, rtol=1e-3, atol=1e-18)
-            assert next(iter(three.scene)).material.name == "wood"
+            assert next(iter(three.scene)).material.name == "steel"
             source.close()
 
     def test_waits_for_the_next_client(self) -> None:

@@ -121,7 +121,9 @@ class GreenFunction:
 
 def basis(points: Array, sources: NDArray[np.floating], floor: float) -> Array:
     """Potential of unit charges and their images in the floor [1/m], (n, 3), (s, 3) -> (n, s)."""
-    return _basis(np.ascontiguousarray(points.T), np.ascontiguousarray(sources.T, np.float64), floor)
+    return _basis(
+        np.ascontiguousarray(points.T), np.ascontiguousarray(sources.T, np.float64), floor
+    )
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")

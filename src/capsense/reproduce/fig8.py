@@ -33,9 +33,9 @@ Array = NDArray[np.float64]
 
 DESIGN = "six_patch_bare"
 PRESETS: tuple[PresetName, ...] = ("learning", "standard", "fine")
-REFINEMENTS = (0.5, 0.65, 0.8, 1.0)
+REFINEMENTS = (0.43, 0.65, 0.8, 1.0)
 """Meshes of the paper's scheme, as multiples of the default's nodes along an axis."""
-REDUCED = (0.5, 0.65)
+REDUCED = (0.43, 0.65)
 SIZE = 30_000
 """Tetrahedra at which times are compared: "107 ms" in the paper's abstract."""
 REFERENCE = {
