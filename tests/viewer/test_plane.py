@@ -16,7 +16,7 @@ def simulator() -> cs.Simulator:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_plane(simulator: cs.Simulator, axis: int) -> None:
-    """Its points lie on it, in the region, evenly; of a flat sensor's next to nothing is left out."""
+    """Its points lie on it, in the region, evenly; hardly any is left out."""
     bounds = region(simulator.design)
     plane = Plane(simulator.background.green, bounds, axis, 0.02)
     for points, pitch in ((plane.drawn, plane.pitch), (plane.points, None)):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capsense.cli.run import progress_shown
-from capsense.scenario.model import METHODS
 
 if TYPE_CHECKING:
     from capsense.recording.replay import Replay
@@ -40,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="difference of a capacitance that is allowed, in farads; default 0",
     )  # fmt: skip
     parser.add_argument(
-        "--method", choices=METHODS, help="simulate with this method instead of the recorded one"
+        "--method",
+        choices=("surface", "masked"),
+        help="simulate with this method instead of the recorded one",
     )
     parser.add_argument(
         "-q", "--quiet", action="store_true", help="no progress bar, no summary; errors only"

@@ -62,8 +62,7 @@ def region(design: Design) -> Array:
 class Plane:
     """A plane across a region, at a coordinate along one axis.
 
-    Potentials take a few microseconds a point, so they are taken on a coarse grid and carried to a
-    fine one.
+    Potentials take some 20 µs a point: they are taken on a coarse grid and carried to a fine one.
 
     Args:
         green: Of the sensor; points close to its charges are not drawn.
