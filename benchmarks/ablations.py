@@ -23,7 +23,7 @@ from peers_task import DESIGN, GAPS, diagonal_error
 import capsense as cs
 from capsense.bench import WARM_UP, moving_bar, reference_bar
 from capsense.field.background import BuildSettings
-from capsense.field.planes import LatticeSettings
+from capsense.masked.planes import LatticeSettings
 
 
 def variants() -> Iterator[tuple[str, dict[str, Any], bool]]:

@@ -1,12 +1,12 @@
 """Errors of ΔC against boundary elements over a map of scenes, and what a step costs.
 
     python benchmarks/accuracy_map.py                           # the default method
-    python benchmarks/accuracy_map.py --method perturbation surface
-    python benchmarks/accuracy_map.py --settings refine=0.6 "" refine=1.5 --plot out/map.png
+    python benchmarks/accuracy_map.py --method masked surface
+    python benchmarks/accuracy_map.py --settings preset=learning "" preset=fine --plot out/map.png
 
 Every method is run with every settings, a point each of a curve of error against time. Settings
-are arguments of ``Simulator``, as in ``tolerance=1e-17,relative_tolerance=1e-4``; besides,
-``refine=1.5`` gives the lattice half as many nodes again along each axis.
+are arguments of ``Simulator``, as in ``preset=fine``; besides, ``refine=1.5`` makes panels and the
+masked scheme's mesh finer by that along each axis.
 
 Scenes are those of ``tests/data/reference_map.json`` and ``reference_more.json``, over
 ``six_patch_bare``; the references' own error is about 0.3 % (the files say how it is known).
@@ -65,9 +65,8 @@ def parse_settings(text: str) -> dict[str, Any]:
             out[name.strip()] = value
     if "refine" in out:
         from capsense.field.background import BuildSettings
-        from capsense.field.lattice import LatticeSettings
 
-        out["settings"] = BuildSettings(LatticeSettings().refined(float(out.pop("refine"))))
+        out["settings"] = BuildSettings().refined(float(out.pop("refine")))
     return out
 
 

@@ -28,7 +28,7 @@ from numba import njit
 import capsense as cs
 from capsense.bench import WARM_UP, moving_bar
 from capsense.field.background import BuildSettings
-from capsense.field.planes import LatticeSettings
+from capsense.masked.planes import LatticeSettings
 
 DESIGN = "six_patch"
 REFINEMENTS = (0.33, 0.6, 1.0, 1.5, 2.25)

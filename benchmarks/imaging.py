@@ -38,9 +38,12 @@ def middle(images: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Print one row for each method and noise."""
     sim = cs.Simulator("six_patch")
-    field, count = sim.background, len(sim.electrode_names)
+    count = len(sim.electrode_names)
     pairs = electrode_pairs(count, diagonal=True)
-    j = grounded_sensitivity(field.lattice.on_grid(field.potentials[:, :count], GRID), GRID, pairs)
+    nodes = np.stack(np.meshgrid(*GRID, indexing="ij"), axis=-1)
+    sim.step(cs.Scene())
+    potentials = sim.potentials(nodes.reshape(-1, 3))[:, :count]
+    j = grounded_sensitivity(potentials.reshape(*nodes.shape[:3], count), GRID, pairs)
     rng = np.random.default_rng(1)
     places = rng.uniform((-0.045, -0.035, 0.035), (0.045, 0.035, 0.08), (COUNT, 3))
     changes = []

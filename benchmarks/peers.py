@@ -87,7 +87,7 @@ def groups(folder: Path) -> dict[str, Callable[[], Makers]]:
     )  # fmt: skip
     return {
         "30k": lambda: {
-            "capsense": lambda: CapSense(0.65), **on_mesh(SCALES["30k"], folder, everyone)
+            "capsense": CapSense, **on_mesh(SCALES["30k"], folder, everyone)
         },
         "100k": lambda: {"capsense": CapSense, **on_mesh(SCALES["100k"], folder, everyone)},
         "same planes": lambda: {
@@ -108,8 +108,8 @@ def groups(folder: Path) -> dict[str, Callable[[], Makers]]:
         "1M": lambda: on_mesh(0.48, folder, ("pardiso", "jacobi", "ngsolve")),
         "2M": lambda: on_mesh(0.38, folder, ("jacobi", "ngsolve")),
         "remeshed": lambda: {"capsense": CapSense, "ngsolve": NgSolveRemeshed},
-        "finer": lambda: {"capsense": lambda: CapSense(1.5)},
-        "finest": lambda: {"capsense": lambda: CapSense(2.2)},
+        "learning": lambda: {"capsense": lambda: CapSense("learning")},
+        "fine": lambda: {"capsense": lambda: CapSense("fine")},
     }  # fmt: skip
 
 

@@ -7,11 +7,12 @@ from peers_iterative import TOLERANCE
 from peers_task import DESIGN, SIZE, Array, bar_corners, design, within
 
 import capsense as cs
-from capsense.field.background import BuildSettings
-from capsense.field.planes import LatticeSettings, plan_axes
+from capsense.masked.planes import plan_axes
+from capsense.masked.scenes import MaskedScenes
+from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh
-from capsense.solve.masked import GROUNDED, MaskedSolver
-from capsense.solve.scene_masks import MaskedScenes
+from capsense.mesh.settings import MeshSettings
+from capsense.simulator import PresetName
 
 PUBLISHED_TOLERANCE = 1e-5
 """SciPy's default, with which the published code calls its conjugate gradients."""
@@ -19,24 +20,24 @@ _BAR = cs.Body(cs.Box(tuple(SIZE)), material="steel")
 
 
 class CapSense:
-    """Whole ``Simulator.step``, from bodies to ΔC, default tolerance."""
+    """Whole ``Simulator.step``, from bodies to ΔC. There is no mesh."""
 
     name = "CapSense"
     returns_change = True
-    settings = "Simulator.step, default tolerance"
+    n_tets = 0
 
-    def __init__(self, refine: float = 1.0) -> None:
-        lattice = LatticeSettings()
-        chosen = BuildSettings(lattice=lattice if refine == 1.0 else lattice.refined(refine))
-        self._sim = cs.Simulator(DESIGN, settings=chosen)
-        facts = self._sim.describe()
-        self.n_tets = int(facts["tetrahedra"])
-        self.unknowns = int(self._sim.background.lattice.unknown.sum())
+    def __init__(self, preset: PresetName = "standard") -> None:
+        self._sim = cs.Simulator(DESIGN, preset=preset)
+        self.settings = f"Simulator.step, preset {preset}"
+        self.unknowns = 0
+        """Of the last step."""
         self.baseline: Array = self._sim.baseline
 
     def step(self, x: float, gap: float) -> Array:
         """ΔC [F] with the bar at x [m], gap [m]."""
-        return self._sim.step(cs.Scene([bar_at(x, gap)])).delta
+        reading = self._sim.step(cs.Scene([bar_at(x, gap)]))
+        self.unknowns = reading.stats.unknowns
+        return reading.delta
 
 
 class PaperScheme:
@@ -68,7 +69,7 @@ class PaperScheme:
 
 
 class PaperOnLattice:
-    """The same on the planes of CapSense's own default lattice, as ``method="masked"`` has it.
+    """The same on the default mesh of CapSense's ``method="masked"``.
 
     The bar's staircase there changes only in some steps; a warm start makes the others cheap.
     """
@@ -83,12 +84,12 @@ class PaperOnLattice:
         self._scenes = MaskedScenes(
             design(), sim.background, sim.settings, sim.frequency, warm_start=warm_start
         )
-        planes = np.array([len(axis) for axis in plan_axes(design(), LatticeSettings())])
+        planes = np.array([len(axis) for axis in plan_axes(design(), MeshSettings())])
         self.n_tets, self.unknowns = int(6 * (planes - 1).prod()), int(planes.prod())
 
     def step(self, x: float, gap: float) -> Array:
         """ΔC [F] with the bar at x [m], gap [m]."""
-        return self._scenes.solve(cs.Scene([bar_at(x, gap)]))[0]
+        return self._scenes.solve(cs.Scene([bar_at(x, gap)])).matrix
 
 
 def bar_at(x: float, gap: float) -> cs.Body:

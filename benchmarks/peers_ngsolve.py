@@ -9,7 +9,7 @@ from peers_iterative import TOLERANCE
 from peers_task import Array, bar_corners, design, within
 
 from capsense.constants import EPS0
-from capsense.field.stiffness import unit_potentials
+from capsense.masked.stiffness import unit_potentials
 from capsense.mesh import TetMesh
 
 _MM = 1e3

@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.field.stiffness import stiffness, unit_potentials
+from capsense.masked.stiffness import stiffness, unit_potentials
 from capsense.mesh import TetMesh, mesh_design
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ import argparse
 from dataclasses import replace
 
 import numpy as np
+from capsense.field.lattice import LatticeSettings
 
 import capsense as cs
 from capsense.field.background import BuildSettings
-from capsense.field.lattice import LatticeSettings
 
 GAPS = (0.005, 0.01, 0.02, 0.04, 0.08)
 COUNT = 40

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from capsense.solve.factor_kernels import factorise
 from machine import describe_machine, on_one_core
 
 import capsense as cs
 from capsense.bench import DESIGN, WORLDS, World
 from capsense.solve import load_kernels as loading
 from capsense.solve import trace_kernels as tracing
-from capsense.solve.factor_kernels import factorise
 
 STEPS, WARM_UP = 300, 20
 SOLVE = "solve"

@@ -37,7 +37,7 @@ from capsense.bench import (
 )
 from capsense.design.loader import available_designs
 from capsense.field.background import BuildSettings
-from capsense.field.planes import LatticeSettings
+from capsense.masked.planes import LatticeSettings
 
 Array = NDArray[np.float64]
 REFINEMENTS = (0.6, 1.0, 1.5)

@@ -66,7 +66,7 @@ def test_base() -> None:
     assert scenario.duration == pytest.approx(3.0)
     assert scenario.times == pytest.approx(np.arange(31) / 10)
     assert [c.column_name for c in scenario.channels] == ["Cm_E1_E2", "Cm_E3_E1"]
-    assert (scenario.method, scenario.tolerance) == ("perturbation", None)
+    assert scenario.method == "surface"
     scene = scenario.scene_at(1.0)
     assert scene["bar"].pose.position == pytest.approx((0.0, 0.0, 0.05))
     assert scene["bar"].grounding == "grounded"
@@ -308,8 +308,9 @@ REFUSED = [
     (("pairs", [["E1", "E7"]]), "no electrode 'E7' of design 'six_patch'.*E6"),
     (("pairs", [["E1", "E1"]]), "two different electrodes"),
     (("pairs", [["E1", "E2"], ["E2", "E1"]]), r"pairs\[1\].*listed twice"),
-    (("method", "perturb"), "did you mean 'perturbation'"),
-    (("tolerance", 1.0), "tolerance = 1 must be from 1e-24 to 1e-12 F"),
+    (("method", "surfaces"), "did you mean 'surface'"),
+    (("method", "perturbation"), 'method = "perturbation" is gone; write "surface", or remove'),
+    (("tolerance", 1e-17), "tolerance is gone.*remove the line"),
     (("body", {"name": "x"}), r"write \[\[body\]\]"),
     (("body", []), r"no body and no duration; add a \[\[body\]\]"),
     (("body.1.name", "bar"), "two bodies are named 'bar'"),

@@ -24,7 +24,7 @@ DESIGN = "six_patch"
 SPEED, RATE = 0.116, 100.0
 """Speed of the bar [m/s], and samples a second [Hz]."""
 WARM_UP = 10
-"""Steps left out of the statistics: they compile or load code and fill the warm start."""
+"""Steps left out of the statistics: they compile or load code and make room for results."""
 REPEATS = 3
 """Starts in fresh processes, and batches, of which medians are taken."""
 BATCH = 256
@@ -82,8 +82,8 @@ CHECKS: dict[str, tuple[Callable[[], World], tuple[float, ...]]] = {
 }
 """By world: a sample of it, and what it changes in the diagonal [pF].
 
-The bar by boundary elements, good to 4.4e-4 pF; the others on a lattice of a million tetrahedra,
-``python benchmarks/steps.py``."""
+The bar by boundary elements, good to 4.4e-4 pF; the others on a lattice of a million tetrahedra, of
+the solver that came before."""
 
 
 @dataclass
@@ -119,12 +119,12 @@ class Times:
 
 
 def time_steps(sim: Simulator, world: Callable[[int], World], steps: int) -> dict[str, float]:
-    """:meth:`Times.summary` and iterations of ``steps`` samples; making the worlds is not timed."""
-    times, iterations = Times(), []
+    """:meth:`Times.summary` and unknowns of ``steps`` samples; making the worlds is not timed."""
+    times, unknowns = Times(), []
     for k in range(WARM_UP + steps):
         reading = times.take(partial(sim.step, world(k)), keep=k >= WARM_UP)
-        iterations.append(reading.stats.iterations)
-    return {**times.summary(), "iterations": float(np.median(iterations[WARM_UP:]))}
+        unknowns.append(reading.stats.unknowns)
+    return {**times.summary(), "unknowns": float(np.median(unknowns[WARM_UP:]))}
 
 
 _START = f"""
@@ -167,18 +167,16 @@ def batch_scenes(count: int = BATCH, after: int = 0) -> list[cs.Scene]:
     return [cs.Scene([bar.moved(cs.Pose(place))]) for place in places + after * SPEED / RATE * ways]
 
 
-def time_batch(
-    sim: Simulator, threads: int | None = None, warm_start: bool = False
-) -> dict[str, float]:
+def time_batch(sim: Simulator, threads: int | None = None) -> dict[str, float]:
     """Scenes a second of ``step_batch``, by the clock, and as many as the processor's time of one
-    scene gives times the threads: each from rest, or each after the one before.
+    scene gives times the threads.
     """
     threads = threads or len(os.sched_getaffinity(0))
     rates = []
-    for k in range(2 + REPEATS):  # the first two make room for solutions
+    for k in range(2 + REPEATS):  # the first two make room for results
         scenes = batch_scenes(after=k)
         clock, processor = time.perf_counter(), time.process_time()
-        sim.step_batch(scenes, threads=threads, warm_start=warm_start)
+        sim.step_batch(scenes, threads=threads)
         spent = time.process_time() - processor
         if k >= 2:
             rates.append((BATCH / (time.perf_counter() - clock), threads * BATCH / spent))
@@ -201,9 +199,8 @@ def measure(steps: int = 300) -> dict[str, Any]:
 
     Returns:
         The machine and its load, versions, the times of :func:`start_times` (cached field, compiled
-        code), per world the times of :meth:`Times.summary`, the iterations and ``error``, see
-        :func:`check_error`, and ``batch`` and, with a warm start, ``worlds_at_once`` of
-        :func:`time_batch`.
+        code), per world the times of :meth:`Times.summary`, the unknowns and ``error``, see
+        :func:`check_error`, and ``batch`` of :func:`time_batch`.
 
     Raises:
         ValueError: ``steps`` is less than 1.
@@ -219,12 +216,11 @@ def measure(steps: int = 300) -> dict[str, Any]:
         "load": load,
         "versions": {n: version(n) for n in ("capsense", "numpy", "scipy", "numba")},
         "design": DESIGN,
-        "tetrahedra": sim.describe()["tetrahedra"],
+        "preset": sim.preset,
         **start_times(),
         "worlds": {
             name: {**time_steps(sim, world, steps), "error": check_error(sim, name)}
             for name, world in WORLDS.items()
         },
         "batch": time_batch(sim),
-        "worlds_at_once": time_batch(sim, warm_start=True),
     }

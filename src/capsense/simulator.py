@@ -171,7 +171,7 @@ class Simulator:
 
     def _make_solver(self) -> _Solver:
         if self.method == "masked":
-            from capsense.solve.scene_masks import MaskedScenes
+            from capsense.masked.scenes import MaskedScenes
 
             return MaskedScenes(self.design, self.background, self.settings, self.frequency)
         from capsense.surface.solver import PRESETS, SurfaceSolver

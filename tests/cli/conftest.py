@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FakeStats:
-    iterations: int
     error_estimate: float
-    tolerance: float
     wall_time: float
+    unknowns: int
+    iterations: int
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,11 @@ class FakeSimulator:
     def __init__(
         self,
         design: cs.Design | str,
-        method: str = "perturbation",
-        tolerance: float = 1e-17,
+        method: str = "surface",
         progress: Callable[[str, float], None] | None = None,
     ) -> None:
         self.design = cs.load_design(design) if isinstance(design, str) else design
         self.electrode_names = self.design.electrode_names
-        self.tolerance = tolerance
         self.steps = 0
         centers = np.array([e.surface.bounds.mean(axis=0) for e in self.design.electrodes])
         gap = np.linalg.norm(centers[:, None] - centers[None], axis=2)
@@ -61,7 +59,7 @@ class FakeSimulator:
         self.baseline = self._maxwell(np.zeros(len(centers)))
         if progress is not None:
             progress("panels", 0.5)
-            progress("mesh", 1.0)
+            progress("fit", 1.0)
 
     def _maxwell(self, reach: Array) -> Array:
         mutual = self.mutual * (1 - 0.3 * np.sqrt(np.outer(reach, reach)))
@@ -69,7 +67,7 @@ class FakeSimulator:
         return np.diag(diagonal) - mutual
 
     def describe(self) -> dict[str, Any]:
-        return {"nodes": 11234, "links": 26012, "panels": 3456, "build time [s]": 1.25}
+        return {"boundary panels": 3456, "point charges": 812, "modes": 180}
 
     def reset(self) -> None:
         self.steps = 0
@@ -86,7 +84,7 @@ class FakeSimulator:
             hook = type(self).after_step
             if hook is not None:
                 hook(self.steps)
-        stats = FakeStats(3, 0.4 * self.tolerance, self.tolerance, 1e-3)
+        stats = FakeStats(4e-18, 1e-3, 120, 3)
         return FakeReading(capacitance, capacitance - self.baseline, stats)
 
 

@@ -31,9 +31,9 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("fake")
 def test_figures_and_baseline(capsys: pytest.CaptureFixture[str]) -> None:
-    """Electrodes, layers, conductors, mesh and the matrix in picofarads."""
+    """Electrodes, layers, conductors, the field and the matrix in picofarads."""
     text = output_of(["design", "stripe"], capsys)
-    for part in ("-17.5 to -11.9", "back plane", "ground", "4.5", "11 234", "baseline [pF]"):
+    for part in ("-17.5 to -11.9", "back plane", "ground", "4.5", "3 456", "baseline [pF]"):
         assert part in text, part
     matrix = text[text.index("baseline [pF]") :].splitlines()
     simulator = cs.Simulator("stripe")

@@ -17,7 +17,7 @@ COMMAND = [sys.executable, "-m", "capsense"]
 
 
 def test_run(tmp_path: Path) -> None:
-    """A whole run: physical matrices, and a solver that kept its promise."""
+    """A whole run: physical matrices, and a small estimate of the error."""
     scenario = ROOT / "examples" / "hand_approach.toml"
     out = tmp_path / "out"
     done = subprocess.run(
@@ -36,8 +36,8 @@ def test_run(tmp_path: Path) -> None:
     assert off.max() <= 1e-3 * scale
     assert capacitance.sum(axis=2).min() >= -1e-3 * scale
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    assert summary["largest_error_estimate_F"] <= summary["tolerance_F"]
-    assert summary["mesh"]["nodes"] > 1000
+    assert summary["largest_error_estimate_F"] < 0.05 * np.abs(arrays["delta"]).max()
+    assert summary["field"]["boundary panels"] > 1000
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is not a signal there")

@@ -1,4 +1,4 @@
-"""The cache of fields: found by content, built once, resumed, and never in the way."""
+"""The cache of fields: found by content, built once, and never in the way."""
 
 from __future__ import annotations
 
@@ -19,29 +19,20 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_field
-from tiny_field import PART, SETTINGS, digest, tiny_data, tiny_design
+from tiny_field import SETTINGS, digest, tiny_data, tiny_design
 
 from capsense.design.loader import parse_design
 from capsense.field import background, cache, lock
 from capsense.field.background import BuildSettings
-from capsense.field.cache import cache_key, default_cache_dir, load_or_build
-from capsense.field.lattice import LatticeSettings
+from capsense.field.boundary import BoundarySolution
+from capsense.field.cache import cache_key, default_cache_dir, default_settings, load_or_build
 from capsense.field.lock import exclusive
 from capsense.field.store import read_arrays, write_arrays
+from capsense.mesh.settings import MeshSettings
 
 DENSE = "boundary elements: factorising"
-NODES = "field at the nodes"
+FIT = "response to charges: fit"
 KEY = cache_key(tiny_design(), SETTINGS)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_parts() -> Any:
-    """Many parts, each kept at once; the parts' size decides the last bit of the field."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr(background, "_PART", PART)
-    patch.setattr(background, "_SAVE_EVERY", 0.0)
-    yield
-    patch.undo()
 
 
 @pytest.fixture(scope="module")
@@ -125,17 +116,23 @@ def test_names_and_descriptions_do_not_change_the_key() -> None:
     assert cache_key(parse_design(renamed), SETTINGS) == KEY
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        BuildSettings(),
-        replace(SETTINGS, panel_scale=8.1),
-        replace(SETTINGS, calibration=0.31),
-        replace(SETTINGS, lattice=LatticeSettings().refined(0.51)),
-    ],
-)
+@pytest.mark.parametrize("settings", [BuildSettings(), replace(SETTINGS, panel_scale=8.1)])
 def test_settings_change_the_key(settings: BuildSettings) -> None:
     assert cache_key(tiny_design(), settings) != KEY
+
+
+def test_the_mesh_of_the_masked_scheme_does_not_change_the_key() -> None:
+    other = replace(SETTINGS, mesh=MeshSettings(edge=1e-3))
+    assert cache_key(tiny_design(), other) == KEY
+
+
+@pytest.mark.parametrize("resolution", [0.5, 1.0, 2.0])
+def test_resolution_refines_panels_and_mesh(resolution: float) -> None:
+    chosen = default_settings(tiny_design(build={"resolution": resolution}))
+    assert chosen.panel_scale == 1 / resolution
+    assert chosen.mesh == MeshSettings().refined(resolution)
+    if resolution == 1.0:
+        assert chosen == BuildSettings()
 
 
 @pytest.mark.parametrize("name", ["FORMAT", "NUMERICS"])
@@ -165,7 +162,7 @@ def test_build_then_load(tmp_path: Path, reference: str) -> None:
     assert fractions[0] == 0.0
     assert fractions[-1] == 1.0
     assert stages.count(DENSE) == 1
-    assert stages.count(NODES) > 5
+    assert stages.count(FIT) == 1
     assert files(folder) == [f"{KEY}.npz"]
     again = Stages()
     loaded = load_or_build(tiny_design(), SETTINGS, cache_dir=str(folder), progress=again)
@@ -243,85 +240,29 @@ def test_a_bad_file_is_reported_and_replaced(
 def test_a_field_that_is_not_finite_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def bad(*args: Any) -> Any:
-        weights, half = calibrate(*args)
-        weights[0, 0] = np.nan
-        return weights, half
+    def bad(self: BoundarySolution, densities: np.ndarray) -> np.ndarray:
+        return np.full((2, 2), np.nan)
 
-    calibrate = background.calibrate
-    monkeypatch.setattr(background, "calibrate", bad)
+    monkeypatch.setattr(BoundarySolution, "terminal_charges", bad)
     with pytest.raises(background.FieldError, match="design 'tiny' is not finite"):
         load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path)
-    assert f"{KEY}.npz" not in files(tmp_path)
+    assert files(tmp_path) == []
 
 
 # -- interrupted builds ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("stage", "at", "dense"),
-    [(DENSE, 1, 1), (NODES, 1, 0), (NODES, 5, 0), ("calibration", 1, 0), ("done", 1, 0)],
-)
-def test_an_interrupted_build_goes_on(
-    stage: str, at: int, dense: int, tmp_path: Path, reference: str
-) -> None:
-    first = Stages(stage, at, KeyboardInterrupt())
-    with pytest.raises(KeyboardInterrupt):
-        load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path, progress=first)
-    assert not list(tmp_path.glob("*.lock"))
-    assert not list(tmp_path.rglob("*.part"))
-    assert not list(tmp_path.glob("*.npz"))
-    second = Stages()
-    field = load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path, progress=second)
-    assert digest(field) == reference
-    assert second.count(DENSE) == dense
-    parts = -(-int(field.lattice.unknown.sum()) // PART)
-    done = max(0, first.count(NODES) - (stage == NODES))
-    assert second.count(NODES) == parts - done
-    assert files(tmp_path) == [f"{KEY}.npz"]
-
-
-@pytest.mark.parametrize("harm", [_flip, _foreign, lambda path: path.write_bytes(b"x")])
-def test_bad_intermediate_results_are_computed_again(
-    harm: Callable[[Path], None], tmp_path: Path, reference: str
-) -> None:
+@pytest.mark.parametrize("stage", [DENSE, FIT, "done"])
+def test_an_interrupted_build_leaves_nothing(stage: str, tmp_path: Path, reference: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         load_or_build(
             tiny_design(), SETTINGS, cache_dir=tmp_path,
-            progress=Stages(NODES, 8, KeyboardInterrupt()),
+            progress=Stages(stage, 1, KeyboardInterrupt()),
         )  # fmt: skip
-    work = tmp_path / f"{KEY}.work"
-    names = ["charges.npz", *(f"potentials-{PART * k}.npz" for k in range(7))]
-    assert sorted(files(work)) == sorted(names)
-    harm(work / "charges.npz")
-    harm(work / f"potentials-{3 * PART}.npz")
-    stages = Stages()
-    field = load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path, progress=stages)
+    assert files(tmp_path) == []
+    field = load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path)
     assert digest(field) == reference
-    assert stages.count(DENSE) == 1
     assert files(tmp_path) == [f"{KEY}.npz"]
-
-
-def test_intermediate_results_of_another_shape_are_computed_again(
-    tmp_path: Path, reference: str
-) -> None:
-    work = tmp_path / f"{KEY}.work"
-    work.mkdir()
-    meta = {"key": KEY}
-    wrong = {"densities": np.ones((7, 2)), "capacitance": np.eye(2)}
-    write_arrays(work / "charges.npz", wrong, {**meta, "kind": "charges"})
-    for rows in (np.ones((5, 2)), np.ones((PART, 3)), np.ones((0, 2)), np.ones((PART * 9999, 2))):
-        write_arrays(work / "potentials-0.npz", {"values": rows}, {**meta, "kind": "potentials-0"})
-        field = load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path)
-        assert digest(field) == reference
-        (tmp_path / f"{KEY}.npz").unlink()
-        work.mkdir()
-
-
-def test_a_file_in_place_of_the_work_folder(tmp_path: Path, reference: str) -> None:
-    (tmp_path / f"{KEY}.work").write_text("not a folder")
-    assert digest(load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path)) == reference
-    assert (tmp_path / f"{KEY}.npz").exists()
 
 
 # -- processes and threads --------------------------------------------------------------------
@@ -350,12 +291,10 @@ def test_two_processes_build_once(tmp_path: Path, reference: str) -> None:
     assert files(tmp_path / "cache") == [f"{KEY}.npz"]
 
 
-def test_a_killed_builder_frees_the_lock_and_leaves_its_work(
-    tmp_path: Path, reference: str
-) -> None:
+def test_a_killed_builder_frees_the_lock(tmp_path: Path, reference: str) -> None:
     log = tmp_path / "log"
     builder = _start(tmp_path, log, 0.3)
-    _wait_for(log, f"{builder.pid} {NODES}", 4)
+    _wait_for(log, f"{builder.pid} {FIT}")
     builder.send_signal(signal.SIGSTOP)  # on a busy machine it would end before the other begins
     waiter = _start(tmp_path, log, 0.0)
     _wait_for(log, f"{waiter.pid} waiting for another process")
@@ -365,33 +304,22 @@ def test_a_killed_builder_frees_the_lock_and_leaves_its_work(
     assert waiter.returncode == 0, err
     assert out.strip() == reference
     lines = log.read_text().splitlines()
-    assert f"{waiter.pid} {DENSE}" not in lines
-    assert sum(line.endswith(DENSE) for line in lines) == 1
-    assert f"{KEY}.npz" in files(tmp_path)
-    assert not list(tmp_path.glob("*.lock"))
-    assert not list(tmp_path.glob("*.work"))
+    assert sum(line == f"{waiter.pid} {DENSE}" for line in lines) == 1
+    assert files(tmp_path) == [f"{KEY}.npz", "log"]
 
 
-def test_ctrl_c_ends_a_build_at_once_and_the_next_goes_on(tmp_path: Path, reference: str) -> None:
+def test_ctrl_c_ends_a_build_at_once(tmp_path: Path) -> None:
     log = tmp_path / "log"
     folder = tmp_path / "cache"
     builder = _start(folder, log, 0.3)
-    _wait_for(log, NODES, 4)
+    _wait_for(log, FIT)
     start = time.monotonic()
     builder.send_signal(signal.SIGINT)
     _, err = builder.communicate(timeout=60)
     assert time.monotonic() - start < 5.0
     assert builder.returncode != 0
     assert "KeyboardInterrupt" in err
-    assert files(folder)[0] == f"{KEY}.work"
-    kept = sum("potentials-" in name for name in files(folder))
-    assert kept >= 3
-    stages = Stages()
-    field = load_or_build(tiny_design(), SETTINGS, cache_dir=folder, progress=stages)
-    assert digest(field) == reference
-    assert stages.count(DENSE) == 0
-    assert stages.count(NODES) == -(-int(field.lattice.unknown.sum()) // PART) - kept
-    assert files(folder) == [f"{KEY}.npz"]
+    assert files(folder) == []
 
 
 def test_threads_build_once(tmp_path: Path, reference: str) -> None:

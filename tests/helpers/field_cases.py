@@ -21,7 +21,6 @@ import capsense as cs
 from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Design, Domain, Electrode
 from capsense.field.background import BuildSettings
-from capsense.field.lattice import LatticeSettings
 
 Array = NDArray[np.float64]
 
@@ -29,7 +28,7 @@ DATA = Path(__file__).parents[1] / "data"
 PICO = 1e-12
 BAR = (0.15, 0.15, 0.02)
 """The bar of the reference cases [m]."""
-COARSE = BuildSettings(lattice=LatticeSettings().refined(0.5), panel_scale=2.0)
+COARSE = BuildSettings().refined(0.5)
 """Settings for what does not ask for accuracy: a field is built in a second or two."""
 
 

@@ -38,11 +38,14 @@ def scene_at(k: int) -> cs.Scene:
     return cs.Scene(out)
 
 
-def frame_at(k: int) -> cs.DepthFrame:
-    """Sample k of a depth camera: two materials, rows stored top down, a camera that turns."""
+def frame_at(k: int, other: float = np.inf) -> cs.DepthFrame:
+    """Sample k of a depth camera: rows stored top down, a camera that turns.
+
+    The half on the right has permittivity ``other``; the surface solver knows conductors only.
+    """
     y, x = np.mgrid[0:24, 0:32]
     depth = np.where((x > 5) & (x < 20) & (y > 3) & (y < 15), 0.06 + 0.002 * k + 0.001 * y, np.nan)
-    eps_r = np.where(x < 12, np.inf, 4.0)
+    eps_r = np.where(x < 12, np.inf, other)
     pose = cs.Pose.from_euler((0.001 * k, 0.0, 0.0), (0.0, 0.0, 0.05 * k))
     camera = cs.OrthographicCamera(0.2, 0.15, pose, far=0.4, rows="-y", columns="-x")
     return cs.DepthFrame(depth, eps_r, camera, back=0.02)

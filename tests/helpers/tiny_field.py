@@ -1,7 +1,7 @@
 """A design whose field is built in a fraction of a second, and a process that builds it.
 
 ``python tiny_field.py CACHE LOG DELAY`` writes each stage to LOG as ``PID STAGE``, pausing DELAY
-seconds at every part of the field, and prints a digest of the field.
+seconds at every stage of it, and prints a digest of the field.
 """
 
 from __future__ import annotations
@@ -17,15 +17,12 @@ import numpy as np
 
 from capsense.design import Design
 from capsense.design.loader import parse_design
-from capsense.field import background
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.cache import load_or_build
 from capsense.field.green import to_arrays
-from capsense.field.lattice import LatticeSettings
+from capsense.mesh.settings import MeshSettings
 
-SETTINGS = BuildSettings(LatticeSettings().refined(0.5), panel_scale=8.0)
-PART = 32
-"""Nodes of a part; so few that the tiny field has many parts."""
+SETTINGS = BuildSettings(panel_scale=8.0, mesh=MeshSettings().refined(0.5))
 
 
 def tiny_data(**changes: Any) -> dict[str, Any]:
@@ -48,15 +45,8 @@ def tiny_design(**changes: Any) -> Design:
 
 def arrays(field: BackgroundField) -> dict[str, np.ndarray]:
     """All arrays of a field."""
-    la = field.lattice
-    out = {
-        **{f"axis {k} {n}": a for k, s in enumerate(la.storeys) for n, a in enumerate(s.axes)},
-        "weights": la.weights, "eps_r": la.eps_r, "owner": la.owner, "kink": la.kink,
-        "half_weights": field.half_weights, "potentials": field.potentials,
-        "capacitance": field.capacitance,
-        **{f"green {name}": values for name, values in to_arrays(field.green).items()},
-    }  # fmt: skip
-    return {**out, **{f"cut {k}": v for k, v in vars(la.cuts).items()}}
+    green = {f"green {name}": values for name, values in to_arrays(field.green).items()}
+    return {"capacitance": field.capacitance, **green}
 
 
 def digest(field: BackgroundField) -> str:
@@ -70,13 +60,11 @@ def digest(field: BackgroundField) -> str:
 def main() -> None:
     """Build, and report."""
     cache, log, delay = Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3])
-    background._PART, background._SAVE_EVERY = PART, 0.0
 
     def progress(stage: str, fraction: float) -> None:
         with log.open("a") as stream:
             stream.write(f"{os.getpid()} {stage}\n")
-        if stage == "field at the nodes":
-            time.sleep(delay)
+        time.sleep(delay)
 
     field = load_or_build(tiny_design(), SETTINGS, cache_dir=cache, progress=progress)
     sys.stdout.write(f"{digest(field)}\n")

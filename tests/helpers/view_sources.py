@@ -25,7 +25,7 @@ class Stated:
         self.title, self.design = title, cs.load_design("patch")
         self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
         self.empty = self.reading(-1)
-        self.lattice = None
+        self.green = None
         self.closed = False
 
     def reading(self, k: int) -> cs.Reading:
@@ -44,15 +44,16 @@ class Counting(Stated):
     def __init__(self, count: int = 20, period: float = 1e-3) -> None:
         super().__init__("counting")
         self.times = period * np.arange(count)
-        self.asked: list[tuple[int, bool]] = []
+        self.asked: list[tuple[int, object]] = []
         self.broken: set[int] = set()
 
-    def shot(self, index: int, *, field: bool) -> Shot:
-        self.asked.append((index, field))
+    def shot(self, index: int, plane: object = None) -> Shot:
+        self.asked.append((index, plane))
         if index in self.broken:
             raise SolveError(f"sample {index} was not solved")
-        potentials = np.full((3, 2), float(index)) if field else None
-        return Shot(index, float(self.times[index]), cs.Scene(), self.reading(index), potentials)
+        potentials = None if plane is None else np.full((3, 2), float(index))
+        time = float(self.times[index])
+        return Shot(index, time, cs.Scene(), self.reading(index), plane, potentials)
 
 
 class Queued(Stated):
@@ -65,7 +66,7 @@ class Queued(Stated):
 
     def put(self, count: int = 1) -> None:
         for k in range(self.count, self.count + count):
-            self.items.put(Shot(k, 0.1 * k, cs.Scene(), self.reading(k), None))
+            self.items.put(Shot(k, 0.1 * k, cs.Scene(), self.reading(k)))
         self.count += count
 
     def next(self, timeout: float) -> Shot | None:
@@ -77,7 +78,7 @@ class Queued(Stated):
             raise item
         return item
 
-    def potentials(self, shot: Shot) -> np.ndarray:
+    def potentials(self, shot: Shot, plane: object) -> np.ndarray:
         return np.full((3, 2), float(shot.index))
 
 

@@ -17,7 +17,7 @@ import capsense.mesh.gmsh_mesher as mesher
 from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.errors import MeshError, MissingDependencyError
-from capsense.field.stiffness import capacitance_p1
+from capsense.masked.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, mesh_design
 
 gmsh = pytest.importorskip("gmsh", exc_type=(ImportError, OSError))

@@ -7,7 +7,7 @@ import pytest
 
 from capsense.constants import EPS0
 from capsense.errors import MeshError
-from capsense.field.stiffness import link_weights, stiffness
+from capsense.masked.stiffness import link_weights, stiffness
 from capsense.mesh import kuhn_tets
 
 X = np.array([-1.0, -0.4, 0.1, 1.3])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capsense.errors import MeshError
-from capsense.field.stiffness import link_weights
+from capsense.masked.stiffness import link_weights
 from capsense.mesh import TetMesh, kuhn_tets
 
 UNIT = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)

@@ -23,8 +23,13 @@ PAIRS = electrode_pairs(6, diagonal=True)
 def sensor(simulators):
     """A simulator, and its potentials on a grid."""
     sim = simulators("six_patch")
-    field = sim.background
-    return sim, lambda grid: field.lattice.on_grid(field.potentials[:, :6], grid)
+
+    def potentials(grid):
+        nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
+        sim.step(cs.Scene())
+        return sim.potentials(nodes.reshape(-1, 3))[:, :6].reshape(*nodes.shape[:3], 6)
+
+    return sim, potentials
 
 
 def change(sim, body):

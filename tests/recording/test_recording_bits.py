@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -231,7 +232,7 @@ def test_steps_come_back(recorded: Recorded) -> None:
         for name in ("capacitance", "delta", "self_capacitance"):
             a, b = getattr(step.reading, name), getattr(reading, name)
             assert a.tobytes() == b.tobytes()
-        assert step.reading.stats == reading.stats
+        assert step.reading.stats == dataclasses.replace(reading.stats, unknowns=0)  # not kept
         assert reading.counts is not None
         if len(reading.counts):
             assert step.reading.counts is not None
@@ -257,11 +258,9 @@ def test_replay_is_the_same_to_the_last_bit(recorded: Recorded) -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"tolerance": 1e-16, "relative_tolerance": 1e-2},
         {"frequency": 10e6},
         {"method": "masked"},
-        {"method": "surface"},
-        {"method": "surface", "preset": "fine"},
+        {"preset": "fine"},
     ],
     ids=lambda o: "-".join(o),
 )
@@ -271,8 +270,7 @@ def test_design_and_settings_are_taken_over(
     """The file is all that a replay needs. With the simulator's defaults it would differ."""
     design, path = tiny_design(), tmp_path / "a.mcap"
     sim = cs.Simulator(design, settings=SETTINGS, cache_dir=field_cache, **options)  # type: ignore[arg-type]
-    other = {} if "preset" not in options else {"method": "surface"}
-    plain = cs.Simulator(design, settings=SETTINGS, cache_dir=field_cache, **other)
+    plain = cs.Simulator(design, settings=SETTINGS, cache_dir=field_cache)
     ball = cs.Body(cs.Sphere(0.012), material="cortical bone")
     differs = False
     with cs.record(path, sim, name="left_wrist") as run:

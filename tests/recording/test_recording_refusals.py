@@ -57,7 +57,7 @@ def test_a_step_that_fails_needs_a_reset(
 ) -> None:
     """What a failed step leaves in the solver is not known to a replay."""
 
-    def fail(_: object) -> None:
+    def fail(_: object, *, jacobian: bool = False) -> None:
         raise cs.SolveError("the residual is 1e-3")
 
     with cs.record(path, sim) as run:

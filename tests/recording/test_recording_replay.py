@@ -193,5 +193,6 @@ def test_attachments_are_plain_json(tampered: Path) -> None:
 
     with tampered.open("rb") as file:
         found = {a.name: json.loads(a.data) for a in make_reader(file).iter_attachments()}
-    assert found["session.json"]["relative_tolerance"] == 1e-5
+    assert found["session.json"]["method"] == "surface"
+    assert found["session.json"]["settings"]["panel_scale"] == 1.0
     assert [e["name"] for e in found["design.json"]["electrodes"]][:2] == ["E1", "E2"]

@@ -18,8 +18,8 @@ from capsense.viewer.follower import Follower
 def followed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Queued, Follower]]:
     monkeypatch.setattr(follower, "KEPT", 10)
     stream = Queued()
-    stream.lattice = object()  # potentials are given
     player = Follower(stream)  # type: ignore[arg-type]
+    player.plane = object()
     yield stream, player
     player.stop()
     assert stream.closed
@@ -50,6 +50,10 @@ def test_holds_and_looks_back(followed: tuple[Queued, Follower]) -> None:
     player.step(-2)
     assert player.newest.index == 1
     until(lambda: player.with_field.index == 1)
+    assert player.with_field.plane is player.plane
+    player.plane = object()  # moved while the sample is held
+    until(lambda: player.with_field.plane is player.plane)
+    assert player.with_field.index == 1
     player.step(1)
     assert player.newest.index == 2
     player.go(1000)

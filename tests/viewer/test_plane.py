@@ -1,4 +1,4 @@
-"""Planes through the lattice, and the potentials they show."""
+"""Planes in front of the sensor, and the potentials they show."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.viewer.plane import OCTAVES, Plane, interpolation, paint, palette, region
+from capsense.viewer.plane import NEAR, OCTAVES, Plane, is_flat, paint, palette, region
 
 
 @pytest.fixture(scope="module")
@@ -14,60 +14,90 @@ def simulator() -> cs.Simulator:
     return cs.Simulator("six_patch")
 
 
-def test_interpolation(simulator: cs.Simulator) -> None:
-    """A linear function is carried exactly to any point of all storeys; nodes are kept."""
-    lattice = simulator.background.lattice
-    assert len(lattice.storeys) > 1
-    slope = np.array([1.0, -2.0, 3.0])
-    bounds = np.array(lattice.bounds)
-    points = np.random.default_rng(7).uniform(bounds[:, 0], bounds[:, 1], (2000, 3))
-    matrix = interpolation(lattice, points)
-    np.testing.assert_allclose(matrix @ (lattice.points @ slope), points @ slope, atol=1e-12)
-    np.testing.assert_allclose(matrix.sum(axis=1), 1.0)
-    assert matrix.data.min() >= 0
-    corners = bounds[:, [0, 1]].T
-    np.testing.assert_allclose(
-        interpolation(lattice, corners) @ (lattice.points @ slope), corners @ slope
-    )
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_plane(simulator: cs.Simulator, axis: int) -> None:
-    """Its points lie on it, in the region, evenly."""
+    """Its points lie on it, in the region, evenly; hardly any is left out."""
     bounds = region(simulator.design)
-    plane = Plane(simulator.background.lattice, bounds, axis, 0.02)
-    points = plane.points.reshape(-1, 3)
-    assert set(points[:, axis]) == {0.02}
-    assert (points >= bounds[:, 0] - 1e-12).all()
-    assert (points <= bounds[:, 1] + 1e-12).all()
-    steps = np.diff(plane.points, axis=0)[..., 1 if axis == 0 else 0]
-    np.testing.assert_allclose(steps, plane.pitch)
-    height = plane.sample(simulator.background.lattice.points[:, 2])
-    np.testing.assert_allclose(height, plane.points[..., 2], atol=1e-12)
+    plane = Plane(simulator.background.green, bounds, axis, 0.02)
+    for points, pitch in ((plane.drawn, plane.pitch), (plane.points, None)):
+        assert set(points[:, axis]) == {0.02}
+        assert (points >= bounds[:, 0] - 1e-12).all()
+        assert (points <= bounds[:, 1] + 1e-12).all()
+        lines = [np.unique(points[:, k]) for k in range(3) if k != axis]
+        assert len(points) > 0.998 * len(lines[0]) * len(lines[1])
+        for line in lines:
+            steps = np.diff(line)
+            np.testing.assert_allclose(steps, pitch or steps[0])
+    assert len(plane.points) < 0.08 * len(plane.drawn)
+
+
+def test_carrying_keeps_linear_functions(simulator: cs.Simulator) -> None:
+    """To any point that is drawn, the ends of the region included."""
+    slope = np.array([1.0, -2.0, 3.0])
+    for axis in range(3):
+        plane = Plane(simulator.background.green, region(simulator.design), axis, 0.03)
+        np.testing.assert_allclose(
+            plane.carried(plane.points @ slope), plane.drawn @ slope, atol=1e-12
+        )
 
 
 def test_plane_outside_is_taken_in(simulator: cs.Simulator) -> None:
     """A coordinate beyond the region is its end."""
     bounds = region(simulator.design)
-    assert Plane(simulator.background.lattice, bounds, 0, 9.0).at == bounds[0, 1]
+    assert Plane(simulator.background.green, bounds, 0, 9.0).at == bounds[0, 1]
 
 
-def test_region(simulator: cs.Simulator) -> None:
-    """Around the electrodes, within the domain."""
-    bounds, domain = region(simulator.design), simulator.design.domain
+@pytest.mark.parametrize("name", cs.available_designs())
+def test_region(name: str) -> None:
+    """Around the electrodes, within the domain; of a flat design, in front of all it is made of."""
+    design = cs.load_design(name)
+    bounds, domain = region(design), design.domain
+    assert is_flat(design) == (name != "arm_segment")
     assert (bounds[:, 0] >= domain.lower).all()
     assert (bounds[:, 1] <= domain.upper).all()
-    for electrode in simulator.design.electrodes:
+    for electrode in design.electrodes:
         low, high = electrode.surface.bounds
-        assert (low >= bounds[:, 0]).all()
-        assert (high <= bounds[:, 1]).all()
+        assert (low[:2] >= bounds[:2, 0]).all()
+        assert (high[:2] <= bounds[:2, 1]).all()
+    if is_flat(design):
+        parts = [b.surface.bounds[1, 2] for b in design.sheets]
+        assert bounds[2, 0] == max(parts + [layer.upper[2] for layer in design.layers])
+
+
+def test_points_close_to_charges_are_left_out() -> None:
+    """Planes of a curved sensor go through what it is made of."""
+    simulator = cs.Simulator("arm_segment")
+    green, bounds = simulator.background.green, region(simulator.design)
+    middle = green.near_sources[np.argmin(np.abs(green.near_sources[:, 1]))]
+    plane = Plane(green, bounds, 1, float(middle[1]))
+    away = np.linalg.norm(plane.drawn[:, None] - green.near_sources, axis=2).min(axis=1)
+    assert NEAR <= away.min() < NEAR + plane.pitch
+
+
+def test_potentials_on_a_plane(simulator: cs.Simulator) -> None:
+    """Near 1 V in front of the electrode, falling with height; a grounded body is at 0 V."""
+    centre = simulator.design.electrodes[1].surface.bounds.mean(axis=0)
+    plane = Plane(simulator.background.green, region(simulator.design), 1, float(centre[1]))
+    ball = cs.Body(cs.Sphere(0.02), cs.Pose((centre[0], centre[1], 0.06)), "steel")
+    x, _, z = plane.drawn.T
+    above = np.abs(x - centre[0]) < 0.6 * plane.pitch
+    lowest = above & (z < z.min() + 0.5 * plane.pitch)
+    inside = np.linalg.norm(plane.drawn - ball.pose.position, axis=1) < 0.012
+    simulator.step(cs.Scene())
+    empty = plane.carried(simulator.potentials(plane.points)[:, 1])
+    simulator.step(cs.Scene([ball]))
+    found = plane.carried(simulator.potentials(plane.points)[:, 1])
+    assert (empty[lowest] > 0.8).all()
+    line = empty[above & (x == x[above][0])]
+    assert (np.diff(line) < 0).all()
+    assert np.abs(found[inside]).max() < 0.05 * empty[inside].max()
 
 
 def test_paint() -> None:
     """One colour for each halving; nothing below the last, nor below zero."""
-    potential = np.array([[1.0, 0.51, 0.49], [2.0**-OCTAVES * 1.01, 2.0**-OCTAVES * 0.99, -0.1]])
+    potential = np.array([1.0, 0.51, 0.49, 2.0**-OCTAVES * 1.01, 2.0**-OCTAVES * 0.99, -0.1])
     shown, colours = paint(potential)
-    np.testing.assert_array_equal(shown, [[True, True, True], [True, False, False]])
+    np.testing.assert_array_equal(shown, [True, True, True, True, False, False])
     c = palette()
     np.testing.assert_array_equal(colours, c[[-1, -1, -2, 0]])
     assert len(np.unique(c, axis=0)) == OCTAVES

@@ -37,7 +37,7 @@ def test_first_sample_and_pause() -> None:
         assert shows(player, 0)()
         assert not player.playing
         assert player.span == (0, 19)
-    assert source.asked == [(0, True)]
+    assert source.asked == [(0, None)]
 
 
 def test_plays_every_sample_to_the_end() -> None:
@@ -126,15 +126,17 @@ def test_a_failure_stops_time_and_is_told() -> None:
 
 def test_potentials_as_wanted() -> None:
     """Taken when paused; while time runs, not of every sample; not at all where not wanted."""
-    source = Counting(200)
+    source, plane = Counting(200), object()
     with playing(source, speed=0.0) as player:
         player.loop = False
+        player.plane = plane
         player.play()
         until(lambda: not player.playing)
-        assert sum(field for _, field in source.asked) < 100
+        assert sum(asked is plane for _, asked in source.asked) < 100
         player.pause()
         until(lambda: player.with_field is not None and player.with_field.index == 199)
-        player.field = False
+        assert player.with_field.plane is plane
+        player.plane = None
         player.go(3)
         until(shows(player, 3))
         assert player.with_field.index == 199

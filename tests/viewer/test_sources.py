@@ -12,6 +12,7 @@ import pytest
 import capsense as cs
 from capsense.errors import ProtocolError, RecordingError, ServerError
 from capsense.scenario import parse_scenario
+from capsense.viewer.plane import Plane, region
 from capsense.viewer.source import RecordingSource, ScenarioSource, Shot
 
 DATA = {
@@ -33,22 +34,24 @@ def test_scenario() -> None:
     source = ScenarioSource(scenario, cs.Simulator("six_patch"))
     assert source.title == "a ball goes by"
     np.testing.assert_array_equal(source.times, scenario.times)
-    for index, field in ((3, True), (0, False), (5, True)):
-        shot = source.shot(index, field=field)
+    assert source.green is not None
+    plane = Plane(source.green, region(source.design), 1, 0.0)
+    for index, wanted in ((3, plane), (0, None), (5, plane)):
+        shot = source.shot(index, wanted)
         assert (shot.index, shot.time) == (index, scenario.times[index])
         expected = cs.Simulator("six_patch").step(scenario.scene_at(shot.time))
-        np.testing.assert_allclose(shot.reading.delta, expected.delta, rtol=1e-3, atol=1e-17)
-        assert (shot.potentials is not None) == field
-    assert source.lattice is not None
-    assert shot.potentials.shape == (source.lattice.n_nodes, 6)
+        np.testing.assert_array_equal(shot.reading.delta, expected.delta)
+        assert shot.plane is wanted
+        assert (shot.potentials is None) == (wanted is None)
+    assert shot.potentials.shape == (len(plane.points), 6)
     source.close()
 
 
 def test_masked_gives_no_potentials() -> None:
-    """The other method has no lattice to show."""
+    """The other method solves on a mesh of its own."""
     source = ScenarioSource(parse_scenario(DATA), cs.Simulator("six_patch", method="masked"))
-    assert source.lattice is None
-    assert source.shot(0, field=True).potentials is None
+    assert source.green is None
+    assert source.shot(0).potentials is None
 
 
 def test_recording(tmp_path: Path) -> None:
@@ -65,11 +68,12 @@ def test_recording(tmp_path: Path) -> None:
             written.append(reading)
     source = RecordingSource(cs.open_recording(tmp_path / "a.mcap"))
     np.testing.assert_allclose(source.times, scenario.times)
+    plane = Plane(source.green, region(source.design), 2, 0.02)
     for index in (4, 1):
-        shot = source.shot(index, field=index == 1)
+        shot = source.shot(index, plane if index == 1 else None)
         np.testing.assert_array_equal(shot.reading.delta, written[index].delta)
         assert [b.name for b in shot.scene] == ["ball"]
-    assert shot.potentials.shape == (source.lattice.n_nodes, 6)
+    assert shot.potentials.shape == (len(plane.points), 6)
 
 
 def test_empty_recording(tmp_path: Path) -> None:
@@ -111,7 +115,7 @@ class TestWatched:
         from capsense.viewer.watched import Watched
 
         with RunningServer("six_patch", watch=True) as server, server.client() as client:
-            sensor = client.open(material="wood", back=0.02)
+            sensor = client.open(material="steel", back=0.02)
             source = Watched(server.url)
             np.testing.assert_array_equal(source.empty.capacitance, sensor.baseline)
             assert source.next(0.01) is None
@@ -130,18 +134,21 @@ class TestWatched:
 
             mine = cs.Simulator("six_patch")
             mine.step(two.scene)
-            np.testing.assert_allclose(source.potentials(two), mine.potentials(), atol=1e-4)
+            plane = Plane(source.green, region(source.design), 0, 0.0)
+            np.testing.assert_array_equal(
+                source.potentials(two, plane), mine.potentials(plane.points)
+            )
 
             depth = np.full((16, 16), np.nan)
             depth[6:10, 6:10] = 0.07
             answer = sensor.step(depth)
             three = self.next_of(source)
             expected = cs.Simulator("six_patch").step(
-                cs.DepthFrame(np.float32(depth), "wood", back=0.02)
+                cs.DepthFrame(np.float32(depth), "steel", back=0.02)
             )
             np.testing.assert_array_equal(three.reading.delta, answer.delta)
             np.testing.assert_allclose(answer.delta, expected.delta, rtol=1e-3, atol=1e-18)
-            assert next(iter(three.scene)).material.name == "wood"
+            assert next(iter(three.scene)).material.name == "steel"
             source.close()
 
     def test_waits_for_the_next_client(self) -> None:

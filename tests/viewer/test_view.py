@@ -120,10 +120,11 @@ def test_plane(server: Any) -> None:
     server.scene.reset()
     simulator = cs.Simulator("six_patch")
     stage = Stage(server, simulator.design)
-    plane = Plane(simulator.background.lattice, region(simulator.design), 1, 0.0)
-    stage.show_plane(plane, simulator.background.potentials[:, 1])
+    plane = Plane(simulator.background.green, region(simulator.design), 1, 0.0)
+    simulator.step(cs.Scene())
+    stage.show_plane(plane, simulator.potentials(plane.points)[:, 1])
     cloud = server.scene._handle_from_node_name["/potential"]
-    assert 1000 < len(cloud.points) < plane.points.shape[0] * plane.points.shape[1]
+    assert 1000 < len(cloud.points) < len(plane.drawn)
     assert np.abs(cloud.points[:, 1].astype(float)).max() == 0
     stage.hide_plane()
     assert "/potential" not in server.scene._handle_from_node_name

@@ -60,12 +60,12 @@ def execute(args: argparse.Namespace) -> int:
 
 def report(figures: dict[str, Any]) -> str:
     """The figures as text."""
-    from capsense.cli.tables import facts, grouped, seconds, table
+    from capsense.cli.tables import facts, seconds, table
 
     head = [
         ("machine", f"{figures['machine']}, {figures['cpus']} cores, load {figures['load']:.2f}"),
         ("versions", ", ".join(f"{k} {v}" for k, v in figures["versions"].items())),
-        ("design", f"{figures['design']}, {grouped(figures['tetrahedra'])} tetrahedra"),
+        ("design", f"{figures['design']}, preset {figures['preset']}"),
         ("import", seconds(figures["import_s"])),
         ("start", seconds(figures["simulator_s"])),
         (
@@ -79,19 +79,16 @@ def report(figures: dict[str, Any]) -> str:
         (
             name,
             *(f"{row[key]:.2f}" for key in times),
-            f"{row['iterations']:g}",
+            f"{row['unknowns']:g}",
             f"{100 * row['error']:.2f}",
         )
         for name, row in figures["worlds"].items()
     ]
-    columns = ("world", "median [ms]", "p95 [ms]", "p99 [ms]", "processor [ms]", "iterations",
+    columns = ("world", "median [ms]", "p95 [ms]", "p99 [ms]", "processor [ms]", "unknowns",
                "error [%]")  # fmt: skip
-    batches = [
-        f"batch of {row['scenes']} scenes, {row['threads']} threads, {start}: "
+    row = figures["batch"]
+    batch = (
+        f"batch of {row['scenes']} scenes, {row['threads']} threads: "
         f"{row['clock_per_s']:.0f} scenes a second (processor: {row['per_s']:.0f})"
-        for row, start in (
-            (figures["batch"], "each from rest"),
-            (figures["worlds_at_once"], "each after one before"),
-        )
-    ]
-    return "\n\n".join([facts(head), table(columns, rows), "\n".join(batches)])
+    )
+    return "\n\n".join([facts(head), table(columns, rows), batch])

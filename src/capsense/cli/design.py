@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from capsense.simulator import Simulator
 
 NAME = "design"
-HELP = "print a sensor design with its mesh and baseline figures, or draw it"
+HELP = "print a sensor design with its field's figures and baseline, or draw it"
 DESCRIPTION = """\
-Print what a sensor design is made of, the figures of its mesh, and its baseline: the
+Print what a sensor design is made of, the figures of its field, and its baseline: the
 capacitance matrix with nothing in front of it. The field is computed at a design's first
 use and kept in the user's cache; --no-build leaves it alone.
 """
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"draw the layout to this file ({', '.join(PICTURES)}); without it nothing is drawn",
     )
     parser.add_argument(
-        "--no-build", action="store_true", help="leave out the mesh and baseline figures"
+        "--no-build", action="store_true", help="leave out the field's figures and the baseline"
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
 
@@ -158,13 +158,13 @@ def _area(surface: Surface) -> str:
 
 
 def describe_field(simulator: Simulator) -> str:
-    """Mesh figures and baseline matrix, as text."""
+    """Figures of the field and baseline matrix, as text."""
     from capsense.cli.tables import facts, field_figures, grouped, table
 
     names = simulator.electrode_names
-    mesh = facts((str(key), grouped(value)) for key, value in field_figures(simulator).items())
+    figures = facts((str(key), grouped(value)) for key, value in field_figures(simulator).items())
     rows = [
         (name, *(f"{c * 1e12:.4f}" for c in row))
         for name, row in zip(names, simulator.baseline, strict=True)
     ]
-    return f"{mesh}\n\n{table(('baseline [pF]', *names), rows)}"
+    return f"{figures}\n\n{table(('baseline [pF]', *names), rows)}"

@@ -109,7 +109,7 @@ class Recorder:
             stats.iterations,
             stats.error_estimate,
             stats.wall_time,
-            stats.tolerance,
+            stats.unknowns,
         )
         self._rows.writerow(csv_row(sample.time, self._values[k], self.levels))
         self._file.flush()
@@ -156,7 +156,7 @@ class Recorder:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
     def summary(
-        self, mesh: dict[str, Any], *, interrupted: bool, failure: str | None
+        self, field: dict[str, Any], *, interrupted: bool, failure: str | None
     ) -> dict[str, Any]:
         """What ``summary.json`` holds."""
         scenario, n = self.scenario, self.count
@@ -168,7 +168,7 @@ class Recorder:
             "electrodes": list(scenario.design.electrode_names),
             "shields": sum(c.role == "shield" for c in scenario.design.conductors),
             "bodies": [b.body.name for b in scenario.bodies],
-            "mesh": mesh,
+            "field": field,
             "method": scenario.method,
             "excitation": scenario.excitation.value,
             "sample_rate_Hz": scenario.sample_rate,
@@ -177,9 +177,9 @@ class Recorder:
             "interrupted": interrupted,
             "failure": failure,
             "step_time_s": _quantiles(stats[:, 2]),
+            "unknowns": _quantiles(stats[:, 3]),
             "iterations": _quantiles(stats[:, 0]),
             "largest_error_estimate_F": _largest(stats[:, 1]),
-            "tolerance_F": _largest(stats[:, 3]),
             "channels": [
                 self._channel_summary(k, channel) for k, channel in enumerate(scenario.channels)
             ],

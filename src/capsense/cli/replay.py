@@ -27,6 +27,7 @@ Another processor, or another version of numba or NumPy, may change the last dig
 EXAMPLES = """\
   capsense replay hand.mcap
   capsense replay hand.mcap --tolerance 1e-19    differences up to 0.1 aF are allowed
+  capsense replay old.mcap --method surface      recorded by a version with other methods
 """
 
 
@@ -37,6 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tolerance", metavar="F", type=float, default=0.0,
         help="difference of a capacitance that is allowed, in farads; default 0",
     )  # fmt: skip
+    parser.add_argument(
+        "--method",
+        choices=("surface", "masked"),
+        help="simulate with this method instead of the recorded one",
+    )
     parser.add_argument(
         "-q", "--quiet", action="store_true", help="no progress bar, no summary; errors only"
     )
@@ -60,7 +66,11 @@ def execute(args: argparse.Namespace) -> int:
         BuildProgress(shown=shown) as progress,
     ):
         found = replay(
-            recording, tolerance=args.tolerance, progress=progress, each=lambda _: bar.update()
+            recording,
+            method=args.method,
+            tolerance=args.tolerance,
+            progress=progress,
+            each=lambda _: bar.update(),
         )
     if not args.quiet:
         print(_report(found))

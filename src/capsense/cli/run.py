@@ -145,13 +145,8 @@ def build_simulator(scenario: Scenario, *, quiet: bool) -> Simulator:
     import capsense
     from capsense.cli.progress import BuildProgress
 
-    settings: dict[str, Any] = {}
-    if scenario.tolerance is not None:
-        settings["tolerance"] = scenario.tolerance
     with BuildProgress(shown=progress_shown(quiet)) as progress:
-        return capsense.Simulator(
-            scenario.design, method=scenario.method, progress=progress, **settings
-        )
+        return capsense.Simulator(scenario.design, method=scenario.method, progress=progress)
 
 
 def play_samples(
@@ -191,7 +186,7 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     from capsense.cli.recorder import FILES
     from capsense.cli.tables import facts, grouped, seconds, table
 
-    mesh = ", ".join(f"{grouped(value)} {key}" for key, value in summary["mesh"].items())
+    field = ", ".join(f"{grouped(value)} {key}" for key, value in summary["field"].items())
     samples = f"{summary['samples']} of {summary['samples_planned']}"
     if summary["interrupted"]:
         samples += ", interrupted"
@@ -200,15 +195,15 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     lines = [
         ("scenario", summary["scenario"]),
         ("design", f"{summary['design']}, {len(summary['electrodes'])} electrodes"),
-        ("mesh", mesh),
+        ("field", field),
         ("samples", f"{samples}, at {summary['sample_rate_Hz']:g} Hz"),
     ]
     step = summary["step_time_s"]
     if step is not None:
         times = [f"{name} {seconds(step[key])}" for name, key in _STEP_TIMES]
-        error, tolerance = summary["largest_error_estimate_F"], summary["tolerance_F"]
         lines.append(("step time", ", ".join(times)))
-        lines.append(("error", f"at most {error:.2g} F estimated, tolerance {tolerance:.2g} F"))
+        error = summary["largest_error_estimate_F"]
+        lines.append(("error", f"at most {error:.2g} F estimated"))
     blocks = [facts(lines)]
     channels = summary["channels"]
     if step is not None:

@@ -52,6 +52,6 @@ def grouped(value: object) -> str:
 
 
 def field_figures(simulator: Simulator) -> dict[str, float | int | str]:
-    """The figures of a design's mesh and field, without what is printed elsewhere."""
+    """The figures of a design's field, without what is printed elsewhere."""
     told = ("design", "electrodes", "method")
     return {key: value for key, value in simulator.describe().items() if key not in told}

@@ -11,7 +11,7 @@ import logging
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -27,7 +27,6 @@ from capsense.field.background import (
     build_background,
 )
 from capsense.field.boundary import terminals
-from capsense.field.checkpoint import FolderCheckpoint
 from capsense.field.lock import exclusive
 from capsense.field.store import (
     FORMAT,
@@ -43,7 +42,7 @@ Progress = Callable[[str, float], None]
 
 
 def cache_key(design: Design, settings: BuildSettings) -> str:
-    """Hash of everything a background field depends on.
+    """Hash of everything a background field depends on; the mesh of ``"masked"`` is not of it.
 
     The content hash of a design leaves the order of shields and floating conductors out, but their
     columns of a field come in that order, so it enters here.
@@ -53,7 +52,7 @@ def cache_key(design: Design, settings: BuildSettings) -> str:
     order = [
         Design("", design.domain, (), conductors=(by_name[name],)).content_hash() for name in extra
     ]
-    parts = [FORMAT, NUMERICS, design.content_hash(), order, sorted(asdict(settings).items())]
+    parts = [FORMAT, NUMERICS, design.content_hash(), order, settings.panel_scale]
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
@@ -70,9 +69,7 @@ def shipped_dir() -> Traversable:
 
 def default_settings(design: Design) -> BuildSettings:
     """Settings that a design's ``[build]`` table asks for."""
-    base = BuildSettings()
-    factor = float(design.build.get("resolution", 1.0))
-    return replace(base, lattice=base.lattice.refined(factor))
+    return BuildSettings().refined(float(design.build.get("resolution", 1.0)))
 
 
 def load_or_build(
@@ -85,9 +82,9 @@ def load_or_build(
 ) -> BackgroundField:
     """Return a design's background field: shipped, from the cache, or built and cached.
 
-    A build that was interrupted is continued. While another process builds the same field, this
-    one waits for it. A cache that is damaged or cannot be written is reported by a warning of
-    the logger ``capsense.field.cache``, and the field is built.
+    While another process builds the same field, this one waits for it. A cache that is damaged or
+    cannot be written is reported by a warning of the logger ``capsense.field.cache``, and the field
+    is built.
 
     Args:
         design: The design.
@@ -138,10 +135,8 @@ def _wait_or_build(
         if field is None:
             if locked:
                 _sweep(folder, key)
-            work = FolderCheckpoint(folder / f"{key}.work", key)
-            field = build_background(design, settings, progress, work)
+            field = build_background(design, settings, progress)
             _keep(field, folder, key)
-            work.clear()
         return field
 
 

@@ -1,4 +1,4 @@
-"""Fields and intermediate results as files: written whole or not at all, damage is detected.
+"""Fields as files: written whole or not at all, damage is detected.
 
 A file is an ``.npz`` archive followed by the SHA-256 of its bytes, so that whatever is read was
 written by this module and is complete. ``meta`` inside it says what the file is and for which key.
@@ -23,13 +23,11 @@ from numpy.typing import NDArray
 from capsense.errors import FieldError
 from capsense.field.background import BackgroundField
 from capsense.field.green import TABLES, from_arrays, to_arrays
-from capsense.field.lattice import Cuts, Joints, Lattice, Storey
 
-FORMAT = 4
+FORMAT = 5
 """Version of the stored form; part of the cache key."""
 
 _DIGEST = hashlib.sha256().digest_size
-_CUTS = ("axis", "node", "lower", "lower_owner", "upper", "upper_owner")
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -128,36 +126,21 @@ def save_background(
 ) -> None:
     """Write a field.
 
-    By default exactly. ``compact`` stores potentials and link weights in single precision, with a
-    relative error of 6e-8 everywhere, also far away where potentials are small, and packs harder.
-    ``note`` is kept in the file's meta.
+    Exactly: its tables are in single precision to begin with. ``compact`` packs harder, which takes
+    longer. ``note`` is kept in the file's meta.
 
     Raises:
         OSError: The file could not be written; nothing is left behind.
         FieldError: The field is not finite.
     """
-    la, green = field.lattice, to_arrays(field.green)
-    real = np.dtype("<f4" if compact else "<f8")
     arrays = {
-        **{
-            f"{what}_{name}{k}": values
-            for k, storey in enumerate(la.storeys)
-            for what, three in (("node", storey.axes), ("face", storey.faces))
-            for name, values in zip("xyz", three, strict=True)
-        },
-        "ceiling": la.joints.ceiling, "parent": la.joints.parent,
-        "eps_r": la.eps_r, "owner": la.owner.astype(np.int16), "kink": la.kink,
-        **{f"cut_{name}": getattr(la.cuts, name) for name in _CUTS},
-        "half_weights": field.half_weights, "capacitance": field.capacitance,
-        "weights": _byte_planes(la.weights.astype(real)),
-        "potentials": _byte_planes(field.potentials.T.astype(real)),
+        "capacitance": field.capacitance,
         **{
             f"green_{name}": _byte_planes(values.T) if name in TABLES else values
-            for name, values in green.items()
+            for name, values in to_arrays(field.green).items()
         },
-    }  # fmt: skip
-    packed = (la.weights, field.potentials, *green.values())
-    if not all(np.isfinite(values).all() for values in packed):
+    }
+    if not all(np.isfinite(values).all() for values in to_arrays(field.green).values()):
         raise FieldError(f"the field is not finite; it is not stored in {path}")
     meta = {
         **(note or {}),
@@ -178,20 +161,6 @@ def load_background(path: Path, key: str = "") -> BackgroundField:
 
 def to_background(arrays: Arrays, meta: Mapping[str, Any]) -> BackgroundField:
     """Put a field together from the content of its file."""
-    storeys: list[Storey] = []
-    while f"node_x{len(storeys)}" in arrays:
-        k = len(storeys)
-        nodes, faces = (
-            (arrays[f"{what}_x{k}"], arrays[f"{what}_y{k}"], arrays[f"{what}_z{k}"])
-            for what in ("node", "face")
-        )
-        storeys.append(Storey(nodes, faces, storeys[-1].stop if k else 0))
-    lattice = Lattice(
-        tuple(storeys), Joints(arrays["ceiling"], arrays["parent"]),
-        _from_byte_planes(arrays["weights"]), arrays["eps_r"],
-        arrays["owner"].astype(np.int64), arrays["kink"],
-        Cuts(*(arrays[f"cut_{name}"] for name in _CUTS)),
-    )  # fmt: skip
     green = {
         name.removeprefix("green_"): values
         for name, values in arrays.items()
@@ -199,11 +168,8 @@ def to_background(arrays: Arrays, meta: Mapping[str, Any]) -> BackgroundField:
     }
     green.update({name: _from_byte_planes(green[name]).T for name in TABLES})
     return BackgroundField(
-        lattice, arrays["half_weights"],
-        np.ascontiguousarray(_from_byte_planes(arrays["potentials"]).T),
-        arrays["capacitance"], tuple(meta["terminals"]), int(meta["n_panels"]),
-        from_arrays(green),
-    )  # fmt: skip
+        arrays["capacitance"], tuple(meta["terminals"]), int(meta["n_panels"]), from_arrays(green)
+    )
 
 
 def _byte_planes(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

@@ -149,7 +149,7 @@ class _Builder:
         return None
 
     def _step(self, m: Any, stamp: int) -> Step:
-        stats = StepStats(m.iterations, m.error_estimate, m.tolerance, m.wall_time)
+        stats = StepStats(m.error_estimate, m.wall_time, iterations=m.iterations)
         reading = reading_of(self._session.design, m.capacitance, m.delta, m.shield_coupling, stats)
         counts, self._counts = self._counts, None
         if counts is not None:

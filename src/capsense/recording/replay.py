@@ -14,7 +14,7 @@ from capsense.readout.counts import Counts
 from capsense.recording.reader import Recording, open_recording
 from capsense.recording.session import Session, shield_coupling
 from capsense.recording.versions import versions
-from capsense.simulator import Reading
+from capsense.simulator import Method, Reading
 
 Array = NDArray[np.float64]
 
@@ -65,6 +65,7 @@ class Replay:
 def replay(
     path: str | Path | Recording,
     *,
+    method: Method | None = None,
     tolerance: float = 0.0,
     cache_dir: Path | None = None,
     progress: Callable[[str, float], None] | None = None,
@@ -77,6 +78,7 @@ def replay(
 
     Args:
         path: The recording.
+        method: Simulate with this method instead of the recorded one.
         tolerance: Difference of a capacitance that is allowed [F]; counts must be the same, unless
             it is above zero.
         cache_dir: As for :class:`capsense.Simulator`.
@@ -84,7 +86,7 @@ def replay(
         each: Called after every step with how many were replayed.
 
     Raises:
-        RecordingError: The file is no recording, or damaged.
+        RecordingError: The file is no recording, or damaged, or made by a method that is gone.
         FieldError: The background field could not be built.
         SolveError: A step could not be solved.
     """
@@ -92,7 +94,7 @@ def replay(
         raise RecordingError(f"tolerance is {tolerance!r} F; give zero or more")
     recording = path if isinstance(path, Recording) else open_recording(path)
     session = recording.session
-    simulator = session.simulator(cache_dir=cache_dir, progress=progress)
+    simulator = session.simulator(method=method, cache_dir=cache_dir, progress=progress)
     simulator.reset()  # as the recorder did; the masked method keeps a solution from its making
     readout = session.new_readout()
     compare = _Comparison(session, tolerance)

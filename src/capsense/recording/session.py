@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from capsense.design.model import Design
 from capsense.errors import RecordingError
 from capsense.field.background import BuildSettings
-from capsense.field.lattice import LatticeSettings
+from capsense.mesh.settings import MeshSettings
 from capsense.readout.config import parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.recording.versions import versions
@@ -30,6 +30,8 @@ NAME = "capsense"
 """Of the metadata record that makes an MCAP file a recording."""
 DESIGN, SESSION = "design.json", "session.json"
 """The attachments."""
+GONE = ("perturbation",)
+"""Methods of earlier versions, which no longer exist; what they recorded can still be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +43,9 @@ class Session:
     title: str
     """What was recorded, in words."""
     design: Design
-    method: Method
-    """The simulator's."""
+    method: str
+    """The simulator's; one of ``METHODS``, or of :data:`GONE`."""
     preset: PresetName
-    """The simulator's."""
-    tolerance: float
-    """The simulator's [F]."""
-    relative_tolerance: float
     """The simulator's."""
     frequency: float
     """The simulator's [Hz]."""
@@ -70,17 +68,28 @@ class Session:
         return channels_of(self.excitation, self.design.electrode_names, self.pairs)
 
     def simulator(
-        self, *, cache_dir: Path | None = None, progress: Callable[[str, float], None] | None = None
+        self,
+        *,
+        method: Method | None = None,
+        cache_dir: Path | None = None,
+        progress: Callable[[str, float], None] | None = None,
     ) -> Simulator:
-        """A simulator with the recorded settings.
+        """A simulator with the recorded settings, or with another method.
 
         Raises:
+            RecordingError: The recorded method is gone, and no other is given.
             FieldError: The background field could not be built.
         """
+        if method is None and self.method in GONE:
+            raise RecordingError(
+                f"this was recorded with method {self.method!r} of capsense "
+                f"{self.versions.get('capsense', 'before')}, which is gone; its readings can be "
+                'read, and method "surface" (capsense replay --method surface) simulates it anew'
+            )
         return Simulator(
-            self.design, method=self.method, preset=self.preset, tolerance=self.tolerance,
-            relative_tolerance=self.relative_tolerance, frequency=self.frequency,
-            settings=self.settings, cache_dir=cache_dir, progress=progress,
+            self.design, method=method or cast("Method", self.method), preset=self.preset,
+            frequency=self.frequency, settings=self.settings, cache_dir=cache_dir,
+            progress=progress,
         )  # fmt: skip
 
     def new_readout(self) -> ReadOut | None:
@@ -114,8 +123,6 @@ class Session:
                 "title": self.title,
                 "method": self.method,
                 "preset": self.preset,
-                "tolerance_F": self.tolerance,
-                "relative_tolerance": self.relative_tolerance,
                 "frequency_Hz": self.frequency,
                 "settings": asdict(self.settings),
                 "electrodes": list(self.design.electrode_names),
@@ -143,8 +150,8 @@ def describe(
     """The session of a simulator as it is."""
     s = simulator
     return Session(
-        name, title, s.design, s.method, s.preset, s.tolerance, s.relative_tolerance, s.frequency,
-        s.settings, empty, excitation, pairs, readout, versions(),
+        name, title, s.design, s.method, s.preset, s.frequency, s.settings, empty, excitation,
+        pairs, readout, versions(),
     )  # fmt: skip
 
 
@@ -161,25 +168,29 @@ def read_session(text: bytes, design: Design) -> Session:
                 f"the recording has format {data['format']!r}, but this version reads {FORMAT}; "
                 f"it was made by capsense {data['versions']['capsense']}"
             )
-        given = dict(data["settings"])
-        lattice = LatticeSettings(**given.pop("lattice"))
         preset = data.get("preset", "standard")  # older files have none
-        known = data["method"] in METHODS and preset in get_args(PresetName)
+        known = data["method"] in (*METHODS, *GONE) and preset in get_args(PresetName)
         if not known or tuple(data["electrodes"]) != design.electrode_names:
             raise RecordingError("the recording's settings do not fit its design; it is damaged")
         capacitance = np.array(data["empty_F"], dtype=float)
         coupling = np.array(data["empty_shield_coupling_F"], dtype=float)
         empty = reading_of(design, capacitance, np.zeros_like(capacitance), coupling)
         return Session(
-            data["name"], data["title"], design, data["method"], preset, data["tolerance_F"],
-            data["relative_tolerance"], data["frequency_Hz"], BuildSettings(lattice, **given),
-            empty, Excitation(data["excitation"]), tuple((a, b) for a, b in data["pairs"]),
-            data["readout"], data["versions"],
+            data["name"], data["title"], design, data["method"], preset, data["frequency_Hz"],
+            _read_settings(data["settings"]), empty, Excitation(data["excitation"]),
+            tuple((a, b) for a, b in data["pairs"]), data["readout"], data["versions"],
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, RecordingError):
             raise
         raise RecordingError(f"the recording's settings are damaged: {error!r}") from None
+
+
+def _read_settings(data: Mapping[str, Any]) -> BuildSettings:
+    """Settings from what is written down; earlier versions called the mesh a lattice, with more."""
+    mesh = data["mesh"] if "mesh" in data else data["lattice"]
+    known = {f.name: float(mesh[f.name]) for f in fields(MeshSettings)}
+    return BuildSettings(float(data["panel_scale"]), MeshSettings(**known))
 
 
 def shield_coupling(reading: Reading) -> Array:
@@ -189,7 +200,7 @@ def shield_coupling(reading: Reading) -> Array:
 
 def reading_of(
     design: Design, capacitance: Array, delta: Array, coupling: Array,
-    stats: StepStats = StepStats(0, 0.0, 0.0, 0.0),  # noqa: B008, it is immutable
+    stats: StepStats = StepStats(0.0, 0.0),  # noqa: B008, it is immutable
 ) -> Reading:  # fmt: skip
     """A reading from its parts.
 

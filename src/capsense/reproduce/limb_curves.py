@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 import capsense as cs
 from capsense.design.loader import parse_design
 from capsense.field.background import BuildSettings
-from capsense.field.lattice import LatticeSettings
 from capsense.reproduce.store import Store
 from capsense.scene.body import Grounding
 
@@ -74,7 +73,7 @@ class Setup:
     box: float = BOX
     """Edge of the box [m]."""
     fine: bool = False
-    """Mesh as by default, and not coarser towards the walls."""
+    """Panels as by default, and not coarser."""
 
     @property
     def design(self) -> Design:
@@ -90,16 +89,14 @@ class Setup:
 
     @property
     def settings(self) -> BuildSettings:
-        """Boxes of a metre and more are mostly far from everything: larger cells there."""
+        """Large boxes have large walls: coarser panels keep their number down."""
         if self.fine:
             return BuildSettings()
-        far = 0.12 if self.box <= 1.0 else 0.24
-        scale = 1.7 if self.box <= 1.0 else 2.0
-        return BuildSettings(LatticeSettings(far=far, tall=0.12), panel_scale=scale)
+        return BuildSettings(panel_scale=1.7 if self.box <= 1.0 else 2.0)
 
 
 CHECK = Setup(box=0.5, fine=True)
-"""Tells what the coarser mesh costs."""
+"""Tells what the coarser panels cost."""
 
 
 @dataclass(frozen=True, eq=False)

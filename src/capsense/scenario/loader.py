@@ -26,7 +26,6 @@ TOP_KEYS = (
     "excitation",
     "pairs",
     "method",
-    "tolerance",
     "body",
 )
 
@@ -63,13 +62,13 @@ def parse_scenario(
     """
     where = folder if folder is not None else Path()
     top = Table(data, source, "scenario")
+    _refuse_former(top)
     top.only(TOP_KEYS)
     name = top.string("name")
     design = _read_design(top, where)
     sample_rate = top.number("sample_rate", 1e-3, 1e6, unit="Hz")
     excitation = Excitation(top.choice("excitation", list(Excitation), Excitation.MATRIX.value))
     pairs = _read_pairs(top, excitation, design)
-    tolerance = top.number("tolerance", 1e-24, 1e-12, unit="F") if "tolerance" in top else None
     bodies = read_bodies(top, where)
     if not bodies and "duration" not in top:
         raise top.error("has no body and no duration; add a [[body]], or duration = seconds")
@@ -85,11 +84,18 @@ def parse_scenario(
             excitation=excitation,
             pairs=pairs,
             method=cast("Method", top.choice("method", METHODS, METHODS[0])),
-            tolerance=tolerance,
             description=top.text("description"),
         )
     except ScenarioError as error:
         raise top.error(str(error)) from None
+
+
+def _refuse_former(top: Table) -> None:
+    """Say what to write instead of what files of earlier versions may hold."""
+    if "tolerance" in top:
+        raise top.error("tolerance is gone: no method needs one any more; remove the line")
+    if "method" in top and top.raw("method", "a method") == "perturbation":
+        raise top.error('method = "perturbation" is gone; write "surface", or remove the line')
 
 
 def _read_design(top: Table, folder: Path) -> Design:

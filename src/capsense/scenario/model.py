@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 MAX_SAMPLES = 1_000_000
 """A scenario of more samples is refused."""
-METHODS: tuple[Method, ...] = ("perturbation", "surface", "masked")
+METHODS: tuple[Method, ...] = ("surface", "masked")
 """The simulator's methods, the default first."""
 
 
@@ -64,8 +64,6 @@ class Scenario:
     """For mutual excitation: the pairs read, by electrode name; all of them if empty."""
     method: Method = METHODS[0]
     """The simulator's method."""
-    tolerance: float | None = None
-    """Error of a capacitance that the solver may leave [F]; None for its own default."""
     description: str = ""
 
     def __post_init__(self) -> None:

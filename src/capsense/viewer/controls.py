@@ -64,8 +64,8 @@ class PlaneControls:
     """Which plane, and whose potential."""
 
     def __init__(self, gui: GuiApi, player: Playback) -> None:
-        assert player.source.lattice is not None
-        self._player, self._lattice = player, player.source.lattice
+        assert player.source.green is not None
+        self._player, self._green = player, player.source.green
         design = player.source.design
         self._names = design.electrode_names
         self._region = region(design)
@@ -85,7 +85,7 @@ class PlaneControls:
             ]
             gui.add_html(legend())
         self._lay()
-        self._on.on_update(self._switch)
+        self._on.on_update(self._ask)
         self._driven.on_update(self._centre)
         self._across.on_update(lambda _: self._lay())
         for slider in self._at:
@@ -118,11 +118,13 @@ class PlaneControls:
                 slider.visible = k == axis
         at = 1e-3 * float(self._at[axis].value)
         if self._plane is None or (self._plane.axis, self._plane.at) != (axis, at):
-            self._plane = Plane(self._lattice, self._region, axis, at)
+            self._plane = Plane(self._green, self._region, axis, at)
+            self._ask()
 
-    def _switch(self, _: object) -> None:
-        self._player.field = self._on.value
-        if self._on.value and not self._player.playing:
+    def _ask(self, _: object = None) -> None:
+        """Tell the player where potentials are wanted, and to take them while time stands still."""
+        self._player.plane = self.plane
+        if self._player.plane is not None and not self._player.playing:
             self._player.pause()
 
 
@@ -150,8 +152,8 @@ def status(player: Playback, shot: Shot, largest: float) -> str:
     lines = [
         f"<b>{html.escape(player.source.title)}</b>",
         f"t = {shot.time:.3f} s, sample {shot.index} of {last}",
-        f"step {1e3 * stats.wall_time:.1f} ms, {stats.iterations} "
-        f"iteration{'' if stats.iterations == 1 else 's'}",
+        f"step {1e3 * stats.wall_time:.1f} ms"
+        + (f", {stats.unknowns} unknowns" if stats.unknowns else ""),
         'electrodes: <span style="background:linear-gradient(90deg,rgb(214,219,222),'
         'rgb(213,94,0));padding:0 2.5em;border-radius:2px">&nbsp;</span> '
         f"0 to {1e15 * largest:.3g} fF",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from capsense.errors import CapSenseError
 from capsense.viewer.player import FIELD_PERIOD
 from capsense.viewer.source import Shot, Stream
+
+if TYPE_CHECKING:
+    from capsense.viewer.plane import Plane
 
 Array = NDArray[np.float64]
 
@@ -37,7 +41,7 @@ class Follower:
     def __init__(self, source: Stream) -> None:
         self.source = source
         self.loop = False
-        self.field = True
+        self.plane: Plane | None = None
         self.with_field: Shot | None = None
         self.failure: CapSenseError | None = None
         self._shots: list[Shot] = []
@@ -139,10 +143,12 @@ class Follower:
 
     def _take_potentials(self) -> None:
         """Take those of what is shown, when they are wanted and it is time."""
-        shot, now = self.newest, time.monotonic()
-        if not self.field or self.source.lattice is None or shot is None:
+        shot, plane, now = self.newest, self.plane, time.monotonic()
+        if plane is None or shot is None:
             return
-        taken = self.with_field is not None and self.with_field.index == shot.index
+        last = self.with_field
+        taken = last is not None and (last.index, last.plane) == (shot.index, plane)
         if not taken and now - self._field_taken >= FIELD_PERIOD:
-            self.with_field = replace(shot, potentials=self.source.potentials(shot))
+            found = self.source.potentials(shot, plane)
+            self.with_field = replace(shot, plane=plane, potentials=found)
             self._field_taken = now

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import CapSenseError
 from capsense.viewer.source import Seekable, Shot, Source
+
+if TYPE_CHECKING:
+    from capsense.viewer.plane import Plane
 
 Array = NDArray[np.float64]
 
@@ -31,8 +34,8 @@ class Playback(Protocol):
     """Whether time goes on by itself, so that there is no speed and no end."""
     loop: bool
     """Whether the end is followed by the beginning."""
-    field: bool
-    """Whether potentials are wanted."""
+    plane: Plane | None
+    """Where potentials are wanted; None where they are not."""
     with_field: Shot | None
     """The last one whose potentials were taken."""
     failure: CapSenseError | None
@@ -94,7 +97,7 @@ class Player:
     def __init__(self, source: Seekable, *, speed: float = 1.0) -> None:
         self.source = source
         self.loop = True
-        self.field = True
+        self.plane: Plane | None = None
         self.newest: Shot | None = None
         self.with_field: Shot | None = None
         self.failure: CapSenseError | None = None
@@ -179,7 +182,7 @@ class Player:
     def _take(self, index: int) -> None:
         now = time.monotonic()
         due = not self._playing or now - self._field_taken >= FIELD_PERIOD
-        shot = self.source.shot(index, field=self.field and due)
+        shot = self.source.shot(index, self.plane if due else None)
         values = [c.read(shot.reading) for c in self.source.channels]
         self._changes[index] = np.array(values) - self._levels
         if shot.potentials is not None:

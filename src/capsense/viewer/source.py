@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from capsense.design import Design
 from capsense.errors import RecordingError
+from capsense.recording.session import GONE
 from capsense.scenario import Channel, Scenario
 from capsense.scene import Scene
 from capsense.simulator import Reading, Simulator
 
 if TYPE_CHECKING:
-    from capsense.field.lattice import Lattice
+    from capsense.field.green import GreenFunction
     from capsense.recording.reader import Recording
+    from capsense.viewer.plane import Plane
 
 Array = NDArray[np.float64]
 
@@ -32,8 +34,10 @@ class Shot:
     """Its time [s]."""
     scene: Scene
     reading: Reading
-    potentials: Array | None
-    """Potentials at the lattice's nodes [V], shape (n, terminals), where they were asked for."""
+    plane: Plane | None = None
+    """Where potentials were asked for."""
+    potentials: Array | None = None
+    """Potentials at its points [V], shape (n, terminals)."""
 
 
 class Source(Protocol):
@@ -45,8 +49,8 @@ class Source(Protocol):
     """What charts show."""
     empty: Reading
     """The reading with nothing in front of the sensor."""
-    lattice: Lattice | None
-    """Where potentials are given; None if they are not."""
+    green: GreenFunction | None
+    """Of the sensor, where potentials can be had; None where they cannot."""
 
     def close(self) -> None:
         """Let go of what is held."""
@@ -62,8 +66,8 @@ class Stream(Source, Protocol):
             CapSenseError: There will be none, or not before another call finds a new beginning.
         """
 
-    def potentials(self, shot: Shot) -> Array:
-        """Potentials of an instant at the lattice's nodes [V], shape (n, terminals).
+    def potentials(self, shot: Shot, plane: Plane) -> Array:
+        """Potentials of an instant at a plane's points [V], shape (n, terminals).
 
         Raises:
             CapSenseError: They could not be had.
@@ -76,12 +80,12 @@ class Seekable(Source, Protocol):
     times: Array
     """Of the instants [s], increasing, shape (N,)."""
 
-    def shot(self, index: int, *, field: bool) -> Shot:
+    def shot(self, index: int, plane: Plane | None = None) -> Shot:
         """The instant of a number.
 
         Args:
             index: Its number.
-            field: Whether potentials are wanted, where there are any.
+            plane: Where potentials are wanted, if they are; ``green`` is not None then.
 
         Raises:
             CapSenseError: It could not be had.
@@ -101,15 +105,15 @@ class ScenarioSource:
         self.times, self.channels = scenario.times, scenario.channels
         self._scenario, self._simulator = scenario, simulator
         self.empty = simulator.step(Scene())
-        self.lattice = lattice_of(simulator)
+        self.green = green_of(simulator)
 
-    def shot(self, index: int, *, field: bool) -> Shot:
+    def shot(self, index: int, plane: Plane | None = None) -> Shot:
         """See :class:`Seekable`."""
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
         reading = self._simulator.step(scene)
-        wanted = field and self.lattice is not None
-        return Shot(index, time, scene, reading, self._simulator.potentials() if wanted else None)
+        found = None if plane is None else self._simulator.potentials(plane.points)
+        return Shot(index, time, scene, reading, plane, found)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -117,6 +121,8 @@ class ScenarioSource:
 
 class RecordingSource:
     """Shows what a recording holds; the simulator is asked for potentials only.
+
+    Those of a recording of a method that is gone come from ``"surface"``.
 
     Args:
         recording: Is read as a whole.
@@ -137,21 +143,22 @@ class RecordingSource:
         self.title, self.design = session.title or session.name, session.design
         self.times = np.array([step.clock for step in self._steps])
         self.channels, self.empty = session.channels, session.empty
-        self._simulator = session.simulator(progress=progress)
-        self.lattice = lattice_of(self._simulator)
+        gone = session.method in GONE
+        self._simulator = session.simulator(method="surface" if gone else None, progress=progress)
+        self.green = green_of(self._simulator)
 
-    def shot(self, index: int, *, field: bool) -> Shot:
+    def shot(self, index: int, plane: Plane | None = None) -> Shot:
         """See :class:`Seekable`."""
-        step, potentials = self._steps[index], None
-        if field and self.lattice is not None:
+        step, found = self._steps[index], None
+        if plane is not None:
             self._simulator.step(step.scene)
-            potentials = self._simulator.potentials()
-        return Shot(index, float(self.times[index]), step.scene, step.reading, potentials)
+            found = self._simulator.potentials(plane.points)
+        return Shot(index, float(self.times[index]), step.scene, step.reading, plane, found)
 
     def close(self) -> None:
         """Nothing is held."""
 
 
-def lattice_of(simulator: Simulator) -> Lattice | None:
-    """Where a simulator gives potentials; None if it does not."""
-    return simulator.background.lattice if simulator.method == "perturbation" else None
+def green_of(simulator: Simulator) -> GreenFunction | None:
+    """Green's function of a simulator that gives potentials; None if it does not."""
+    return simulator.background.green if simulator.method == "surface" else None

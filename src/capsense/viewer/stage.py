@@ -93,14 +93,14 @@ class Stage:
             handle.wxyz, handle.position = (w, x, y, z), body.pose.position
 
     def show_plane(self, plane: Plane, potential: Array) -> None:
-        """Paint the potential, at the lattice's nodes [V], shape (n,), on a plane.
+        """Paint the potential at a plane's points [V], shape (n,).
 
         As points, which hide and are hidden as they should be: an image would be sorted as a whole
         among the bodies that light passes through.
         """
-        shown, colours = paint(plane.sample(potential))
+        shown, colours = paint(plane.carried(potential))
         self._scene.add_point_cloud(
-            "/potential", plane.points[shown], colours, point_size=0.6 * plane.pitch,
+            "/potential", plane.drawn[shown], colours, point_size=0.6 * plane.pitch,
             point_shape="square", point_shading="flat",
         )  # fmt: skip
 

@@ -50,7 +50,7 @@ class View:
         self._stage = Stage(self._server, source.design)
         self._status = gui.add_html("")
         self._time = TimeControls(gui, player)
-        self._plane = PlaneControls(gui, player) if source.lattice is not None else None
+        self._plane = PlaneControls(gui, player) if source.green is not None else None
         panel = gui.add_panel()
         tab = panel.add_tab("signals")
         self._charts = make_charts(gui, tab, source.channels)
@@ -107,7 +107,7 @@ class View:
         self._painted = (plane, shot, driven)
         if plane is None:
             self._stage.hide_plane()
-        elif shot is not None and shot.potentials is not None:
+        elif shot is not None and shot.plane is plane and shot.potentials is not None:
             self._stage.show_plane(plane, shot.potentials[:, driven])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,10 @@ from capsense.server.client import Client
 from capsense.server.frames import DepthMessage, ReadingMessage
 from capsense.server.messages import Open, Table, read_open, read_scene
 from capsense.simulator import Reading, Simulator, StepStats
-from capsense.viewer.source import Shot, lattice_of
+from capsense.viewer.source import Shot, green_of
+
+if TYPE_CHECKING:
+    from capsense.viewer.plane import Plane
 
 Array = NDArray[np.float64]
 Address = tuple[int, int]
@@ -64,7 +67,7 @@ class Watched:
         nothing = np.zeros_like(baseline)
         self.empty = reading_of(self.design, baseline, nothing, nothing[0])
         self._simulator = Simulator(self.design, progress=progress)
-        self.lattice = lattice_of(self._simulator)
+        self.green = green_of(self._simulator)
         self._began, self._count = time.monotonic(), 0
         self._seen: DepthMessage | dict[str, Any] | None = None
         self._scene = Scene()
@@ -79,10 +82,10 @@ class Watched:
             self.close()
             raise
 
-    def potentials(self, shot: Shot) -> Array:
+    def potentials(self, shot: Shot, plane: Plane) -> Array:
         """See :class:`~capsense.viewer.source.Stream`."""
         self._simulator.step(shot.scene)
-        return self._simulator.potentials()
+        return self._simulator.potentials(plane.points)
 
     def close(self) -> None:
         """Close the connection."""
@@ -161,12 +164,12 @@ class Watched:
             bodies = read_scene(Table(self._seen, "message", "scene"), len(self._seen["body"]))
             self._scene = _alike(self._scene, Scene(bodies.bodies))
         coupling = answer.self_capacitance - np.diag(answer.capacitance)
-        stats = StepStats(answer.iterations, answer.error_estimate, 0.0, answer.wall_time)
+        stats = StepStats(answer.error_estimate, answer.wall_time, iterations=answer.iterations)
         reading: Reading = reading_of(
             self.design, answer.capacitance, answer.delta, coupling, stats
         )
         self._count += 1
-        return Shot(self._count - 1, time.monotonic() - self._began, self._scene, reading, None)
+        return Shot(self._count - 1, time.monotonic() - self._began, self._scene, reading)
 
     def _depth_scene(self, seen: DepthMessage) -> Scene:
         o = self._open

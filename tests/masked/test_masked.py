@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from capsense.errors import FieldError, SolveError
-from capsense.field.stiffness import capacitance_p1
+from capsense.masked.solver import GROUNDED, MaskedSolver
+from capsense.masked.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, kuhn_tets
-from capsense.solve.masked import GROUNDED, MaskedSolver
 
 STRIPES = ("E1", "E2", "E3")
 

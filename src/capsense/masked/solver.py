@@ -24,7 +24,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SolveError
-from capsense.field.stiffness import StiffnessMap, check_eps_r, unit_potentials
+from capsense.masked.stiffness import StiffnessMap, check_eps_r, unit_potentials
 from capsense.mesh.tetmesh import TetMesh
 
 Array = NDArray[np.float64]

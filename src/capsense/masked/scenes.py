@@ -9,17 +9,17 @@ from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.change import Change
-from capsense.field.held_nodes import WALL, hold_nodes
-from capsense.field.planes import plan_axes
+from capsense.masked.held_nodes import WALL, hold_nodes
+from capsense.masked.planes import plan_axes
+from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh, kuhn_tets
 from capsense.scene import Scene
-from capsense.solve.masked import GROUNDED, MaskedSolver
 
 Array = NDArray[np.float64]
 
 
 class MaskedScenes:
-    """Masks the Kuhn tetrahedra of the online lattice with a scene's bodies and solves in full.
+    """Masks the Kuhn tetrahedra of a graded mesh with a scene's bodies and solves in full.
 
     Floating conductors are met by a large permittivity, as a scheme that knows only permittivity
     must; impedances to ground cannot be represented and are refused. Each scene is solved from the
@@ -38,9 +38,9 @@ class MaskedScenes:
         warm_start: bool = True,
     ) -> None:
         self._frequency = frequency
-        axes = plan_axes(design, settings.lattice)
+        axes = plan_axes(design, settings.mesh)
         mesh = kuhn_tets(*axes)
-        owner = hold_nodes(design, axes)[0].ravel()
+        owner = hold_nodes(design, axes).ravel()
         groups = {
             name: np.flatnonzero(owner == k).astype(np.int32)
             for k, name in enumerate(background.terminals)
@@ -102,5 +102,5 @@ class MaskedScenes:
         matrix = self._solver.step(inside, eps.tolist())
         stats = self._solver.stats
         goal = self._solver.tolerance * float(np.abs(matrix).max())
-        free = len(self._mesh.points) - stats.grounded_nodes
+        free = self._mesh.n_points - stats.grounded_nodes
         return Change(matrix - self._empty, goal, int(stats.iterations), free)

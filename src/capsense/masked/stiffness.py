@@ -116,22 +116,13 @@ def stiffness(mesh: TetMesh, eps_r: ArrayLike = 1.0) -> sp.csr_matrix:
 
 @dataclass(frozen=True, eq=False)
 class StiffnessMap:
-    """The linear maps from element permittivities to link weights and to CSR values.
+    """The linear map from element permittivities to CSR values, ``data = csr_map @ eps_r``.
 
     The sparsity pattern of K is fixed: `indptr` and `indices` are those of every matrix made
-    here. ``weights = link_map @ eps_r`` and ``data = csr_map @ eps_r``.
+    here.
     """
 
     mesh: TetMesh
-
-    @cached_property
-    def link_map(self) -> sp.csc_matrix:
-        """Maps eps_r, shape (k,), to link weights [F], shape (m, k)."""
-        k = self.mesh.n_tets
-        columns = np.repeat(np.arange(k), 6)
-        entries = element_weights(self.mesh).ravel()
-        shape = (len(self.mesh.edges), k)
-        return sp.csc_matrix((entries, (self.mesh.tet_edges.ravel(), columns)), shape=shape)
 
     @cached_property
     def pattern(self) -> sp.csr_matrix:
