@@ -108,30 +108,76 @@ def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Su
 def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_]]:
     """The surfaces that a layered image shows, a piece a pixel.
 
-    Backs count where they lie farther behind than two pixels are wide, and before 10 m.
+    Backs count where they lie farther behind than two pixels are wide, and before 10 m; there, the
+    sides between front and back count too, at pixels whose neighbour begins farther behind.
 
     Returns:
         Clusters of all pixels; the pieces; and which of them there are.
     """
     dx, dy = layers.pixel
     front, back = layers.front.astype(float), layers.back.astype(float)
-    behind = (back - front > 2 * max(dx, dy)) & (back < _FILLED)
-    back = np.where(behind, back, np.nan)[behind.any(axis=(1, 2))]
+    known = (back - front > 2 * max(dx, dy)) & (back < _FILLED)
+    back = np.where(known, back, np.nan)[known.any(axis=(1, 2))]
     depth = np.concatenate([front, back])
-    wanted = ~np.isnan(depth)
     slope_x, slope_y = _slopes(depth, 2, dx), _slopes(depth, 1, dy)
-    _, rows, columns = depth.shape
     centers, moments = np.empty((*depth.shape, 3)), np.zeros((*depth.shape, 3, 3))
-    centers[..., 0] = (np.arange(columns) + 0.5) * dx - 0.5 * layers.size[0]
-    centers[..., 1] = ((np.arange(rows) + 0.5) * dy - 0.5 * layers.size[1])[:, None]
-    centers[..., 2] = np.where(wanted, depth, 0.0)
+    centers[..., 0], centers[..., 1] = _pixel_centers(layers)
+    centers[..., 2] = depth
     areas = dx * dy * np.sqrt(1 + slope_x**2 + slope_y**2)
     moments[..., 0, 0], moments[..., 1, 1] = dx * dx / 12, dy * dy / 12
     moments[..., 0, 2] = moments[..., 2, 0] = dx * dx / 12 * slope_x
     moments[..., 1, 2] = moments[..., 2, 1] = dy * dy / 12 * slope_y
     moments[..., 2, 2] = (dx * slope_x) ** 2 / 12 + (dy * slope_y) ** 2 / 12
+    if len(back):
+        sides = _sides(layers, front, np.where(known, layers.back, np.nan))
+        centers, areas, moments = (
+            np.concatenate(both) for both in zip((centers, areas, moments), sides, strict=True)
+        )
+    wanted = ~np.isnan(centers[..., 2])
+    centers[..., 2][~wanted] = 0.0
     pieces = Surface(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
-    return _pixel_tree(*depth.shape, dx / dy), pieces, wanted.ravel()
+    return _pixel_tree(*wanted.shape, dx / dy), pieces, wanted.ravel()
+
+
+def _pixel_centers(layers: Layers) -> tuple[Array, Array]:
+    """Coordinates x and y of the pixels [m], shapes (columns,) and (rows, 1)."""
+    (dx, dy), (rows, columns) = layers.pixel, layers.resolution
+    x = (np.arange(columns) + 0.5) * dx - 0.5 * layers.size[0]
+    y = (np.arange(rows) + 0.5) * dy - 0.5 * layers.size[1]
+    return x, y[:, None]
+
+
+def _sides(layers: Layers, front: Array, back: Array) -> tuple[Array, Array, Array]:
+    """Upright rectangles at the edges of pixels, from the front to the back or the neighbour.
+
+    Args:
+        layers: The image.
+        front, back: Depths [m], NaN where nothing is or no back is known, (slots, rows, columns).
+
+    Returns:
+        Centres [m], (4 slots, rows, columns, 3), NaN where there is no side; areas [m²]; moments.
+    """
+    pitch = layers.pixel
+    shape = (4 * len(front), *front.shape[1:])
+    centers, areas, moments = np.full((*shape, 3), np.nan), np.ones(shape), np.zeros((*shape, 3, 3))
+    first = 0
+    for axis, along in ((0, 2), (1, 1)):
+        for way in (-1, 1):
+            beside = np.roll(np.where(np.isnan(front), np.inf, front), -way, axis=along)
+            rim: list[int | slice] = [slice(None)] * 3
+            rim[along] = -1 if way > 0 else 0
+            beside[tuple(rim)] = np.inf
+            end = np.minimum(back, beside)
+            tall = np.where(end - front > STEP_SLOPE * pitch[axis], end - front, np.nan)
+            part = slice(first, first + len(front))
+            first += len(front)
+            centers[part, ..., 0], centers[part, ..., 1] = _pixel_centers(layers)
+            centers[part, ..., axis] += 0.5 * way * pitch[axis]
+            centers[part, ..., 2] = front + 0.5 * tall
+            areas[part] = pitch[1 - axis] * np.nan_to_num(tall, nan=1.0)
+            moments[part, ..., 1 - axis, 1 - axis] = pitch[1 - axis] ** 2 / 12
+            moments[part, ..., 2, 2] = np.nan_to_num(tall) ** 2 / 12
+    return centers, areas, moments
 
 
 def _slopes(depth: Array, axis: int, pitch: float) -> Array:
