@@ -55,7 +55,7 @@ def test_random_scenes_are_physical(simulators, seed):
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_mirror_images(simulators, axis):
-    """Invariant: a mirrored scene gives the mirrored matrix, within the mesh's own symmetry."""
+    """Invariant: a mirrored scene gives the mirrored matrix, within the panels' own symmetry."""
     sim, order = simulators("arm_segment"), MIRRORED[axis]
     place = np.array(curved_body("ball 20").pose.position)
     readings = []
@@ -64,7 +64,7 @@ def test_mirror_images(simulators, axis):
         place[axis] *= sign
         readings.append(sim.step(cs.Scene([cs.Body(cs.Sphere(0.04), cs.Pose(place))])).delta)
     mirrored = readings[1][np.ix_(order, order)]
-    assert np.abs(readings[0] - mirrored).max() < 1e-3 * np.abs(readings[0]).max()
+    assert np.abs(readings[0] - mirrored).max() < 2e-3 * np.abs(readings[0]).max()
 
 
 def test_approach_is_monotonic(simulators):

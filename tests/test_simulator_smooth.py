@@ -15,7 +15,7 @@ COUNT = 201
 
 
 def sweep(sim: cs.Simulator, bodies: list[cs.Body]) -> Array:
-    """ΔC_11 [F] of one body after the other, in a warm-started walk."""
+    """ΔC_11 [F] of one body after the other, one step after the other."""
     return np.array([sim.step(cs.Scene([b])).delta[0, 0] for b in bodies])
 
 
@@ -50,7 +50,8 @@ def test_bar_rising_is_monotonic(rising):
 def test_bar_passing(simulators, gap, start):
     """Measured: no jump over 20 mm in x, over the middle and where the bar's edge passes E1."""
     sim = simulators("six_patch_bare")
-    assert_no_jump(sweep(sim, [bar(gap, x=start + STEP * k) for k in range(COUNT)]))
+    values = sweep(sim, [bar(gap, x=start + STEP * k) for k in range(COUNT)])
+    assert np.abs(np.diff(values, 2)).max() < (3e-3 if gap == 0.005 else 5e-4) * values.max()
 
 
 def test_bar_leaving_is_monotonic(simulators):
@@ -76,17 +77,11 @@ def test_bar_leaving_is_monotonic(simulators):
     ids=["capsule", "sphere", "dielectric", "floating"],
 )  # fmt: skip
 def test_other_bodies_rising(simulators, body):
-    """Measured: round, dielectric, oblique and floating bodies leave as smoothly.
-
-    Where an edge leaves a lattice node behind, single steps go the wrong way: together 0.4 fF for a
-    floating tilted cylinder, whose whole range is 3 fF. A known shortfall.
-    """
+    """Measured: round, dielectric, oblique and floating bodies leave as smoothly."""
     sim = simulators("six_patch_bare")
     values = sweep(sim, [body(0.008 + 2 * STEP * k) for k in range(60)])
     assert_no_jump(values)
-    steps = np.diff(values)
-    allowed = max(0.01 * (values[0] - values[-1]), 0.45e-15)
-    assert steps[steps > 0].sum() < allowed
+    assert (np.diff(values) < 0).all()
 
 
 @pytest.mark.slow

@@ -165,6 +165,9 @@ class Simulator:
             [k for k in range(n, len(names)) if names[k] not in floating], dtype=np.int64
         )
         self._empty = self._without_floating(self.background.capacitance)
+        self._screened = -self.background.capacitance
+        """At most so much changes [F]: terminals screened from each other do not couple."""
+        np.fill_diagonal(self._screened, np.inf)
         self.baseline: Array = self._empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
         self.baseline.setflags(write=False)
@@ -206,15 +209,15 @@ class Simulator:
             scene = scene.scene()
         self.steps += 1
         found = self._solver.solve(scene, jacobian=jacobian)
-        change, whole = found.matrix, self.background.capacitance + found.matrix
+        change = np.minimum(found.matrix, self._screened)
+        error = max(found.error, float((found.matrix - change).max()))
+        whole = self.background.capacitance + change
         if len(self._floating):
             change = self._without_floating(whole) - self._empty
         n = len(self._electrodes)
         total = self._empty + change
         delta = change[:n, :n]
-        stats = StepStats(
-            found.error, time.perf_counter() - start, found.unknowns, found.iterations
-        )
+        stats = StepStats(error, time.perf_counter() - start, found.unknowns, found.iterations)
         return Reading(
             self.baseline + delta, delta.copy(), stats, self._names, total[:n, n:].sum(axis=1),
             jacobian=None if found.jacobian is None else self._slope(whole, found.jacobian),

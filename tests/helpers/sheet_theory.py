@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 import capsense as cs
 from capsense.constants import EPS0
@@ -30,12 +29,5 @@ def first_order(sim: cs.Simulator, z: float, thickness: float, size: float, eps_
 
 
 def potential(sim: cs.Simulator, points: np.ndarray, terminal: int) -> np.ndarray:
-    """Potential of the empty domain at points [m] inside it, 1 V on a terminal, shape (n,)."""
-    out = np.full(len(points), np.nan)
-    for storey in sim.background.lattice.storeys:  # the lowest and finest comes first
-        values = sim.background.potentials[storey.first : storey.stop, terminal]
-        found = RegularGridInterpolator(
-            storey.axes, values.reshape(storey.shape), "cubic", bounds_error=False
-        )(points)
-        out = np.where(np.isnan(out), found, out)
-    return out
+    """Potential of the empty domain at points [m] before the sensor, 1 V on a terminal, (n,)."""
+    return sim.background.green.phi0(points)[:, terminal]
