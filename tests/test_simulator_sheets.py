@@ -21,7 +21,7 @@ def sheet(z: float, thickness: float = 0.001, eps_r: float = EPS_R) -> cs.Body:
 
 @pytest.mark.parametrize("thickness", [0.0005, 0.001, 0.002])
 def test_level_sheets_against_first_order_theory(simulators, thickness):
-    """Measured: within 16 % from 10 to 33 mm; at 8 mm sheets of half a millimetre read 29 % high."""
+    """Measured: within 16 % from 10 to 33 mm; at 8 mm sheets of 0.5 mm read 29 % high."""
     sim = simulators("six_patch")
     for z in (0.008, 0.010, 0.012, 0.0147, 0.018, 0.022, 0.025, 0.030, 0.033):
         sim.reset()
