@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from capsense.surface.pair_kernels import _FAR, _SOFT
+from capsense.surface.pair_kernels import FAR, SOFT
 from capsense.surface.place_kernels import Green
 from capsense.surface.step import Solution
 
@@ -81,7 +81,7 @@ def _potentials(points: Array, sources: Array, floor: float) -> Array:
 
 def _far(points: Array, others: Array, extent: Array) -> Array:
     between = np.linalg.norm(points.mean(axis=1)[:, None] - others.mean(axis=1), axis=-1)
-    return between > _FAR * (extent[:, None] + extent)
+    return between > FAR * (extent[:, None] + extent)
 
 
 def _means(points: Array, others: Array, far: Array, extent: Array) -> Array:
@@ -99,5 +99,5 @@ def _means(points: Array, others: Array, far: Array, extent: Array) -> Array:
             second += 3 * (arm * d).sum(-1) ** 2 / r**2 - (arm**2).sum(-1)
     moments = 1 / r + second / (2 * r**3)
     s = ((points[:, None, :, None] - others[None, :, None]) ** 2).sum(-1)
-    bound = (_SOFT * np.maximum(extent[:, None], extent)) ** 4
+    bound = (SOFT * np.maximum(extent[:, None], extent)) ** 4
     return np.where(far, moments, ((s**2 + bound[..., None, None]) ** -0.25).mean((-2, -1)))

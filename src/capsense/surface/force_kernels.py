@@ -14,7 +14,7 @@ from numba import njit
 from numba.extending import intrinsic
 
 from capsense._simd import LANES, at, madd, put_span, span, splat, vadd, vmadd
-from capsense.surface.pair_kernels import _SOFT, _moments
+from capsense.surface.pair_kernels import SOFT, cluster_moments
 from capsense.surface.vector_kernels import fast
 
 
@@ -93,7 +93,7 @@ def _put_six(out, place, layer, a, b, c, d, e, f):
 def wide_moments(points, extent, width):
     """Moments of the clusters, shape (10, width)."""
     out = np.ones((10, width), np.float32)
-    moments = _moments(points, extent)
+    moments = cluster_moments(points, extent)
     for i in range(10):
         for j in range(extent.shape[0]):
             out[i, j] = moments[i, j]
@@ -189,7 +189,7 @@ def near_pairs(points, others, extent, i, start, stop, n, weight, near, out, row
         for q in range(4):
             for k in range(3):
                 near[3 * q + k, count] = others[j, q, k]
-        near[12, count] = (_SOFT * max(extent[i], extent[j])) ** 4
+        near[12, count] = (SOFT * max(extent[i], extent[j])) ** 4
         near[13, count] = j
         count += 1
     width = near.shape[1]

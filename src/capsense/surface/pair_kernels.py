@@ -8,7 +8,7 @@ import numpy as np
 
 from capsense.surface.vector_kernels import fast, rsqrt
 
-_FAR = 1.5
+FAR = 1.5
 """Clusters farther apart than so many of their joint extents are met by their moments."""
 _CLOSE = 0.6
 """Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
@@ -16,7 +16,7 @@ _BARRIER = 1e6
 """Energy of charge that is out of reach [1/m]."""
 _LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
-_SOFT = 0.15
+SOFT = 0.15
 """Distance, as a part of the larger extent, below which 1/r of two points is bounded: flat clusters
 that coincide then have less energy between them than each has alone. Coarse ones that are bent may
 not; ``solve_kernels`` raises the diagonal then."""
@@ -41,7 +41,7 @@ def leaf_pairs(leaves, floor):
         for q in range(4):
             image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
-    shapes, mirrored = _moments(points, extent), _moments(image, extent)
+    shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
     line = np.empty(n, np.float32)
     behind = 0  # clusters of bodies before this one's
     for i in range(n):
@@ -93,7 +93,7 @@ def _add_lifted(leaves, out):
 
 
 @fast
-def _moments(points, extent):
+def cluster_moments(points, extent):
     """Centre, the two arms and the reach of each cluster, a column each, shape (10, l)."""
     out = np.empty((10, points.shape[0]), np.float32)
     for j in range(points.shape[0]):
@@ -101,7 +101,7 @@ def _moments(points, extent):
             out[i, j] = 0.5 * (points[j, 0, i] + points[j, 3, i])
             out[3 + i, j] = 0.5 * (points[j, 0, i] - points[j, 1, i])
             out[6 + i, j] = 0.5 * (points[j, 0, i] - points[j, 2, i])
-        out[9, j] = _FAR * extent[j]
+        out[9, j] = FAR * extent[j]
     return out
 
 
@@ -133,7 +133,7 @@ def _far_means(shapes, i, others, out):
 @fast
 def mean_inverse(first, second, extent):
     """Mean of a bounded 1/r [1/m] over four points of each of two clusters, shapes (4, 3)."""
-    bound = (_SOFT * extent) ** 4
+    bound = (SOFT * extent) ** 4
     total = 0.0
     for p in range(4):
         for q in range(4):
