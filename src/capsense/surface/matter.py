@@ -155,7 +155,7 @@ def _surface_points(body: Body) -> Array:
     if found is None:
         from capsense.surface.panels import panels_of
 
-        panels = panels_of(body.shape, 300)
+        panels = panels_of(body.shape, 80)
         found = np.concatenate([panels.centers, panels.corners.reshape(-1, 3)])
         body.shape.__dict__["_surface_points"] = found
     return found

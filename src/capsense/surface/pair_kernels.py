@@ -42,21 +42,20 @@ def leaf_pairs(leaves, floor):
             image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
-    line = np.empty(n, np.float32)
+    flat, below = _flat(points, extent), _flat(image, extent)
+    line, room = np.empty(n, np.float32), np.empty((15, n), np.float32)
     behind = 0  # clusters of bodies before this one's
     for i in range(n):
         if owner[i] != owner[behind]:
             behind = i
         _far_means(shapes, i, mirrored, line[: i + 1])
+        _near_means(flat, i, below, line[: i + 1], room)
         for j in range(i + 1):
-            if line[j] < 0.0:
-                line[j] = mean_inverse(points[i], image[j], max(extent[i], extent[j]))
             out[i, j] = -line[j]
         if behind > 0:
             _far_means(shapes, i, shapes, line[:behind])
+            _near_means(flat, i, flat, line[:behind], room)
             for j in range(behind):
-                if line[j] < 0.0:
-                    line[j] = mean_inverse(points[i], points[j], max(extent[i], extent[j]))
                 out[i, j] += line[j]
         if leaves.within[i] > 0.0:
             _far_means(shapes, i, shapes, line[: i + 1])
@@ -131,18 +130,59 @@ def _far_means(shapes, i, others, out):
 
 
 @fast
+def _flat(points, extent):
+    """Coordinates of the four points and extent of each cluster, a column each, shape (13, l)."""
+    out = np.empty((13, points.shape[0]), np.float32)
+    for j in range(points.shape[0]):
+        for q in range(4):
+            for i in range(3):
+                out[3 * q + i, j] = points[j, q, i]
+        out[12, j] = extent[j]
+    return out
+
+
+@fast
+def _near_means(flat, i, others, out, room):
+    """Replace what is negative in a line by :func:`mean_inverse` of cluster i and those others."""
+    count = 0
+    for j in range(out.shape[0]):
+        if out[j] < 0.0:
+            for k in range(12):
+                room[k, count] = others[k, j]
+            bound = np.float32(SOFT) * max(flat[12, i], others[12, j])
+            room[12, count], room[13, count] = (
+                bound * bound * bound * bound + np.float32(1e-24),
+                0.0,
+            )
+            room[14, count] = j
+            count += 1
+    for p in range(4):
+        x, y, z = flat[3 * p, i], flat[3 * p + 1, i], flat[3 * p + 2, i]
+        for q in range(4):
+            for k in range(count):
+                dx, dy = x - room[3 * q, k], y - room[3 * q + 1, k]
+                dz = z - room[3 * q + 2, k]
+                square = dx * dx + dy * dy + dz * dz
+                fourth = square * square + room[12, k]
+                room[13, k] += rsqrt(fourth * rsqrt(fourth))
+    for k in range(count):
+        out[int(room[14, k])] = room[13, k] * np.float32(1.0 / 16.0)
+
+
+@fast
 def mean_inverse(first, second, extent):
     """Mean of a bounded 1/r [1/m] over four points of each of two clusters, shapes (4, 3)."""
-    bound = (SOFT * extent) ** 4
-    total = 0.0
+    bound = np.float32((SOFT * extent) ** 4 + 1e-24)
+    total = np.float32(0.0)
     for p in range(4):
         for q in range(4):
-            x = first[p, 0] - second[q, 0]
-            y = first[p, 1] - second[q, 1]
-            z = first[p, 2] - second[q, 2]
+            x = np.float32(first[p, 0] - second[q, 0])
+            y = np.float32(first[p, 1] - second[q, 1])
+            z = np.float32(first[p, 2] - second[q, 2])
             s = x * x + y * y + z * z
-            total += 1.0 / math.sqrt(math.sqrt(s * s + bound))
-    return total / 16.0
+            fourth = s * s + bound
+            total += rsqrt(fourth * rsqrt(fourth))
+    return total / np.float32(16.0)
 
 
 @fast

@@ -89,8 +89,8 @@ def _function(body, node):
 
 @fast
 def _differences(cut, functions, values, out):
-    """Integrals with the functions (f, m) of what has these means on the clusters, (k, m)."""
-    for f in range(functions.cluster.shape[0]):
+    """Integrals with the first functions, (f, m), of what has these means on clusters, (k, m)."""
+    for f in range(out.shape[0]):
         a = functions.cluster[f]
         if a < 0:
             for i in range(values.shape[1]):
@@ -117,49 +117,33 @@ def _climb(cut, values):
 @fast
 def assembled(bodies, cut, functions, rows, pairs, lead):
     """Set up the system of a cut from the rows (l, w) and pairs (l, l) of its leaves."""
-    clusters, leaves = cut.node.shape[0], cut.leaves.shape[0]
     total, solved = functions.cluster.shape[0], functions.solved
-    width = rows.shape[1]
-    values = np.empty((clusters, width + leaves), np.float32)
-    for j in range(leaves):
-        a = cut.leaves[j]
-        for i in range(width):
-            values[a, i] = rows[j, i]
-        for i in range(leaves):
-            values[a, width + i] = pairs[j, i]
-    _climb(cut, values)
-    wide = np.empty((total, width + leaves), np.float32)
-    _differences(cut, functions, values, wide)
-    columns = np.empty((clusters, total), np.float32)
-    for j in range(leaves):
-        for f in range(total):
-            columns[cut.leaves[j], f] = wide[f, width + j]
-    _climb(cut, columns)
-    outer = np.empty((total, total), np.float32)
-    _differences(cut, functions, columns, outer)
-    psi = np.empty((total, width - lead), np.float32)
-    for f in range(total):
-        for k in range(width - lead):
-            psi[f, k] = wide[f, lead + k]
-    padded = WIDTH * ((solved + WIDTH - 1) // WIDTH)
-    turned = np.zeros((width - lead, padded), np.float32)
-    for f in range(solved):
-        for k in range(width - lead):
-            turned[k, f] = psi[f, k]
-    response = np.empty((total, padded), np.float32)
-    multiply(psi, turned, response)
+    wide, outer = _integrals(cut, functions, rows, pairs)
+    modes = rows.shape[1] - lead
+    psi = np.empty((total, modes), np.float32)
     phi, own = np.empty((total, lead)), np.empty(total)
+    for f in range(total):
+        for i in range(lead):
+            phi[f, i] = wide[f, i]
+        own[f] = 0.0
+        for k in range(modes):
+            psi[f, k] = wide[f, lead + k]
+            own[f] -= float(psi[f, k]) * float(psi[f, k])
+    response = _products(psi, solved)
     matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
     for f in range(total):
         body = bodies[functions.body[f]]
-        energy = singles(body.energy)
-        for i in range(lead):
-            phi[f, i] = wide[f, i]
-        at_f = functions.number[f]
-        for e in range(min(f + 1, solved) if f < solved else solved):
-            value = float(outer[e, f]) - float(response[f, e])
+        energy, line = singles(body.energy), functions.number[f] * body.n
+        if f >= solved:  # its two parts are leaves
+            parts = cut.kids[functions.cluster[f]]
+            x, y = cut.leaf[parts[0]], cut.leaf[parts[1]]
+            own[f] += float(pairs[x, x]) + float(pairs[y, y]) - 2.0 * float(pairs[x, y])
+            if body.energy != 0:
+                own[f] += float(energy[line + functions.number[f]]) / body.scale
+        for e in range(min(f + 1, solved)):
+            value = float(outer[f, e]) - float(response[f, e])
             if functions.body[e] == functions.body[f] and body.energy != 0:
-                value += float(energy[at_f * body.n + functions.number[e]]) / body.scale
+                value += float(energy[line + functions.number[e]]) / body.scale
             if f < solved:
                 matrix[f, e] = value
                 matrix[e, f] = value
@@ -167,15 +151,49 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
                 rest[f - solved, e] = value
         if f < solved:
             own[f] = matrix[f, f]
-        else:
-            square = 0.0
-            for k in range(width - lead):
-                square += float(psi[f, k]) * float(psi[f, k])
-            own[f] = float(outer[f, f]) - square
-            if body.energy != 0:
-                own[f] += float(energy[at_f * body.n + at_f]) / body.scale
     _add_matter(bodies, functions, matrix, rest, own)
     return System(phi, matrix, rest, own)
+
+
+@fast
+def _integrals(cut, functions, rows, pairs):
+    """Integrate rows (l, w) with all functions, and pairs (l, l) with all and those solved for."""
+    clusters, leaves, solved = cut.node.shape[0], cut.leaves.shape[0], functions.solved
+    total, width = functions.cluster.shape[0], rows.shape[1]
+    means, met = np.empty((clusters, width), np.float32), np.empty((clusters, leaves), np.float32)
+    for j in range(leaves):
+        a = cut.leaves[j]
+        for i in range(width):
+            means[a, i] = rows[j, i]
+        for i in range(leaves):
+            met[a, i] = pairs[j, i]
+    _climb(cut, means)
+    _climb(cut, met)
+    wide, half = np.empty((total, width), np.float32), np.empty((solved, leaves), np.float32)
+    _differences(cut, functions, means, wide)
+    _differences(cut, functions, met, half)
+    columns = np.empty((clusters, solved), np.float32)
+    for j in range(leaves):
+        line = columns[cut.leaves[j]]
+        for e in range(solved):
+            line[e] = half[e, j]
+    _climb(cut, columns)
+    outer = np.empty((total, solved), np.float32)
+    _differences(cut, functions, columns, outer)
+    return wide, outer
+
+
+@fast
+def _products(psi, solved):
+    """Products of all rows of ψ with the first ``solved`` ones, and some columns more."""
+    total, modes = psi.shape
+    turned = np.zeros((modes, WIDTH * ((solved + WIDTH - 1) // WIDTH)), np.float32)
+    for f in range(solved):
+        for k in range(modes):
+            turned[k, f] = psi[f, k]
+    out = np.empty((total, turned.shape[1]), np.float32)
+    multiply(psi, turned, out)
+    return out
 
 
 @fast
