@@ -140,7 +140,8 @@ def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_], 
     sheet = 0.0 if deep.any() else layers.volume / float(areas[wanted].sum())
     centers[..., 2][~wanted] = 0.0
     pieces = Surface(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
-    return _pixel_tree(*wanted.shape, dx / dy), pieces, wanted.ravel(), sheet
+    tree = _pixel_tree(len(depth), (len(wanted) - len(depth)) // 4, *front.shape[1:], dx / dy)
+    return tree, pieces, wanted.ravel(), sheet
 
 
 def _pixel_centers(layers: Layers) -> tuple[Array, Array]:
@@ -197,9 +198,19 @@ def _slopes(depth: Array, axis: int, pitch: float) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _pixel_tree(views: int, rows: int, columns: int, ratio: float) -> Clusters:
-    """Clusters of the pixels of images that lie behind each other."""
-    view, row, column = np.indices((views, rows, columns)).reshape(3, -1).astype(float)
+def _pixel_tree(views: int, sides: int, rows: int, columns: int, ratio: float) -> Clusters:
+    """Clusters of the pixels of images that lie behind each other, and of their sides.
+
+    The sides of an image, ``sides`` for each of four directions as of :func:`_sides`, are taken
+    together: along a slanting edge, those across x and those across y take turns.
+    """
+    view, row, column = np.indices((views + 4 * sides, rows, columns)).astype(float)
+    for direction, (x, y) in enumerate(((-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5))):
+        of = slice(views + direction * sides, views + (direction + 1) * sides)
+        column[of] += x
+        row[of] += y
+        view[of] -= direction * sides
+    view, row, column = view.ravel(), row.ravel(), column.ravel()
     far = 2.0 * max(rows, columns * ratio)
     features = np.zeros((len(view), 6))
     features[:, :3] = np.stack([column * ratio, row, far * view], axis=1)
