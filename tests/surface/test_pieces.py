@@ -337,16 +337,24 @@ def test_a_block_with_a_known_back_reads_as_the_block(
     assert np.diag(wrong[1]).min() < -0.08
 
 
-def test_sides_across_x_and_y_go_together(simulators: Callable[..., cs.Simulator]) -> None:
-    """Regression: a block turned by 23°, whose edges are stairs; the two kinds of sides take turns.
+@pytest.mark.parametrize(
+    ("shape", "place", "angles"),
+    [
+        (cs.Box((0.15, 0.1, 0.02)), (0.02047903677, -0.02599859947, 0.06), (0, 0, 0.4)),
+        (cs.Cylinder(0.0236, 0.12), (0.01, -0.02, 0.12), (-0.0586, 0.194, 0.0141)),
+    ],
+)
+def test_sides_and_fronts_go_together(
+    shape: cs.Shape, place: Array, angles: Array, simulators: Callable[..., cs.Simulator]
+) -> None:
+    """Regression: a block turned by 23°, a cylinder nearly upright, of stairs.
 
-    Measured 0.9 %; 88 % where clusters held one kind each and lay within each other.
+    Measured 1.7 and 1.2 %; 88 % where clusters of each kind of side lay within each other.
     """
-    shape = cs.Box((0.15, 0.1, 0.02))
-    pose = cs.Pose.from_euler((0.020479036776742995, -0.025998599473973913, 0.06), (0, 0, 0.4))
+    pose = cs.Pose.from_euler(place, angles)
     sim = simulators("six_patch")
     expected = sim.step(cs.Scene([cs.Body(shape, pose, "steel")])).delta
     front, back = view(shape, pose, 256, 0.5)
     found = sim.step(cs.DepthFrame(front, back=back))
-    assert np.abs(found.delta - expected).max() < 0.02 * np.abs(expected).max()
+    assert np.abs(found.delta - expected).max() < 0.04 * np.abs(expected).max()
     assert found.stats.error_estimate < 0.1 * np.abs(expected).max()

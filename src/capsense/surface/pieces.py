@@ -201,15 +201,15 @@ def _slopes(depth: Array, axis: int, pitch: float) -> Array:
 def _pixel_tree(views: int, sides: int, rows: int, columns: int, ratio: float) -> Clusters:
     """Clusters of the pixels of images that lie behind each other, and of their sides.
 
-    The sides of an image, ``sides`` for each of four directions as of :func:`_sides`, are taken
-    together: along a slanting edge, those across x and those across y take turns.
+    The sides of an image, ``sides`` for each of four directions as of :func:`_sides`, go with the
+    fronts: on slanting edges and steep faces, they take turns.
     """
     view, row, column = np.indices((views + 4 * sides, rows, columns)).astype(float)
     for direction, (x, y) in enumerate(((-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5))):
         of = slice(views + direction * sides, views + (direction + 1) * sides)
         column[of] += x
         row[of] += y
-        view[of] -= direction * sides
+        view[of] -= views + direction * sides
     view, row, column = view.ravel(), row.ravel(), column.ravel()
     far = 2.0 * max(rows, columns * ratio)
     features = np.zeros((len(view), 6))
