@@ -55,9 +55,10 @@ def error(found: cs.Reading, simulator: cs.Simulator, *bodies: cs.Body) -> float
 def test_a_moving_block_reads_as_its_shape_does(
     server: StandIn, sim: Any, tiny_simulator: cs.Simulator
 ) -> None:
-    """Differential, along a path: as the geometry, step by step, with times.
+    """Differential, along a path: as an image of its own, and as the geometry; with times.
 
-    The block's edges lie between pixels, so that its image is as wide as itself.
+    The block's edges lie between pixels, so that its image is as wide as itself. Measured 4.6 %
+    from the geometry; from the image made by hand, less than 0.1 %.
     """
     block = put(server, "block")
     flange = server.pose(server.getObject("/Robot/flange"))
@@ -77,7 +78,13 @@ def test_a_moving_block_reads_as_its_shape_does(
             assert now == pytest.approx(k * TIME_STEP)
             assert sensor.time == now
             reading = sensor.read()
-            assert error(reading, tiny_simulator, cs.Body(BLOCK, place(now), "steel")) < 1e-3
+            assert error(reading, tiny_simulator, cs.Body(BLOCK, place(now), "steel")) < 0.08
+            mesh = BLOCK.to_trimesh()
+            seen = cs.rasterise(place(now).apply(mesh.vertices), mesh.faces, (0.1, 0.1), (100, 100))
+            depth = np.where(seen.depth > 0, seen.depth, np.nan)
+            by_hand = cs.DepthFrame(depth, camera=cs.OrthographicCamera(0.1, 0.1), back=0.01)
+            expected = tiny_simulator.step(by_hand).delta
+            assert np.abs(reading.delta - expected).max() < 1e-3 * np.abs(expected).max()
     assert not server.running
     assert not server.stepping
 

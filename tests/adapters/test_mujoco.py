@@ -48,13 +48,24 @@ def test_every_primitive_has_its_size(tiny_simulator: cs.Simulator) -> None:
 
 
 def test_a_floor_has_no_end(tiny_simulator: cs.Simulator) -> None:
-    """Analytic: a plane reads as a slab that fills the domain beyond it, wherever its middle."""
-    slab = tiny_simulator.step(cs.Scene([cs.Body(cs.Box((1, 1, 0.2)), cs.Pose((0, 0, 0.14)))]))
-    tiny_simulator.reset()
-    for middle in ("0 0 .04", "50 -80 .04"):
-        floor = f'<geom type="plane" size="1 1 .1" pos="{middle}" euler="180 0 0"/>'
-        found = sensor_in(floor, tiny_simulator).read()
-        assert found.delta == pytest.approx(slab.delta, abs=1e-18)
+    """Differential: a plane reads as a slab as wide as the domain does, wherever its middle.
+
+    Measured 0.6 % with fine panels, and as much for a table of 100 m; 1 mm nearer is 10 %.
+    """
+    fine = cs.Simulator(
+        tiny_simulator.design, preset="fine", settings=tiny_simulator.settings,
+        background=tiny_simulator.background,
+    )  # fmt: skip
+    slab = fine.step(cs.Scene([cs.Body(cs.Box((0.1, 0.1, 0.02)), cs.Pose((0, 0, 0.05)))])).delta
+    found = []
+    for floor in (
+        '<geom type="plane" size="1 1 .1" pos="0 0 .04" euler="180 0 0"/>',
+        '<geom type="plane" size="1 1 .1" pos="50 -80 .04" euler="180 0 0"/>',
+        '<geom type="box" size="50 70 5" pos="30 20 5.04"/>',
+    ):
+        found.append(sensor_in(floor, fine).read().delta)
+        assert np.abs(found[-1] - slab).max() < 0.012 * np.abs(slab).max()
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
     behind = sensor_in('<geom type="plane" size="0 0 .1" pos="0 0 -.5"/>', tiny_simulator)
     assert len(behind.scene()) == 0
 
@@ -202,12 +213,13 @@ def test_sizes_changed_later_are_taken_by_refresh(tiny_simulator: cs.Simulator) 
 def test_readings_follow_the_simulation(tiny_simulator: cs.Simulator) -> None:
     """A ball that falls towards the sensor is felt more and more."""
     sensor = sensor_in(
-        '<body name="ball" pos="0 0 .09"><freejoint/><geom size=".01"/></body>', tiny_simulator
+        '<body name="ball" pos="0 0 .07"><freejoint/><geom size=".01"/></body>', tiny_simulator
     )
     felt = []
     for _ in range(5):
         felt.append(sensor.read().delta[0, 0])
         mujoco.mj_step(sensor.model, sensor.data, 10)
+    assert felt[0] > 0
     assert np.all(np.diff(felt) > 0)
 
 

@@ -213,8 +213,9 @@ def test_level_pixels_are_squares() -> None:
     """Analytic: centres, areas and moments of a level image of oblong pixels; filled backs."""
     front = np.full((3, 4), 0.1)
     front[1, 2] = np.nan
-    tree, found, wanted = layer_pieces(cs.Layers(front, np.full((3, 4), 10.0), (0.4, 0.6)))
+    tree, found, wanted, sheet = layer_pieces(cs.Layers(front, np.full((3, 4), 10.0), (0.4, 0.6)))
     assert wanted.sum() == 11
+    assert sheet == 0.0
     assert not wanted[6]
     assert sorted(leaves(tree, 0)) == list(range(12))
     np.testing.assert_allclose(found.centers[0], [-0.15, -0.2, 0.1], atol=1e-8)
@@ -225,24 +226,26 @@ def test_level_pixels_are_squares() -> None:
 
 
 def test_slanted_pixels_are_parallelograms() -> None:
-    """Analytic: area and moments of a plane, its slopes below the limit; then of backs too."""
+    """Analytic: area and moments of a plane, its slopes below the limit, and of its back."""
     x = (np.arange(8) + 0.5) / 8 * 0.8 - 0.4
     front = 0.5 + 0.7 * x[None, :] - 0.4 * x[:, None]
-    _, found, wanted = layer_pieces(cs.Layers(front, front + 0.3, (0.8, 0.8)))
-    assert wanted.all()
-    assert len(wanted) == 128
-    np.testing.assert_allclose(found.areas, 0.01 * np.sqrt(1 + 0.49 + 0.16), rtol=1e-5)
+    tree, found, wanted, _ = layer_pieces(cs.Layers(front, front + 0.3, (0.8, 0.8)))
+    assert wanted[:128].all()  # fronts and backs; then come sides in four directions
+    assert len(wanted) == 128 + 4 * 64
+    assert sorted(leaves(tree, 0)) == list(range(len(wanted)))
+    np.testing.assert_allclose(found.areas[:128], 0.01 * np.sqrt(1 + 0.49 + 0.16), rtol=1e-5)
     sides = np.array([[0.1, 0, 0.07], [0, 0.1, -0.04]])
     np.testing.assert_allclose(found.moments[70], sides.T @ sides / 12, rtol=1e-4, atol=1e-9)
-    thin = layer_pieces(cs.Layers(front, front + 0.1, (0.8, 0.8)))
-    assert len(thin[2]) == 64  # a back nearer than two pixels is no surface of its own
+    _, _, wanted, sheet = layer_pieces(cs.Layers(front, front + 0.1, (0.8, 0.8)))
+    assert len(wanted) == 64  # a back nearer than two pixels is no surface of its own
+    assert sheet == pytest.approx(0.1 / np.sqrt(1 + 0.49 + 0.16), rel=1e-5)
 
 
 def test_steps_are_no_slopes() -> None:
     """Analytic: beside a step of the image, pixels stay level."""
     front = np.full((5, 6), 0.1)
     front[:, 3:] = 0.9
-    _, found, _ = layer_pieces(cs.Layers(front, np.full((5, 6), 10.0), (0.6, 0.5)))
+    _, found, _, _ = layer_pieces(cs.Layers(front, np.full((5, 6), 10.0), (0.6, 0.5)))
     np.testing.assert_allclose(found.areas, 0.01)
 
 
@@ -250,8 +253,116 @@ def test_a_ball_has_its_area() -> None:
     """Analytic: the cap of a ball that slopes less than 2, on both sides of it."""
     radius, middle = 0.06, np.array([0.004, 0.003, 0.2])
     front, back = view(cs.Sphere(radius), cs.Pose(middle), 128, 0.2)
-    _, found, wanted = layer_pieces(cs.Layers(front, back, (0.2, 0.2)))
+    _, found, wanted, _ = layer_pieces(cs.Layers(front, back, (0.2, 0.2)))
+    wanted[2 * 128 * 128 :] = False  # the sides
     off = np.linalg.norm(found.centers[:, :2] - middle[:2], axis=1)
     cap = wanted & (off < radius * 2 / np.sqrt(5))
     expected = 4 * np.pi * radius**2 * (1 - 1 / np.sqrt(5))
     assert found.areas[cap].sum() == pytest.approx(expected, rel=0.01)
+
+
+def block_image(turned: bool) -> tuple[cs.Layers, Array]:
+    """A block of 6 x 4 x 2 cm whose edges lie between pixels of 5 x 4 mm, and its edge lengths."""
+    size = np.array([0.06, 0.04, 0.02])
+    front, back = np.full((2, 20, 20), np.nan)
+    front[5:15, 4:16], back[5:15, 4:16] = 0.05, 0.07
+    if turned:
+        return cs.Layers(front.T, back.T, (0.08, 0.1)), size[[1, 0, 2]]
+    return cs.Layers(front, back, (0.1, 0.08)), size
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_block_has_all_its_faces(turned: bool) -> None:
+    """Analytic: area, centre and second moments of the surface of a box, and of its sides alone."""
+    image, size = block_image(turned)
+    _, found, wanted, sheet = layer_pieces(image)
+    assert sheet == 0.0
+    areas, moments = np.zeros(3), np.zeros((3, 3))  # of both faces across each axis, of one
+    for k in range(3):
+        areas[k] = 2 * size.prod() / size[k]
+        moments[k] = size**2 / 12
+        moments[k, k] = size[k] ** 2 / 4
+    for first, faces in ((0, [0, 1, 2]), (2 * 400, [0, 1])):
+        of = wanted & (np.arange(len(wanted)) >= first)
+        share = found.areas[of] / found.areas[of].sum()
+        assert found.areas[of].sum() == pytest.approx(areas[faces].sum(), rel=1e-5)
+        middle = share @ found.centers[of]
+        np.testing.assert_allclose(middle, [0, 0, 0.06], atol=1e-8)
+        arms = found.centers[of] - middle
+        total = np.einsum("k,kij->ij", share, found.moments[of] + arms[:, :, None] * arms[:, None])
+        expected = np.diag(areas[faces] @ moments[faces] / areas[faces].sum())
+        np.testing.assert_allclose(total, expected, rtol=1e-5, atol=1e-10)
+
+
+def test_a_side_ends_where_the_neighbour_begins() -> None:
+    """Analytic: two blocks side by side, one 16 mm farther behind than the other."""
+    front, back = np.full((2, 9, 10), np.nan)
+    front[2:7, 2:5], front[2:7, 5:8] = 0.05, 0.066
+    back[2:7, 2:8] = 0.09
+    image = cs.Layers(front, back, (0.04, 0.036))  # pixels of 4 mm
+    _, found, wanted, _ = layer_pieces(image)
+    sides = np.flatnonzero(wanted)
+    sides = sides[sides >= 2 * 90]
+    across = found.moments[sides][:, 1, 1] > 0  # of the sides across x
+    between = sides[across & (np.abs(found.centers[sides, 0]) < 1e-8)]
+    assert len(between) == 5
+    np.testing.assert_allclose(found.areas[between], 0.004 * 0.016, rtol=1e-5)
+    np.testing.assert_allclose(found.centers[between, 2], 0.058, rtol=1e-5)
+    np.testing.assert_allclose(
+        found.moments[between], np.tile(np.diag([0, 0.004**2, 0.016**2]) / 12, (5, 1, 1)),
+        rtol=1e-5, atol=1e-12,
+    )  # fmt: skip
+    outer = 5 * 0.004 * (0.04 + 0.024) + 2 * 3 * 0.004 * (0.04 + 0.024)
+    assert found.areas[sides].sum() == pytest.approx(outer + 5 * 0.004 * 0.016, rel=1e-5)
+
+
+def test_a_block_with_a_known_back_reads_as_the_block(
+    simulators: Callable[..., cs.Simulator],
+) -> None:
+    """Differential: 100 x 100 pixels against the box of fine panels.
+
+    Measured 4.0 %; the front alone reads up to 11 % of the largest change too little.
+    """
+    pose = cs.Pose((0.005, -0.005, 0.03))
+    box = cs.Scene([cs.Body(cs.Box((0.06, 0.04, 0.03)), pose, "steel")])
+    front = np.full((100, 100), np.nan)
+    front[45:53, 45:57] = 0.015
+    expected = simulators("six_patch_bare", preset="fine").step(box).delta
+    sim, scale = simulators("six_patch_bare"), np.abs(expected).max()
+    wrong = [
+        (sim.step(cs.DepthFrame(front, back=back)).delta - expected) / scale
+        for back in (0.03, "fill")
+    ]
+    assert np.abs(wrong[0]).max() < 0.07
+    assert np.diag(wrong[1]).min() < -0.08
+
+
+@pytest.mark.parametrize(
+    ("shape", "place", "angles"),
+    [
+        (
+            cs.Box((0.15, 0.1, 0.02)),
+            (0.020479036776742995, -0.025998599473973913, 0.06),
+            (0, 0, 0.4),
+        ),
+        (
+            cs.Cylinder(0.02360329457436822, 0.11998133195090117),
+            (0.019040544730360084, 0.024467873915431232, 0.12),
+            (-0.05855985689801323, 0.1939935670728962, 0.014113411841972533),
+        ),
+    ],
+)
+def test_sides_and_fronts_go_together(
+    shape: cs.Shape, place: Array, angles: Array, simulators: Callable[..., cs.Simulator]
+) -> None:
+    """Regression: a block turned by 23°, a cylinder nearly upright, of stairs.
+
+    Measured 1.7 and 1.2 %; 88 and 33 % where clusters of sides and fronts lay within each other.
+    """
+    pose = cs.Pose.from_euler(place, angles)
+    sim = simulators("six_patch")
+    expected = sim.step(cs.Scene([cs.Body(shape, pose, "steel")])).delta
+    front, back = view(shape, pose, 256, 0.5)
+    found = sim.step(cs.DepthFrame(front, back=back))
+    assert np.abs(found.delta - expected).max() < 0.04 * np.abs(expected).max()
+    assert found.stats.error_estimate < 0.1 * np.abs(expected).max()

@@ -105,18 +105,21 @@ def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Su
     return Surface(centers, areas, arms.transpose(0, 2, 1) @ arms / 12), normals
 
 
-def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_]]:
+def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_], float]:
     """The surfaces that a layered image shows, a piece a pixel.
 
     Backs count where they lie farther behind than two pixels are wide, and before 10 m; there, the
-    sides between front and back count too, at pixels whose neighbour begins farther behind.
+    sides between front and back count too, at pixels whose neighbour begins farther behind. Where
+    every back is nearer than that, the image is one of a sheet.
 
     Returns:
-        Clusters of all pixels; the pieces; and which of them there are.
+        Clusters of all pixels; the pieces; which of them there are; and the mean thickness of a
+        sheet [m], 0 for the surface of a solid.
     """
     dx, dy = layers.pixel
     front, back = layers.front.astype(float), layers.back.astype(float)
-    known = (back - front > 2 * max(dx, dy)) & (back < _FILLED)
+    deep = back - front > 2 * max(dx, dy)
+    known = deep & (back < _FILLED)
     back = np.where(known, back, np.nan)[known.any(axis=(1, 2))]
     depth = np.concatenate([front, back])
     slope_x, slope_y = _slopes(depth, 2, dx), _slopes(depth, 1, dy)
@@ -134,16 +137,18 @@ def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_]]:
             np.concatenate(both) for both in zip((centers, areas, moments), sides, strict=True)
         )
     wanted = ~np.isnan(centers[..., 2])
+    sheet = 0.0 if deep.any() else layers.volume / float(areas[wanted].sum())
     centers[..., 2][~wanted] = 0.0
     pieces = Surface(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
-    return _pixel_tree(*wanted.shape, dx / dy), pieces, wanted.ravel()
+    tree = _pixel_tree(len(depth), (len(wanted) - len(depth)) // 4, *front.shape[1:], dx / dy)
+    return tree, pieces, wanted.ravel(), sheet
 
 
 def _pixel_centers(layers: Layers) -> tuple[Array, Array]:
     """Coordinates x and y of the pixels [m], shapes (columns,) and (rows, 1)."""
     (dx, dy), (rows, columns) = layers.pixel, layers.resolution
-    x = (np.arange(columns) + 0.5) * dx - 0.5 * layers.size[0]
-    y = (np.arange(rows) + 0.5) * dy - 0.5 * layers.size[1]
+    x = (np.arange(columns, dtype=np.float64) + 0.5) * dx - 0.5 * layers.size[0]
+    y = (np.arange(rows, dtype=np.float64) + 0.5) * dy - 0.5 * layers.size[1]
     return x, y[:, None]
 
 
@@ -193,9 +198,19 @@ def _slopes(depth: Array, axis: int, pitch: float) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _pixel_tree(views: int, rows: int, columns: int, ratio: float) -> Clusters:
-    """Clusters of the pixels of images that lie behind each other."""
-    view, row, column = np.indices((views, rows, columns)).reshape(3, -1).astype(float)
+def _pixel_tree(views: int, sides: int, rows: int, columns: int, ratio: float) -> Clusters:
+    """Clusters of the pixels of images that lie behind each other, and of their sides.
+
+    The sides of an image, ``sides`` for each of four directions as of :func:`_sides`, go with the
+    fronts: on slanting edges and steep faces, they take turns.
+    """
+    view, row, column = np.indices((views + 4 * sides, rows, columns)).astype(float)
+    for direction, (x, y) in enumerate(((-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5))):
+        of = slice(views + direction * sides, views + (direction + 1) * sides)
+        column[of] += x
+        row[of] += y
+        view[of] -= views + direction * sides
+    view, row, column = view.ravel(), row.ravel(), column.ravel()
     far = 2.0 * max(rows, columns * ratio)
     features = np.zeros((len(view), 6))
     features[:, :3] = np.stack([column * ratio, row, far * view], axis=1)

@@ -21,8 +21,11 @@ from capsense.field.store import read_arrays, write_arrays
 from capsense.scene import Shape, TriMesh
 from capsense.surface.panels import panels_of, polygon_panels
 from capsense.surface.rigid import Clusters, RigidShape, charged_tree, rigid_shape
+from capsense.surface.standing import standing
 
-VERSION = 1
+Array = NDArray[np.float64]
+
+VERSION = 3
 """Of stored shapes: to be raised when the same mesh would get other panels or functions."""
 
 _log = logging.getLogger(__name__)
@@ -99,7 +102,8 @@ def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
     except FieldError as error:
         _log.warning("a stored shape is not used, it is made again: %s", error)
     wanted = count * min(_MOST, max(_TRIANGLES, _EACH * shape.parts))
-    made = rigid_shape(panels_of(shape, round(wanted)))
+    own = standing(shape.vertices, shape.faces)
+    made = _turned(rigid_shape(panels_of(own.corners, round(wanted))), own.axes, own.middle)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         _write(made, file, key)
@@ -109,16 +113,29 @@ def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
     return made
 
 
+def _turned(shape: RigidShape, axes: Array, middle: Array) -> RigidShape:
+    """A shape taken to another frame, ``x @ axes.T + middle``: energies stay what they are."""
+    old = shape.panels
+    panels = polygon_panels(old.corners @ axes.T + middle, old.parts, old.closed)
+    tree = charged_tree(panels, shape.tree, _charges(shape))
+    return RigidShape(panels, tree, shape.energy, shape.capacitance)
+
+
+def _charges(shape: RigidShape) -> Array:
+    """Share of each panel in the equilibrium charge, shape (n,)."""
+    single = shape.tree.panel >= 0
+    charge = np.empty(len(shape.panels))
+    charge[shape.tree.panel[single]] = shape.tree.charge[single]
+    return charge
+
+
 def _write(shape: RigidShape, file: Path, key: str) -> None:
     panels, tree = shape.panels, shape.tree
-    single = tree.panel >= 0
-    charge = np.empty(len(panels))
-    charge[tree.panel[single]] = tree.charge[single]
     arrays: dict[str, NDArray[Any]] = {
         "corners": panels.corners[:, :3],  # of triangles
         "parts": panels.parts.astype(np.int32), "kids": tree.kids.astype(np.int32),
         "function": tree.function.astype(np.int32), "panel": tree.panel.astype(np.int32),
-        "charge": charge, "energy": shape.energy[np.tril_indices(len(panels))],
+        "charge": _charges(shape), "energy": shape.energy[np.tril_indices(len(panels))],
     }  # fmt: skip
     meta = {
         "kind": "shape", "key": key, "closed": panels.closed, "capacitance": shape.capacitance,
