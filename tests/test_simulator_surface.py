@@ -241,6 +241,40 @@ def test_what_stands_outside_changes_nothing(sim):
     np.testing.assert_array_equal(sim.step(cs.Scene([outside])).delta, 0.0)
 
 
+LONG = {
+    "table": (cs.Box((3.0, 2.0, 0.02)), (0.0, 0.0, 0.05), (0, 0, 0, 1), cs.Box((0.85, 0.85, 0.02))),
+    "pole": (cs.Capsule(0.03, 4.0), (0.0, 0.01, 0.07), (0, 0.5**0.5, 0, 0.5**0.5),
+             cs.Capsule(0.03, 0.85)),
+    "pipe": (cs.Cylinder(0.03, 4.0), (0.0, 0.01, 0.07), (0, 0.5**0.5, 0, 0.5**0.5),
+             cs.Cylinder(0.03, 0.85)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_long_bodies_read_as_their_part_in_the_domain(sim, name):
+    """Measured: as a body that ends just outside; it may be pushed along without a change."""
+    shape, place, turn, part = LONG[name]
+    whole, shifted, short = (
+        sim.step(cs.Scene([cs.Body(s, cs.Pose(np.add(place, (x, 0, 0)), turn))])).delta
+        for s, x in ((shape, 0.0), (shape, 0.7), (part, 0.0))
+    )
+    np.testing.assert_allclose(shifted, whole, rtol=0, atol=1e-6 * whole.max())
+    np.testing.assert_allclose(short, whole, rtol=0, atol=0.025 * whole.max())
+
+
+def test_jacobian_of_a_long_body_is_about_its_own_origin(sim):
+    """Measured: a table turned about its far edge, against central differences."""
+    turn = np.array([0.0, 1.0, 0.0])
+
+    def read(angle):
+        pose = cs.Pose((0.9, 0.0, 0.06), (*(np.sin(angle / 2) * turn), np.cos(angle / 2)))
+        return sim.step(cs.Scene([cs.Body(cs.Box((3.0, 2.0, 0.02)), pose)]), jacobian=True)
+
+    slope, step = read(0.0).jacobian[0, 1, 1, 4], 2e-4
+    difference = (read(step).delta - read(-step).delta)[1, 1] / (2 * step)
+    assert slope == pytest.approx(difference, rel=0.03)
+
+
 # -- other views ------------------------------------------------------------------------------
 
 

@@ -165,25 +165,3 @@ def test_a_missing_simulator_is_named(name: str, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(cs.MissingDependencyError, match=rf"pip install 'capsense\[{name}\]'"):
         getattr(cs, name).attach(None, None, "pad")
-
-
-def test_large_boxes_are_cut_to_what_the_domain_holds() -> None:
-    """Differential: the same points inside as of the whole box, an edge of it near or not."""
-    rng = np.random.default_rng(3)
-    low, high = DOMAIN.lower, DOMAIN.upper
-    reach = float(np.linalg.norm(DOMAIN.size))
-    sizes = [(1.6, 0.8, 0.04), (200.0, 200.0, 10.0), (0.5, 0.5, 5.0)]
-    met = 0
-    for size in sizes * 20:
-        turn = cs.Pose((0, 0, 0), rng.normal(size=4))
-        corner = rng.integers(-1, 2, 3) * np.divide(size, 2)  # also of an edge, or of a face
-        box = cs.Pose(rng.uniform(low, high)) @ turn @ cs.Pose(corner)
-        world = World([solid(cs.Box(size), 0, cs.Pose())], DOMAIN)
-        (body,) = world.scene(frames_of([box], cs.Pose()))
-        np.testing.assert_allclose(body.shape.size, np.minimum(size, reach), rtol=1e-12)
-        points = rng.uniform(low, high, (500, 3))
-        whole = cs.Box(size).signed_distance(box.inverse().apply(points)) < 0
-        part = body.shape.signed_distance(body.pose.inverse().apply(points)) < 0
-        assert np.array_equal(whole, part)
-        met += 0 < whole.sum() < 500
-    assert met > 30

@@ -150,20 +150,8 @@ class World:
             for k in np.flatnonzero(sharing >= 0).tolist():
                 bodies[k] = self._share(int(seen[k]), int(count[k]))
         poses = zip(self._position[seen].tolist(), self._quaternion[seen].tolist(), strict=True)
-        placed = [self._window(b.moved(Pose(*p))) for b, p in zip(bodies, poses, strict=True)]
+        placed = [b.moved(Pose(*p)) for b, p in zip(bodies, poses, strict=True)]
         return Scene(placed + self._soft_bodies(frames) if self.soft else placed)
-
-    def _window(self, body: Body) -> Body:
-        """A box no longer than the domain's diagonal, cut from one whose panels were too large."""
-        if not isinstance(body.shape, Box) or max(body.shape.size) <= self._reach:
-            return body
-        size = np.array(body.shape.size)
-        part = np.minimum(size, self._reach)
-        middle = body.pose.inverse().apply([0.5 * (self._lower + self._upper)])[0]
-        at = np.clip(middle, 0.5 * (part - size), 0.5 * (size - part))
-        return Body(
-            Box(part.tolist()), body.pose @ Pose(at), body.material, body.grounding, body.name
-        )
 
     def _soft_bodies(self, frames: Frames) -> list[Body]:
         """The deformables that reach into the domain, as they are now."""

@@ -25,6 +25,7 @@ from capsense.surface.rigid import RigidShape
 from capsense.surface.step import Solution, solve, solve_lossy
 from capsense.surface.store import rigid
 from capsense.surface.vector_kernels import WIDTH
+from capsense.surface.window import windowed
 
 Array = NDArray[np.float64]
 
@@ -82,6 +83,8 @@ class PackedBodies:
     """What they are made of and what ties them to ground."""
     shapes: list[RigidShape | ChangingBody]
     """What the records point to."""
+    offsets: Array
+    """From the bodies' origins to those of the parts of them that are solved for [m], (n, 3)."""
 
 
 class SurfaceSolver:
@@ -106,6 +109,8 @@ class SurfaceSolver:
         self.preset = preset or Preset()
         self.green = pack_green(green, design)
         self._function = green
+        walls = np.array([design.domain.lower, design.domain.upper])
+        self._middle, self._reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         self._last: tuple[View, Solution] | None = None
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
@@ -215,24 +220,30 @@ class SurfaceSolver:
             )
         from capsense.surface.gradient_kernels import jacobian
 
-        out[bodies.chosen] = UNIT * jacobian(solution, bodies.records, self.green)
+        slope = UNIT * jacobian(solution, bodies.records, self.green)
+        slope[..., 3:] += np.cross(bodies.offsets[:, None, None], slope[..., :3])
+        out[bodies.chosen] = slope
         return out
 
     def pack(self, view: View) -> PackedBodies:
         """Lay out the bodies that reach into the domain."""
         shapes: list[RigidShape | ChangingBody] = []
         sizes: list[float] = []
-        for k in view.met.tolist():
-            shape, size = self._shape(view.scene[k].shape)
+        matter, packed = view.matter.joined(view.scene, view.packed, view.met), view.packed
+        offsets = np.zeros((len(view.met), 3))
+        for place, k in enumerate(view.met.tolist()):
+            rotation, middle = packed.rotation[k], self._middle - packed.position[k]
+            part, at = windowed(view.scene[k].shape, middle @ rotation, self._reach)
+            shape, size = self._shape(part)
             shapes.append(shape)
             sizes.append(size)
-        matter, packed = view.matter.joined(view.scene, view.packed, view.met), view.packed
+            offsets[place] = rotation @ at
         records = np.array([s.record for s in shapes], BODY)
         records["scale"] = sizes
         records["rotation"] = packed.rotation[view.met]
-        records["position"] = packed.position[view.met]
+        records["position"] = packed.position[view.met] + offsets
         matter.write(records, shapes)
-        return PackedBodies(records, view.met, matter, shapes)
+        return PackedBodies(records, view.met, matter, shapes, offsets)
 
     def _shape(self, shape: Shape) -> tuple[RigidShape | ChangingBody, float]:
         """Charge functions of a body, and its size."""
