@@ -1,7 +1,7 @@
 """Reference ΔC of what sensor designers ask for, sensor and object solved as one.
 
     python benchmarks/reference_designs.py              # writes tests/data/reference_designs.json
-    python benchmarks/reference_designs.py --method perturbation     # errors against that file
+    python benchmarks/reference_designs.py --method surface     # errors against that file
 
 A guarded pad, on air and on FR4, bare and under a plastic cover, with a grounded plate before it;
 and a pair of pads with a block of plastic before them. The object is put into the design, as a
