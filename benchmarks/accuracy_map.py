@@ -197,6 +197,7 @@ def plot(results: list[dict[str, Any]], path: Path) -> None:
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure, axes = plt.subplots(figsize=(6.4, 4), layout="constrained")
     for method in dict.fromkeys(r["label"].split()[0] for r in results):
@@ -214,9 +215,10 @@ def plot(results: list[dict[str, Any]], path: Path) -> None:
                           textcoords="offset points", ha="center")  # fmt: skip
     axes.set(xlabel="median step, one core, ms", ylabel="error of the diagonal of ΔC, %")
     axes.margins(0.15)
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("{x:.1g}")
-    axes.yaxis.set_major_formatter("{x:g}")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.grid(True, which="both", alpha=0.3)
     axes.legend(frameon=False)
     figure.savefig(path, dpi=120)

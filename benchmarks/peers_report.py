@@ -94,6 +94,8 @@ def plot(results: dict[str, Any], path: Path) -> None:
         found = [row for _, row in sorted(series.get(name, {}).items())]
         if name == "CapSense":
             found.sort(key=lambda r: r["median_ms"])
+        if not found:
+            continue
         x, y = [r["median_ms"] for r in found], [100 * r["worst"] for r in found]
         axes.loglog(x, y, marker=marker, color=colour, label=name,
                     markersize=11 if marker == "*" else 7, linewidth=1.2 + (name == "CapSense"),

@@ -22,6 +22,7 @@ import shapely
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
 import accuracy_map
+import limits
 import reference_designs
 from curved_cases import curved_body, curved_figures, curved_reference
 from field_cases import (
@@ -62,8 +63,7 @@ TEMPLATE = Path(__file__).with_name("validation_page.md")
 MADELUNG = 1.7475646
 """Of rock salt: what the images of a charge in the middle of a grounded cube amount to."""
 PRESETS = ("learning", "standard", "fine")
-NEAR = 0.002
-"""Scenes up to this gap [m] are near contact."""
+GAPS = ("5 mm", "10 mm", "20 mm", "50 mm")
 
 
 def per_cent(value: float) -> str:
@@ -195,8 +195,8 @@ HEAD = ("scenes", "rms", "95 % below", "worst", "mean", "others: rms", "worst")
 
 def presets(names: Sequence[str] = PRESETS) -> str:
     """Errors of each preset over the two maps."""
-    far = [c for c in reference_scenes(MORE) if c.gap > NEAR]
-    near = [c for c in reference_scenes(MORE) if c.gap <= NEAR]
+    far = [c for c in reference_scenes(MORE) if c.gap > limits.NEAR]
+    near = [c for c in reference_scenes(MORE) if c.gap <= limits.NEAR]
     groups = (("map, 5 to 100 mm", reference_scenes(MAP)), ("more, from 5 mm on", far),
               ("more, 0.5 to 2 mm", near))  # fmt: skip
     lines = []
@@ -227,6 +227,13 @@ def designs() -> str:
         lines.append((case["name"], *cells, f"{100 * case['error']:.2f} %"))
     head = ("case", "pad (shields at ground)", "mutual", "self (shields driven)", "reference's own")
     return table(head, lines)
+
+
+def limited(part: str, *columns: str) -> str:
+    """A table of ``limits.py``, in per cent."""
+    found = getattr(limits, part)(cs.Simulator(limits.DESIGN))
+    lines = [(name, *(f"{100 * e:.1f}" for e in errors)) for name, errors in found]
+    return table(("", *columns), lines)
 
 
 def machine() -> str:
@@ -285,6 +292,9 @@ def main() -> None:
         categories=categories(), references=references(), designs=designs(),
         smoothness=smoothness(out / "smoothness.json"), boards=boards(out / "boards.txt"),
         elements=elements(out / "peers_bem.json"), peers=peers(out / "peers" / "peers.json"),
+        contact=limited("contact", *PRESETS, "2,800 panels"),
+        images=limited("images", *GAPS), cloth=limited("cloth", *GAPS),
+        inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),
         studies=studies(reproduced), foretold=foretold(),
     )  # fmt: skip
     args.output.write_text(page, encoding="utf-8")
