@@ -41,12 +41,10 @@ from reference_scenes import MAP, MORE, ReferenceScene, reference_scenes
 from validation_results import (
     BOARDS,
     ELEMENTS,
-    PEERS,
     SMOOTHNESS,
     Cells,
     boards,
     elements,
-    peers,
     smoothness,
     studies,
     table,
@@ -265,7 +263,7 @@ def run(*command: str) -> int:
 
 def measure_the_rest(out: Path) -> None:
     """Fill the folder with what the page only shows."""
-    for command in (SMOOTHNESS, ELEMENTS, PEERS):
+    for command in (SMOOTHNESS, ELEMENTS):
         if run(*command.split()[1:]):
             raise SystemExit(f"{command} failed")
     board = [sys.executable, *BOARDS.split()[1:]]
@@ -291,7 +289,7 @@ def main() -> None:
         command=COMMAND, machine=machine(), analytic=analytic(), presets=presets(),
         categories=categories(), references=references(), designs=designs(),
         smoothness=smoothness(out / "smoothness.json"), boards=boards(out / "boards.txt"),
-        elements=elements(out / "peers_bem.json"), peers=peers(out / "peers" / "peers.json"),
+        elements=elements(out / "peers_bem.json"),
         contact=limited("contact", *PRESETS, "2,800 panels"),
         images=limited("images", *GAPS), cloth=limited("cloth", *GAPS),
         inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),

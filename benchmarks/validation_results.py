@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from peers_report import rows as peer_rows
-
 from capsense.reproduce.registry import STUDIES
 
 BOARDS = "python benchmarks/boards.py stripe patch"
 SMOOTHNESS = "python benchmarks/smoothness.py -o out/smoothness.json"
 ELEMENTS = "python benchmarks/peers_bem.py -o out/peers_bem.json"
-PEERS = "python benchmarks/peers.py"
 Cells = Sequence[object]
 
 
@@ -62,23 +59,9 @@ def elements(path: Path) -> str:
     rows: dict[str, list[Any]] = {}
     scenes = list(dict.fromkeys(r["scene"] for r in found["results"]))
     for r in found["results"]:
-        rows.setdefault(r["label"], [r["label"]]).append(f"{r['ms']:.3g}, {r['worst']:+.2f} %")
+        ms = f"{r['ms']:.0f}" if r["ms"] >= 100 else f"{r['ms']:.2g}"
+        rows.setdefault(r["label"], [r["label"]]).append(f"{ms}, {r['worst']:+.2f} %")
     return table(("step, ms, and worst error of the diagonal", *scenes), list(rows.values()))
-
-
-def peers(path: Path) -> str:
-    """Time and error of each solver on a volume mesh."""
-    found = _load(path, PEERS)
-    if isinstance(found, str):
-        return found
-    lines = []
-    for group in found:
-        for row in sorted(peer_rows(found, group).values(), key=lambda r: r["median_ms"]):
-            size = f"{row['tetrahedra']:,d}" if row["tetrahedra"] else "–"
-            lines.append((group, row["name"], size, f"{row['median_ms']:.2f}",
-                          f"{100 * row['worst']:.1f} %"))  # fmt: skip
-    head = ("group", "method", "tetrahedra", "step, ms (median)", "largest error of ΔC's diagonal")
-    return table(head, lines)
 
 
 def studies(folder: Path) -> str:

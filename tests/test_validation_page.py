@@ -124,7 +124,7 @@ def test_limits(validation: ModuleType, part: str, columns: int, bound: float) -
 
 def test_what_was_not_run_is_said(parts: dict[str, ModuleType], tmp_path: Path) -> None:
     results = parts["validation_results"]
-    for table in (results.peers, results.elements, results.smoothness, results.boards):
+    for table in (results.elements, results.smoothness, results.boards):
         assert "Not measured in this edition: `python benchmarks/" in table(tmp_path / "none.json")
     found = results.studies(tmp_path)
     for name in STUDIES:
