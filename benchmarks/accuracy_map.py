@@ -1,12 +1,13 @@
 """Errors of ΔC against boundary elements over a map of scenes, and what a step costs.
 
-    python benchmarks/accuracy_map.py                           # the default method
-    python benchmarks/accuracy_map.py --method masked surface
-    python benchmarks/accuracy_map.py --settings preset=learning "" preset=fine --plot out/map.png
+    python benchmarks/accuracy_map.py                           # the default method and preset
+    python benchmarks/accuracy_map.py --presets learning standard fine -o out/accuracy_time.png
+    python benchmarks/accuracy_map.py --method masked --worst 0
+    python benchmarks/accuracy_map.py --settings refine=1.5
 
-Every method is run with every settings, a point each of a curve of error against time. Settings
-are arguments of ``Simulator``, as in ``preset=fine``; besides, ``refine=1.5`` makes panels and the
-masked scheme's mesh finer by that along each axis.
+Every method is run with every preset and all settings, a point each of a curve of error against
+time, which is printed last and drawn by ``-o FILE.png``. Settings are arguments of ``Simulator``;
+besides, ``refine=1.5`` makes panels and the masked scheme's mesh finer by that along each axis.
 
 Scenes are those of ``tests/data/reference_map.json`` and ``reference_more.json``, over
 ``six_patch_bare``; the references' own error is about 0.3 % (the files say how it is known).
@@ -70,14 +71,18 @@ def parse_settings(text: str) -> dict[str, Any]:
     return out
 
 
-def configurations(methods: list[str], settings: list[str]) -> list[Configuration]:
-    """Every method, or the default one, with every settings."""
+def configurations(
+    methods: list[str], presets: list[str], settings: list[str]
+) -> list[Configuration]:
+    """Every method, or the default one, with every preset and all settings."""
     usual = inspect.signature(cs.Simulator).parameters["method"].default
     out = []
     for method in methods or [usual]:
-        for text in settings or [""]:
-            label = " ".join(filter(None, (method, text)))
-            out.append((label, {"method": method, **parse_settings(text)}))
+        for preset in presets or [""]:
+            for text in settings or [""]:
+                label = " ".join(filter(None, (method, preset, text)))
+                named = {"preset": preset} if preset else {}
+                out.append((label, {"method": method, **named, **parse_settings(text)}))
     return out
 
 
@@ -178,31 +183,46 @@ def report(label: str, rows: list[dict[str, Any]], worst: int) -> dict[str, Any]
     return out
 
 
+def curve(results: list[dict[str, Any]]) -> None:
+    """Print error against time, the fastest first."""
+    print("\nerror against time: median step, ms; diagonal's rms, 95 %, worst, %")
+    for r in sorted((r for r in results if "all" in r), key=lambda r: r["all"]["ms"]):
+        s = r["all"]
+        print(f"{r['label']:38s} {s['ms']:8.3f}  {s['rms']:6.2f} {s['p95']:6.2f} {s['worst']:6.2f}")
+
+
 def plot(results: list[dict[str, Any]], path: Path) -> None:
-    """Error against time, a line a method, points its settings."""
+    """Error against time, lines for each method, points its presets and settings."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullFormatter
 
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+    figure, axes = plt.subplots(figsize=(6.4, 4), layout="constrained")
     for method in dict.fromkeys(r["label"].split()[0] for r in results):
         mine = [r for r in results if r["label"].split()[0] == method and "all" in r]
         mine.sort(key=lambda r: r["all"]["ms"])
-        ms = [r["all"]["ms"] for r in mine]
-        (drawn,) = axes.loglog(ms, [r["all"]["rms"] for r in mine], "o-", label=f"{method}, rms")
-        axes.loglog(
-            ms, [r["all"]["worst"] for r in mine], "v:", color=drawn.get_color(),
-            label=f"{method}, worst",
-        )  # fmt: skip
+        ms, colour = [r["all"]["ms"] for r in mine], None
+        for key, word, style in (("worst", "worst", "v:"), ("p95", "95 % below", "s--"),
+                                 ("rms", "rms", "o-")):  # fmt: skip
+            errors = [r["all"][key] for r in mine]
+            (drawn,) = axes.loglog(ms, errors, style, color=colour, label=f"{method}, {word}")
+            colour = drawn.get_color()
         for r in mine:
             text = r["label"].removeprefix(method).strip()
-            axes.annotate(text, (r["all"]["ms"], r["all"]["rms"]), fontsize=7)
-    axes.set(xlabel="median step, one core, ms", ylabel="error of the diagonal, %")
+            axes.annotate(text, (r["all"]["ms"], r["all"]["rms"]), (0, -14), fontsize=9,
+                          textcoords="offset points", ha="center")  # fmt: skip
+    axes.set(xlabel="median step, one core, ms", ylabel="error of the diagonal of ΔC, %")
+    axes.margins(0.15)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.grid(True, which="both", alpha=0.3)
-    axes.legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
 
 
 def load(which: str, category: str) -> list[ReferenceScene]:
@@ -218,13 +238,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--method", nargs="+", default=[], help="methods of Simulator")
+    parser.add_argument("--presets", nargs="+", default=[], help="presets of Simulator")
     parser.add_argument("--settings", nargs="+", default=[], metavar="NAME=VALUE,…")
     parser.add_argument("--scenes", choices=("map", "more", "all"), default="all")
     parser.add_argument("--category", default="", help="only categories with this in their name")
     parser.add_argument("--worst", type=int, default=10, help="scenes to name")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="error against time")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="figures as JSON")
+    parser.add_argument("-o", "--output", nargs="+", type=Path, default=[], metavar="FILE",
+                        help="FILE.json gets the figures, FILE.png error against time")  # fmt: skip
     args = parser.parse_args()
+    if wrong := [str(p) for p in args.output if p.suffix not in (".png", ".json")]:
+        parser.error(f"{', '.join(wrong)}: give names that end in .json or .png")
     on_one_core()
     cases = load(args.scenes, args.category)
     if not cases:
@@ -232,17 +255,15 @@ def main() -> None:
     machine = describe_machine(("capsense", "numpy", "scipy", "numba"))
     print(f"{len(cases)} scenes; {machine['processor']}, one core, load {machine['load']:.1f}")
     results = []
-    for configuration in configurations(args.method, args.settings):
+    for configuration in configurations(args.method, args.presets, args.settings):
         results.append(report(configuration[0], run(configuration, cases), args.worst))
-    if len(results) > 1:
-        print(f"\n{HEADER}")
-        for r in results:
-            print(line(r["label"], r["all"]) if "all" in r else f"{r['label']}: nothing solved")
-    if args.plot:
-        plot(results, args.plot)
-    if args.output:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
-        args.output.write_text(json.dumps({**machine, "results": results}, indent=1) + "\n")
+    curve(results)
+    for path in args.output:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".png":
+            plot(results, path)
+        else:
+            path.write_text(json.dumps({**machine, "results": results}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -120,12 +120,12 @@ def measure(makers: Makers, budget: float) -> list[dict[str, Any]]:
         start = time.perf_counter()
         try:
             method = make()
+            prepared = time.perf_counter() - start
+            method.step(*timed_place(0))
         except ImportError as error:
             rows.append({"label": label, "missing": str(error)})
             print(f"  {label}: left out, {error}", flush=True)
             continue
-        prepared = time.perf_counter() - start
-        method.step(*timed_place(0))
         start = time.perf_counter()
         method.step(*timed_place(1))
         steps = int(np.clip(budget / (time.perf_counter() - start), 1, SAMPLES) / TURNS)

@@ -1,7 +1,7 @@
 """CapSense and boundary elements of others at three scenes: time and error of a step.
 
     pip install ".[peers]"
-    python benchmarks/peers_bem.py [--method perturbation surface] [-o out/peers_bem.json]
+    python benchmarks/peers_bem.py [--presets standard] [--peers fastcap] [-o out/peers_bem.json]
 
 Scenes over ``six_patch_bare``: the grounded bar at 20 mm, a finger and a limb of
 ``tests/data/reference_map.json`` at 10 mm. The task is a step: a body at a new pose in, the 6 × 6
@@ -53,6 +53,8 @@ except ImportError:
 
 Array = NDArray[np.float64]
 STEPS = 5
+PEERS = ("plain", "fastcap")
+"""Those in NumPy and SciPy, and FastCap2."""
 CELLS = (0.7, 0.5, 0.35)
 """Panel sizes of the peers, over a body's smaller half width."""
 TABLE_STEP = 4e-3
@@ -231,10 +233,10 @@ def timed(step: Callable[[cs.Pose], Array], body: cs.Body, steps: int) -> tuple[
     return delta, float(np.median(times.processor))
 
 
-def runs(methods: list[str]) -> Any:
-    """Label, panels and stepper-maker of everything that takes part, one by one."""
-    for method in methods:
-        sim = cs.Simulator(DESIGN, method=method)
+def runs(presets: list[str], peers: list[str]) -> Any:
+    """Label, stepper-maker and steps of everything that takes part, one by one."""
+    for preset in presets:
+        sim = cs.Simulator(DESIGN, preset=preset)  # type: ignore[arg-type]
 
         def ours(body: cs.Body, sim: cs.Simulator = sim) -> Callable[[cs.Pose], Array]:
             for _ in range(2):  # compiles
@@ -242,17 +244,20 @@ def runs(methods: list[str]) -> Any:
             sim.reset()
             return lambda pose: sim.step(cs.Scene([body.moved(pose)])).delta
 
-        yield f"capsense {method}", ours, 30
+        yield f"capsense, {preset}", ours, 30
     design = cs.load_design(DESIGN)
-    plain = Plain(design)
+    plain = Plain(design) if "plain" in peers else None
     for with_sensor, label in ((False, "object only"), (True, "object and sensor")):
-        for cell in CELLS:
+        for cell in CELLS if plain else ():
 
             def theirs(body: cs.Body, answered: bool = with_sensor, cell: float = cell) -> Any:
+                assert plain
                 mesh = plain.mesh(body, cell)
                 return lambda pose: plain.step(mesh, pose, answered)
 
             yield f"{label}, cells of {cell:g}", theirs, STEPS
+    if "fastcap" not in peers:
+        return
     if fastcap2 is None:
         print("fastcap: not installed")
         return
@@ -271,7 +276,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--method", nargs="+", default=["perturbation"])
+    parser.add_argument("--presets", nargs="+", default=["learning", "standard", "fine"])
+    parser.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="figures as JSON")
     args = parser.parse_args()
     on_one_core()
@@ -281,7 +287,7 @@ def main() -> None:
     print(f"{'':34s}" + "".join(f"{name:^30s}" for name in worlds))
     print(f"{'':34s}" + f"{'ms':>10s} {'rms %':>9s} {'worst %':>9s}" * len(worlds))
     rows = []
-    for label, maker, steps in runs(args.method):
+    for label, maker, steps in runs(args.presets, args.peers):
         cells = []
         for name, (body, truth) in worlds.items():
             delta, ms = timed(maker(body), body, steps)

@@ -1,7 +1,7 @@
 """Reference ΔC of what sensor designers ask for, sensor and object solved as one.
 
     python benchmarks/reference_designs.py              # writes tests/data/reference_designs.json
-    python benchmarks/reference_designs.py --method perturbation     # errors against that file
+    python benchmarks/reference_designs.py --method surface     # errors against that file
 
 A guarded pad, on air and on FR4, bare and under a plastic cover, with a grounded plate before it;
 and a pair of pads with a block of plastic before them. The object is put into the design, as a
@@ -23,6 +23,7 @@ import json
 import sys
 import time
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -211,27 +212,36 @@ def write(found: list[dict[str, Any]]) -> None:
     OUTPUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n")
 
 
-def compare(method: str, only: str) -> None:
-    """Errors of a method of the simulator."""
+def compared(method: str, only: str = "") -> Iterator[dict[str, Any]]:
+    """Name, the reference's own error, and pairs of reference and reading [fF] of each case: pad,
+    mutual (NaN where there is none), self.
+    """
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
     from reference_scenes import body_of_json
 
-    print(f"{'':50s} {'pad, fF':>10s} {'off %':>7s} {'mutual':>10s} {'off %':>7s} "
-          f"{'self, fF':>10s} {'off %':>7s} {'ref. %':>7s}")  # fmt: skip
     for case in json.loads(OUTPUT.read_text())["cases"]:
         if only not in case["name"]:
             continue
         sim = cs.Simulator(parse_design(tomllib.loads(case["design"])), method=method)
         rest = sim.step(cs.Scene([])).self_capacitance
         reading = sim.step(cs.Scene([body_of_json(b) for b in case["bodies"]]))
-        truth, self_truth = np.array(case["delta_fF"]), case["self_delta_fF"][0]
-        got, self_got = reading.delta / FEMTO, (reading.self_capacitance - rest)[0] / FEMTO
-        other = (truth[0, 1], got[0, 1]) if len(truth) > 1 else (np.nan, np.nan)
+        truth, got = np.array(case["delta_fF"]), reading.delta / FEMTO
+        mutual = (truth[0, 1], got[0, 1]) if len(truth) > 1 else (np.nan, np.nan)
+        own = (case["self_delta_fF"][0], (reading.self_capacitance - rest)[0] / FEMTO)
+        yield {"name": case["name"], "error": max(case["error"]),
+               "pairs": ((truth[0, 0], got[0, 0]), mutual, own)}  # fmt: skip
+
+
+def compare(method: str, only: str) -> None:
+    """Print errors of a method of the simulator."""
+    print(f"{'':50s} {'pad, fF':>10s} {'off %':>7s} {'mutual':>10s} {'off %':>7s} "
+          f"{'self, fF':>10s} {'off %':>7s} {'ref. %':>7s}")  # fmt: skip
+    for case in compared(method, only):
         cells = "".join(
-            f" {t:10.3f} {100 * (g / t - 1):+7.2f}" if t == t else f"{'–':>11s} {'–':>7s}"
-            for t, g in ((truth[0, 0], got[0, 0]), other, (self_truth, self_got))
+            f"{'–':>11s} {'–':>7s}" if np.isnan(t) else f" {t:10.3f} {100 * (g / t - 1):+7.2f}"
+            for t, g in case["pairs"]
         )
-        print(f"{case['name']:50s}{cells} {100 * max(case['error']):7.2f}", flush=True)
+        print(f"{case['name']:50s}{cells} {100 * case['error']:7.2f}", flush=True)
 
 
 def main() -> None:

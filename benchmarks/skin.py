@@ -61,7 +61,7 @@ class World:
 def time_steps(world: World, threads: int, steps: int) -> None:
     """Print the time of a step of all sensors."""
     skin = world.skin(threads)
-    times, iterations, largest = [], 0, 0.0
+    times, unknowns, largest = [], 0, 0.0
     busy = time.process_time()
     for k in range(-20, steps):
         world.move(k)
@@ -71,13 +71,13 @@ def time_steps(world: World, threads: int, steps: int) -> None:
         readings = skin.read()  # type: ignore[attr-defined]
         if k >= 0:
             times.append(time.perf_counter() - start)
-            iterations += sum(r.stats.iterations for r in readings.values())
+            unknowns += sum(r.stats.unknowns for r in readings.values())
             largest = max(largest, *(r.delta.max() for r in readings.values()))
     busy = (time.process_time() - busy) / steps
     p50, p95, p99 = 1e3 * np.percentile(times, (50, 95, 99))
     print(
         f"  {threads} threads: median {p50:.1f} ms, 95 % below {p95:.1f}, 99 % below {p99:.1f}; "
-        f"processor time {1e3 * busy:.1f} ms; {iterations / steps / len(SITES):.1f} iterations a "
+        f"processor time {1e3 * busy:.1f} ms; {unknowns / steps / len(SITES):.0f} unknowns a "
         f"sensor; largest change {1e15 * largest:.1f} fF"
     )
 
@@ -126,9 +126,7 @@ def memory() -> None:
     second.step(scene)
     taken = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    print(
-        f"  one more sensor takes {taken / 1e6:.1f} MB; mesh of {first.describe()['nodes']} nodes"
-    )
+    print(f"  one more sensor takes {taken / 1e6:.1f} MB")
 
 
 def accuracy() -> None:

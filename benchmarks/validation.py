@@ -1,29 +1,31 @@
 """Everything CapSense was measured against, on one page: ``python benchmarks/validation.py``.
 
-Writes ``docs/validation.md``. Analytic cases and converged references are computed here; the
-paper's and the hardware's part come from ``capsense reproduce all``, which is run first and only
-computes what it has not yet; the peers' and the boards' from what ``--all`` or their benchmarks
-left in ``out/``, for these take an hour.
+Writes ``docs/validation.md`` from ``validation_page.md``. Analytic cases and references are
+computed here, in a minute or two; the paper's and the hardware's part come from ``capsense
+reproduce all``, which is run first and only computes what it has not yet. Smoothness, boards and
+other solvers come from what their benchmarks have left in ``out/``; ``--all`` runs these.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "helpers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
-from curved_cases import curved_body, curved_figures, curved_reference  # noqa: E402
-from field_cases import (  # noqa: E402
+import accuracy_map
+import limits
+import reference_designs
+from curved_cases import curved_body, curved_figures, curved_reference
+from field_cases import (
     body_of,
     capsule,
     capsule_reference,
@@ -33,27 +35,33 @@ from field_cases import (  # noqa: E402
     patches,
     rectangle,
 )
-from fit_scenario1 import held_out, likeness, simulators, tables_of  # noqa: E402
-from machine import describe_machine  # noqa: E402
-from peers_report import rows as peer_rows  # noqa: E402
+from fit_scenario1 import held_out, likeness, simulators, tables_of
+from machine import describe_machine
+from reference_scenes import MAP, MORE, ReferenceScene, reference_scenes
+from validation_results import (
+    BOARDS,
+    ELEMENTS,
+    SMOOTHNESS,
+    Cells,
+    boards,
+    elements,
+    smoothness,
+    studies,
+    table,
+)
 
-import capsense as cs  # noqa: E402
-from capsense.constants import EPS0  # noqa: E402
-from capsense.reproduce.registry import STUDIES  # noqa: E402
-from capsense.reproduce.scenario1_fit import tabulate  # noqa: E402
-from capsense.reproduce.scenario1_setup import load_setup  # noqa: E402
+import capsense as cs
+from capsense.constants import EPS0
+from capsense.reproduce.scenario1_fit import tabulate
+from capsense.reproduce.scenario1_setup import load_setup
 
+ROOT = Path(__file__).parents[1]
 COMMAND = "python benchmarks/validation.py"
-BOARDS = "python benchmarks/boards.py stripe patch"
+TEMPLATE = Path(__file__).with_name("validation_page.md")
 MADELUNG = 1.7475646
 """Of rock salt: what the images of a charge in the middle of a grounded cube amount to."""
-Cells = Sequence[object]
-
-
-def table(header: Cells, lines: Sequence[Cells]) -> str:
-    """A table in Markdown."""
-    rows = [header, ["---"] * len(header), *lines]
-    return "\n".join(f"| {' | '.join(str(c) for c in row)} |" for row in rows)
+PRESETS = ("learning", "standard", "fine")
+GAPS = ("5 mm", "10 mm", "20 mm", "50 mm")
 
 
 def per_cent(value: float) -> str:
@@ -165,18 +173,65 @@ def _apart(delta: np.ndarray, expected: np.ndarray) -> tuple[str, str]:
     return f"{100 * diagonal:.2f} %", f"{100 * wrong.max() / np.abs(expected).max():.2f} %"
 
 
-def random_scenes() -> str:
-    """The summary that ``benchmarks/random_scenes.py`` prints last."""
-    run = [sys.executable, str(ROOT / "benchmarks" / "random_scenes.py")]
-    printed = subprocess.run(run, check=True, capture_output=True, text=True).stdout
-    return printed.strip().splitlines()[-1].removeprefix("  all: ")
+# -- maps of scenes --------------------------------------------------------------------------------
 
 
-def boards(path: Path) -> str:
-    """What ``benchmarks/boards.py`` printed."""
-    if not path.exists():
-        return f"Not measured in this edition: `{BOARDS}`; half an hour."
-    return f"`{BOARDS}`:\n\n```\n{path.read_text(encoding='utf-8').strip()}\n```"
+def map_rows(preset: str, cases: Sequence[ReferenceScene]) -> list[dict[str, Any]]:
+    """Errors of every scene, as ``accuracy_map.py`` takes them."""
+    return accuracy_map.run((preset, {"preset": preset}), list(cases))
+
+
+def figures_of(rows: list[dict[str, Any]]) -> tuple[str, ...]:
+    """Errors of the diagonal (rms, 95 %, worst, mean) and of the other entries (rms, worst), %."""
+    s = accuracy_map.summary(rows)
+    keys = ("rms", "p95", "worst", "mean", "others_rms", "others_worst")
+    return tuple(f"{s[k]:+.2f}" if k == "mean" else f"{s[k]:.2f}" for k in keys)
+
+
+HEAD = ("scenes", "rms", "95 % below", "worst", "mean", "others: rms", "worst")
+
+
+def presets(names: Sequence[str] = PRESETS) -> str:
+    """Errors of each preset over the two maps."""
+    far = [c for c in reference_scenes(MORE) if c.gap > limits.NEAR]
+    near = [c for c in reference_scenes(MORE) if c.gap <= limits.NEAR]
+    groups = (("map, 5 to 100 mm", reference_scenes(MAP)), ("more, from 5 mm on", far),
+              ("more, 0.5 to 2 mm", near))  # fmt: skip
+    lines = []
+    for title, cases in groups:
+        for name in names:
+            lines.append((title, name, len(cases), *figures_of(map_rows(name, cases))))
+    return table(("scenes", "preset", "number", *HEAD[1:]), lines)
+
+
+def categories() -> str:
+    """Errors of the standard preset, a line a category."""
+    rows = map_rows("standard", [*reference_scenes(MAP), *reference_scenes(MORE)])
+    lines = []
+    for category in sorted({r["category"] for r in rows}):
+        mine = [r for r in rows if r["category"] == category]
+        lines.append((category, len(mine), *figures_of(mine)))
+    return table(("category", *HEAD), lines)
+
+
+def designs() -> str:
+    """Errors over guarded pads and a pair of pads."""
+    lines = []
+    for case in reference_designs.compared("surface"):
+        cells = [
+            "–" if np.isnan(t) else f"{t:.2f} fF, {100 * (g / t - 1):+.2f} %"
+            for t, g in case["pairs"]
+        ]
+        lines.append((case["name"], *cells, f"{100 * case['error']:.2f} %"))
+    head = ("case", "pad (shields at ground)", "mutual", "self (shields driven)", "reference's own")
+    return table(head, lines)
+
+
+def limited(part: str, *columns: str) -> str:
+    """A table of ``limits.py``, in per cent."""
+    found = getattr(limits, part)(cs.Simulator(limits.DESIGN))
+    lines = [(name, *(f"{100 * e:.1f}" for e in errors)) for name, errors in found]
+    return table(("", *columns), lines)
 
 
 def machine() -> str:
@@ -187,22 +242,6 @@ def machine() -> str:
 
 
 # -- what others computed or measured --------------------------------------------------------------
-
-
-def peers(path: Path) -> str:
-    """Time and error of each solver, from the results that the benchmark left."""
-    if not path.exists():
-        return (
-            "not measured in this edition; it needs the peers installed and a quarter of an hour."
-        )
-    results = json.loads(path.read_text(encoding="utf-8"))
-    lines = []
-    for group in results:
-        for row in sorted(peer_rows(results, group).values(), key=lambda r: r["median_ms"]):
-            lines.append((group, row["name"], f"{row['tetrahedra']:,d}",
-                          f"{row['median_ms']:.2f}", f"{100 * row['worst']:.1f} %"))  # fmt: skip
-    head = ("mesh", "method", "tetrahedra", "step, ms (median)", "largest error of ΔC's diagonal")
-    return table(head, lines)
 
 
 def foretold() -> str:
@@ -217,118 +256,18 @@ def foretold() -> str:
     return table(("panel that is held out", "zero-mean correlation", "rms error"), lines)
 
 
-def studies(folder: Path) -> str:
-    """The rows of every study of ``capsense reproduce``."""
-    blocks = []
-    for name in STUDIES:
-        path = folder / name / "rows.json"
-        if not path.exists():
-            blocks.append(f"### {name}\n\nNot run in this edition: `capsense reproduce {name}`.")
-            continue
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["reduced"]:
-            raise SystemExit(f"{path} is of the reduced form; run: capsense reproduce {name}")
-        lines = [
-            (r["what"], f"{r['value']:.4g} {r['unit']}".strip(), r["target"], r["verdict"])
-            for r in found["rows"]
-        ]
-        grid = table(("what", "value", "target", "verdict"), lines)
-        blocks.append(f"### {found['title']}\n\n`capsense reproduce {name}`\n\n{grid}")
-    return "\n\n".join(blocks)
-
-
-PAGE = """\
-# Validation
-
-What CapSense was measured against, and what it was not. The page is written by
-
-```console
-$ {command}
-```
-
-which runs what is named beside each figure; the peers and the boards only with `--all`, for they
-take an hour. This edition: {machine}.
-
-## Analytic cases
-
-{analytic}
-
-The first three are of the empty domain, solved by boundary elements when a design is built. The
-last two are of the online solver with an object almost in touch, the hardest place for it. Formulas
-of discs leave out terms of second order in the ratio of gap and radius. More such cases run as
-tests: `python -m pytest tests/field tests/solve tests/test_simulator_*.py`.
-
-## Converged references
-
-Largest errors, against boundary elements good to about 0.1 % (bar and ball:
-`tests/data/reference_capacitances.json`; limb, and the curved
-`arm_segment`, to 1 %: `python benchmarks/references.py`). Other entries are taken as a part of the
-case's largest change. Numbers in the names are gaps in millimetres.
-
-{references}
-
-Over 40 random scenes of limbs, balls and tilted boxes 5 to 80 mm away, against a lattice of seven
-times as many nodes (`python benchmarks/random_scenes.py`): {random}.
-
-### Boards with copper pours
-
-A grounded bar over two boards of scenario 1, against boundary elements of board and bar together:
-the largest error of ΔC's diagonal, and of any of its mutual capacitances as a part of itself,
-however small. {boards}
-
-## Peers
-
-A bar that moves over `six_patch_bare`, one core, `python benchmarks/peers.py`:
-
-{peers}
-
-## The paper, and hardware
-
-{studies}
-
-### Scenario 1, foretold
-
-What both boards share is fitted to one panel of hardware and foretells the other; only the latter's
-depth of the triangle and sample rate, and the stripe panel's level, are fitted to it.
-`python benchmarks/fit_scenario1.py --held-out`
-
-{foretold}
-
-## What is not validated
-
-- **Self-capacitance along limbs.** No measurements are public: [scenario 2](scenario2.md) compares
-  simulations with each other, and the [limb approach](limb_approach.md) compares shapes of curves
-  with fits that were published, of a sensor whose size is not.
-- **Scenario 1 beyond two panels.** Its eleven free figures were fitted to the same two panels that
-  it is held against. With one panel held out, only the stripes foretell the other; the patches
-  alone leave distance and stray capacitance open. Hardware curves of the other trajectories and of
-  the meander board are not public.
-- **Absolute capacitances of the paper's boards.** Their dimensions are read from photographs, good
-  to ±5 %; published curves are normalised.
-- **Materials with loss.** A material conducts or it does not. Wet cloth and thin skin, whose
-  conductivity matters in between, are not modelled.
-- **The path to ground of people** beyond one capacitance, and its drift.
-- **Read-out chips** against recordings: figures are those of data sheets, each with its status, see
-  [read-out](readout.md). Flicker floors are assumptions.
-- **Wires, connectors, and robots' bodies behind a sensor,** unless the design describes them. What
-  is behind an electrode changes its range more than anything else, see
-  [limb approach](limb_approach.md).
-- **Deforming skin and cloth** against anything but other geometry, see [depth](depth.md).
-- **CoppeliaSim and Unity** themselves: only their protocols are tested, against stand-ins.
-"""
-
-
 def run(*command: str) -> int:
     """Run a Python command; return its exit code."""
-    return subprocess.run([sys.executable, *command], check=False).returncode
+    return subprocess.run([sys.executable, *command], cwd=ROOT, check=False).returncode
 
 
-def measure_peers_and_boards(out: Path) -> None:
+def measure_the_rest(out: Path) -> None:
     """Fill the folder with what the page only shows."""
-    if run(str(ROOT / "benchmarks" / "peers.py"), "-o", str(out / "peers")):
-        raise SystemExit("benchmarks/peers.py failed")
-    command = [sys.executable, str(ROOT / "benchmarks" / "boards.py"), *BOARDS.split()[2:]]
-    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    for command in (SMOOTHNESS, ELEMENTS):
+        if run(*command.split()[1:]):
+            raise SystemExit(f"{command} failed")
+    board = [sys.executable, *BOARDS.split()[1:]]
+    printed = subprocess.run(board, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     (out / "boards.txt").write_text(printed, encoding="utf-8")
 
 
@@ -336,21 +275,25 @@ def main() -> None:
     """Run, measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "validation.md")
-    parser.add_argument("--out", type=Path, default=ROOT / "out", help="folder for results")
     parser.add_argument("--as-is", action="store_true", help="run no study, take what is there")
-    parser.add_argument("--all", action="store_true", help="peers and boards, too: an hour")
+    parser.add_argument("--all", action="store_true", help="the other benchmarks, too: an hour")
     args = parser.parse_args()
-    reproduced = args.out / "reproduced"
+    out = ROOT / "out"
     if args.all:
-        measure_peers_and_boards(args.out)
+        measure_the_rest(out)
+    reproduced = out / "reproduced"
     code = 0 if args.as_is else run("-m", "capsense", "reproduce", "all", "-o", str(reproduced))
     if code not in (0, 3):  # 3: a figure missed its target, which the page tells
         raise SystemExit(f"capsense reproduce all failed with {code}")
-    page = PAGE.format(
-        command=COMMAND, machine=machine(), analytic=analytic(), references=references(),
-        random=random_scenes(), boards=boards(args.out / "boards.txt"),
-        peers=peers(args.out / "peers" / "peers.json"), studies=studies(reproduced),
-        foretold=foretold(),
+    page = TEMPLATE.read_text(encoding="utf-8").format(
+        command=COMMAND, machine=machine(), analytic=analytic(), presets=presets(),
+        categories=categories(), references=references(), designs=designs(),
+        smoothness=smoothness(out / "smoothness.json"), boards=boards(out / "boards.txt"),
+        elements=elements(out / "peers_bem.json"),
+        contact=limited("contact", *PRESETS, "2,800 panels"),
+        images=limited("images", *GAPS), cloth=limited("cloth", *GAPS),
+        inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),
+        studies=studies(reproduced), foretold=foretold(),
     )  # fmt: skip
     args.output.write_text(page, encoding="utf-8")
     print(f"wrote {args.output}")

@@ -45,7 +45,7 @@ GAPS = (0.010, 0.020, 0.050)
 def ride(
     depth: bool, rate: float, pixels: int = 64, back: str | float = "fill"
 ) -> tuple[Times, Array, list[int]]:
-    """The forearm example: times of its readings but the first, diagonals read [F], iterations."""
+    """The forearm example: times of its readings but the first, diagonals read [F], unknowns."""
     mujoco_forearm.PIXELS = pixels
     way = mujoco_forearm.Ride(depth)
     model, data, sensor = way.model, way.data, way.sensor
@@ -55,7 +55,7 @@ def ride(
             default_grounding=100e-12, back=back,
         )  # fmt: skip
     no_sensors = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-    times, found, iterations = Times(), [], []
+    times, found, unknowns = Times(), [], []
 
     def read() -> cs.Reading:
         if depth:
@@ -67,9 +67,9 @@ def ride(
         reading = times.take(read, keep=bool(found))  # the first loads the compiled kernels
         model.opt.disableflags |= no_sensors
         found.append(np.diag(reading.delta))
-        iterations.append(reading.stats.iterations)
+        unknowns.append(reading.stats.unknowns)
         way.go_on(rate)
-    return times, np.array(found), iterations
+    return times, np.array(found), unknowns
 
 
 def rates() -> None:
@@ -80,12 +80,12 @@ def rates() -> None:
     print("by the clock [ms]; readings in a second by the mean of the processor's time")
     for depth in (False, True):
         for rate in (RATE, 10 * RATE):
-            times, _, iterations = ride(depth, rate)
+            times, _, unknowns = ride(depth, rate)
             t = times.summary()
             print(
                 f"  {'depth, 64 x 64' if depth else 'geometry':15s} sampled at {rate:3.0f} Hz: "
                 f"{t['median_ms']:.2f}, {t['p95_ms']:.2f}, {t['clock_median_ms']:.2f}; "
-                f"{1e3 / t['mean_ms']:.0f} Hz; {np.mean(iterations):.1f} iterations"
+                f"{1e3 / t['mean_ms']:.0f} Hz; {np.mean(unknowns):.0f} unknowns"
             )
 
 

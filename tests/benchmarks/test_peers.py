@@ -85,7 +85,8 @@ def test_a_peer_solves_the_same_problem(
 
 def test_ratios_are_taken_within_a_group(parts: dict[str, ModuleType]) -> None:
     """The best peer within 3 % is held against CapSense in the run of that peer."""
-    row = {"name": "CapSense", "label": "capsense", "tetrahedra": 1000, "worst": 0.01}
+    row = {"name": "CapSense", "label": "capsense", "tetrahedra": 0, "worst": 0.01,
+           "settings": "Simulator.step, preset standard"}  # fmt: skip
     peer = {"name": "a peer", "label": "peer", "tetrahedra": 2000, "worst": 0.02}
     results = {
         "fast": {"results": [row | {"median_ms": 1.0}, peer | {"median_ms": 5.0, "worst": 0.2}]},
@@ -102,4 +103,21 @@ def test_the_plot_is_drawn_from_what_there_is(parts: dict[str, ModuleType], tmp_
     row = {"name": "CapSense", "label": "capsense", "tetrahedra": 1000, "worst": 0.01,
            "median_ms": 1.0}  # fmt: skip
     parts["peers_report"].plot({"30k": {"results": [row]}}, tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").stat().st_size > 1000
+
+
+def test_presets_are_points_of_one_line(parts: dict[str, ModuleType], tmp_path: Path) -> None:
+    """They have no mesh; what tells them apart is the preset, which the report names."""
+    report = parts["peers_report"]
+    row = {"name": "CapSense", "label": "capsense", "tetrahedra": 0, "worst": 0.01}
+    results = {
+        preset: {
+            "results": [row | {"median_ms": k, "settings": f"Simulator.step, preset {preset}"}]
+        }
+        for k, preset in enumerate(("learning", "fine"), start=1)
+    }
+    points = [report.rows(results, group)["capsense"] for group in results]
+    assert len({report._key(point) for point in points}) == 2
+    assert [report._size(point) for point in points] == ["learning", "fine"]
+    report.plot(results, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 1000

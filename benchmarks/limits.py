@@ -1,0 +1,125 @@
+"""Where readings are least certain, over ``six_patch_bare``: ``python benchmarks/limits.py``.
+
+- contact: grounded bodies 2 to 0.5 mm above an electrode, each preset, and one with 2,800 panels,
+  against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels do not
+  help there.
+- dielectrics in depth images of 128 × 128 pixels with front and back, against the shapes.
+- sheets of a dielectric as deforming surfaces of 800 triangles, against boxes as thick.
+- bodies that reach into the sensor: error estimates over the largest entry.
+
+Errors are the largest of any entry over the largest entry, but where said otherwise.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from step_scenes import PIXELS, WIDE, low, sheet
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+
+from field_cases import bar, delta_reference
+from layered_views import view
+from reference_scenes import MORE, diagonal_errors, reference_scenes
+
+import capsense as cs
+from capsense.simulator import PresetName
+from capsense.surface.solver import Preset, SurfaceSolver
+
+DESIGN = "six_patch_bare"
+AT = (0.003, 0.026)
+"""Over the middle of an electrode's edge [m]."""
+NEAR = 0.002
+"""Gaps up to this are near contact [m]."""
+PRESETS: tuple[PresetName, ...] = ("learning", "standard", "fine")
+BODIES: dict[str, tuple[cs.Shape, tuple[float, float, float]]] = {
+    "ball of 20 mm radius": (cs.Sphere(0.02), (0, 0, 0)),
+    "finger": (cs.Capsule(0.008, 0.06), (0.4, 0.6, 0)),
+    "box 40 x 40 x 20 mm": (cs.Box((0.04, 0.04, 0.02)), (0, 0, 0)),
+    "box, tilted": (cs.Box((0.1, 0.08, 0.05)), (0.3, 0.25, 0.15)),
+    "bar 150 x 150 x 20 mm": (cs.Box((0.15, 0.15, 0.02)), (0, 0, 0)),
+}
+FINER = Preset(panels=2800, threshold=1e-3)
+"""Finer than any preset that has a name."""
+
+
+def apart(found: np.ndarray, truth: np.ndarray) -> float:
+    """Largest difference over the largest entry."""
+    return float(np.abs(found - truth).max() / np.abs(truth).max())
+
+
+def contact(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Errors with each preset."""
+    sims = [cs.Simulator(DESIGN, preset=p, background=sim.background) for p in PRESETS]
+    finer = SurfaceSolver(sim.background.green, sim.design, preset=FINER)
+    cases = [(c.name, c.scene, c.delta) for c in reference_scenes(MORE) if c.gap <= NEAR]
+    for gap in (1, 2):
+        known = delta_reference(DESIGN, f"bar {gap}")
+        cases.append((f"bar 150 x 150 x 20 mm {gap} mm", cs.Scene([bar(1e-3 * gap)]), known))
+    for name, scene, truth in cases:
+        found = [s.step(scene).delta for s in sims]
+        found.append(finer.solve(scene).matrix[: len(truth), : len(truth)])
+        yield name, [float(np.abs(diagonal_errors(f, truth)).max()) for f in found]
+
+
+def images(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Errors of depth images of dielectrics at 5, 10, 20, 50 mm."""
+    for name, shape in (("ball", cs.Sphere(0.03)), ("box", cs.Box((0.08, 0.06, 0.04)))):
+        for eps in (3.0, 10.0, 80.0):
+            material, out = cs.Material("dielectric", eps_r=eps), []
+            for gap in (0.005, 0.01, 0.02, 0.05):
+                body = cs.Body(shape, low(shape, gap, AT).pose, material, "floating")
+                front, back = view(shape, body.pose, 2 * PIXELS, WIDE)
+                seen = sim.step(cs.DepthFrame(front, eps_r=material, back=back)).delta
+                out.append(apart(seen, sim.step(cs.Scene([body])).delta))
+            yield f"{name}, eps_r {eps:g}", out
+
+
+def cloth(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Errors of level sheets 120 × 100 mm at 5, 10, 20, 50 mm."""
+    vertices, faces = sheet()
+    for thickness in (0.001, 0.003):
+        for eps in (2.0, 5.0):
+            material, out = cs.Material("cloth", eps_r=eps), []
+            for gap in (0.005, 0.01, 0.02, 0.05):
+                z = gap + thickness / 2
+                box = cs.Body(cs.Box((0.12, 0.10, thickness)), cs.Pose((0, 0, z)), material)
+                level = np.column_stack([vertices[:, :2], np.full(len(vertices), z)])
+                soft = cs.DeformableSurface(level, faces, thickness=thickness, material=material)
+                truth = sim.step(cs.Scene([box])).delta
+                out.append(apart(sim.step(cs.Scene([soft.body()])).delta, truth))
+            yield f"{1e3 * thickness:g} mm, eps_r {eps:g}", out
+
+
+def inside(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Error estimates over the largest entry, lowest points at 1, 0, -1, -5 mm."""
+    for name, (shape, turn) in BODIES.items():
+        out = []
+        for gap in (0.001, 0.0, -0.001, -0.005):
+            reading = sim.step(cs.Scene([low(shape, gap, AT, turn)]))
+            out.append(reading.stats.error_estimate / float(np.abs(reading.delta).max()))
+        yield name, out
+
+
+PARTS = {
+    "contact, presets learning, standard, fine, and 2,800 panels": contact,
+    "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
+    "deforming sheets of dielectrics, gaps of 5, 10, 20, 50 mm": cloth,
+    "in the sensor: error estimate with lowest points at 1, 0, -1, -5 mm": inside,
+}
+
+
+def main() -> None:
+    """Print the tables, in per cent."""
+    sim = cs.Simulator(DESIGN)
+    for title, part in PARTS.items():
+        print(f"\n{title}, %")
+        for name, errors in part(sim):
+            print(f"  {name:54s}" + "".join(f"{100 * e:8.2f}" for e in errors), flush=True)
+
+
+if __name__ == "__main__":
+    main()
