@@ -44,7 +44,7 @@ CODES = {
     "watch": "this server does not let its clients watch sensors, or a client would both watch "
     "and have sensors",
     "readout": "the read-out cannot go from the last time to this one",
-    "solve": "the solver did not reach its tolerance",
+    "solve": "the solver found no solution",
     "internal": "a fault of the server; its log says more",
 }
 """Error codes."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.constants import EPS0
-from capsense.scene import Body, Layers, Scene, SurfaceMesh, TriMesh
+from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
 from capsense.scene.scene import PackedScene
 from capsense.surface.changing import ChangingBody
 from capsense.surface.rigid import RigidShape
@@ -31,6 +31,8 @@ _SHUT = 1e8
 """Energy [1/m] of the net charge of conductors that touch each other and float together."""
 _UNSEEN = TriMesh | Layers | SurfaceMesh
 """Shapes that are not looked at when it is asked which conductors touch."""
+_ALONG = np.linspace(0.0, 1.0, 33)
+"""Where along the axis of a capsule its distance from a shape with edges is taken."""
 _TOUCH = 1e-6
 """Conductors nearer than this [m] touch."""
 
@@ -140,14 +142,47 @@ def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBo
 
 
 def _touch(first: Body, second: Body) -> bool:
-    """Whether two solids meet, as far as the corners of one tell about the other."""
+    """Whether two solids meet; of two with edges, as far as the corners of one tell."""
     if isinstance(first.shape, _UNSEEN) or isinstance(second.shape, _UNSEEN):
         return False
+    ends, others = _axis(first), _axis(second)
+    if ends is not None and others is not None:
+        apart = _distance(ends[0], others[0])
+        return apart <= ends[1] + others[1] + _TOUCH
+    for axis, other in ((ends, second), (others, first)):
+        if axis is not None:
+            points = axis[0][0] + _ALONG[:, None] * (axis[0][1] - axis[0][0])
+            off = other.shape.signed_distance(other.pose.inverse().apply(points))
+            return bool(off.min() <= axis[1] + _TOUCH)
     for one, other in ((first, second), (second, first)):
         points = other.pose.inverse().apply(one.pose.apply(_surface_points(one)))
         if (other.shape.signed_distance(points) <= _TOUCH).any():
             return True
     return False
+
+
+def _axis(body: Body) -> tuple[Array, float] | None:
+    """Ends of the axis of a ball or capsule, (2, 3), and its radius [m]; None of other shapes."""
+    if not isinstance(body.shape, Sphere | Capsule):
+        return None
+    half = 0.5 * body.shape.length if isinstance(body.shape, Capsule) else 0.0
+    return body.pose.apply([[0.0, 0.0, -half], [0.0, 0.0, half]]), body.shape.radius
+
+
+def _distance(first: Array, second: Array) -> float:
+    """Distance of two line segments [m], each given by its ends, (2, 3).
+
+    After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.9.
+    """
+    u, v, w = first[1] - first[0], second[1] - second[0], first[0] - second[0]
+    a, b, c, d, e = (float(x @ y) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    det = a * c - b * b
+    s = min(1.0, max(0.0, (b * e - c * d) / det)) if det > 1e-12 * a * c else 0.0
+    t = (b * s + e) / c if c > 0 else 0.0
+    if not 0.0 <= t <= 1.0 or c == 0:
+        t = min(1.0, max(0.0, t))
+        s = min(1.0, max(0.0, (b * t - d) / a)) if a > 0 else 0.0
+    return float(np.linalg.norm(w + s * u - t * v))
 
 
 def _surface_points(body: Body) -> Array:
