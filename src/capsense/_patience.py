@@ -26,7 +26,7 @@ def first_use() -> Iterator[None]:
         return
     timer = threading.Timer(
         WAIT, _log.warning,
-        ["compiling the solver for this processor; this takes some 20 s once, and is then kept"],
+        ["compiling the solver for this processor; it takes half a minute once, and is then kept"],
     )  # fmt: skip
     timer.daemon = True
     timer.start()

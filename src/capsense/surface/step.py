@@ -1,4 +1,7 @@
-"""The step: from bodies to the change of the matrix and the charges behind it; 4π eps0 = 1."""
+"""The step: from bodies to the change of the matrix and the charges behind it; 4π eps0 = 1.
+
+Compiled in one piece, so that threads do not wait for each other between its stages.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,7 @@ from capsense.surface.solve_kernels import (
     leaf_charges,
     reduced,
 )
+from capsense.surface.vector_kernels import fast
 
 
 class Solution(NamedTuple):
@@ -46,6 +50,7 @@ class Solution(NamedTuple):
     """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
 
 
+@fast
 def prepared(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float
 ) -> tuple[Cut, Leaves, Functions, System]:
@@ -68,6 +73,7 @@ def prepared(
     return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
 
 
+@fast
 def solve(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
 ) -> Solution:
@@ -78,7 +84,7 @@ def solve(
     """
     cut, leaves, functions, system = prepared(bodies, green, threshold, width)
     delta, left, x, shift = reduced(cut, functions, system, adjoint)
-    charge = leaf_charges(cut, functions, x, len(leaves.points))
+    charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
     size = functions.solved if shift >= 0.0 else 0
     return Solution(
