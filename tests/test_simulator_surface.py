@@ -356,3 +356,34 @@ def test_jacobian_of_the_other_method_is_refused(simulators):
 def test_unknown_options(name, value):
     with pytest.raises(ValueError, match=f"{name} is '{value}'; choose one of"):
         cs.Simulator("six_patch_bare", **{name: value})
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating", 2e-11])
+def test_a_large_mesh_of_several_parts_reads_as_they_do(sim, grounding):
+    """Measured: two crossing capsules and far balls, as one mesh and as bodies in touch."""
+    near = [
+        cs.Body(cs.Capsule(0.015, 0.12), cs.Pose((0.0, 0.01, 0.04), (0, 0.5**0.5, 0, 0.5**0.5))),
+        cs.Body(cs.Capsule(0.02, 0.12), cs.Pose((0.06, 0.0, 0.1))),
+    ]
+    far = [cs.Body(cs.Sphere(0.05), cs.Pose((2.0 + k, 0.0, 0.5))) for k in range(3)]
+    meshes = [(b, b.shape.to_trimesh()) for b in near + far]
+    vertices = np.concatenate([b.pose.apply(m.vertices) for b, m in meshes])
+    first = np.cumsum([0, *(len(m.vertices) for _, m in meshes)])
+    faces = np.concatenate([m.faces + f for (_, m), f in zip(meshes, first, strict=False)])
+    mesh = cs.TriMesh(vertices, faces)
+    assert len(mesh.pieces) == 5
+    share = grounding / 2 if isinstance(grounding, float) else grounding
+    bodies = [cs.Body(b.shape, b.pose, "steel", share) for b in near]
+    expected = sim.step(cs.Scene(bodies)).delta
+    got = sim.step(cs.Scene([cs.Body(mesh, material="steel", grounding=grounding)]), jacobian=True)
+    np.testing.assert_allclose(got.delta, expected, rtol=0, atol=0.02 * expected.max())
+    assert got.jacobian.shape == (1, 6, 6, 6)
+    step = 2e-4
+    higher, lower = (
+        sim.step(cs.Scene([cs.Body(mesh, cs.Pose((0, 0, z)), "steel", grounding)])).delta
+        for z in (step, -step)
+    )
+    slope = (higher - lower) / (2 * step)
+    np.testing.assert_allclose(
+        got.jacobian[0, :, :, 2], slope, rtol=0, atol=0.03 * np.abs(slope).max()
+    )

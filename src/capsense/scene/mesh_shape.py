@@ -65,6 +65,19 @@ class TriMesh(Shape):
         return int(connected_parts(self.faces, len(self.vertices)).max()) + 1
 
     @cached_property
+    def pieces(self) -> tuple[TriMesh, ...]:
+        """Connected parts of a thousandth of the area or more, and the others together."""
+        label = connected_parts(self.faces, len(self.vertices))
+        corners = self.vertices[self.faces]
+        area = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        share = np.bincount(label, area) / area.sum()
+        label = np.where(share[label] < 0.001, -1, label)
+        chosen = [self.faces[label == k] for k in np.unique(label)]
+        return tuple(TriMesh(self.vertices, faces) for faces in chosen)
+
+    @cached_property
     def params(self) -> Array:
         half = 0.5 * np.ptp(self.vertices, axis=0)
         half.setflags(write=False)
@@ -76,7 +89,13 @@ class TriMesh(Shape):
         return enclosed_volume(self.vertices, self.faces)
 
     def bounds(self) -> Array:
-        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        return self._bounds
+
+    @cached_property
+    def _bounds(self) -> Array:
+        out = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        out.setflags(write=False)
+        return out
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """Exact distance to the nearest triangle [m], negative inside.

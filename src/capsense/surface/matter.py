@@ -109,6 +109,19 @@ class Matter:
         np.add.at(total, group, self.ground)
         return replace(self, ground=total[group], group=group)
 
+    def repeated(self, places: Sequence[int]) -> Matter:
+        """The same for parts of bodies; those of one conductor share its net charge.
+
+        Args:
+            places: Body of each part, ascending.
+        """
+        if len(places) == len(self.eps) == len(set(places)):
+            return self
+        at = np.array(places, dtype=np.int64)
+        name = self.group[at]
+        group = np.array([np.flatnonzero(name == n)[0] for n in name], dtype=np.int64)
+        return Matter(self.eps[at], self.ground[at], group)
+
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
         """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
         ties, softness = self.ties(sizes_of(records, shapes)), self.softness()

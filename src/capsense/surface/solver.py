@@ -13,7 +13,7 @@ from capsense.design.model import Design
 from capsense.errors import SceneError, SolveError
 from capsense.field.change import Change
 from capsense.field.green import GreenFunction
-from capsense.scene import Layers, Scene, SurfaceMesh
+from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.scene import PackedScene
 from capsense.scene.shape import Shape, ShapeKind
 from capsense.surface.changing import ChangingBody
@@ -32,6 +32,10 @@ Array = NDArray[np.float64]
 
 _DOUBTFUL = 0.03
 """Readings are in doubt where the matrix's diagonal was raised by more than this part of it."""
+_OF_MANY = 0.4
+"""Panels of one part of a large mesh, over those of a body."""
+_LARGE = 0.4
+"""Meshes that are longer than this [m] are solved for part by part."""
 _FLAT = 1e-4
 """Sheets of a flat design rise by less than this [m]."""
 MARGIN = 0.015
@@ -76,7 +80,7 @@ class PackedBodies:
     """The bodies of a scene that reach into the domain, as the kernels take them."""
 
     records: NDArray[np.void]
-    """One :data:`BODY` each, shape (n,)."""
+    """One :data:`BODY` each, or one for each part of a large mesh, shape (n,)."""
     chosen: NDArray[np.intp]
     """Their places in the scene, shape (n,)."""
     matter: Matter
@@ -222,38 +226,62 @@ class SurfaceSolver:
 
         slope = UNIT * jacobian(solution, bodies.records, self.green)
         slope[..., 3:] += np.cross(bodies.offsets[:, None, None], slope[..., :3])
-        out[bodies.chosen] = slope
+        np.add.at(out, bodies.chosen, slope)
         return out
 
     def pack(self, view: View) -> PackedBodies:
         """Lay out the bodies that reach into the domain."""
-        shapes: list[RigidShape | ChangingBody] = []
-        sizes: list[float] = []
         matter, packed = view.matter.joined(view.scene, view.packed, view.met), view.packed
-        offsets = np.zeros((len(view.met), 3))
+        found: list[tuple[RigidShape | ChangingBody, float]] = []
+        places: list[int] = []
+        offsets: list[Array] = []
         for place, k in enumerate(view.met.tolist()):
             rotation, middle = packed.rotation[k], self._middle - packed.position[k]
-            part, at = windowed(view.scene[k].shape, middle @ rotation, self._reach)
-            shape, size = self._shape(part)
-            shapes.append(shape)
-            sizes.append(size)
-            offsets[place] = rotation @ at
+            parts = self._parts(view, place, middle @ rotation)
+            for part, at in parts:
+                found.append(self._shape(part, _OF_MANY if len(parts) > 1 else 1.0))
+                places.append(place)
+                offsets.append(rotation @ at)
+        chosen, shapes = view.met[places], [shape for shape, _ in found]
         records = np.array([s.record for s in shapes], BODY)
-        records["scale"] = sizes
-        records["rotation"] = packed.rotation[view.met]
-        records["position"] = packed.position[view.met] + offsets
+        records["scale"] = [size for _, size in found]
+        records["rotation"] = packed.rotation[chosen]
+        records["position"] = packed.position[chosen] + np.reshape(offsets, (-1, 3))
+        matter = matter.repeated(places)
         matter.write(records, shapes)
-        return PackedBodies(records, view.met, matter, shapes, offsets)
+        return PackedBodies(records, chosen, matter, shapes, np.reshape(offsets, (-1, 3)))
 
-    def _shape(self, shape: Shape) -> tuple[RigidShape | ChangingBody, float]:
-        """Charge functions of a body, and its size."""
+    def _parts(self, view: View, place: int, middle: Array) -> list[tuple[Shape, Array]]:
+        """Parts of a body to be solved for, and where they are in its frame [m].
+
+        Long bodies are cut, see :func:`windowed`. Of a large conducting mesh each connected part
+        has charge functions of its own, if it reaches into the domain.
+        """
+        shape = view.scene[int(view.met[place])].shape
+        if (
+            not isinstance(shape, TriMesh)
+            or np.ptp(shape.bounds(), axis=0).max() < _LARGE
+            or not view.matter.conducting[place]
+            or shape.parts == 1
+        ):
+            return [windowed(shape, middle, self._reach)]
+        near: list[tuple[Shape, Array]] = []
+        for part in shape.pieces:
+            low, high = part.bounds()
+            off = np.maximum(np.maximum(low - middle, middle - high), 0.0)
+            if np.linalg.norm(off) < 0.5 * self._reach:
+                near.append((part, np.zeros(3)))
+        return near
+
+    def _shape(self, shape: Shape, share: float) -> tuple[RigidShape | ChangingBody, float]:
+        """Charge functions of a body from a share of the usual panels, and its size."""
         if isinstance(shape, Layers):
             return ChangingBody(*layer_pieces(shape)), 1.0
         if isinstance(shape, SurfaceMesh):
             sheet = 0.0 if shape.closed else shape.rest.thickness
             return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
         edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
-        return rigid(shape, self.preset.panels * (2 if edged else 1))
+        return rigid(shape, round(share * self.preset.panels) * (2 if edged else 1))
 
 
 def cover_of(design: Design) -> float:
