@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 _MAX_EXTENT = 10.0
+_MANY = 0.01
+"""Share of faces without area from which a mesh is worth a warning; exporters leave some."""
 _MERGE = 1e-8
 
 
@@ -135,12 +137,12 @@ def _merged(v: Array, f: Faces) -> tuple[Array, Faces]:
     _, first, merged = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     f = merged.reshape(-1)[f]
     repeated = (f == np.roll(f, 1, axis=1)).any(axis=1)
-    if repeated.any():
+    if repeated.sum() > _MANY * len(f):
         warnings.warn(
             f"TriMesh: dropped {repeated.sum()} of {len(f)} faces that repeat a vertex",
             stacklevel=5,
         )
-        f = f[~repeated]
+    f = f[~repeated]
     if not len(f):
         raise SceneError("TriMesh: every face repeats a vertex; are the vertices distinct?")
     return v[first], f
