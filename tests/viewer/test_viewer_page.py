@@ -141,6 +141,8 @@ def test_play_and_pause(page: Any) -> None:
         "() => Number(document.body.innerText.match(/sample (\\d+) of/)[1]) > 15"
     )
     page.wait_for_function(f"() => ({LINES})().every(chart => chart[0].length > 10)")
+    varies = "line => Math.max(...line) > Math.min(...line)"
+    page.wait_for_function(f"() => ({LINES})().every(chart => chart.slice(1).some({varies}))")
     press(page, "Pause")
     page.get_by_role("button", name="Play", exact=True).wait_for()
     page.wait_for_timeout(300)  # what was on its way arrives
