@@ -387,3 +387,16 @@ def test_a_large_mesh_of_several_parts_reads_as_they_do(sim, grounding):
     np.testing.assert_allclose(
         got.jacobian[0, :, :, 2], slope, rtol=0, atol=0.03 * np.abs(slope).max()
     )
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-11])
+def test_a_large_mesh_round_the_domain_changes_nothing(sim, grounding):
+    """Invariant: its bounding box holds the domain, none of its parts reaches into it."""
+    ball = cs.Sphere(0.05).to_trimesh()
+    vertices = np.concatenate([ball.vertices + [x, 0.0, 0.2] for x in (2.0, -2.0)])
+    faces = np.concatenate([ball.faces, ball.faces + len(ball.vertices)])
+    body = cs.Body(cs.TriMesh(vertices, faces), grounding=grounding)
+    reading = sim.step(cs.Scene([body]), jacobian=True)
+    assert not reading.delta.any()
+    assert reading.jacobian.shape == (1, 6, 6, 6)
+    assert not reading.jacobian.any()
