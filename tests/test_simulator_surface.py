@@ -393,7 +393,7 @@ def test_a_large_mesh_of_several_parts_reads_as_they_do(sim, grounding):
 def test_a_large_mesh_round_the_domain_changes_nothing(sim, grounding):
     """Invariant: its bounding box holds the domain, none of its parts reaches into it."""
     ball = cs.Sphere(0.05).to_trimesh()
-    vertices = np.concatenate([ball.vertices + [x, 0.0, 0.2] for x in (2.0, -2.0)])
+    vertices = np.concatenate([cs.Pose((x, 0.0, 0.2)).apply(ball.vertices) for x in (2.0, -2.0)])
     faces = np.concatenate([ball.faces, ball.faces + len(ball.vertices)])
     body = cs.Body(cs.TriMesh(vertices, faces), grounding=grounding)
     reading = sim.step(cs.Scene([body]), jacobian=True)
