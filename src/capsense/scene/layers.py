@@ -96,12 +96,6 @@ class Layers(Shape):
         return ~np.isnan(self.front)
 
     @cached_property
-    def params(self) -> Array:
-        half = 0.5 * np.ptp(self.bounds(), axis=0)
-        half.setflags(write=False)
-        return half
-
-    @cached_property
     def volume(self) -> float:
         """Volume [m³]: depth times area of the pixels."""
         depth = self.back.astype(float) - self.front

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -21,8 +22,53 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
+class Triangles(Shape):
+    """A shape that is given by triangles."""
+
+    vertices: Array
+    """Points [m], shape (n, 3), read-only."""
+
+    faces: NDArray[np.int64]
+    """Vertex indices, shape (m, 3), read-only."""
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Exact distance to the nearest triangle [m], negative inside.
+
+        Args:
+            points: Points [m] in the local frame, shape (n, 3).
+
+        Returns:
+            Shape (n,).
+
+        Raises:
+            SceneError: The points do not have shape (n, 3), or the surface is not closed.
+        """
+        p = as_points(points)
+        self._require_inside("signed distances")
+        from capsense.scene.distance_kernels import signed_distances
+
+        out = np.empty(len(p))
+        signed_distances(self._boxes, np.ascontiguousarray(p), out)
+        return out
+
+    @cached_property
+    def _boxes(self) -> Boxes:
+        from capsense.scene.distance_kernels import boxed
+
+        return boxed(self.vertices[self.faces])
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+    @abstractmethod
+    def _require_inside(self, what: str) -> None:
+        """Raise a SceneError that says why there is no ``what``, if the surface is not closed."""
+
+
 @dataclass(frozen=True, init=False, eq=False)
-class TriMesh(Shape):
+class TriMesh(Triangles):
     """A triangle mesh, moved rigidly.
 
     It may be open, hold faces twice, cross itself, and wind any way: the solver takes the surface
@@ -78,12 +124,6 @@ class TriMesh(Shape):
         return tuple(TriMesh(self.vertices, faces) for faces in chosen)
 
     @cached_property
-    def params(self) -> Array:
-        half = 0.5 * np.ptp(self.vertices, axis=0)
-        half.setflags(write=False)
-        return half
-
-    @cached_property
     def volume(self) -> float:
         self._require_inside("a volume")
         return enclosed_volume(self.vertices, self.faces)
@@ -97,33 +137,6 @@ class TriMesh(Shape):
         out.setflags(write=False)
         return out
 
-    def signed_distance(self, points: ArrayLike) -> Array:
-        """Exact distance to the nearest triangle [m], negative inside.
-
-        Args:
-            points: Points [m] in the local frame, shape (n, 3).
-
-        Returns:
-            Shape (n,).
-
-        Raises:
-            SceneError: The points do not have shape (n, 3), or the mesh is not closed.
-        """
-        p = as_points(points)
-        self._require_inside("signed distances")
-        return distances_to(self._boxes, p)
-
-    @cached_property
-    def _boxes(self) -> Boxes:
-        from capsense.scene.distance_kernels import boxed
-
-        return boxed(self.vertices[self.faces])
-
-    def to_trimesh(self) -> trimesh.Trimesh:
-        import trimesh
-
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
-
     def _require_inside(self, what: str) -> None:
         flaw = self.__dict__["_flaw"]
         if flaw:
@@ -132,12 +145,3 @@ class TriMesh(Shape):
                 "fill the holes (trimesh.repair.fill_holes) or pass the convex hull "
                 "(mesh.convex_hull)"
             )
-
-
-def distances_to(boxes: Boxes, points: Array) -> Array:
-    """Signed distances [m] of points (n, 3) from a closed surface, shape (n,)."""
-    from capsense.scene.distance_kernels import signed_distances
-
-    out = np.empty(len(points))
-    signed_distances(boxes, np.ascontiguousarray(points), out)
-    return out

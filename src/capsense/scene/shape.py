@@ -46,9 +46,11 @@ class Shape(ABC):
     """What sort of shape it is."""
 
     @cached_property
-    @abstractmethod
     def params(self) -> Array:
         """Sizes [m], see :class:`ShapeKind`, shape (3,), read-only."""
+        half = 0.5 * np.ptp(self.bounds(), axis=0)
+        half.setflags(write=False)
+        return half
 
     @cached_property
     def packed(self) -> tuple[float, ...]:

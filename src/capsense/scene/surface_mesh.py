@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
-from capsense.scene.mesh_shape import distances_to
+from capsense.scene.mesh_shape import Triangles
 from capsense.scene.raster import checked_mesh, checked_vertices
-from capsense.scene.shape import Shape, ShapeKind, as_points
+from capsense.scene.shape import ShapeKind
 from capsense.scene.surface import enclosed_volume, is_closed
-
-if TYPE_CHECKING:
-    import trimesh
-
-    from capsense.scene.distance_kernels import Boxes
 
 Array = NDArray[np.float64]
 
@@ -69,7 +63,7 @@ class RestSurface:
 
 
 @dataclass(frozen=True, init=False, eq=False)
-class SurfaceMesh(Shape):
+class SurfaceMesh(Triangles):
     """A surface at one instant, open or closed; an open one is a thin sheet.
 
     Args:
@@ -82,6 +76,8 @@ class SurfaceMesh(Shape):
 
     vertices: Array
     """Points [m] in the local frame, shape (n, 3), read-only."""
+    faces: NDArray[np.int64]
+    """Vertex indices, shape (m, 3), read-only; the same array at every instant."""
     rest: RestSurface
 
     kind = ShapeKind.SURFACE
@@ -94,23 +90,12 @@ class SurfaceMesh(Shape):
                 f"{rest.vertices.shape}; make a new one to change its faces"
             )
         v.setflags(write=False)
-        self.__dict__["vertices"], self.__dict__["rest"] = v, rest
-
-    @property
-    def faces(self) -> NDArray[np.int64]:
-        """Vertex indices, shape (m, 3); the same array at every instant."""
-        return self.rest.faces
+        self.__dict__.update(vertices=v, faces=rest.faces, rest=rest)
 
     @property
     def closed(self) -> bool:
         """Whether the surface has an inside."""
         return self.rest.closed
-
-    @cached_property
-    def params(self) -> Array:
-        half = 0.5 * np.ptp(self.bounds(), axis=0)
-        half.setflags(write=False)
-        return half
 
     @cached_property
     def volume(self) -> float:
@@ -121,22 +106,6 @@ class SurfaceMesh(Shape):
         used = self.rest.used
         v = self.vertices if len(used) == len(self.vertices) else self.vertices[used]
         return np.array([v.min(axis=0), v.max(axis=0)])
-
-    def signed_distance(self, points: ArrayLike) -> Array:
-        p = as_points(points)
-        self._require_inside("signed distances")
-        return distances_to(self._boxes, p)
-
-    @cached_property
-    def _boxes(self) -> Boxes:
-        from capsense.scene.distance_kernels import boxed
-
-        return boxed(self.vertices[self.faces])
-
-    def to_trimesh(self) -> trimesh.Trimesh:
-        import trimesh
-
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     def _require_inside(self, what: str) -> None:
         if not self.closed:

@@ -118,9 +118,8 @@ class Matter:
         if len(places) == len(self.eps) == len(set(places)):
             return self
         at = np.array(places, dtype=np.int64)
-        name = self.group[at]
-        group = np.array([np.flatnonzero(name == n)[0] for n in name], dtype=np.int64)
-        return Matter(self.eps[at], self.ground[at], group)
+        _, first, same = np.unique(self.group[at], return_index=True, return_inverse=True)
+        return Matter(self.eps[at], self.ground[at], first[same.reshape(-1)])
 
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
         """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
