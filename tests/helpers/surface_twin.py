@@ -226,7 +226,7 @@ def reduced(
 
 # ---- scores ----
 
-COARSE, LINEAR, DECAY, LEAST = 31, 0.3, 0.35, 3e-3
+COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 
 
 def scores(
@@ -238,7 +238,7 @@ def scores(
     for piece, (kids, panel, charge) in zip(pieces, trees, strict=True):
         share = shares(kids, panel, charge)
         block = free_block(piece.panels) / piece.scale
-        means = _means(piece, kids, share, green)
+        means, linear = _means(piece, kids, share, green)
         own = np.zeros(len(kids))
         for k, value in means.items():
             x, y = kids[k]
@@ -246,16 +246,17 @@ def scores(
                 function = share[:, x] - share[:, y]
                 own[k] = function @ block @ function
                 p = share[members_of(share, x), k].sum()
-                means[k] = p * means[x] + (1 - p) * means[y]
+                below = p * means[x] + (1 - p) * means[y]
+                means[k] = linear[k] * value + (1 - linear[k]) * below
                 value = means[x] - means[y]
-                energy += value**2 / own[k]
+                energy += (1 - linear[k]) * value**2 / own[k]
         if not piece.neutral:
             energy += means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.tie)
-        seen.append(means)
+        seen.append((means, linear))
         stiff.append(own)
     weight = 1 / (energy + 0.01 * np.linalg.norm(energy))
     out = []
-    for means, own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
+    for (means, linear), own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
         score = np.zeros(len(kids))
         for k in means:
             if own[k] > 0:
@@ -263,11 +264,11 @@ def scores(
                 value = weight @ (means[x] - means[y]) ** 2 / own[k]
                 for below in (score[x], score[y]):
                     value = max(value, below) + 0.5 * min(value, below)
-                score[k] = value
+                score[k] = (1 - linear[k]) * value
         for k in range(len(kids)):
             for part in kids[k]:
-                if part >= 0 and kids[part, 0] >= 0 and kids[part, 0] not in means:
-                    score[part] = DECAY * score[k]
+                if part >= 0 and kids[part, 0] >= 0:
+                    score[part] += linear.get(part, 1.0) * DECAY * score[k]
         out.append(score)
     return out
 
@@ -276,11 +277,14 @@ def members_of(share: Array, cluster: int) -> Array:
     return np.flatnonzero(share[:, cluster])
 
 
-def _means(piece: Piece, kids: Array, share: Array, green: GreenFunction) -> dict[int, Array]:
-    """Potentials in the centres of the clusters that are looked into, finest first."""
+def _means(
+    piece: Piece, kids: Array, share: Array, green: GreenFunction
+) -> tuple[dict[int, Array], dict[int, float]]:
+    """Potentials in the centres of the clusters that are looked at, finest first, and how linear
+    each sees it."""
     sources = green.far_sources.astype(float)
     image = sources * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
-    out = {}
+    out, linear = {}, {}
     wanted = [0]
     for k in wanted:
         center, second = charge_moments(piece.panels, share[:, k])
@@ -288,7 +292,9 @@ def _means(piece: Piece, kids: Array, share: Array, green: GreenFunction) -> dic
         size = piece.scale * np.sqrt(12.0 * max(np.linalg.eigvalsh(second)[2], 0.0))
         near = 1 / np.maximum(np.linalg.norm(point - sources, axis=1), LEAST)
         out[k] = (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
-        small = k >= COARSE and size < LINEAR * green.distance(point[None])[0]
-        if kids[k, 0] >= 0 and not small:
+        t = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
+        t = np.clip(t, 0.0, 1.0) if k >= COARSE else 0.0
+        linear[k] = t * t * (3 - 2 * t)
+        if kids[k, 0] >= 0 and linear[k] < 1:
             wanted += kids[k].tolist()
-    return {k: out[k] for k in sorted(out, reverse=True)}
+    return {k: out[k] for k in sorted(out, reverse=True)}, linear

@@ -32,7 +32,7 @@ class GreenSettings:
     """Largest number of point charges behind the sensor, near representation."""
     near_spacing: float = 2.4e-3
     """Smallest distance of neighbouring point charges, near representation [m]."""
-    far_sources: int = 220
+    far_sources: int = 180
     """As ``near_sources``, far representation."""
     far_spacing: float = 4.5e-3
     """As ``near_spacing``, far representation [m]."""
@@ -40,7 +40,7 @@ class GreenSettings:
     """Depth of the point charges behind the surfaces, in spacings."""
     modes: int = 180
     """Largest number of modes."""
-    far_modes: int = 80
+    far_modes: int = 56
     """Largest number of modes far away."""
     wall_grid: int = 5
     """Point charges along each edge of a wall."""

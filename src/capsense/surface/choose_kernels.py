@@ -6,6 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from capsense.surface.place_kernels import (
@@ -24,8 +25,9 @@ from capsense.surface.vector_kernels import (
     point_potentials,
 )
 
-_LINEAR = 0.3
-"""Clusters smaller than this part of their distance from the design see a linear potential."""
+_LINEAR = 0.45, 0.58
+"""Clusters smaller than the first part of their distance from the design see a linear potential,
+those larger than the second do not; in between they come to do."""
 _COARSE = 31
 """So many clusters, the coarsest of a body, are looked into wherever they are."""
 _DECAY = 0.35
@@ -57,7 +59,7 @@ class Cut(NamedTuple):
     """The leaves in this list, shape (l,)."""
 
 
-@fast
+@njit(inline="always")
 def chosen(bodies, green, threshold, width):
     """Return the cut of a scene: see :func:`score` and :func:`choose`."""
     first = np.zeros(bodies.shape[0] + 1, np.int64)
@@ -80,20 +82,22 @@ def score(bodies, first, green, enough, weight, scores):
     """
     terminals, lead, total = green.terminals, green.lead, first[-1]
     means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
-    met, crossing = np.zeros(total, np.bool_), np.zeros(total)
+    met, crossing, linear = np.zeros(total, np.bool_), np.zeros(total), np.zeros(total)
     for b in range(bodies.shape[0]):
         body, o = bodies[b], first[b]
         kids, function = integers(body.kids), integers(body.function)
         charge, own = doubles(body.charge), doubles(body.own)
         span = slice(o, first[b + 1])
-        _mean_potentials(body, green, means[span], met[span], crossing[span])
+        _mean_potentials(body, green, means[span], met[span], crossing[span], linear[span])
         for k in range(2 * body.n - 2, -1, -1):
             x, y = kids[2 * k], kids[2 * k + 1]
             if x >= 0 and met[o + x]:
-                p = np.float32(charge[x] / charge[k])
-                stiffness = body.scale / own[function[k]]
+                p, t = np.float32(charge[x] / charge[k]), np.float32(linear[o + k])
+                q, r = (np.float32(1.0) - t) * p, (np.float32(1.0) - t) * (np.float32(1.0) - p)
+                stiffness = (1.0 - linear[o + k]) * body.scale / own[function[k]]
                 for i in range(lead):
-                    means[o + k, i] = p * means[o + x, i] + (np.float32(1.0) - p) * means[o + y, i]
+                    whole = t * means[o + k, i] if t > 0.0 else np.float32(0.0)
+                    means[o + k, i] = whole + q * means[o + x, i] + r * means[o + y, i]
                 for i in range(terminals):
                     d = float(means[o + x, i] - means[o + y, i])
                     energy[i] += d * d * stiffness
@@ -107,22 +111,25 @@ def score(bodies, first, green, enough, weight, scores):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
     for b in range(bodies.shape[0]):
         span = slice(first[b], first[b + 1])
-        scores[span] = enough * crossing[span]
-        _raise_scores(bodies[b], means[span], met[span], weight, scores[span])
+        for k in range(first[b], first[b + 1]):
+            scores[k] = enough * crossing[k]
+        _raise_scores(bodies[b], means[span], met[span], linear[span], weight, scores[span])
 
 
 @fast
-def _mean_potentials(body, green, means, met, crossing):
-    """φ⁰ in the middle of clusters that are not looked into, from the far sources.
+def _mean_potentials(body, green, means, met, crossing, linear):
+    """φ⁰ in the middle of clusters that see it as linear or have no parts, from the far sources.
 
-    ``crossing`` is filled with how much each cluster crosses a wall, 0 to 1.
+    ``crossing`` is filled with how much each cluster crosses a wall, 0 to 1, ``linear`` with how
+    linear φ⁰ is there, and ``met`` with which clusters were looked at.
     """
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
-    places, points = np.empty(body.n, np.int64), np.empty((body.n + 3, 3), np.float32)
-    inner = np.empty(body.n)
+    most = 2 * body.n - 1
+    places, points = np.empty(most, np.int64), np.empty((most + 3, 3), np.float32)
+    inner = np.empty(most)
     found = 0
     met[0] = True
-    for k in range(2 * body.n - 1):
+    for k in range(most):
         if not met[k]:
             continue
         square = out = 0.0
@@ -142,13 +149,15 @@ def _mean_potentials(body, green, means, met, crossing):
         crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
             (size - _LONG[0]) / (_LONG[1] - _LONG[0])
         )
-        small = k >= _COARSE and size * size < _LINEAR * _LINEAR * square
+        if k >= _COARSE:
+            part = size / math.sqrt(square + 1e-12)
+            linear[k] = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
         if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
             lift(points[found : found + 1], least_gap(size, green.cover), green.box)
-        if small or kids[2 * k] < 0:
+        if linear[k] > 0.0 or kids[2 * k] < 0:
             places[found], inner[found] = k, 1.0 - smooth(math.sqrt(out) / SHORE)
             found += 1
-        else:
+        if linear[k] < 1.0 and kids[2 * k] >= 0:
             met[kids[2 * k]] = met[kids[2 * k + 1]] = True
     rounded = 4 * ((found + 3) // 4)
     for j in range(found, rounded):
@@ -166,7 +175,7 @@ def _mean_potentials(body, green, means, met, crossing):
 
 
 @fast
-def _raise_scores(body, mean, met, weight, scores):
+def _raise_scores(body, mean, met, linear, weight, scores):
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     count = 2 * body.n - 1
     for k in range(count - 1, -1, -1):
@@ -180,14 +189,13 @@ def _raise_scores(body, mean, met, weight, scores):
             for c in range(2):
                 below = scores[kids[2 * k + c]]
                 value = max(value, below) + 0.5 * min(value, below)
-            scores[k] = max(scores[k], value)
+            scores[k] = max(scores[k], (1.0 - linear[k]) * value)
     for k in range(count):
-        a = kids[2 * k]
-        if a >= 0:
-            for c in range(2):
-                part = kids[2 * k + c]
-                if kids[2 * part] >= 0 and not met[kids[2 * part]]:
-                    scores[part] = _DECAY * scores[k]
+        for c in range(2):
+            part = kids[2 * k + c]
+            if part >= 0 and kids[2 * part] >= 0:
+                share = linear[part] if met[part] else 1.0
+                scores[part] += share * _DECAY * scores[k]
 
 
 @fast

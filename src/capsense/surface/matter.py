@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.constants import EPS0
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
+from capsense.scene.body import Grounding
+from capsense.scene.materials import Material
 from capsense.scene.scene import PackedScene
 from capsense.surface.changing import ChangingBody
 from capsense.surface.rigid import RigidShape
@@ -48,16 +51,17 @@ class Matter:
     group: Ints
     """First of the conductors that a body touches, directly or not; else itself, shape (n,)."""
 
-    @property
+    @cached_property
     def conducting(self) -> NDArray[np.bool_]:
         """Which bodies hold no field inside, shape (n,)."""
         return np.isinf(self.eps.real)
 
-    @property
+    @cached_property
     def lossy(self) -> bool:
         """Whether a body is neither a conductor nor free of losses."""
         return bool(((self.eps.imag != 0) & ~self.conducting).any())
 
+    @cached_property
     def softness(self) -> Complex:
         """1 / (eps - 1), zero for conductors, shape (n,)."""
         out = np.zeros(len(self.eps), complex)
@@ -76,8 +80,10 @@ class Matter:
         Args:
             sizes: Capacitances of the bodies in free space over 4π eps0 [m], shape (n,).
         """
-        with np.errstate(divide="ignore"):
-            out = (UNIT / self.ground).astype(complex)
+        out = self._ground_ties
+        if self.conducting.all():
+            return out
+        out = out.copy()
         for k in np.flatnonzero(~self.conducting):
             eps = self.eps[k]
             x = np.clip(np.log(eps.real / _BOUND[0]) / np.log(_BOUND[1] / _BOUND[0]), 0.0, 1.0)
@@ -87,6 +93,11 @@ class Matter:
             else:
                 out[k] += (_CONTACT - 1.0) / (current * sizes[k])
         return out
+
+    @cached_property
+    def _ground_ties(self) -> Complex:
+        with np.errstate(divide="ignore"):
+            return (UNIT / self.ground).astype(complex)
 
     def joined(self, scene: Scene, packed: PackedScene, chosen: NDArray[np.intp]) -> Matter:
         """Take conductors that touch each other for one, on the sum of their ties to ground.
@@ -123,7 +134,7 @@ class Matter:
 
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
         """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
-        ties, softness = self.ties(sizes_of(records, shapes)), self.softness()
+        ties, softness = self.ties(sizes_of(records, shapes)), self.softness
         members = np.bincount(self.group, minlength=len(records))[self.group]
         none = np.isinf(ties.real)
         shared = none & (members > 1) & self.conducting
@@ -141,10 +152,15 @@ class Matter:
 
 def matter_of(bodies: Sequence[Body], frequency: float) -> Matter:
     """Look up what bodies are made of, at a frequency [Hz]."""
-    eps = np.array([b.material.complex_permittivity(frequency) for b in bodies], complex)
+    return _matter(tuple([(b.material, b.grounding) for b in bodies]), frequency)
+
+
+@lru_cache(maxsize=64)
+def _matter(bodies: tuple[tuple[Material, Grounding], ...], frequency: float) -> Matter:
+    eps = np.array([material.complex_permittivity(frequency) for material, _ in bodies], complex)
     eps[np.abs(eps) >= CONDUCTING] = np.inf
     known = {"grounded": np.inf, "floating": 0.0}
-    ground = [known[b.grounding] if isinstance(b.grounding, str) else b.grounding for b in bodies]
+    ground = [known[tie] if isinstance(tie, str) else tie for _, tie in bodies]
     return Matter(eps, np.array(ground, float), np.arange(len(bodies)))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from capsense.surface.vector_kernels import fast, rsqrt
 
-FAR = 1.5
+FAR = 0.75
 """Clusters farther apart than so many of their joint extents are met by their moments."""
 _CLOSE = 0.6
 """Rectangles of one surface nearer than so many of their joint extents are met in closed form."""

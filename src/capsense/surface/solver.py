@@ -176,9 +176,9 @@ class SurfaceSolver:
             bodies, preset = self.pack(view), self.preset
             if not len(bodies.records):
                 return bodies, None
-            if bodies.matter.lossy:
-                matter = bodies.matter
-                softness = matter.softness()
+            matter = bodies.matter
+            if matter.lossy:
+                softness = matter.softness
                 impedances = [
                     s.impedance if soft != 0 and isinstance(s, RigidShape) else None
                     for s, soft in zip(bodies.shapes, softness, strict=True)
@@ -243,13 +243,14 @@ class SurfaceSolver:
                 places.append(place)
                 offsets.append(rotation @ at)
         chosen, shapes = view.met[places], [shape for shape, _ in found]
+        shift = np.array(offsets).reshape(-1, 3)
         records = np.array([s.record for s in shapes], BODY)
         records["scale"] = [size for _, size in found]
         records["rotation"] = packed.rotation[chosen]
-        records["position"] = packed.position[chosen] + np.reshape(offsets, (-1, 3))
+        records["position"] = packed.position[chosen] + shift
         matter = matter.repeated(places)
         matter.write(records, shapes)
-        return PackedBodies(records, chosen, matter, shapes, np.reshape(offsets, (-1, 3)))
+        return PackedBodies(records, chosen, matter, shapes, shift)
 
     def _parts(self, view: View, place: int, middle: Array) -> list[tuple[Shape, Array]]:
         """Parts of a body to be solved for, and where they are in its frame [m].

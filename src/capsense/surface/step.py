@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
+from numba import njit
 from numpy.typing import NDArray
 
 from capsense.surface.choose_kernels import Cut, chosen
@@ -50,7 +51,7 @@ class Solution(NamedTuple):
     """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
 
 
-@fast
+@njit(inline="always")
 def prepared(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float
 ) -> tuple[Cut, Leaves, Functions, System]:

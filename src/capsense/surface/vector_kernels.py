@@ -112,18 +112,24 @@ def point_potentials(points, sources, floor, least, out):
 
 @fast
 def multiply(left, table, out):
-    """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 32.
+    """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 32."""
+    multiply_part(left, table, left.shape[1], table.shape[1], out)
+
+
+@fast
+def multiply_part(left, table, depth, width, out):
+    """The same, of the first ``depth`` rows of the table and the first ``width`` columns only.
 
     Four rows and 32 columns at a time: sixteen sums stay in registers.
     """
     k, s, w = left.shape[0], left.shape[1], table.shape[1]
     zero = splat(np.float32(0.0))
-    for j in range(0, w, WIDTH):
+    for j in range(0, width, WIDTH):
         for i in range(0, k - 3, 4):
             a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = zero
             c0 = c1 = c2 = c3 = d0 = d1 = d2 = d3 = zero
             p = i * s
-            for t in range(s):
+            for t in range(depth):
                 o = t * w + j
                 v0, v1, v2, v3 = (
                     span(table, o),
@@ -145,7 +151,7 @@ def multiply(left, table, out):
             _put(out, (i + 3) * w + j, d0, d1, d2, d3)
         for i in range(k - k % 4, k):
             a0 = a1 = a2 = a3 = zero
-            for t in range(s):
+            for t in range(depth):
                 o = t * w + j
                 x = at(left, i * s + t)
                 a0, a1 = madd(x, span(table, o), a0), madd(x, span(table, o + 8), a1)
