@@ -31,7 +31,7 @@ class Placed(NamedTuple):
 @cache
 def shape_of(shape: cs.Sphere | cs.Capsule | cs.Box) -> RigidShape:
     """The charge functions of a shape, kept for the whole run of the tests."""
-    return rigid_shape(panels_of(shape, 300))
+    return rigid_shape(panels_of(shape, 300), apart=True)
 
 
 @cache

@@ -266,7 +266,7 @@ def test_haar_functions(shape: cs.Shape) -> None:
     np.testing.assert_allclose(haar.sum(axis=0), np.eye(n)[0], atol=1e-12)
     assert np.linalg.matrix_rank(haar) == n
     rows = np.random.default_rng(1).normal(size=(5, n))
-    np.testing.assert_allclose(tree.to_functions(rows), rows @ haar, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(tree.to_functions(rows.T), (rows @ haar).T, rtol=0, atol=1e-12)
     energy = haar.T @ free_block(found.panels) @ haar
     np.testing.assert_allclose(found.energy, energy, rtol=0, atol=1e-6 * energy.max())
     np.testing.assert_allclose(found.own, np.diag(energy), rtol=1e-6)
@@ -278,6 +278,16 @@ def test_the_first_function_is_at_one_potential(shape: cs.Shape) -> None:
     found = shape_of(shape)
     assert np.abs(found.energy[0, 1:]).max() < 1e-5 * found.energy[0, 0]
     assert found.energy[0, 0] * found.capacitance == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [BALL, FINGER, BOX, cs.Box((0.3, 0.3, 0.001))], ids=repr)
+def test_equilibrium_charge_of_panels_apart(shape: cs.Shape) -> None:
+    """Differential: conjugate gradients and a Cholesky factor."""
+    panels = panels_of(shape, 300)
+    found, wanted = rigid_shape(panels, apart=True), rigid_shape(panels)
+    assert found.capacitance == pytest.approx(wanted.capacitance, rel=1e-8)
+    np.testing.assert_allclose(found.tree.charge, wanted.tree.charge, rtol=1e-4)
+    np.testing.assert_array_equal(found.tree.kids, wanted.tree.kids)
 
 
 @pytest.mark.parametrize("shape", [BALL, FINGER, BOX, CYLINDER], ids=repr)

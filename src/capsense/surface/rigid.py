@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.sparse.linalg import LinearOperator, cg
 
 from capsense.errors import SolveError
 from capsense.surface import tree_kernels
@@ -63,13 +64,11 @@ class Tree(Clusters):
     extent: Array
     """Length of a uniform rod with the cluster's largest second moment [m], shape (2 n - 1,)."""
 
-    def to_functions(self, rows: Array) -> Array:
-        """Integrate rows of panel values with every charge function, shape (k, n) -> (k, n)."""
-        out = np.empty(rows.shape)
-        tree_kernels.to_functions(
-            np.ascontiguousarray(rows), self.kids, self.panel, self.charge, self.function,
-            np.empty(len(self.kids)), out,
-        )  # fmt: skip
+    def to_functions(self, values: Array) -> Array:
+        """Integrate columns of panel values with every charge function, shape (n, k) -> (n, k)."""
+        values = np.ascontiguousarray(values)
+        out = np.empty(values.shape)
+        tree_kernels.to_functions(values, self.kids, self.panel, self.charge, self.function, out)
         return out
 
 
@@ -123,13 +122,35 @@ class RigidShape:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-def rigid_shape(panels: SurfacePanels) -> RigidShape:
+def rigid_shape(panels: SurfacePanels, *, apart: bool = False) -> RigidShape:
     """Work out charge functions and energies.
+
+    Args:
+        panels: The surface.
+        apart: Whether it is known that no two panels lie within each other, as on a primitive. Of
+            others it is looked into, at some cost.
 
     Raises:
         SolveError: The panels lie within each other, so that their block is not definite.
     """
     free = free_block(panels)
+    charge = _equilibrium(free) if apart else _made_definite(free)
+    tree = build_tree(panels, np.maximum(charge, _LEAST_CHARGE * charge.max()))
+    return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
+
+
+def _equilibrium(free: Array) -> Array:
+    """Charges that put all panels at 1 V, by conjugate gradients, free (n, n) -> (n,)."""
+    diagonal = np.diag(free).copy()
+    found, failed = cg(free, np.ones(len(free)), rtol=1e-10, M=LinearOperator(
+        free.shape, matvec=lambda x: x.ravel() / diagonal, dtype=float))  # fmt: skip
+    if failed:
+        raise SolveError(f"the charges of {len(free)} panels do not converge")
+    return found
+
+
+def _made_definite(free: Array) -> Array:
+    """The same where the diagonal may have to be raised first, in place."""
     own = np.diag(free).copy()
     for extra in _EXTRA:
         np.fill_diagonal(free, (1.0 + extra) * own)
@@ -138,13 +159,11 @@ def rigid_shape(panels: SurfacePanels) -> RigidShape:
             break
     else:
         raise SolveError(
-            f"the surface of {len(panels)} panels meets itself, so that no charge can be told; "
+            f"the surface of {len(free)} panels meets itself, so that no charge can be told; "
             "remove doubled faces"
         )
-    charge = solve_triangular(factor, np.ones(len(panels)), lower=True, check_finite=False)
-    charge = solve_triangular(factor, charge, lower=True, trans=1, check_finite=False)
-    tree = build_tree(panels, np.maximum(charge, _LEAST_CHARGE * charge.max()))
-    return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
+    charge = solve_triangular(factor, np.ones(len(free)), lower=True, check_finite=False)
+    return solve_triangular(factor, charge, lower=True, trans=1, check_finite=False)
 
 
 @fast
@@ -193,5 +212,4 @@ def split(features: Array, charge: Array) -> Clusters:
 
 def _of_functions(tree: Tree, block: Array) -> Array32:
     """Change a symmetric block of panels to one of charge functions."""
-    half = tree.to_functions(block)
-    return np.ascontiguousarray(tree.to_functions(half.T), dtype=np.float32)
+    return tree.to_functions(tree.to_functions(block).T).astype(np.float32)

@@ -69,7 +69,7 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
         if isinstance(shape, TriMesh):
             found = _mesh_shape(shape, count, str(key[0]))
         else:
-            found = rigid_shape(panels_of(shape, count).scaled(1.0 / size))
+            found = rigid_shape(panels_of(shape, count).scaled(1.0 / size), apart=True)
         with _LOCK:
             found = _SHAPES.setdefault(key, found)
             while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
