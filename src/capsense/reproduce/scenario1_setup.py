@@ -133,7 +133,7 @@ class Setup:
         return {"zigzag": self.zigzag, **self.boards, **self.panels}[name].__dict__
 
     def value(self, key: str) -> float:
-        """A figure by name, ``"gap"``, ``"zigzag.pitch"``, ``"stripe.depth"`` or ``"patch_T2.pace"``.
+        """A figure by name, like ``"gap"``, ``"stripe.depth"`` or ``"patch_T2.pace"``.
 
         Raises:
             KeyError: There is no such figure.
