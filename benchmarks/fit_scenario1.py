@@ -1,9 +1,9 @@
 """Fit scenario 1 of ``capsense reproduce`` to the measured panels of the paper's Fig. 9.
 
 Prints the figures for ``src/capsense/reproduce/data/scenario1.toml``, how far the table that the
-fit interpolates is from the simulation, and, if asked, how well other assumptions fit and how well
-one panel is foretold from the other. ``python benchmarks/fit_scenario1.py`` takes a minute, each
-option half a minute more, ``--pours`` several, most of them for the fields.
+fit interpolates is from the simulation, and, if asked, how well each panel is foretold from the
+others, how well the predicted panel is known, and how well other pairs and pours fit. ``python
+benchmarks/fit_scenario1.py`` takes seconds once the fields are built, ``--pairs`` a minute.
 """
 
 from __future__ import annotations
@@ -11,25 +11,27 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from itertools import combinations, product
 
 import numpy as np
 
 from capsense.reproduce.metrics import cross_correlation, rmse
-from capsense.reproduce.scenario1 import ZIGZAG, ZIGZAG_SAMPLES
 from capsense.reproduce.scenario1_fit import (
     Fit,
     Grid,
     Table,
     fit,
     fit_without,
+    own_figures,
     predicted,
     tabulate,
 )
-from capsense.reproduce.scenario1_setup import PANEL_SAMPLES, Setup, load_panel, load_setup
+from capsense.reproduce.scenario1_setup import Array, Setup, load_curves, load_setup
 from capsense.reproduce.scenario1_signal import matrices, mutual, normalised
 from capsense.simulator import Simulator
 
-PANELS = ("stripe", "patch")
+BOARDS = ("stripe", "patch")
+PREDICTED = "patch_T4"
 DRAWS = 200
 
 
@@ -42,7 +44,7 @@ def simulators(setup: Setup) -> dict[str, Simulator]:
     """Of both boards."""
     return {
         name: Simulator(setup.boards[name].sensor(setup.pour), frequency=setup.frequency)
-        for name in PANELS
+        for name in BOARDS
     }
 
 
@@ -51,95 +53,113 @@ def tables_of(setup: Setup, grids: dict[str, Grid]) -> dict[str, Table]:
     return {name: grid.table(setup.boards[name].pair) for name, grid in grids.items()}
 
 
-def likeness(setup: Setup, name: str, table: Table) -> tuple[float, float]:
-    """Zero-mean correlation and rms error of a board's curve by the table against hardware."""
-    measured = load_panel(setup.boards[name].panel).measured
-    curve = predicted(setup, name, table)
+def recorded(setup: Setup) -> list[str]:
+    """Names of the panels whose curves are given."""
+    return [name for name, panel in setup.panels.items() if panel.file]
+
+
+def curve_of(setup: Setup, tables: dict[str, Table], panel: str) -> Array:
+    """A panel's curve by the table of its board."""
+    return predicted(setup, panel, tables[setup.panels[panel].board])
+
+
+def likeness(setup: Setup, tables: dict[str, Table], panel: str) -> tuple[float, float]:
+    """Zero-mean correlation and rms error of a panel's curve by the table against hardware."""
+    measured = load_curves(setup.panels[panel]).measured
+    curve = curve_of(setup, tables, panel)
     return cross_correlation(curve, measured), rmse(curve, measured)
 
 
+def level_boards(setup: Setup) -> Setup:
+    """The same with both boards at one height, which is no longer fitted."""
+    kept = {key: u for key, u in setup.uncertainty.items() if key != "patch.height"}
+    return replace(setup.changed({"patch.height": 0.0}), uncertainty=kept)
+
+
 def held_out(setup: Setup, tables: dict[str, Table]) -> dict[str, Setup]:
-    """For each board the set-up that is fitted with its panel held out."""
-    return {name: fit_without(setup, tables, name) for name in PANELS}
+    """For each recorded panel the set-up that is fitted with it held out."""
+    return {name: fit_without(setup, tables, name) for name in recorded(setup)}
 
 
 def print_held_out(setup: Setup, tables: dict[str, Table]) -> None:
-    """What one panel alone tells, and how it foretells the other."""
-    found = held_out(setup, tables)
-    for name, other in found.items():
-        print(f"\n{name} held out")
-        for key in (key for key in setup.uncertainty if "." not in key):
-            print(f"{key} = {other.value(key):.4g}    # ± {other.uncertainty[key]:.2g}")
-        for board, table in tables.items():
-            correlation, error = likeness(other, board, table)
-            print(f"{board}: correlation {correlation:.4f}, rms error {error:.4f}")
+    """How each panel is foretold by the others, and what becomes of the predicted one."""
+    best = curve_of(setup, tables, PREDICTED)
+    for title, begin in (("", setup), (", boards at one height", level_boards(setup))):
+        for name, other in held_out(begin, tables).items():
+            correlation, error = likeness(other, tables, name)
+            moved = curve_of(other, tables, PREDICTED)
+            print(
+                f"\n{name} held out{title}: correlation {correlation:.4f}, rms error {error:.4f}; "
+                f"fitted to it {own_figures(begin, tables, name)}; the predicted panel moves by "
+                f"{rmse(moved, best):.4f} rms"
+            )
+            for key in ("gap", "stray", "sample_rate", "rest", "tilt"):
+                print(f"  {key} = {other.value(key):.4g}    # ± {other.uncertainty[key]:.2g}")
 
 
-def all_pairs(
-    setup: Setup, grids: dict[str, Grid]
-) -> dict[tuple[str, str], tuple[Fit, list[float]]]:
-    """The fit of every choice of pairs, and the rms errors of both boards, the best first."""
-    found = {}
-    choices = {
-        name: [(a, b) for k, a in enumerate(grid.names) for b in grid.names[k + 1 :]]
-        for name, grid in grids.items()
-    }
-    for one in choices["stripe"]:
-        for other in choices["patch"]:
-            tables = {"stripe": grids["stripe"].table(one), "patch": grids["patch"].table(other)}
-            result = fit(setup, tables)
-            errors = [likeness(result.setup, name, tables[name])[1] for name in PANELS]
-            found["-".join(one), "-".join(other)] = result, errors
-    return dict(sorted(found.items(), key=lambda item: item[1][0].cost))
+def print_pairs(setup: Setup, grids: dict[str, Grid], count: int | None = None) -> None:
+    """The fit of every choice of pairs, and the panel that it predicts, the best first."""
+    best = curve_of(setup, tables_of(setup, grids), PREDICTED)
+    found = []
+    pairs = list(combinations(grids["stripe"].names, 2))
+    for one, other in product(pairs, pairs):
+        tables = {"stripe": grids["stripe"].table(one), "patch": grids["patch"].table(other)}
+        result = fit(setup, tables)
+        errors = [likeness(result.setup, tables, name)[1] for name in recorded(setup)]
+        moved = curve_of(result.setup, tables, PREDICTED)
+        stray, height = (result.setup.value(key) for key in ("stray", "patch.height"))
+        ratio = (tables["stripe"].empty + stray) / (tables["patch"].empty + stray)
+        text = (
+            f"{'-'.join(one)} {'-'.join(other)}: {' '.join(f'{e:.4f}' for e in errors)}; "
+            f"{1e15 * stray:.1f} fF, {1e3 * height:.1f} mm, {ratio:.2f}; {rmse(moved, best):.4f}, "
+            f"{cross_correlation(moved, best):.4f}, {moved.min():.3f}"
+        )
+        found.append((result.cost, text))
+    print(
+        "\npairs, stripe and patch: rms error of the panels; stray capacitance, height of the "
+        "patch board, capacitance read on stripes over that on patches; the predicted panel: rms "
+        f"difference from the shipped one, correlation with it, lowest (shipped {best.min():.3f})"
+    )
+    for _, text in sorted(found)[:count]:
+        print(text)
 
 
-def with_teeth(setup: Setup, width: float) -> Setup:
-    """The same with the zig-zag's teeth wider by a factor."""
-    start, *teeth = setup.trajectories[ZIGZAG]
-    wider = (start, *((width * x, z) for x, z in teeth))
-    return replace(setup, trajectories={**setup.trajectories, ZIGZAG: wider})
-
-
-def print_zig_zag(result: Fit, tables: dict[str, Table]) -> None:
-    """How far the zig-zag's curves move with what is known badly."""
-    setup = result.setup
-    drawn = result.drawn(DRAWS)
-    others = {f"{DRAWS} draws of the fitted figures": drawn} | {
-        f"teeth {width:g} times as wide": [with_teeth(setup, width)] for width in (0.5, 2.0)
-    }
-    print("\nzig-zag: rms change; least zero-mean correlation; rms change of the lowest reading")
-    for name, table in tables.items():
-        curve = predicted(setup, name, table, ZIGZAG, ZIGZAG_SAMPLES)
-        for what, setups in others.items():
-            moved = [predicted(other, name, table, ZIGZAG, ZIGZAG_SAMPLES) for other in setups]
-            change = np.sqrt(np.mean([rmse(one, curve) ** 2 for one in moved]))
-            least = min(cross_correlation(one, curve) for one in moved)
-            low = np.sqrt(np.mean([(one.min() - curve.min()) ** 2 for one in moved]))
-            print(f"{name}, {what}: {change:.4f}, {least:.2f}, {low:.4f} of {curve.min():.4f}")
+def print_prediction(result: Fit, tables: dict[str, Table]) -> None:
+    """How far the predicted panel moves with the fitted figures' uncertainties."""
+    curve = curve_of(result.setup, tables, PREDICTED)
+    moved = [curve_of(one, tables, PREDICTED) for one in result.drawn(DRAWS)]
+    change = np.sqrt(np.mean([rmse(one, curve) ** 2 for one in moved]))
+    low = np.std([one.min() for one in moved])
+    least = min(cross_correlation(one, curve) for one in moved)
+    print(
+        f"\n{PREDICTED}, {DRAWS} draws of the fitted figures: rms change {change:.4f}, least "
+        f"zero-mean correlation {least:.4f}, lowest reading {curve.min():.4f} ± {low:.4f}"
+    )
 
 
 def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]) -> Fit:
-    """The figures, and each board's curve by the simulation itself."""
+    """The figures, and each recorded panel's curve by the simulation itself."""
     result = fit(setup, tables, report=report)
     print(f"cost {result.cost:.6f}, correlation of successive residuals {result.memory:.3f}\n")
     for key, deviation in result.setup.uncertainty.items():
         print(f"{key} = {result.setup.value(key):.5g}    # ± {deviation:.2g}")
     print()
-    for name, sim in sims.items():
-        board, panel = result.setup.boards[name], load_panel(setup.boards[name].panel)
-        times = np.arange(PANEL_SAMPLES) / board.sample_rate
-        poses = result.setup.poses(name, "T2", setup.panel_speed, times)
+    for name in recorded(setup):
+        panel = result.setup.panels[name]
+        board, sim, table = setup.boards[panel.board], sims[panel.board], tables[panel.board]
+        times = result.setup.times(panel)
+        poses = result.setup.poses(panel.board, panel.trajectory, setup.panel_speed, times)
         values = mutual(matrices(sim, setup, poses), sim.electrode_names, board.pair)
-        curve = normalised(result.setup, board, values, tables[name].empty, noise=False)
-        apart = rmse(curve, predicted(result.setup, name, tables[name]))
-        steps = np.diff(panel.measured)
-        noise = np.median(np.abs(steps)) / 0.6745 / np.sqrt(2) / board.level
-        noise *= tables[name].empty + result.setup.stray
+        level = result.setup.level_of(panel)
+        curve = level * normalised(result.setup, board, values, table.empty, noise=False)
+        measured = load_curves(panel).measured
+        noise = np.median(np.abs(np.diff(measured, 2))) / 0.6745 / np.sqrt(6)
         print(
-            f"{name}: correlation {cross_correlation(curve, panel.measured):.4f}, rms error "
-            f"{rmse(curve, panel.measured):.4f}; coupling {1e15 * tables[name].empty:.2f} fF; the "
-            f"table is within {apart:.4f} rms of the simulation; noise of the measurement "
-            f"{noise:.2g} F"
+            f"{name}: correlation {cross_correlation(curve, measured):.4f}, rms error "
+            f"{rmse(curve, measured):.4f}; coupling {1e15 * table.empty:.2f} fF; the table is "
+            f"within {rmse(curve, curve_of(result.setup, tables, name)):.4f} rms of the "
+            f"simulation; noise of the measurement {noise:.4f}, "
+            f"{noise / level * (table.empty + result.setup.stray):.2g} F"
         )
     return result
 
@@ -147,8 +167,8 @@ def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]
 def main() -> None:
     """Tabulate, fit, print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--zig-zag", action="store_true", help="how well the zig-zag is known")
-    parser.add_argument("--held-out", action="store_true", help="foretell each panel by the other")
+    parser.add_argument("--prediction", action="store_true", help="how well the panel is known")
+    parser.add_argument("--held-out", action="store_true", help="foretell each panel by the others")
     parser.add_argument("--pairs", action="store_true", help="try every choice of pairs")
     parser.add_argument("--pours", action="store_true", help="try all pairs with floating pours")
     args = parser.parse_args()
@@ -157,20 +177,16 @@ def main() -> None:
     grids = {name: tabulate(sim, setup) for name, sim in sims.items()}
     tables = tables_of(setup, grids)
     result = print_fit(setup, sims, tables)
-    if args.zig_zag:
-        print_zig_zag(result, tables)
+    if args.prediction:
+        print_prediction(result, tables)
     if args.held_out:
-        print_held_out(setup, tables)
+        print_held_out(result.setup, tables)
     if args.pairs:
-        print("\nrms error by pair: stripe, patch")
-        for pairs, (_, errors) in all_pairs(setup, grids).items():
-            print(*pairs, *(f"{error:.4f}" for error in errors))
+        print_pairs(result.setup, grids)
     if args.pours:
-        other = replace(setup, pour="floating")
-        found = {name: tabulate(sim, other) for name, sim in simulators(other).items()}
-        print("\nfloating pours, the best pairs: rms error of stripe, patch; stray capacitance")
-        for pairs, (result, errors) in list(all_pairs(other, found).items())[:3]:
-            print(*pairs, *(f"{error:.4f}" for error in errors), f"{result.setup.stray:.3g} F")
+        other = replace(result.setup, pour="floating")
+        print("\nfloating pours")
+        print_pairs(other, {n: tabulate(sim, other) for n, sim in simulators(other).items()}, 3)
 
 
 if __name__ == "__main__":

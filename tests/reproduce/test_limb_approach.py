@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capsense.reproduce import limb_fit
 from capsense.reproduce.limb_approach import run
 from capsense.reproduce.limb_curves import (
     FITS,
@@ -18,6 +19,7 @@ from capsense.reproduce.limb_curves import (
     slopes,
     zero_distance,
 )
+from capsense.reproduce.limb_fit import EDGES, FAR
 from capsense.reproduce.study import Outcome
 from capsense.reproduce.write import write_outcome
 
@@ -109,3 +111,30 @@ def test_parts_are_reused(reduced: tuple[Outcome, Path]) -> None:
     again = run(folder, reduced=True, report=lambda stage, fraction: None)
     assert {path: path.stat().st_mtime_ns for path in (folder / "parts").iterdir()} == before
     assert again.rows == outcome.rows
+
+
+def test_fit_to_the_arm_finds_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Curves of a known law, from which the slopes are made: edge, offset and tare come back."""
+    z = np.append(distances(6), FAR)
+    edges = np.array(EDGES)[:, None]
+
+    def reading(edge: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        return 1e-14 / (distance * (distance + edge))
+
+    true = (0.05, 0.012, 0.3)
+    seen = reading(np.array(true[0]), z[:-3] + true[1]) - true[2] * reading(
+        np.array(true[0]), np.array(0.15 + true[1])
+    )
+    monkeypatch.setattr(limb_fit, "ARM", tuple(slopes(z[:-3], seen)))
+    found = limb_fit.fit_arm(EDGES, z, reading(edges, z))
+    assert found.apart < 0.003
+    assert found.figures[1] == pytest.approx(true[1], abs=0.003)
+    assert all(low <= value <= high for value, (low, high) in zip(true, found.ranges, strict=True))
+
+
+def test_fit_to_the_arm_says_where_there_is_none() -> None:
+    """Readings that fall as 1/d⁶ are too steep wherever the offset ends."""
+    z = np.append(distances(6), FAR)
+    found = limb_fit.fit_arm(EDGES, z, np.tile(1e-20 * z**-6.0, (len(EDGES), 1)))
+    assert found.ranges == ()
+    assert found.apart > limb_fit.WITHIN

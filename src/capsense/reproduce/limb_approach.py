@@ -26,6 +26,7 @@ from capsense.reproduce.limb_curves import (
     slopes,
     zero_distance,
 )
+from capsense.reproduce.limb_fit import ARM, EDGES, FAR, WITHIN, ArmFit, fit_arm
 from capsense.reproduce.limb_plots import plot_approach
 from capsense.reproduce.store import Store
 from capsense.reproduce.study import Cell, Outcome, Report, Row, Table, judged
@@ -46,14 +47,15 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         radii = RADII if setup in setups and not reduced else (MAIN,)
         names = tuple(GROUNDINGS) if setup in setups else ("grounded",)
         curves[setup] = read_curves(store, setup, radii, names, 3 if reduced else 6)
+    fits = {} if reduced else _fits(store, report)
     report("done", 1.0)
     cases = {setup: curves[setup] for setup in setups}
     in_boxes = {setup: curves[setup] for setup in boxes}
     first = curves[Setup(box=box)]
     return Outcome(
         "Limb approach: one electrode above a forearm",
-        tuple(_rows(first, cases, in_boxes, curves[CHECK])),
-        _tables(first, cases, in_boxes),
+        (*_rows(first, cases, in_boxes, curves[CHECK]), *_arm_rows(fits)),
+        _tables(first, cases, in_boxes) | ({"human_arm": _arm_table(fits)} if fits else {}),
         {"limb_approach": plot_approach(cases, in_boxes)},
         NOTES,
         store.told(),
@@ -94,6 +96,45 @@ def _rows(
         )
     )  # fmt: skip
     return rows
+
+
+def _fits(store: Store, report: Report) -> dict[str, ArmFit]:
+    """Of a person on 100 pF above either backing."""
+    found = {}
+    for backing in BACKINGS:
+        report(f"fit to a human arm, {backing}", 0.9)
+        curves = [
+            read_curves(store, Setup(e, backing), (MAIN,), ("100 pF",), 6, FAR) for e in EDGES
+        ]
+        change = np.array([c.change(MAIN, "100 pF", tared=False) for c in curves])
+        found[backing] = fit_arm(EDGES, curves[0].distance, change)
+    return found
+
+
+def _arm_rows(fits: dict[str, ArmFit]) -> list[Row]:
+    """The best of the fits is judged, the others stand beside it."""
+    best = min(fits, key=lambda name: fits[name].apart, default="")
+    rows = []
+    for name, fit in fits.items():
+        what = f"human arm, {name}: largest difference of the four slopes, three figures fitted"
+        own = judged(what, fit.apart, below=WITHIN, source="our aim")
+        rows.append(own if name == best else Row(what, fit.apart))
+    return rows
+
+
+def _arm_table(fits: dict[str, ArmFit]) -> Table:
+    """Slopes and fitted figures, and the figures' ranges."""
+    units = (1e3, 1e3, 1e2)
+    rows: list[tuple[Cell, ...]] = [("human arm", *_cells(list(ARM)), "", "", "")]
+    for name, fit in fits.items():
+        figures = tuple(f"{u * v:.0f}" for u, v in zip(units, fit.figures, strict=True))
+        rows.append((name, *_cells(list(fit.slopes)), *figures))
+        spans = [
+            f"{u * a:.0f} to {u * b:.0f}" for u, (a, b) in zip(units, fit.ranges, strict=False)
+        ]
+        rows.append((f"{name}: all within {WITHIN}", "", "", "", "", *(spans or ["nowhere"] * 3)))
+    names = ("edge [mm]", "offset [mm]", "tare [% of the reading at 15 cm]")
+    return Table(("behind the electrode", *HEADINGS, *names), tuple(rows))
 
 
 def _fit_slopes(k: float, b: float) -> list[float]:

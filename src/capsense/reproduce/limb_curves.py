@@ -21,6 +21,7 @@ from capsense.scene.body import Grounding
 
 if TYPE_CHECKING:
     from capsense.design.model import Design
+    from capsense.simulator import PresetName
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,8 @@ BOX = 1.5
 """Edge of the grounded box around it all [m]."""
 BOXES = (0.5, 1.0, 1.5, 2.0)
 """Boxes that are compared [m]."""
+PRESET: PresetName = "fine"
+"""Slopes ask for more than single readings do: ``"standard"`` has some of them 0.08 off."""
 RETREAT = (0.20, 0.20, 0.15)
 """The limb at the tare [m]: along itself, to the side, and its distance above the electrode."""
 ACROSS = (0.0, float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)))
@@ -152,16 +155,21 @@ def zero_distance(distance: Array, change: Array) -> float:
 
 
 def read_curves(
-    store: Store, setup: Setup, radii: tuple[float, ...], names: tuple[str, ...], per_range: int
+    store: Store,
+    setup: Setup,
+    radii: tuple[float, ...],
+    names: tuple[str, ...],
+    per_range: int,
+    far: tuple[float, ...] = (),
 ) -> Curves:
     """The curves of one electrode over limbs of these radii [m] and groundings.
 
-    They come from disk if they are there.
+    They come from disk if they are there. ``far`` adds distances [m] beyond the ranges.
     """
-    design, z = setup.design, distances(per_range)
+    design, z = setup.design, np.append(distances(per_range), far)
 
     def compute() -> dict[str, Array]:
-        sim = cs.Simulator(design, settings=setup.settings)
+        sim = cs.Simulator(design, settings=setup.settings, preset=PRESET)
         values = np.empty((len(radii), len(names), len(z)))
         retreat = np.empty(values.shape[:2])
         for i, k in np.ndindex(retreat.shape):
@@ -172,10 +180,12 @@ def read_curves(
         return {"away": sim.baseline[0, 0], "value": values, "retreat": retreat}
 
     inputs = {
-        "design": design.content_hash(), "settings": repr(setup.settings), "radii": list(radii),
-        "groundings": list(names), "distance": z, "retreat": list(RETREAT), "length": LIMB_LENGTH,
+        "design": design.content_hash(), "preset": PRESET, "settings": repr(setup.settings),
+        "radii": list(radii), "groundings": list(names), "distance": z,
+        "retreat": list(RETREAT), "length": LIMB_LENGTH,
     }  # fmt: skip
     label = f"{setup.size * 1e3:.0f}mm-{setup.backing.replace(' ', '-')}-{setup.box:g}m"
+    label = f"far-{label}" if far else label
     found = store.get(label, inputs, compute)
     return Curves(radii, names, z, found["away"], found["value"], found["retreat"])
 

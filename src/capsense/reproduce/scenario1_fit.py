@@ -1,4 +1,4 @@
-"""Fits what the paper leaves out of scenario 1 to the measured curves of its triangular panels.
+"""Fits what the paper leaves out of scenario 1 to the measured curves of its panels.
 
 The change of a pair's capacitance is tabulated over the bar's place once per board, and
 interpolated while fitting; the final curves come from the simulation itself.
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import least_squares
 
-from capsense.reproduce.scenario1_setup import PANEL_SAMPLES, Array, Panel, Setup, load_panel
+from capsense.reproduce.scenario1_setup import Array, Setup, load_curves
 from capsense.reproduce.scenario1_signal import matrices, mutual
 from capsense.scene import Pose
 from capsense.simulator import Simulator
@@ -81,16 +81,13 @@ def tabulate(sim: Simulator, setup: Setup, coarser: float = 1.0) -> Grid:
     return Grid(sim.electrode_names, sim.baseline, x, gaps, stacked, setup.size[2])
 
 
-def predicted(
-    setup: Setup, name: str, table: Table, trajectory: str = "T2", samples: int = PANEL_SAMPLES
-) -> Array:
-    """A curve at the panels' speed by the table, without rounding and noise, shape (samples,)."""
-    board = setup.boards[name]
-    times = np.arange(samples) / board.sample_rate
-    poses = setup.poses(name, trajectory, setup.panel_speed, times)
+def predicted(setup: Setup, panel: str, table: Table) -> Array:
+    """A panel's curve by its board's table, without rounding and noise, shape (samples,)."""
+    shown = setup.panels[panel]
+    poses = setup.poses(shown.board, shown.trajectory, setup.panel_speed, setup.times(shown))
     place = np.array([pose.position for pose in poses])
     share = table.empty / (table.empty + setup.stray)
-    return board.level * (1 + share * table.change(place[:, 0], place[:, 2]))
+    return setup.level_of(shown) * (1 + share * table.change(place[:, 0], place[:, 2]))
 
 
 @dataclass(frozen=True)
@@ -100,9 +97,9 @@ class Fit:
     setup: Setup
     """The set-up with the fitted figures and their uncertainties."""
     cost: float
-    """Half the sum of squared differences over both panels."""
+    """Half the sum of squared differences over all panels."""
     memory: float
-    """Correlation of successive residuals, the larger of the two panels'."""
+    """Correlation of successive residuals, the largest of the panels'."""
     keys: tuple[str, ...]
     """The figures that were fitted."""
     covariance: Array
@@ -120,11 +117,12 @@ def fit(
     setup: Setup,
     tables: Mapping[str, Table],
     *,
+    panels: Sequence[str] | None = None,
     keys: Sequence[str] | None = None,
-    starts: tuple[float, ...] = (0.5, 1.0, 1.6),
+    starts: tuple[float, ...] = (0.6, 1.0, 1.6),
     report: Callable[[str, float], None] = lambda stage, fraction: None,
 ) -> Fit:
-    """Least squares over the panels of all tables.
+    """Least squares over panels.
 
     Residuals are not white: what is left is mostly the model's, and lasts several samples. So
     the covariance s²(JᵀJ)⁻¹ is widened by (1 + ρ)/(1 − ρ), where ρ is the correlation of
@@ -133,20 +131,20 @@ def fit(
     Args:
         setup: Where to begin.
         tables: By board, of :meth:`Grid.table`.
+        panels: Their names, by default of all whose curves are given.
         keys: The figures to be fitted, by default all that have an uncertainty.
         starts: Factors on the gap, if it is fitted; the fit begins from each, and the best counts.
         report: Told of each start.
     """
     keys = list(setup.uncertainty if keys is None else keys)
-    panels: dict[str, Panel] = {name: load_panel(setup.boards[name].panel) for name in tables}
+    names = list(_recorded(setup) if panels is None else panels)
+    measured = [load_curves(setup.panels[name]).measured for name in names]
     start = np.array([setup.value(key) for key in keys])
     scale = np.where(start == 0, 1.0, np.abs(start))
 
     def residuals(vector: Array) -> Array:
         trial = setup.changed(dict(zip(keys, vector * scale, strict=True)))
-        return np.concatenate(
-            [predicted(trial, name, tables[name]) - panels[name].measured for name in tables]
-        )
+        return np.concatenate(_curves(trial, tables, names)) - np.concatenate(measured)
 
     best = None
     for number, factor in enumerate(starts if "gap" in keys else (1.0,)):
@@ -157,7 +155,7 @@ def fit(
         if best is None or found.cost < best.cost:
             best = found
     assert best is not None
-    parts = np.split(best.fun, len(tables))
+    parts = np.split(best.fun, np.cumsum([len(curve) for curve in measured])[:-1])
     memory = max(float(np.corrcoef(part[1:], part[:-1])[0, 1]) for part in parts)
     variance = 2 * best.cost / (len(best.fun) - len(keys)) * (1 + memory) / (1 - memory)
     covariance = np.linalg.inv(best.jac.T @ best.jac) * variance * np.outer(scale, scale)
@@ -168,19 +166,40 @@ def fit(
     return Fit(fitted, float(best.cost), memory, tuple(keys), covariance)
 
 
-def fit_without(setup: Setup, tables: Mapping[str, Table], name: str) -> Setup:
-    """Fit with a board's panel held out, but for what belongs to that panel alone.
+def own_figures(setup: Setup, tables: Mapping[str, Table], panel: str) -> list[str]:
+    """The fitted figures on which the curve of no other recorded panel depends."""
+    others = [name for name in _recorded(setup) if name != panel]
+    before = np.concatenate(_curves(setup, tables, others))
+    moved = {
+        key: np.concatenate(
+            _curves(setup.changed({key: setup.value(key) + deviation}), tables, others)
+        )
+        for key, deviation in setup.uncertainty.items()
+    }
+    return [key for key, after in moved.items() if np.array_equal(before, after)]
 
-    What both boards share is fitted to the other panels; then the held-out board's own figures,
-    the triangle's depth, its sample rate and the stripe panel's level, to its panel.
+
+def fit_without(setup: Setup, tables: Mapping[str, Table], panel: str) -> Setup:
+    """Fit with a panel held out, but for what belongs to that panel alone.
+
+    All that other panels depend on is fitted to them; then the held-out panel's own figures, see
+    :func:`own_figures`, to it.
 
     Args:
         setup: Where to begin.
         tables: By board.
-        name: The board that is held out.
+        panel: The one that is held out.
     """
-    own = [key for key in setup.uncertainty if key.startswith(f"{name}.")]
-    rest = [key for key in setup.uncertainty if key not in own]
-    others = {board: table for board, table in tables.items() if board != name}
-    shared = fit(setup, others, keys=rest).setup
-    return fit(shared, {name: tables[name]}, keys=own).setup
+    own = own_figures(setup, tables, panel)
+    shared = [key for key in setup.uncertainty if key not in own]
+    others = [name for name in _recorded(setup) if name != panel]
+    found = fit(setup, tables, panels=others, keys=shared).setup
+    return fit(found, tables, panels=[panel], keys=own).setup
+
+
+def _recorded(setup: Setup) -> list[str]:
+    return [name for name, panel in setup.panels.items() if panel.file]
+
+
+def _curves(setup: Setup, tables: Mapping[str, Table], panels: Sequence[str]) -> list[Array]:
+    return [predicted(setup, name, tables[setup.panels[name].board]) for name in panels]

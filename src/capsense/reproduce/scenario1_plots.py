@@ -8,21 +8,25 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from capsense.reproduce.scenario1_setup import PANEL_SAMPLES, Array, Panel, Setup
+from capsense.reproduce.scenario1_setup import Array, Curves, Setup
 
 MEASURED, PAPER, OURS, FAINT = "#2b2b2b", "#E69F00", "#0072B2", "#b9bdc1"
 
 
-def plot_panels(panels: Mapping[str, tuple[Array, Panel]]) -> Figure:
-    """Fig. 9's triangular panels with our curves: hardware, the paper's simulation, ours."""
-    figure = Figure(figsize=(8.2, 3.0 * len(panels)), layout="constrained")
-    sample = np.arange(1, PANEL_SAMPLES + 1)
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+def plot_panels(panels: Mapping[str, tuple[Array, Curves | None]]) -> Figure:
+    """Fig. 9's panels with our curves: hardware and the paper's simulation where given, ours."""
+    figure = Figure(figsize=(8.2, 2.4 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
     for ax, (name, (ours, panel)) in zip(axes, panels.items(), strict=True):
-        ax.plot(sample, panel.simulated, color=PAPER, lw=1.2, label="the paper's simulation")
-        ax.plot(sample, panel.measured, ".", color=MEASURED, ms=3, label="hardware (the paper)")
+        sample = np.arange(1, len(ours) + 1)
+        if panel:
+            ax.plot(sample, panel.simulated, color=PAPER, lw=1.2, label="the paper's simulation")
+            ax.plot(sample, panel.measured, ".", color=MEASURED, ms=3, label="hardware (the paper)")
+        else:
+            name += ", predicted"
         ax.plot(sample, ours, color=OURS, lw=1.6, label="CapSense")
-        ax.set_ylabel(f"{name}: C / C of the empty scene")
+        ax.set_ylabel(f"C / C empty\n{name.replace('_', ', ')}")
+        ax.set_xlim(0, len(ours) + 1)
         _bare(ax)
     axes[0].legend(frameon=False, fontsize=9, loc="lower left", ncols=3, bbox_to_anchor=(0, 1))
     axes[-1].set_xlabel("sample")
@@ -60,12 +64,15 @@ def plot_trajectories(
 
 def _draw_way(ax: Axes, setup: Setup, boards: list[str], way: str) -> None:
     """The middle of the bar's lower face on each distinct way, and the board, to scale."""
-    by_depth: dict[float, list[str]] = {}
-    for name in boards:
-        by_depth.setdefault(setup.boards[name].depth, []).append(name)
-    for names, colour in zip(by_depth.values(), (OURS, PAPER, MEASURED), strict=False):
-        poses = setup.path(names[0], way, 1.0).waypoints
-        points = 1e3 * np.array([pose.position for pose in (*poses, poses[0])])
+    distinct: dict[bytes, list[str]] = {}
+    ways_of = {
+        name: 1e3 * np.array([p.position for p in setup.path(name, way, 1.0).waypoints])
+        for name in boards
+    }
+    for name, points in ways_of.items():
+        distinct.setdefault(points.tobytes(), []).append(name)
+    for names, colour in zip(distinct.values(), (OURS, PAPER, MEASURED), strict=False):
+        points = np.concatenate([ways_of[names[0]], ways_of[names[0]][:1]])
         height = points[:, 2] - 5e2 * setup.size[2]
         label = ", ".join(names)
         ax.plot(points[:, 0], height, color=colour, lw=1.0, marker="o", ms=2.5, label=label)
@@ -75,7 +82,7 @@ def _draw_way(ax: Axes, setup: Setup, boards: list[str], way: str) -> None:
     ax.plot([-32.5, 32.5], [0, 0], color=MEASURED, lw=3, solid_capstyle="butt")
     ax.set_title(f"{way} [mm]", fontsize=10)
     ax.set_xlim(-265, 265)
-    ax.set_ylim(-8, 165)
+    ax.set_ylim(-8, 220)
     ax.set_aspect("equal")
     _bare(ax)
 

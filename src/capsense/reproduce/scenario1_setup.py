@@ -23,6 +23,7 @@ from capsense.scene import Pose
 Array = NDArray[np.float64]
 DATA = files("capsense.reproduce") / "data"
 FILE = "scenario1.toml"
+TRIANGLE, ZIGZAG = "T2", "T4"
 
 
 @dataclass(frozen=True)
@@ -32,16 +33,12 @@ class Board:
     design: str
     pair: tuple[str, str]
     """Transmitter and receiver."""
+    height: float
+    """How much nearer to the bar it lies than the stripe board [m]."""
     depth: float
     """How far the triangle in front of it goes away from the line across it [m]."""
-    sample_rate: float
-    """[Hz]"""
-    level: float
-    """What the reading without an object is normalised to."""
     gain: float
     """Of the amplifier."""
-    panel: str = ""
-    """File with the curves of the paper's figure; empty without one."""
 
     def sensor(self, pour: str) -> Design:
         """The packaged design with its pour and back plane at a potential.
@@ -56,11 +53,58 @@ class Board:
 
 
 @dataclass(frozen=True)
+class Panel:
+    """A recording: a board on a trajectory at the panels' speed."""
+
+    board: str
+    trajectory: str
+    samples: int
+    level: float | None = None
+    """What the reading without an object is normalised to; if none, as in the others."""
+    pace: float = 1.0
+    """Its samples per second, as a multiple of the sample rate of the others."""
+    file: str = ""
+    """With the curves of the paper's figure; empty where they are not given."""
+
+    @property
+    def name(self) -> str:
+        """Like ``"stripe_T2"``."""
+        return f"{self.board}_{self.trajectory}"
+
+
+@dataclass(frozen=True)
+class Zigzag:
+    """Trajectory T4: to and fro in front of the board while the bar drifts across it, once."""
+
+    teeth: int
+    """How often the bar is near while it crosses; it also starts and ends near."""
+    depth: float
+    """Of a tooth, away from the board [m]."""
+    pitch: float
+    """From tooth to tooth along x [m]."""
+    lift: float
+    """How much farther than the line across the sensor a tooth's tip stays [m]."""
+    start: float
+    """How much farther than a tooth's tip the bar starts [m]."""
+
+    def corners(self) -> Array:
+        """Along x from the board's middle and away from the line across it [m], shape (n, 2)."""
+        steps = np.arange(2 * self.teeth + 4)
+        x = 0.5 * self.pitch * (steps - self.teeth - 1)
+        away = self.lift + self.depth * (steps % 2)
+        away[0] += self.start
+        return np.stack([x, away], axis=1)
+
+
+@dataclass(frozen=True)
 class Setup:
     """Everything that scenario 1 depends on; SI units, tilt in degrees."""
 
     speeds: tuple[float, ...]
     panel_speed: float
+    sample_rate: float
+    level: float
+    """What readings without an object are normalised to where a panel has none of its own."""
     frequency: float
     pour: str
     """Potential of the boards' pours and back planes, see :meth:`Board.sensor`."""
@@ -72,32 +116,56 @@ class Setup:
     offset: float
     rest: float
     trajectories: Mapping[str, tuple[tuple[float, float], ...]]
+    """Corners of T1 to T3, as multiples of :attr:`half_line` and of a board's depth."""
+    zigzag: Zigzag
     stray: float
     shunt: float
     full_scale: float
     conversion: float
     noise: float
     boards: Mapping[str, Board]
+    panels: Mapping[str, Panel]
+    """By :attr:`Panel.name`."""
     uncertainty: Mapping[str, float]
     """Standard uncertainties; its keys are those of the fitted figures, see :meth:`value`."""
 
+    def _parts(self, name: str) -> dict[str, Any]:
+        return {"zigzag": self.zigzag, **self.boards, **self.panels}[name].__dict__
+
     def value(self, key: str) -> float:
-        """A figure by name, ``"gap"``, or ``"stripe.level"`` for one of a board's."""
-        name, _, own = key.partition(".")
-        return float(getattr(self.boards[name], own) if own else getattr(self, name))
+        """A figure by name, like ``"gap"``, ``"stripe.depth"`` or ``"patch_T2.pace"``.
+
+        Raises:
+            KeyError: There is no such figure.
+        """
+        name, _, own = key.rpartition(".")
+        return float((self._parts(name) if name else self.__dict__)[own])
 
     def changed(self, values: Mapping[str, float]) -> Setup:
         """The same with other figures, by the names of :meth:`value`."""
-        boards = dict(self.boards)
-        top: dict[str, Any] = {}
+        out: dict[str, Any] = {
+            "zigzag": self.zigzag, "boards": dict(self.boards), "panels": dict(self.panels)
+        }  # fmt: skip
         for key, value in values.items():
-            name, _, own = key.partition(".")
-            if own:
-                change: dict[str, Any] = {own: float(value)}
-                boards[name] = dataclasses.replace(boards[name], **change)
+            name, _, own = key.rpartition(".")
+            change: dict[str, Any] = {own: float(value)}
+            if not name:
+                out |= change
+            elif name == "zigzag":
+                out[name] = dataclasses.replace(out[name], **change)
             else:
-                top[name] = float(value)
-        return dataclasses.replace(self, boards=boards, **top)
+                group = out["boards" if name in self.boards else "panels"]
+                group[name] = dataclasses.replace(group[name], **change)
+        return dataclasses.replace(self, **out)
+
+    def level_of(self, panel: Panel) -> float:
+        """What a panel's reading without an object is normalised to."""
+        return self.level if panel.level is None else panel.level
+
+    @property
+    def ways(self) -> tuple[str, ...]:
+        """Names of all trajectories."""
+        return (*self.trajectories, ZIGZAG)
 
     def path(self, board: str, trajectory: str, speed: float) -> Trajectory:
         """The way of the bar's centre in the sensor frame, without the rest at its start.
@@ -107,13 +175,15 @@ class Setup:
             trajectory: Name, ``"T1"`` to ``"T4"``.
             speed: [m/s]
         """
+        if trajectory == ZIGZAG:
+            flat = self.zigzag.corners() - [self.offset, 0.0]
+        else:
+            scale = [self.half_line, self.boards[board].depth]
+            flat = np.array(self.trajectories[trajectory]) * scale
         angle = -math.radians(self.tilt)  # a positive tilt lifts the bar at positive x
-        middle = (self.offset, 0.0, self.gap + 0.5 * self.size[2])
-        corners = [
-            (x * self.half_line, 0.0, z * self.boards[board].depth)
-            for x, z in self.trajectories[trajectory]
-        ]
-        points = Pose.from_euler(middle, (0.0, angle, 0.0)).apply(np.array(corners))
+        height = self.gap - self.boards[board].height + 0.5 * self.size[2]
+        corners = np.insert(flat, 1, 0.0, axis=1)
+        points = Pose.from_euler((self.offset, 0.0, height), (0.0, angle, 0.0)).apply(corners)
         poses = tuple(Pose(point) for point in points)
         return Trajectory(poses, (speed,) * len(poses), closed=True)
 
@@ -121,6 +191,10 @@ class Setup:
         """Poses of the bar at times [s] since the start of a recording."""
         path = self.path(board, trajectory, speed)
         return [path.pose_at(t - self.rest) for t in np.asarray(times, dtype=float).tolist()]
+
+    def times(self, panel: Panel) -> Array:
+        """Of a panel's samples [s], shape (samples,)."""
+        return np.arange(panel.samples) / (self.sample_rate * panel.pace)
 
 
 def load_setup() -> Setup:
@@ -132,10 +206,11 @@ def load_setup() -> Setup:
     return parse_setup(tomllib.loads((DATA / FILE).read_text(encoding="utf-8")))
 
 
-_TOP = ("speeds", "panel_speed", "frequency", "pour", "bar", "path", "trajectories", "front_end",
-        "board", "uncertainty")  # fmt: skip
+_TOP = ("speeds", "panel_speed", "sample_rate", "level", "frequency", "pour", "bar", "path",
+        "zigzag", "trajectories", "front_end", "board", "panel", "uncertainty")  # fmt: skip
 _PATH = {"half_line": 1.0, "gap": 1.0, "tilt": 45.0, "offset": 1.0, "rest": 1e3}
 _FRONT_END = {"stray": 1e-9, "shunt": 1e9, "full_scale": 1e3, "conversion": 10.0, "noise": 1e-9}
+_ZIGZAG = {"depth": 1.0, "pitch": 1.0, "lift": 1.0, "start": 1.0}
 
 
 def parse_setup(data: Mapping[str, Any]) -> Setup:
@@ -150,13 +225,21 @@ def parse_setup(data: Mapping[str, Any]) -> Setup:
     def part(name: str) -> Table:
         return Table(top.raw(name, "a table"), FILE, name)
 
-    path, front, bar, ways = (part(n) for n in ("path", "front_end", "bar", "trajectories"))
+    path, front, bar, ways, teeth = (
+        part(n) for n in ("path", "front_end", "bar", "trajectories", "zigzag")
+    )
     speeds = top.series("speeds", 1e-6, 1e3, "m/s")
     a, b, c = bar.sizes("size", 3, "[x, y, z] in metres")
     boards = [_board(Table(raw, FILE, f"board {n}")) for n, raw in enumerate(top.tables("board"))]
+    panels = [
+        _panel(Table(raw, FILE, f"panel {n}"), [board.design for board in boards])
+        for n, raw in enumerate(top.tables("panel"))
+    ]
     setup = Setup(
         speeds=tuple(speeds) if isinstance(speeds, list) else (speeds,),
         panel_speed=top.number("panel_speed", 1e-6, 1e3, unit="m/s"),
+        sample_rate=top.number("sample_rate", 1e-3, 1e6, unit="Hz"),
+        level=top.number("level", 0.0, 10.0),
         frequency=top.number("frequency", 1.0, 1e12, unit="Hz"),
         pour=top.choice("pour", (Role.GROUND, Role.FLOATING)),
         size=(a, b, c),
@@ -165,14 +248,19 @@ def parse_setup(data: Mapping[str, Any]) -> Setup:
         trajectories={
             name: tuple((x, z) for x, z in ways.vectors(name, 2, "[x, z]")) for name in ways.data
         },
+        zigzag=Zigzag(
+            teeth.integer("teeth", 1, 1000),
+            **{key: teeth.number(key, -limit, limit) for key, limit in _ZIGZAG.items()},
+        ),
         **{key: front.number(key, 0.0, limit) for key, limit in _FRONT_END.items()},
         boards={board.design: board for board in boards},
+        panels={panel.name: panel for panel in panels},
         uncertainty={key: part("uncertainty").number(key, 0.0, 1e3) for key in data["uncertainty"]},
     )
     for key in setup.uncertainty:
         try:
             setup.value(key)
-        except (KeyError, AttributeError):
+        except KeyError:
             raise ScenarioError(f"{FILE}: uncertainty: there is no figure {key!r}") from None
     return setup
 
@@ -185,31 +273,37 @@ def _board(table: Table) -> Board:
     return Board(
         table.string("design"),
         (str(pair[0]), str(pair[1])),
+        table.number("height", -1.0, 1.0, unit="m"),
         table.number("depth", 1e-3, 1.0, unit="m"),
-        table.number("sample_rate", 1e-3, 1e6, unit="Hz"),
-        table.number("level", 0.0, 10.0),
         table.number("gain", 1e-6, 1e9),
-        table.string("panel", "") if "panel" in table else "",
     )
 
 
-PANEL_SAMPLES = 250
-"""Samples of the paper's triangular panels."""
+def _panel(table: Table, boards: list[str]) -> Panel:
+    table.only([f.name for f in dataclasses.fields(Panel)])
+    return Panel(
+        table.choice("board", boards),
+        table.string("trajectory"),
+        table.integer("samples", 1, 1_000_000),
+        table.number("level", 0.0, 10.0) if "level" in table else None,
+        table.number("pace", 1e-3, 1e3, 1.0),
+        table.text("file"),
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
-    """The two curves of a panel of the paper's Fig. 9, at samples 1 to 250."""
+class Curves:
+    """The two curves of a panel of the paper's Fig. 9, at samples 1 to n."""
 
     measured: Array
-    """Hardware, normalised, shape (250,)."""
+    """Hardware, normalised, shape (n,)."""
     simulated: Array
-    """The paper's simulation, normalised, shape (250,)."""
+    """The paper's simulation, normalised, shape (n,)."""
 
 
-def load_panel(name: str) -> Panel:
+def load_curves(panel: Panel) -> Curves:
     """Read a panel; points were read off the vector figure, and are interpolated to samples."""
-    text = (DATA / name).read_text(encoding="utf-8")
+    text = (DATA / panel.file).read_text(encoding="utf-8")
     rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
     curves = []
     for series in ("measured", "simulated"):
@@ -219,5 +313,5 @@ def load_panel(name: str) -> Panel:
             if row["series"] == series
         ]
         sample, value = np.array(points).T
-        curves.append(np.interp(np.arange(1, PANEL_SAMPLES + 1), sample, value))
-    return Panel(*curves)
+        curves.append(np.interp(np.arange(1, panel.samples + 1), sample, value))
+    return Curves(*curves)

@@ -39,12 +39,12 @@ def mutual(matrix: Array, names: tuple[str, ...], pair: tuple[str, str]) -> Arra
 
 
 def read_out(setup: Setup, board: Board, *, noise: bool, seed: int = 0) -> ReadOut:
-    """The radio behind the front end, reading the board's pair at its sample rate."""
+    """The radio behind the front end, reading the board's pair at the sample rate."""
     front_end = ShuntFrontEnd(setup.frequency, setup.shunt, board.gain)
     return ReadOut(
         mutual_patterns(board.pair),
         board.pair,
-        Schedule.simultaneous(1, setup.conversion, period=1.0 / board.sample_rate),
+        Schedule.simultaneous(1, setup.conversion, period=1.0 / setup.sample_rate),
         ShuntLaw(front_end, setup.full_scale),
         wiring=Wiring(coupling=setup.stray),
         stages=[White(setup.noise)] if noise else [],
@@ -55,7 +55,7 @@ def read_out(setup: Setup, board: Board, *, noise: bool, seed: int = 0) -> ReadO
 def normalised(
     setup: Setup, board: Board, capacitance: ArrayLike, empty: float, *, noise: bool, seed: int = 0
 ) -> Array:
-    """What the front end makes of capacitances, as the paper's figures show it.
+    """What the front end makes of capacitances, over what it reads without an object.
 
     Args:
         setup: The scenario.
@@ -66,15 +66,15 @@ def normalised(
         seed: Of the noise.
 
     Returns:
-        Readings over the base capacitance, times the board's level, shape (n,).
+        Readings over the base capacitance, shape (n,).
     """
     chain = read_out(setup, board, noise=noise, seed=seed)
     values = [*np.full(CALIBRATION_SAMPLES, empty), *np.asarray(capacitance, dtype=float)]
-    times = chain.due((len(values) - 0.5) / board.sample_rate)
+    times = chain.due((len(values) - 0.5) / setup.sample_rate)
     parts = [
         chain.sample(time, [value]).capacitance for time, value in zip(times, values, strict=True)
     ]
     parts.append(chain.sample(times[-1] + setup.conversion, values[-1:]).capacitance)
     readings = np.concatenate(parts)
     base = base_capacitance(readings[:CALIBRATION_SAMPLES])
-    return board.level * relative_to(readings[CALIBRATION_SAMPLES:], base)
+    return relative_to(readings[CALIBRATION_SAMPLES:], base)
