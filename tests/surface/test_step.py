@@ -807,7 +807,7 @@ def test_converges_as_the_threshold_falls(name: str) -> None:
         left.append(np.abs(found.left).max() / scale)
     assert left == sorted(left, reverse=True)
     assert errors[1] < 0.45 * errors[0]
-    assert errors[2] < 0.35 * errors[1]
+    assert errors[2] < 0.5 * errors[1]
     assert errors[3] < 6e-4
     assert left[3] < 1e-3
 
@@ -831,7 +831,7 @@ def test_changing_and_rigid_bodies_agree(shape: cs.Shape, neutral: bool) -> None
         wanted = solve(records, packed_green(), threshold, WIDTH, False)
         found = solve(other, packed_green(), threshold, WIDTH, False)
         assert found.size > 0
-        assert apart(found.delta, wanted.delta) < 0.018
+        assert apart(found.delta, wanted.delta) < 0.022
 
 
 # ---- losses ----

@@ -87,7 +87,7 @@ def _sort(values, members):
 
 @njit(cache=True, nogil=True)
 def _cut(values, members, charges, of_normals, spatial, last):
-    """How many of the sorted members go into the first part; of equal cuts, the first or the last."""
+    """How many of the sorted members the first part gets; of equal cuts, the first or the last."""
     n = values.shape[0]
     spread = values[n - 1] - values[0]
     if of_normals:
