@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from capsense.errors import DesignError
 
@@ -72,7 +75,8 @@ def execute(args: argparse.Namespace) -> int:
         draw_design(design).get_figure().savefig(args.output, dpi=150)  # type: ignore[union-attr]
         print(f"\ndrawn to {args.output}")
     else:
-        print(f"\ndraw it with: capsense design {args.design} --no-build -o {design.name}.png")
+        design_file, picture = (shlex.quote(x) for x in (args.design, f"{design.name}.png"))
+        print(f"\ndraw it with: capsense design {design_file} --no-build -o {picture}")
     if not args.no_build:
         import capsense
         from capsense.cli.progress import BuildProgress
@@ -160,6 +164,7 @@ def _area(surface: Surface) -> str:
 def describe_field(simulator: Simulator) -> str:
     """Figures of the field and baseline matrix, as text."""
     from capsense.cli.tables import facts, field_figures, grouped, table
+    from capsense.scene import Scene
 
     names = simulator.electrode_names
     figures = facts((str(key), grouped(value)) for key, value in field_figures(simulator).items())
@@ -167,4 +172,9 @@ def describe_field(simulator: Simulator) -> str:
         (name, *(f"{c * 1e12:.4f}" for c in row))
         for name, row in zip(names, simulator.baseline, strict=True)
     ]
-    return f"{figures}\n\n{table(('baseline [pF]', *names), rows)}"
+    text = f"{figures}\n\n{table(('baseline [pF]', *names), rows)}"
+    guarded = simulator.step(Scene()).self_capacitance
+    if not np.allclose(guarded, simulator.baseline.diagonal(), rtol=1e-6):
+        head = "self, shields driven [pF]"
+        text += f"\n\n{table((head, *names), [('', *(f'{c * 1e12:.4f}' for c in guarded))])}"
+    return text

@@ -18,6 +18,8 @@ from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
 
+SMALLEST = 5e-4
+"""What is smaller across [m] is taken for a file in another unit."""
 SIZE_TOLERANCE = 1e-5
 """By how much [m] an imprinted box may differ from the domain."""
 
@@ -38,6 +40,13 @@ def _read_triangles(table: Table, folder: Path) -> Array:
         raise table.error(
             f'file = "{file}" is {extent:g} m across with unit = "{unit}", larger than '
             f"{table.limit:g} m; {mend}"
+        )
+    if extent < SMALLEST:
+        larger = [f'"{u}"' for u, f in UNITS.items() if SMALLEST / extent < f / UNITS[unit]]
+        mend = f"did you mean unit = {' or '.join(larger)}?" if larger else "give a larger scale"
+        raise table.error(
+            f'file = "{file}" is {extent * 1e3:g} mm across with unit = "{unit}", smaller than '
+            f"{SMALLEST * 1e3:g} mm; {mend}"
         )
     return triangles
 
