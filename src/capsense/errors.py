@@ -49,6 +49,9 @@ class PartialError(CapSenseError, RuntimeError):
         self.failures = failures
         """Name or number → error, of those that did."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (*self.args, self.readings, self.failures)
+
 
 class SkinError(PartialError):
     """Some sensors of a skin failed; the readings of the others are kept, by name."""

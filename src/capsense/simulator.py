@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._crew import Crew, some_failed
+from capsense._crew import Crew, OneAtATime, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design, Role
 from capsense.errors import BatchError, FieldError, SceneError
@@ -95,6 +95,8 @@ class _Solver(Protocol):
 class Simulator:
     """Reads the capacitances of a sensor, scene after scene.
 
+    Threads may share one: they take turns. :meth:`step_batch` uses several at a time.
+
     Args:
         design: A design, a packaged name, or the path of a design file.
         method: ``"surface"``: charges on the surfaces of the bodies. ``"masked"``: the scheme of
@@ -154,7 +156,8 @@ class Simulator:
         self.background: BackgroundField = background
         """Field of the empty domain; never changed, so that it can be shared."""
         self._solver = self._make_solver()
-        self._batch: list[Simulator] = []  # a sensor for each thread
+        self._one = OneAtATime()
+        self._idle: deque[Simulator] = deque()  # sensors for the threads of batches
         n = len(self.design.electrodes)
         floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
         names = self.background.terminals
@@ -207,8 +210,9 @@ class Simulator:
             raise ValueError('method "masked" has no Jacobian; use "surface"')
         if isinstance(scene, DepthFrame):
             scene = scene.scene()
-        self.steps += 1
-        found = self._solver.solve(scene, jacobian=jacobian)
+        with self._one:
+            self.steps += 1
+            found = self._solver.solve(scene, jacobian=jacobian)
         change = np.minimum(found.matrix, self._screened)
         error = max(found.error, float((found.matrix - change).max()))
         whole = self.background.capacitance + change
@@ -254,20 +258,19 @@ class Simulator:
         """
         for number, scene in enumerate(scenes):
             _check_view(f"scenes[{number}]: a batch holds", scene)
-        crew = Crew(threads)
-        while len(self._batch) < min(crew.threads, len(scenes)):
-            self._batch.append(self.sibling())
-        idle = deque(self._batch)
 
         def from_rest(scene: Scene | DepthFrame) -> Reading:
-            sensor = idle.popleft()
+            try:
+                sensor = self._idle.popleft()
+            except IndexError:
+                sensor = self.sibling()
             try:
                 sensor.reset()
                 return sensor.step(scene)
             finally:
-                idle.append(sensor)
+                self._idle.append(sensor)
 
-        readings, failures = crew.run(
+        readings, failures = Crew(threads).run(
             {k: partial(from_rest, scene) for k, scene in enumerate(scenes)}
         )
         if failures:
@@ -292,7 +295,8 @@ class Simulator:
             SceneError: The points do not have shape (n, 3).
             ValueError: The method is ``"masked"``, which solves on a mesh of its own.
         """
-        return self._solver.potentials(as_points(points))
+        with self._one:
+            return self._solver.potentials(as_points(points))
 
     def sibling(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field."""
@@ -303,8 +307,9 @@ class Simulator:
 
     def reset(self) -> None:
         """Forget the previous step, which ``"masked"`` starts the next one from."""
-        self._solver.reset()
-        self.steps = 0
+        with self._one:
+            self._solver.reset()
+            self.steps = 0
 
     def describe(self) -> dict[str, float | int | str]:
         """Return the figures of the design's field."""
