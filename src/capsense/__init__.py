@@ -7,7 +7,10 @@ itself is light.
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from capsense._kernel_cache import ensure_place
 
 if TYPE_CHECKING:
     from capsense import humans
@@ -159,6 +162,7 @@ _SUBMODULES = {
     "mujoco": "capsense.adapters.mujoco",
     "pybullet": "capsense.adapters.pybullet",
 }
+ensure_place(Path(__file__).parent)
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 
