@@ -180,7 +180,7 @@ def read_session(text: bytes, design: Design) -> Session:
             _read_settings(data["settings"]), empty, Excitation(data["excitation"]),
             tuple((a, b) for a, b in data["pairs"]), data["readout"], data["versions"],
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         if isinstance(error, RecordingError):
             raise
         raise RecordingError(f"the recording's settings are damaged: {error!r}") from None

@@ -25,7 +25,7 @@ def checked_floats(values: object, count: int, what: str, mend: str) -> tuple[fl
     """Turn ``values`` into ``count`` finite floats, or raise :class:`SceneError`."""
     try:
         out = tuple([float(v) for v in values])  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f"{what} is {values!r}; {mend}") from None
     if len(out) != count:
         raise SceneError(f"{what} has {len(out)} entries; {mend}")
