@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import errno
+import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,8 @@ from capsense.scenario.channels import Excitation
 from capsense.scenario.model import Scenario
 from capsense.scene import DepthFrame, Scene
 from capsense.simulator import Reading, Simulator
+
+_log = logging.getLogger(__name__)
 
 _SECOND = 10**9
 
@@ -68,6 +71,7 @@ class Recorder:
     ) -> None:
         require()
         self.path = Path(path)
+        self._told = False
         self.count = 0
         """Steps recorded so far."""
         self._sensor = source if isinstance(source, AttachedSensor) else None
@@ -93,7 +97,7 @@ class Recorder:
             self._begin(self.session)
         except OSError as error:
             raise self._unwritten(error) from None
-        atexit.register(self._file.close)
+        atexit.register(self._close_late)
 
     def step(self, world: Scene | DepthFrame, time: float) -> Reading:
         """Step the simulator, record, and return the reading.
@@ -199,7 +203,16 @@ class Recorder:
             self._file.close()
         except OSError as error:
             raise self._unwritten(error) from None
-        atexit.unregister(self._file.close)
+        atexit.unregister(self._close_late)
+
+    def _close_late(self) -> None:
+        """Close when the process ends; a failure that nobody was told of goes to the log."""
+        told = self._told
+        try:
+            self.close()
+        except OSError as error:
+            if not told:
+                _log.warning("a recording could not be closed: %s", error)
 
     def __enter__(self) -> Recorder:
         return self
@@ -236,6 +249,7 @@ class Recorder:
         return self._base + now
 
     def _unwritten(self, error: OSError) -> OSError:
+        self._told = True
         why = error.strerror or str(error)
         return OSError(
             error.errno or errno.EIO,
