@@ -68,3 +68,21 @@ def test_a_weak_signal_does_not_depend_on_what_was_read_before(pair: Pair) -> No
     np.testing.assert_array_equal(sim.step(scene).delta, reading.delta)
     error = np.abs(whole.step(scene).delta - reading.delta).max()
     assert error < 2 * reading.stats.error_estimate
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-10])
+def test_it_does_not_depend_on_what_a_large_body_is_tied_to(pair: Pair, grounding: object) -> None:
+    """A plate of 0.3 m at ten places: errors and estimates of floating ones are of that size too."""
+    sim, whole = pair
+    rng = np.random.default_rng(2)
+    share = []
+    for _ in range(10):
+        place = *rng.uniform(-0.08, 0.08, 2), rng.uniform(0.03, 0.15)
+        plate = cs.Body(cs.Box((0.3, 0.3, 0.01)), cs.Pose(place), grounding=grounding)  # type: ignore[arg-type]
+        scene = cs.Scene([plate])
+        reading = sim.step(scene)
+        error = np.abs(reading.delta - whole.step(scene).delta).max()
+        share.append(error / reading.stats.error_estimate)
+        assert reading.stats.error_estimate < 0.05 * np.abs(reading.delta).max()
+    assert np.median(share) < 1.0
+    assert max(share) < 5.0
