@@ -72,7 +72,7 @@ def test_a_weak_signal_does_not_depend_on_what_was_read_before(pair: Pair) -> No
 
 @pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-10])
 def test_it_does_not_depend_on_what_a_large_body_is_tied_to(pair: Pair, grounding: object) -> None:
-    """A plate of 0.3 m at ten places: errors and estimates of floating ones are of that size too."""
+    """A plate of 0.3 m at ten places: errors of floating ones are estimated as well as others."""
     sim, whole = pair
     rng = np.random.default_rng(2)
     share = []
