@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from capsense._crew import Crew, OneAtATime, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design, Role
-from capsense.errors import BatchError, FieldError, SceneError
+from capsense.errors import BatchError, FieldError, ReadOutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
@@ -27,6 +27,7 @@ from capsense.scene.shape import as_points
 
 if TYPE_CHECKING:
     from capsense.readout.counts import Counts
+    from capsense.readout.read_out import ReadOut
 
 Array = NDArray[np.float64]
 Method = Literal["surface", "masked"]
@@ -109,9 +110,11 @@ class Simulator:
         progress: Called with a stage's name and the fraction done while a field is built.
         background: The field of this design with these settings, if it is at hand; it is shared,
             not copied. :meth:`sibling` passes its own.
+        readout: What steps report through, as :meth:`use_readout` takes it.
 
     Raises:
         DesignError: The design is wrong.
+        ReadOutError: There is no such chip or file, or the file is wrong.
         FieldError: The background field could not be built, or ``background`` is of another design.
     """
 
@@ -126,6 +129,7 @@ class Simulator:
         cache_dir: Path | None = None,
         progress: Callable[[str, float], None] | None = None,
         background: BackgroundField | None = None,
+        readout: ReadOut | str | Path | None = None,
     ) -> None:
         for what, chosen, known in (
             ("method", method, get_args(Method)), ("preset", preset, get_args(PresetName)),
@@ -174,6 +178,9 @@ class Simulator:
         self.baseline: Array = self._empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
         self.baseline.setflags(write=False)
+        self.readout: ReadOut | None = None
+        """The chip that turns capacitances into counts, if any."""
+        self.use_readout(readout)
 
     def _make_solver(self) -> _Solver:
         if self.method == "masked":
@@ -192,40 +199,84 @@ class Simulator:
         """Electrode names in matrix order."""
         return self._names
 
-    def step(self, scene: Scene | DepthFrame, *, jacobian: bool = False) -> Reading:
+    @property
+    def empty(self) -> Reading:
+        """The reading of an empty scene, which no chip has seen."""
+        return self._reading(np.zeros_like(self._empty), StepStats(0.0, 0.0))
+
+    def use_readout(self, readout: ReadOut | str | Path | None, *, start: float = 0.0) -> None:
+        """Read through a chip from now on.
+
+        Args:
+            readout: A read-out of this sensor alone, the name of a chip with its usual settings,
+                the path of a read-out file (``.toml``), or None.
+            start: Time at which it is switched on [s].
+
+        Raises:
+            ReadOutError: There is no such chip or file, or the file is wrong.
+        """
+        self.readout = make_readout(readout, self)
+        if self.readout is not None:
+            self.readout.reset(start=start)
+
+    def step(
+        self, scene: Scene | DepthFrame, *, time: float | None = None, jacobian: bool = False
+    ) -> Reading:
         """Return the reading of a scene or of a depth camera's view, given in the sensor frame.
+
+        With a :attr:`readout`, the reading holds the conversions that have finished since the last
+        step, with their time stamps, as ``reading.counts``.
 
         Args:
             scene: What stands around the sensor.
+            time: Time of the scene [s], not before that of the last step; a read-out needs it.
             jacobian: Whether to work out ``reading.jacobian`` as well, for half a step's time.
 
         Raises:
             SceneError: ``scene`` is neither a scene nor a depth frame, or has no Jacobian.
             SolveError: The solver found no solution.
+            ReadOutError: A read-out is given no time, or time went back.
             ValueError: A Jacobian is asked for of a method that has none.
         """
-        start = time.perf_counter()
+        start = perf_counter()
         _check_view("step takes", scene)
         if jacobian and self.method == "masked":
             raise ValueError('method "masked" has no Jacobian; use "surface"')
+        if self.readout is not None and time is None:
+            raise ReadOutError("a read-out needs the time; write step(scene, time=…), in seconds")
         if isinstance(scene, DepthFrame):
             scene = scene.scene()
         with self._one:
             self.steps += 1
-            found = self._solver.solve(scene, jacobian=jacobian)
+            reading = self._of(self._solver.solve(scene, jacobian=jacobian), start)
+            if self.readout is None or time is None:
+                return reading
+            return replace(reading, counts=self.readout.sample(time, reading))
+
+    def _of(self, found: Change, start: float) -> Reading:
+        """The reading that a solver's result makes, of a step that began at ``start`` [s]."""
         change = np.minimum(found.matrix, self._screened)
         error = max(found.error, float((found.matrix - change).max()))
         whole = self.background.capacitance + change
         if len(self._floating):
             change = self._without_floating(whole) - self._empty
+        stats = StepStats(error, perf_counter() - start, found.unknowns, found.iterations)
+        slope = None if found.jacobian is None else self._slope(whole, found.jacobian)
+        return self._reading(change, stats, slope)
+
+    def _reading(self, change: Array, stats: StepStats, slope: Array | None = None) -> Reading:
+        """A reading by the change of the matrix of electrodes and shields [F]."""
         n = len(self._electrodes)
         total = self._empty + change
         delta = change[:n, :n]
-        stats = StepStats(error, time.perf_counter() - start, found.unknowns, found.iterations)
         return Reading(
-            self.baseline + delta, delta.copy(), stats, self._names, total[:n, n:].sum(axis=1),
-            jacobian=None if found.jacobian is None else self._slope(whole, found.jacobian),
-        )  # fmt: skip
+            self.baseline + delta,
+            delta.copy(),
+            stats,
+            self._names,
+            total[:n, n:].sum(axis=1),
+            jacobian=slope,
+        )
 
     def _slope(self, whole: Array, slope: Array) -> Array:
         """Jacobian of the electrodes' matrix, the design's floating conductors eliminated."""
@@ -243,9 +294,9 @@ class Simulator:
     ) -> list[Reading]:
         """Return the readings of many scenes, each solved on whichever thread is free.
 
-        Readings are those of :meth:`reset` and :meth:`step`, to the last bit. They do not depend
-        on the number of threads, nor on what stands beside them in the batch. This sensor's own
-        last step and count stay as they are.
+        Readings are those of :meth:`reset` and :meth:`step`, to the last bit, without a read-out.
+        They do not depend on the number of threads, nor on what stands beside them in the batch.
+        This sensor's own last step and count stay as they are.
 
         Args:
             scenes: Scenes or depth frames, in the sensor frame.
@@ -299,17 +350,30 @@ class Simulator:
             return self._solver.potentials(as_points(points))
 
     def sibling(self) -> Simulator:
-        """Another sensor of the same design and settings, at rest; the two share the field."""
+        """Another sensor of the same design and settings, at rest; the two share the field.
+
+        It has no read-out: a chip belongs to one sensor.
+        """
         return Simulator(
             self.design, method=self.method, preset=self.preset, frequency=self.frequency,
             settings=self.settings, background=self.background,
         )  # fmt: skip
 
-    def reset(self) -> None:
-        """Forget the previous step, which ``"masked"`` starts the next one from."""
+    def reset(self, *, seed: int | None = None, start: float = 0.0) -> None:
+        """Forget the previous step, which ``"masked"`` starts the next one from; restart the chip.
+
+        Args:
+            seed: Of the read-out's noise from now on; by default its random numbers repeat.
+            start: Time at which it is switched on [s].
+
+        Raises:
+            ReadOutError: The seed is no whole number from 0 on.
+        """
         with self._one:
             self._solver.reset()
             self.steps = 0
+            if self.readout is not None:
+                self.readout.reset(start=start, seed=seed)
 
     def describe(self) -> dict[str, float | int | str]:
         """Return the figures of the design's field."""
@@ -332,6 +396,24 @@ class Simulator:
         cross = matrix[np.ix_(keep, self._floating)]
         own = matrix[np.ix_(self._floating, self._floating)]
         return inner - cross @ np.linalg.solve(own, cross.T)
+
+
+def make_readout(readout: ReadOut | str | Path | None, simulator: Simulator) -> ReadOut | None:
+    """The read-out given, or that of a chip or a file for a simulator's electrodes.
+
+    Raises:
+        ReadOutError: There is no such chip or file, or the file is wrong.
+    """
+    if readout is None:
+        return None
+    from capsense.readout.config import choose_readout
+    from capsense.readout.read_out import ReadOut
+
+    if isinstance(readout, ReadOut):
+        return readout
+    if not isinstance(readout, str | Path):
+        raise ReadOutError(f"readout is {readout!r}; give a chip's name, a file, or a ReadOut")
+    return choose_readout(readout, simulator.electrode_names, simulator.empty)
 
 
 def _check_view(where: str, scene: object) -> None:

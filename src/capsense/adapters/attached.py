@@ -15,11 +15,10 @@ from capsense._crew import OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import ReadOutError, SceneError
-from capsense.readout.config import choose_readout
+from capsense.errors import SceneError
 from capsense.readout.read_out import ReadOut
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Reading, Simulator, make_readout
 
 Array = NDArray[np.float64]
 
@@ -33,8 +32,9 @@ class AttachedSensor(ABC):
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         """The sensor itself."""
-        self.readout: ReadOut | None = None
-        """The chip that turns capacitances into counts, if any."""
+        self.readout: ReadOut | None = simulator.readout
+        """The chip that turns capacitances into counts, if any; a simulator's own is taken over."""
+        simulator.use_readout(None)
         self._one = OneAtATime()
 
     def read(self, time: float | None = None, view: Scene | DepthFrame | None = None) -> Reading:
@@ -283,21 +283,6 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
         FieldError: The background field could not be built.
     """
     return design if isinstance(design, Simulator) else Simulator(design)
-
-
-def make_readout(readout: ReadOut | str | Path | None, simulator: Simulator) -> ReadOut | None:
-    """The read-out given, or that of a chip or a file for a simulator's electrodes.
-
-    Raises:
-        ReadOutError: There is no such chip or file, or the file is wrong.
-    """
-    if readout is None or isinstance(readout, ReadOut):
-        return readout
-    if not isinstance(readout, str | Path):
-        raise ReadOutError(f"readout is {readout!r}; give a chip's name, a file, or a ReadOut")
-    empty = simulator.step(Scene())
-    simulator.reset()
-    return choose_readout(readout, simulator.electrode_names, empty)
 
 
 def check_world(

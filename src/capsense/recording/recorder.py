@@ -77,9 +77,9 @@ class Recorder:
         self._sensor = source if isinstance(source, AttachedSensor) else None
         self._simulator = source if isinstance(source, Simulator) else source.simulator
         check_name(name)
-        if readout is not None and self._sensor is not None and self._sensor.readout is not None:
+        if readout is not None and source.readout is not None:
             raise ReadOutError("the sensor has a read-out of its own; leave out readout=")
-        empty = self._simulator.step(Scene())
+        empty = self._simulator.empty
         self._readout, config = make_readout(readout, self._simulator.electrode_names, empty)
         self.reset()
         self._live = None if ros_domain is None else LiveTopics(ros_domain)
@@ -114,7 +114,7 @@ class Recorder:
         """
         self._check(time)
         scene = _scene(world)
-        return self._write(time, world, scene, self._simulator.step(scene))
+        return self._write(time, world, scene, self._simulator.step(scene, time=time))
 
     def read(self, time: float | None = None) -> Reading:
         """Read the attached sensor, record, and return the reading.

@@ -104,7 +104,7 @@ class ScenarioSource:
         self.title, self.design = scenario.name, scenario.design
         self.times, self.channels = scenario.times, scenario.channels
         self._scenario, self._simulator = scenario, simulator
-        self.empty = simulator.step(Scene())
+        self.empty = simulator.empty
         self.green = green_of(simulator)
 
     def shot(self, index: int, plane: Plane | None = None) -> Shot:
