@@ -74,7 +74,7 @@ def recording_file(folder: Path, kind: str) -> Format:
     plain = {"compression": mcap.writer.CompressionType.NONE, "enable_crcs": False}
     with pytest.MonkeyPatch.context() as patch:
         if kind == "mcap uncompressed":
-            patch.setattr(mcap.writer, "Writer", lambda file: writer(file, **plain))
+            patch.setattr(mcap.writer, "Writer", lambda file, **_: writer(file, **plain))
         sensor = cs.Simulator(tiny_design(), settings=SETTINGS)
         with cs.record(folder / "a.mcap", sensor, readout="fdc1004") as run:
             for k in range(3):

@@ -47,6 +47,8 @@ def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         ("192.168.3.4:8080", "http://192.168.3.4:8080", True),
         ("robot:80", "http://ROBOT:80", True),
         (f"{socket.gethostname()}:80", None, True),
+        (f"{socket.gethostname()}.local:80", None, True),
+        (f"{socket.gethostname()}.evil.example:80", None, False),
         ("evil.example:8080", None, False),
         ("evil.example:8080", "http://evil.example:8080", False),
         ("127.0.0.1:8080", "http://evil.example", False),

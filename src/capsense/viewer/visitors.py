@@ -37,7 +37,8 @@ def welcome(host: str, origin: str | None, listening: str) -> bool:
         own = origin is None or urlsplit(origin).netloc.lower() == host.lower()
     except ValueError:
         return False
-    known = {"localhost", listening.lower(), socket.gethostname().lower()}
+    own_name = socket.gethostname().lower()
+    known = {"localhost", listening.lower(), own_name, f"{own_name}.local"}
     return own and (name in known or _is_address(name))
 
 
