@@ -12,8 +12,9 @@ from capsense._crew import Crew, OneAtATime, some_failed
 from capsense._validate import suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError, SkinError
+from capsense.reading import Reading
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 
 Array = NDArray[np.float64]
 AnyDesign = Design | str | Path | Simulator

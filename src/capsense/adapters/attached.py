@@ -16,9 +16,10 @@ from capsense._validate import suggest
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
+from capsense.reading import Reading
 from capsense.readout.read_out import ReadOut
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Reading, Simulator, make_readout
+from capsense.simulator import Simulator, make_readout
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,10 @@ from capsense._crew import Crew
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
 from capsense.errors import ReadOutError, SceneError
+from capsense.reading import Reading
 from capsense.readout.read_out import SEED_STRIDE, ReadOut
 from capsense.scene import Pose
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 from capsense.skin import AnyDesign, make_simulators, read_all
 
 

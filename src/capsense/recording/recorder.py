@@ -14,6 +14,7 @@ from typing import Any
 
 from capsense.adapters.attached import AttachedSensor
 from capsense.errors import ReadOutError, RecordingError
+from capsense.reading import Reading
 from capsense.readout.config import file_content, parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.recording.design_json import design_to_json
@@ -25,7 +26,7 @@ from capsense.recording.steps import Moment, StepMessages
 from capsense.scenario.channels import Excitation
 from capsense.scenario.model import Scenario
 from capsense.scene import DepthFrame, Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 
 _log = logging.getLogger(__name__)
 

@@ -15,12 +15,13 @@ from capsense.design.model import Design
 from capsense.errors import RecordingError
 from capsense.field.background import BuildSettings
 from capsense.mesh.settings import MeshSettings
+from capsense.reading import Reading, StepStats
 from capsense.readout.config import parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.recording.versions import versions
 from capsense.scenario.channels import Channel, Excitation, channels_of
 from capsense.scenario.model import METHODS
-from capsense.simulator import Method, PresetName, Reading, Simulator, StepStats
+from capsense.simulator import Method, PresetName, Simulator
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from capsense.design import Design
 from capsense.errors import RecordingError
+from capsense.reading import Reading
 from capsense.recording.session import GONE
 from capsense.scenario import Channel, Scenario
 from capsense.scene import Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
     from capsense.field.green import GreenFunction
