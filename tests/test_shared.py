@@ -14,6 +14,7 @@ import pytest
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
+from capsense.adapters import skin as skin_module
 
 
 @pytest.fixture(params=["surface", "masked"])
@@ -100,3 +101,18 @@ def test_threads_that_share_a_skin(field_cache: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(skin, "views", slow)
     found = at_once(lambda k: skin.step(scene, {"A": poses[k]})["A"].delta)
     np.testing.assert_array_equal(found, expected)
+
+
+def test_threads_that_share_a_robots_skin(
+    field_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All sensors are read of one instant, before the next thread's."""
+    mujoco = pytest.importorskip("mujoco", reason='needs pip install "capsense[mujoco]"')
+    sites = "<site name='a'/><site name='b'/>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{sites}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    sensor = cs.Simulator(tiny_design(), settings=SETTINGS, cache_dir=field_cache)
+    skin = cs.mujoco.attach_skin(model, data, ["a", "b"], sensor, threads=1)
+    monkeypatch.setattr(skin_module, "read_all", alone(skin_module.read_all))
+    assert all(set(readings) == {"a", "b"} for readings in at_once(lambda _: skin.read()))
