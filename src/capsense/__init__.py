@@ -7,7 +7,10 @@ itself is light.
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from capsense._kernel_cache import ensure_place
 
 if TYPE_CHECKING:
     from capsense import humans
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
         SkinError,
         SolveError,
     )
+    from capsense.reading import Reading
     from capsense.readout.config import load_readout
     from capsense.readout.counts import Counts
     from capsense.readout.read_out import ReadOut
@@ -49,7 +53,7 @@ if TYPE_CHECKING:
     from capsense.scene.raster import rasterise
     from capsense.scene.scene import Scene
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
-    from capsense.simulator import Reading, Simulator
+    from capsense.simulator import Simulator
     from capsense.skin import Skin
 
     __version__: str
@@ -134,6 +138,7 @@ _HOMES = {
     "capsense.readout.config": ("load_readout",),
     "capsense.readout.counts": ("Counts",),
     "capsense.readout.read_out": ("ReadOut",),
+    "capsense.reading": ("Reading",),
     "capsense.recording.reader": ("open_recording",),
     "capsense.recording.recorder": ("Recorder", "record"),
     "capsense.recording.replay": ("replay",),
@@ -149,7 +154,7 @@ _HOMES = {
     "capsense.scene.raster": ("rasterise",),
     "capsense.scene.scene": ("Scene",),
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
-    "capsense.simulator": ("Reading", "Simulator"),
+    "capsense.simulator": ("Simulator",),
     "capsense.skin": ("Skin",),
 }
 _SUBMODULES = {
@@ -159,6 +164,7 @@ _SUBMODULES = {
     "mujoco": "capsense.adapters.mujoco",
     "pybullet": "capsense.adapters.pybullet",
 }
+ensure_place(Path(__file__).parent)
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 

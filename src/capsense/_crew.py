@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,22 @@ from capsense.errors import CapSenseError, SceneError
 
 Key = TypeVar("Key", bound=Hashable)
 Result = TypeVar("Result")
+
+
+class OneAtATime:
+    """A lock for what one thread may use at a time; a copy, or a pickled one, is a new lock."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def __reduce__(self) -> tuple[type[OneAtATime], tuple[()]]:
+        return OneAtATime, ()
 
 
 class Crew:

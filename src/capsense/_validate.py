@@ -21,9 +21,12 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 
 
 def as_number(value: object) -> float:
-    """A real number as a float; NaN for anything else, booleans too."""
+    """A real number as a float; NaN for anything else, booleans too; infinity beyond floats."""
     if isinstance(value, Real) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            return math.inf
     return math.nan
 
 
@@ -68,7 +71,7 @@ def read_toml(
         raise error(f"there is no {what} file {path}; check the path{hint}") from None
     except OSError as cause:
         raise error(f"{path} cannot be read: {cause.strerror}; give a .toml file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
+    except (ValueError, RecursionError) as cause:
         raise error(f"{path} is not valid TOML: {cause}; mend the line it names") from None
 
 
@@ -97,7 +100,7 @@ class Table:
         self.item = item
         self.limit = min(limit, MAX_LENGTH)
         if not isinstance(data, Mapping):
-            raise self.error(f"must be a table of key = value lines, not {data!r}")
+            raise self.error(f"must be a table of key = value lines, not {shorten(data)}")
         self.data: Mapping[str, Any] = data
 
     def __contains__(self, key: str) -> bool:
@@ -126,7 +129,7 @@ class Table:
             return default
         value = self.raw(key, '"…"')
         if not isinstance(value, str) or not value.strip():
-            raise self.error(f"{key} = {value!r} must be a non-empty string in quotes")
+            raise self.error(f"{key} = {shorten(value)} must be a non-empty string in quotes")
         return value
 
     def text(self, key: str) -> str:
@@ -142,14 +145,15 @@ class Table:
             return default
         value = self.raw(key, " | ".join(f'"{o}"' for o in options))
         if not isinstance(value, str) or value not in options:
-            raise self.error(f"{key} = {value!r} is not known; {suggest(str(value), options)}")
+            word = value if isinstance(value, str) else ""
+            raise self.error(f"{key} = {shorten(value)} is not known; {suggest(word, options)}")
         return value
 
     def boolean(self, key: str, default: bool) -> bool:
         """``true`` or ``false``."""
         value = self.data.get(key, default)
         if not isinstance(value, bool):
-            raise self.error(f"{key} = {value!r} must be true or false")
+            raise self.error(f"{key} = {shorten(value)} must be true or false")
         return value
 
     def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
@@ -158,7 +162,7 @@ class Table:
             return default
         value = self.raw(key, f"an integer from {low} to {high}")
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.error(f"{key} = {value!r} must be an integer from {low} to {high}")
+            raise self.error(f"{key} = {shorten(value)} must be an integer from {low} to {high}")
         return value
 
     def number(
@@ -294,7 +298,7 @@ class Table:
             raise self.error(
                 f"{key} = {shorten(value)} must be a number without quotes or brackets"
             )
-        number = float(value)
+        number = as_number(value)
         if not math.isfinite(number):
             raise self.error(f"{key} = {number} must be a finite number")
         return number
@@ -307,5 +311,8 @@ class Table:
 
 def shorten(value: Any) -> str:
     """``repr`` of a value, cut to 60 characters."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of thousands of digits
+        text = f"a {type(value).__name__} too long to print"
     return text if len(text) <= 60 else text[:57] + "…"

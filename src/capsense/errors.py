@@ -4,9 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
+_LONGEST, _HEAD, _TAIL = 1000, 600, 300
+"""Longer messages are cut in the middle: the head names the thing, the tail the mend."""
+
 
 class CapSenseError(Exception):
-    """Base of every error that CapSense raises on purpose."""
+    """Base of every error that CapSense raises on purpose.
+
+    A message that echoes long input is cut in the middle.
+    """
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        return text if len(text) <= _LONGEST else f"{text[:_HEAD]} […] {text[-_TAIL:]}"
 
 
 class DesignError(CapSenseError, ValueError):
@@ -48,6 +58,9 @@ class PartialError(CapSenseError, RuntimeError):
         """Name of a sensor, or number of a scene → reading, of those that did not fail."""
         self.failures = failures
         """Name or number → error, of those that did."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (*self.args, self.readings, self.failures)
 
 
 class SkinError(PartialError):

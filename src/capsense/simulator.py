@@ -2,84 +2,36 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._crew import Crew, some_failed
+from capsense._crew import Crew, OneAtATime, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design, Role
-from capsense.errors import BatchError, FieldError, SceneError
+from capsense.errors import BatchError, FieldError, ReadOutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.field.change import Change
+from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
 from capsense.scene.shape import as_points
 
 if TYPE_CHECKING:
-    from capsense.readout.counts import Counts
+    from capsense.readout.read_out import ReadOut
 
 Array = NDArray[np.float64]
 Method = Literal["surface", "masked"]
 PresetName = Literal["standard", "learning", "fine"]
-
-
-@dataclass(frozen=True)
-class StepStats:
-    """How a step was solved."""
-
-    error_estimate: float
-    """Estimated error of a capacitance that more unknowns or iterations would remove [F]."""
-    wall_time: float
-    """Time the step took [s]."""
-    unknowns: int = 0
-    """Charge functions that were solved for, or free nodes of the paper's scheme."""
-    iterations: int = 0
-    """Iterations of the linear solver; 0 with ``"surface"``, which solves directly."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """The capacitances of one instant."""
-
-    capacitance: Array
-    """Maxwell capacitance matrix of the electrodes, shields at ground [F], shape (M, M)."""
-    delta: Array
-    """Change against the empty domain, ``capacitance - baseline`` [F], shape (M, M)."""
-    stats: StepStats
-    electrode_names: tuple[str, ...]
-    _shield_coupling: Array = field(repr=False)
-    counts: Counts | None = None
-    """What the chip has reported since the reading before, where a read-out is configured."""
-    jacobian: Array | None = None
-    """How ``capacitance`` changes as each body of the scene moves along the sensor frame's x, y, z
-    [F/m], then turns about axes parallel to these through its own origin [F/rad], where it was
-    asked for, shape (bodies, M, M, 6)."""
-
-    @property
-    def self_capacitance(self) -> Array:
-        """What a self-mode channel measures [F], shape (M,).
-
-        Electrode i is driven, shields are driven with it, all other electrodes are grounded:
-        the diagonal of the Maxwell matrix plus the (negative) coupling to the shields.
-        """
-        return np.diag(self.capacitance) + self._shield_coupling
-
-    @property
-    def mutual_capacitance(self) -> Array:
-        """Mutual capacitances ``-C_ij`` [F] off the diagonal, zero on it, shape (M, M)."""
-        out = -self.capacitance
-        np.fill_diagonal(out, 0.0)
-        return out
 
 
 class _Solver(Protocol):
@@ -95,6 +47,8 @@ class _Solver(Protocol):
 class Simulator:
     """Reads the capacitances of a sensor, scene after scene.
 
+    Threads may share one: they take turns. :meth:`step_batch` uses several at a time.
+
     Args:
         design: A design, a packaged name, or the path of a design file.
         method: ``"surface"``: charges on the surfaces of the bodies. ``"masked"``: the scheme of
@@ -107,9 +61,11 @@ class Simulator:
         progress: Called with a stage's name and the fraction done while a field is built.
         background: The field of this design with these settings, if it is at hand; it is shared,
             not copied. :meth:`sibling` passes its own.
+        readout: What steps report through, as :meth:`use_readout` takes it.
 
     Raises:
         DesignError: The design is wrong.
+        ReadOutError: There is no such chip or file, or the file is wrong.
         FieldError: The background field could not be built, or ``background`` is of another design.
     """
 
@@ -124,6 +80,7 @@ class Simulator:
         cache_dir: Path | None = None,
         progress: Callable[[str, float], None] | None = None,
         background: BackgroundField | None = None,
+        readout: ReadOut | str | Path | None = None,
     ) -> None:
         for what, chosen, known in (
             ("method", method, get_args(Method)), ("preset", preset, get_args(PresetName)),
@@ -154,7 +111,8 @@ class Simulator:
         self.background: BackgroundField = background
         """Field of the empty domain; never changed, so that it can be shared."""
         self._solver = self._make_solver()
-        self._batch: list[Simulator] = []  # a sensor for each thread
+        self._one = OneAtATime()
+        self._idle: deque[Simulator] = deque()  # sensors for the threads of batches
         n = len(self.design.electrodes)
         floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
         names = self.background.terminals
@@ -171,6 +129,9 @@ class Simulator:
         self.baseline: Array = self._empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
         self.baseline.setflags(write=False)
+        self.readout: ReadOut | None = None
+        """The chip that turns capacitances into counts, if any."""
+        self.use_readout(readout)
 
     def _make_solver(self) -> _Solver:
         if self.method == "masked":
@@ -189,39 +150,84 @@ class Simulator:
         """Electrode names in matrix order."""
         return self._names
 
-    def step(self, scene: Scene | DepthFrame, *, jacobian: bool = False) -> Reading:
+    @property
+    def empty(self) -> Reading:
+        """The reading of an empty scene, which no chip has seen."""
+        return self._reading(np.zeros_like(self._empty), StepStats(0.0, 0.0))
+
+    def use_readout(self, readout: ReadOut | str | Path | None, *, start: float = 0.0) -> None:
+        """Read through a chip from now on.
+
+        Args:
+            readout: A read-out of this sensor alone, the name of a chip with its usual settings,
+                the path of a read-out file (``.toml``), or None.
+            start: Time at which it is switched on [s].
+
+        Raises:
+            ReadOutError: There is no such chip or file, or the file is wrong.
+        """
+        self.readout = make_readout(readout, self)
+        if self.readout is not None:
+            self.readout.reset(start=start)
+
+    def step(
+        self, scene: Scene | DepthFrame, *, time: float | None = None, jacobian: bool = False
+    ) -> Reading:
         """Return the reading of a scene or of a depth camera's view, given in the sensor frame.
+
+        With a :attr:`readout`, the reading holds the conversions that have finished since the last
+        step, with their time stamps, as ``reading.counts``.
 
         Args:
             scene: What stands around the sensor.
+            time: Time of the scene [s], not before that of the last step; a read-out needs it.
             jacobian: Whether to work out ``reading.jacobian`` as well, for half a step's time.
 
         Raises:
             SceneError: ``scene`` is neither a scene nor a depth frame, or has no Jacobian.
             SolveError: The solver found no solution.
+            ReadOutError: A read-out is given no time, or time went back.
             ValueError: A Jacobian is asked for of a method that has none.
         """
-        start = time.perf_counter()
+        start = perf_counter()
         _check_view("step takes", scene)
         if jacobian and self.method == "masked":
             raise ValueError('method "masked" has no Jacobian; use "surface"')
+        if self.readout is not None and time is None:
+            raise ReadOutError("a read-out needs the time; write step(scene, time=…), in seconds")
         if isinstance(scene, DepthFrame):
             scene = scene.scene()
-        self.steps += 1
-        found = self._solver.solve(scene, jacobian=jacobian)
+        with self._one:
+            self.steps += 1
+            reading = self._of(self._solver.solve(scene, jacobian=jacobian), start)
+            if self.readout is None or time is None:
+                return reading
+            return replace(reading, counts=self.readout.sample(time, reading))
+
+    def _of(self, found: Change, start: float) -> Reading:
+        """The reading that a solver's result makes, of a step that began at ``start`` [s]."""
         change = np.minimum(found.matrix, self._screened)
         error = max(found.error, float((found.matrix - change).max()))
         whole = self.background.capacitance + change
         if len(self._floating):
             change = self._without_floating(whole) - self._empty
+        stats = StepStats(error, perf_counter() - start, found.unknowns, found.iterations)
+        slope = None if found.jacobian is None else self._slope(whole, found.jacobian)
+        return self._reading(change, stats, slope)
+
+    def _reading(self, change: Array, stats: StepStats, slope: Array | None = None) -> Reading:
+        """A reading by the change of the matrix of electrodes and shields [F]."""
         n = len(self._electrodes)
         total = self._empty + change
         delta = change[:n, :n]
-        stats = StepStats(error, time.perf_counter() - start, found.unknowns, found.iterations)
         return Reading(
-            self.baseline + delta, delta.copy(), stats, self._names, total[:n, n:].sum(axis=1),
-            jacobian=None if found.jacobian is None else self._slope(whole, found.jacobian),
-        )  # fmt: skip
+            self.baseline + delta,
+            delta.copy(),
+            stats,
+            self._names,
+            total[:n, n:].sum(axis=1),
+            jacobian=slope,
+        )
 
     def _slope(self, whole: Array, slope: Array) -> Array:
         """Jacobian of the electrodes' matrix, the design's floating conductors eliminated."""
@@ -239,9 +245,9 @@ class Simulator:
     ) -> list[Reading]:
         """Return the readings of many scenes, each solved on whichever thread is free.
 
-        Readings are those of :meth:`reset` and :meth:`step`, to the last bit. They do not depend
-        on the number of threads, nor on what stands beside them in the batch. This sensor's own
-        last step and count stay as they are.
+        Readings are those of :meth:`reset` and :meth:`step`, to the last bit, without a read-out.
+        They do not depend on the number of threads, nor on what stands beside them in the batch.
+        This sensor's own last step and count stay as they are.
 
         Args:
             scenes: Scenes or depth frames, in the sensor frame.
@@ -254,20 +260,19 @@ class Simulator:
         """
         for number, scene in enumerate(scenes):
             _check_view(f"scenes[{number}]: a batch holds", scene)
-        crew = Crew(threads)
-        while len(self._batch) < min(crew.threads, len(scenes)):
-            self._batch.append(self.sibling())
-        idle = deque(self._batch)
 
         def from_rest(scene: Scene | DepthFrame) -> Reading:
-            sensor = idle.popleft()
+            try:
+                sensor = self._idle.popleft()
+            except IndexError:
+                sensor = self.sibling()
             try:
                 sensor.reset()
                 return sensor.step(scene)
             finally:
-                idle.append(sensor)
+                self._idle.append(sensor)
 
-        readings, failures = crew.run(
+        readings, failures = Crew(threads).run(
             {k: partial(from_rest, scene) for k, scene in enumerate(scenes)}
         )
         if failures:
@@ -292,19 +297,34 @@ class Simulator:
             SceneError: The points do not have shape (n, 3).
             ValueError: The method is ``"masked"``, which solves on a mesh of its own.
         """
-        return self._solver.potentials(as_points(points))
+        with self._one:
+            return self._solver.potentials(as_points(points))
 
     def sibling(self) -> Simulator:
-        """Another sensor of the same design and settings, at rest; the two share the field."""
+        """Another sensor of the same design and settings, at rest; the two share the field.
+
+        It has no read-out: a chip belongs to one sensor.
+        """
         return Simulator(
             self.design, method=self.method, preset=self.preset, frequency=self.frequency,
             settings=self.settings, background=self.background,
         )  # fmt: skip
 
-    def reset(self) -> None:
-        """Forget the previous step, which ``"masked"`` starts the next one from."""
-        self._solver.reset()
-        self.steps = 0
+    def reset(self, *, seed: int | None = None, start: float = 0.0) -> None:
+        """Forget the previous step, which ``"masked"`` starts the next one from; restart the chip.
+
+        Args:
+            seed: Of the read-out's noise from now on; by default its random numbers repeat.
+            start: Time at which it is switched on [s].
+
+        Raises:
+            ReadOutError: The seed is no whole number from 0 on.
+        """
+        with self._one:
+            self._solver.reset()
+            self.steps = 0
+            if self.readout is not None:
+                self.readout.reset(start=start, seed=seed)
 
     def describe(self) -> dict[str, float | int | str]:
         """Return the figures of the design's field."""
@@ -327,6 +347,24 @@ class Simulator:
         cross = matrix[np.ix_(keep, self._floating)]
         own = matrix[np.ix_(self._floating, self._floating)]
         return inner - cross @ np.linalg.solve(own, cross.T)
+
+
+def make_readout(readout: ReadOut | str | Path | None, simulator: Simulator) -> ReadOut | None:
+    """The read-out given, or that of a chip or a file for a simulator's electrodes.
+
+    Raises:
+        ReadOutError: There is no such chip or file, or the file is wrong.
+    """
+    if readout is None:
+        return None
+    from capsense.readout.config import choose_readout
+    from capsense.readout.read_out import ReadOut
+
+    if isinstance(readout, ReadOut):
+        return readout
+    if not isinstance(readout, str | Path):
+        raise ReadOutError(f"readout is {readout!r}; give a chip's name, a file, or a ReadOut")
+    return choose_readout(readout, simulator.electrode_names, simulator.empty)
 
 
 def _check_view(where: str, scene: object) -> None:

@@ -8,19 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._crew import Crew, some_failed
+from capsense._crew import Crew, OneAtATime, some_failed
 from capsense._validate import suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError, SkinError
+from capsense.reading import Reading
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 
 Array = NDArray[np.float64]
 AnyDesign = Design | str | Path | Simulator
 
 
 class Skin:
-    """Sensors in a common world, each with its own frame.
+    """Sensors in a common world, each with its own frame. Threads may share one: they take turns.
 
     Args:
         sensors: Name → design (or packaged name, design file, simulator) and the pose of its
@@ -43,7 +44,7 @@ class Skin:
             if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], Pose)):
                 raise SceneError(f"sensor {name!r} is {pair!r}; give a pair (design, Pose(…))")
             designs[name], self.poses[name] = pair
-        self._crew = Crew(threads)
+        self._crew, self._one = Crew(threads), OneAtATime()
         self.simulators: dict[str, Simulator] = make_simulators(designs)
         """The sensors themselves."""
 
@@ -64,7 +65,8 @@ class Skin:
             SceneError: ``scene`` is not a scene, or there is no sensor of a name in ``poses``.
             SkinError: Some sensors failed; it holds the readings of the others.
         """
-        return self.step_views(self.views(scene, poses))
+        with self._one:  # poses are remembered
+            return self.step_views(self.views(scene, poses))
 
     def views(self, scene: Scene, poses: Mapping[str, Pose] | None = None) -> dict[str, Scene]:
         """What each sensor sees of a scene, in its own frame; arguments as of :meth:`step`."""

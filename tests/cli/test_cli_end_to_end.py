@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -38,6 +39,39 @@ def test_run(tmp_path: Path) -> None:
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert summary["largest_error_estimate_F"] < 0.05 * np.abs(arrays["delta"]).max()
     assert summary["field"]["boundary panels"] > 1000
+
+
+DESIGN = """
+name = "one"
+[domain]
+size = [0.5, 0.5, 0.5]
+backplane = 0.010
+[[electrode]]
+name = "pad"
+shape = "rectangle"
+size = [0.031, 0.030]
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is not a signal there")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_while_a_field_is_built(tmp_path: Path, number: signal.Signals) -> None:
+    """Exit code 130, a message, and nothing is left behind."""
+    path, cache = tmp_path / "one.toml", tmp_path / "cache"
+    path.write_text(DESIGN)
+    process = subprocess.Popen(
+        [*COMMAND, "design", str(path)], env={**os.environ, "CAPSENSE_CACHE_DIR": str(cache)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not list(cache.glob("*.lock")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "no build within a minute"
+        time.sleep(0.01)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (130, "capsense: interrupted\n")
+    assert list(cache.iterdir()) == []
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is not a signal there")

@@ -9,6 +9,7 @@ from scipy import stats
 
 from capsense.errors import ReadOutError
 from capsense.readout.calibration import (
+    CalibrationWarning,
     LinearSensor,
     _flicker_covariance,
     base_capacitance,
@@ -85,6 +86,57 @@ def test_small_changes_on_a_large_base():
     assert fit.drift == pytest.approx([0.0], abs=1e-27)
 
 
+def saturated(top, random=0.0, seed=0):
+    """True and measured capacitances, instants and flags of an approach, by a chip with a limit."""
+    time = np.arange(0, 60, 0.05)
+    true = (2 + 2 * np.exp(-(((time - 30) / 8) ** 2)))[:, None] * [1e-12, 0.9e-12]
+    readout = ReadOut(
+        self_patterns(("A", "B"), shield=0.0), ("A", "B"), Schedule.simultaneous(2, 0.1),
+        LinearLaw(1e-18, 0, round(top / 1e-18)), seed=seed,
+        stages=(LinearSensor(1.03, 2e-13, 0.0, 0.0), White(1e-15)),
+    )  # fmt: skip
+    counts = readout(time, true)
+    stamps, measured = counts.table()
+    instants, flags = stamps - readout.schedule.lag, counts.table("flags")[1]
+    rng = np.random.default_rng(seed)
+    lost = rng.random(measured.shape) < random
+    measured, flags = np.where(lost, top, measured), np.where(lost, 1, flags)
+    world = np.stack(
+        [np.interp(t, time, c) for t, c in zip(instants.T, true.T, strict=True)], axis=1
+    )
+    return world, measured, instants, flags
+
+
+@pytest.mark.parametrize(("top", "random"), [(3.2e-12, 0.0), (1e-11, 0.2)])
+def test_samples_out_of_range_are_left_out(top, random):
+    """Round trip: with a fifth of the conversions at the limit, in a row or here and there."""
+    world, measured, instants, flags = saturated(top, random)
+    assert 0.1 < (flags != 0).mean() < 0.4
+    fit = calibrate(world, measured, instants, flags=flags)
+    assert np.abs(fit.gain - 1.03).max() < 4 * fit.uncertainty[:, 0].max() < 0.005
+    assert not fit.doubtful.any()
+    assert (fit.samples == (flags == 0).sum(axis=0)).all()
+    assert (np.isnan(fit.residuals) == (flags != 0)).all()
+    assert np.nanstd(fit.residuals, axis=0) == pytest.approx([1e-15, 1e-15], rel=0.2)
+    with pytest.warns(CalibrationWarning, match=r"channel 1: residuals are .* times as large"):
+        blind = calibrate(world, measured, instants)
+    assert blind.doubtful.all()
+    assert np.abs(blind.gain - 1.03).min() > 0.01
+
+
+def test_a_sensor_that_is_not_linear_is_doubted():
+    """Half a per cent of curvature shows; noise of any size, and flicker with its floor, do not."""
+    true, _, time = recording(np.random.default_rng(0), 400)
+    noise = 1e-15 * np.random.default_rng(1).standard_normal(true.shape)
+    with pytest.warns(CalibrationWarning, match="channel 0"):
+        assert calibrate(true, true + 5e10 * true**2 + noise, time).doubtful.all()
+    for size in (0.0, 1.0, 1000.0):
+        fit = calibrate(true, 1.02 * true + size * noise, time)
+        assert not fit.doubtful.any()
+        if size:
+            assert fit.excess == pytest.approx([1.0, 1.0], abs=0.15)
+
+
 def test_without_drift():
     true, measured, _ = recording(np.random.default_rng(0))
     fit = calibrate(true, GAIN * true + OFFSET, drift=False)
@@ -153,7 +205,7 @@ def test_flicker_covariance_is_its_definition():
 def test_residual_is_the_noise():
     fit = calibrate(*recording(np.random.default_rng(2), 5000, 2e-15))
     assert fit.residual == near(np.full(2, 2e-15), rel=0.05)
-    assert fit.samples == 5000
+    assert fit.samples.tolist() == [5000, 5000]
 
 
 def test_a_calibrated_model_measures_like_the_sensor():
@@ -207,6 +259,8 @@ RISING = np.linspace(1, 2, 10)[:, None]
     [
         (lambda: calibrate(ONES, np.ones((9, 1)), np.arange(10)), r"shape \(10, 1\), measured"),
         (lambda: calibrate(RISING * np.nan, RISING, np.arange(10)), "not finite"),
+        (lambda: calibrate(RISING, RISING, np.arange(10), flags=[0]), r"flags have shape \(1,\)"),
+        (lambda: calibrate(RISING, RISING, drift=False, flags=RISING > 1.15), "2 samples for 2"),
         (lambda: calibrate(RISING, RISING), "drift and floor need the times"),
         (lambda: calibrate(RISING, RISING, np.arange(10), floor=-1.0), "floor is -1.0"),
         (lambda: calibrate(RISING, RISING**2, np.zeros(10), drift=False, floor=1.0), "must rise"),

@@ -155,6 +155,14 @@ def test_a_tank_or_front_end_of_ones_own():
     assert rest == ShuntLaw(ShuntFrontEnd(5e5, 2e3, 20.0, 1.0, 3e6), 0.5, 14)
 
 
+def test_nonlinearity():
+    """As in Python; the data sheet's is among the chip's facts, and off by default."""
+    law = parse('chip = "ad7746"\nnonlinearity = 1e-4\n').law
+    assert law == ReadOut.preset("ad7746", NAMES, nonlinearity=1e-4).law
+    assert law.nonlinearity == 1e-4
+    assert parse('chip = "ad7746"\n').law.nonlinearity == 0
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -195,6 +203,8 @@ def test_a_tank_or_front_end_of_ones_own():
         ('chip = "fdc1004"\ncapdac = 32', "my.toml: .*give a whole number from 0 to 31"),
         ('chip = "fdc1004"\ncapdac = "auto"', "capdac = 'auto' must be an integer"),
         ('chip = "fdc1004"\nlatency = -1', "latency = -1 must be from 0"),
+        ('chip = "ad7746"\nnonlinearity = 1', "nonlinearity = 1 must be from -0.1"),
+        ('chip = "mpr121"\nnonlinearity = 1e-4', "the law of the mpr121 is curved by itself"),
         ('chip = "fdc1004"\n[climate]\ntemperature = [[1, 2], [1, 3]]', "times must rise"),
         ('chip = "fdc1004"\n[detector]\ntouch = 5\nrelease = 9', "release = 9 must be from"),
         ('chip = "fdc1004"\n[detector]\nrelease = 9', "detector: missing key 'touch'"),

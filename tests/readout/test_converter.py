@@ -68,6 +68,21 @@ def test_quantisation_error_is_uniform():
     assert abs(error.mean()) < 5 * 1e-15 / math.sqrt(12 * len(c))
 
 
+@pytest.mark.parametrize("share", [1e-4, -1e-3])
+def test_nonlinearity(share):
+    """Analytic: none at the ends, all of it in the middle of the range; codes never fall."""
+    law, straight = LinearLaw(1e-15, -8000, 8000, nonlinearity=share), LinearLaw(1e-15, -8000, 8000)
+    at = np.array([-8e-12, -4e-12, 0.0, 4e-12, 8e-12, 9e-12])
+    expected = share * 16000 * np.array([0.0, 0.75, 1.0, 0.75, 0.0, 0.0])
+    assert law.level(at) - straight.level(at) == pytest.approx(expected, abs=1e-9)
+    line = np.linspace(-9e-12, 9e-12, 5000)
+    assert (np.diff(law.level(line)) > 0).all()
+    assert np.abs(law.level(line) - straight.level(line)).max() == near(
+        abs(share) * 16000, rel=1e-3
+    )
+    assert (law.capacitance(np.arange(9)) == straight.capacitance(np.arange(9))).all()
+
+
 def test_reciprocal_law():
     """Analytic: 1024 I T/(C V_dd); the resolution of a code is C/code."""
     c = 5e-12
@@ -164,6 +179,7 @@ def test_dac_follows_both_ways_to_its_ends():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: LinearLaw(1e-15, 0, 9, nonlinearity=0.2), "nonlinearity is 0.2; give a share"),
         (lambda: LinearLaw(0.0, 0, 1), "lsb is 0.0"),
         (lambda: LinearLaw(1e-15, 5, 5), "codes run from 5 to 5"),
         (lambda: ReciprocalLaw(-1e-6, 1e-6, 3.3), "current is -1e-06"),

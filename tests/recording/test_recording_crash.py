@@ -111,6 +111,36 @@ def test_a_full_disk(tmp_path: Path) -> None:
     assert cs.replay(recording).same
 
 
+COMMAND = """
+import resource, signal, sys
+from capsense.cli.main import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, resource.RLIM_INFINITY))
+sys.exit(main(["record", {scenario!r}, "-o", {path!r}, "-q"]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no limits of that kind")
+@pytest.mark.parametrize("room", [5000, 40_000, 90_000])
+def test_a_command_on_a_full_disk(tmp_path: Path, room: int) -> None:
+    """It ends with its message, not with a trace, and what fits can be read."""
+    path = tmp_path / "full.mcap"
+    scenario = Path(__file__).parents[2] / "examples" / "hand_approach.toml"
+    script = COMMAND.format(room=room, scenario=str(scenario), path=str(path))
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 1
+    assert "File too large; the file holds what was recorded" in done.stderr
+    assert "Traceback" not in done.stderr
+    if room > 5000:  # the beginning fits
+        assert path.stat().st_size > 0.7 * room
+        recording = cs.open_recording(path)
+        steps = list(recording.steps())
+        assert 30 < len(steps) < 282
+        assert cs.replay(recording).same
+
+
 def test_every_length_can_be_read(recorded: Recorded, tmp_path: Path) -> None:
     """Cut anywhere: no recording at all if the beginning is gone, else the first n steps."""
     content = recorded[0].read_bytes()

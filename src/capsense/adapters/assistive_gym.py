@@ -107,7 +107,7 @@ def attach(
         )  # fmt: skip
 
     sensor = AssistiveGymSensor(env, simulator, attach_now)
-    sensor.use_readout(readout)
+    sensor.use_readout(sensor.readout if readout is None else readout)
     return sensor
 
 

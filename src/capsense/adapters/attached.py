@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._crew import OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import ReadOutError, SceneError
-from capsense.readout.config import choose_readout
+from capsense.errors import SceneError
+from capsense.reading import Reading
 from capsense.readout.read_out import ReadOut
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator, make_readout
 
 Array = NDArray[np.float64]
 
@@ -26,14 +27,16 @@ Array = NDArray[np.float64]
 class AttachedSensor(ABC):
     """Reads a sensor that rides on a link of a simulated robot.
 
-    Made by the ``attach`` of an adapter.
+    Made by the ``attach`` of an adapter. Threads may share one: they take turns.
     """
 
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         """The sensor itself."""
-        self.readout: ReadOut | None = None
-        """The chip that turns capacitances into counts, if any."""
+        self.readout: ReadOut | None = simulator.readout
+        """The chip that turns capacitances into counts, if any; a simulator's own is taken over."""
+        simulator.use_readout(None)
+        self._one = OneAtATime()
 
     def read(self, time: float | None = None, view: Scene | DepthFrame | None = None) -> Reading:
         """The reading of the simulator's present state.
@@ -52,12 +55,13 @@ class AttachedSensor(ABC):
             SolveError: The solver did not reach its tolerance.
             ReadOutError: Time went back; call :meth:`reset` when the simulator is set back.
         """
-        world = self.view() if view is None else view
-        if self.readout is None:
-            return self.simulator.step(world)
-        now = self._time() if time is None else float(time)
-        reading = self.simulator.step(world)
-        return replace(reading, counts=self.readout.sample(now, reading))
+        with self._one:
+            world = self.view() if view is None else view
+            if self.readout is None:
+                return self.simulator.step(world)
+            now = self._time() if time is None else float(time)
+            reading = self.simulator.step(world)
+            return replace(reading, counts=self.readout.sample(now, reading))
 
     def use_readout(self, readout: ReadOut | str | Path | None) -> None:
         """Read through a chip from now on: it starts at the simulator's time, or at 0 s.
@@ -142,8 +146,9 @@ class AttachedSensor(ABC):
         Raises:
             ReadOutError: The seed is no whole number from 0 on.
         """
-        self.simulator.reset()
-        self._restart_readout(seed)
+        with self._one:
+            self.simulator.reset()
+            self._restart_readout(seed)
 
 
 class DepthSensor(AttachedSensor):
@@ -225,8 +230,9 @@ class GeometrySensor(AttachedSensor):
         Raises:
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
-        frames = self._now(links)  # may take over another world
-        return self.world.scene(frames)
+        with self._one:
+            frames = self._now(links)  # may take over another world
+            return self.world.scene(frames)
 
     @property
     def pose(self) -> Pose:
@@ -278,21 +284,6 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
         FieldError: The background field could not be built.
     """
     return design if isinstance(design, Simulator) else Simulator(design)
-
-
-def make_readout(readout: ReadOut | str | Path | None, simulator: Simulator) -> ReadOut | None:
-    """The read-out given, or that of a chip or a file for a simulator's electrodes.
-
-    Raises:
-        ReadOutError: There is no such chip or file, or the file is wrong.
-    """
-    if readout is None or isinstance(readout, ReadOut):
-        return readout
-    if not isinstance(readout, str | Path):
-        raise ReadOutError(f"readout is {readout!r}; give a chip's name, a file, or a ReadOut")
-    empty = simulator.step(Scene())
-    simulator.reset()
-    return choose_readout(readout, simulator.electrode_names, empty)
 
 
 def check_world(

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from capsense.adapters.attached import check_image, make_readout, make_simulator
+from capsense.adapters.attached import check_image, make_simulator
 from capsense.adapters.coppeliasim_calls import Remote, translated
 from capsense.adapters.coppeliasim_vision import (
     CoppeliaSensor,
@@ -23,7 +23,7 @@ from capsense.errors import MissingDependencyError, SceneError, SimulatorError
 from capsense.readout.read_out import ReadOut
 from capsense.scene import Material, Pose
 from capsense.scene.body import Grounding, checked_grounding
-from capsense.simulator import Simulator
+from capsense.simulator import Simulator, make_readout
 
 __all__ = ["CoppeliaSensor", "attach", "connect", "running"]
 
@@ -209,7 +209,7 @@ def attach(
         eye = make_eye(remote, handle, pose, size, far, pixels, paint.collection)
         material = None  # the colours say it
     sensor = CoppeliaSensor(remote, eye, simulator, grounding, back, paint, material)
-    sensor.use_readout(chip)
+    sensor.use_readout(sensor.readout if readout is None else chip)
     return sensor
 
 

@@ -118,14 +118,14 @@ def attach(
             model, data, number, eye, make_simulator(design), default_material,
             checked_grounding(default_grounding), back,
         )  # fmt: skip
-        sensor.use_readout(readout)
+        sensor.use_readout(sensor.readout if readout is None else readout)
         return sensor
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
     )
     source = ModelSource(model, data, rules, groups)
     sensor = MujocoSensor(source, number, make_simulator(design), exclude_own=exclude_own)
-    sensor.use_readout(readout)
+    sensor.use_readout(sensor.readout if readout is None else readout)
     return sensor
 
 

@@ -128,11 +128,11 @@ def attach(
             number, body, index, pose_in_link, simulator, rules,
             exclude_own=exclude_own, size=size, resolution=resolution, back=back,
         )  # fmt: skip
-        sensor.use_readout(readout)
+        sensor.use_readout(sensor.readout if readout is None else readout)
         return sensor
     source = ClientSource(number, rules, shapes)
     sensor = PybulletSensor(source, body, index, pose_in_link, simulator, exclude_own=exclude_own)
-    sensor.use_readout(readout)
+    sensor.use_readout(sensor.readout if readout is None else readout)
     return sensor
 
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from capsense._crew import Crew
+from capsense._crew import Crew, OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
 from capsense.errors import ReadOutError, SceneError
+from capsense.reading import Reading
 from capsense.readout.read_out import SEED_STRIDE, ReadOut
 from capsense.scene import Pose
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 from capsense.skin import AnyDesign, make_simulators, read_all
 
 
 class AttachedSkin:
     """Reads sensors that ride on links of a simulated robot; made by an adapter's ``attach_skin``.
+
+    Threads may share one: they take turns.
 
     Args:
         sensors: Name → sensor; they share one source of their world.
@@ -39,7 +42,7 @@ class AttachedSkin:
         self.sensors = dict(sensors)
         """The sensors, as ``attach`` makes them."""
         self._source = next(iter(self.sensors.values())).source
-        self._crew = Crew(threads)
+        self._crew, self._one = Crew(threads), OneAtATime()
         for sensor in self.sensors.values():
             sensor.use_readout(readout)
         first = next(iter(self.sensors.values())).readout
@@ -59,14 +62,15 @@ class AttachedSkin:
             SkinError: Some sensors failed; it holds the readings of the others.
             SceneError: A pattern fits nothing any more, after bodies were added or removed.
         """
-        links = self._source.links()
-        for sensor in self.sensors.values():
-            sensor.catch_up()
 
         def task(sensor: GeometrySensor) -> Callable[[], Reading]:
             return lambda: sensor.read(time, sensor.scene(links))
 
-        return read_all(self._crew, {name: task(sensor) for name, sensor in self.sensors.items()})
+        with self._one:
+            links = self._source.links()
+            for sensor in self.sensors.values():
+                sensor.catch_up()
+            return read_all(self._crew, {name: task(s) for name, s in self.sensors.items()})
 
     @property
     def poses(self) -> dict[str, Pose]:
@@ -83,9 +87,10 @@ class AttachedSkin:
         Raises:
             SceneError: A shape is not supported, or a name pattern fits nothing.
         """
-        self._source.refresh()
-        for sensor in self.sensors.values():
-            sensor.catch_up()
+        with self._one:
+            self._source.refresh()
+            for sensor in self.sensors.values():
+                sensor.catch_up()
 
     def reset(self, seed: int | None = None) -> None:
         """Forget the previous step, as after the simulator was set back; restart read-outs.
@@ -97,8 +102,9 @@ class AttachedSkin:
         Raises:
             ReadOutError: The seed is no whole number from 0 on.
         """
-        for number, sensor in enumerate(self.sensors.values()):
-            sensor.reset(None if seed is None else seed + number * SEED_STRIDE)
+        with self._one:
+            for number, sensor in enumerate(self.sensors.values()):
+                sensor.reset(None if seed is None else seed + number * SEED_STRIDE)
 
     def __len__(self) -> int:
         return len(self.sensors)

@@ -87,8 +87,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         The exit code, see :data:`EXIT_CODES`.
     """
+    from capsense.cli.interrupt import Interrupt
+
     args = build_parser().parse_args(argv)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), Interrupt():
         warnings.showwarning = _show_warning
         try:
             return args.execute(args)

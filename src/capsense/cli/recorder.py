@@ -17,7 +17,7 @@ from capsense.recording.versions import versions
 from capsense.scenario import Channel, Sample, Scenario
 
 if TYPE_CHECKING:
-    from capsense.simulator import Reading
+    from capsense.reading import Reading
 
 Array = NDArray[np.float64]
 

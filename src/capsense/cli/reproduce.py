@@ -48,7 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the studies, write each as it is done, and return the exit code."""
-    from capsense.cli.interrupt import Interrupt
     from capsense.cli.main import OK, TARGET_MISSED, say
     from capsense.reproduce.registry import STUDIES, load_study
 
@@ -56,13 +55,12 @@ def execute(args: argparse.Namespace) -> int:
     studies = {name: load_study(name) for name in names}
     folders = {name: _prepared(args.output / name) for name in names}
     missed = 0
-    with Interrupt():
-        for name, study in studies.items():
-            try:
-                missed += _carry_out(name, study, folders[name], reduced=args.reduced)
-            except KeyboardInterrupt:
-                say(f"{name}: what was computed is kept in {folders[name]}; run it again to go on")
-                raise
+    for name, study in studies.items():
+        try:
+            missed += _carry_out(name, study, folders[name], reduced=args.reduced)
+        except KeyboardInterrupt:
+            say(f"{name}: what was computed is kept in {folders[name]}; run it again to go on")
+            raise
     if missed:
         say(f"{missed} of the figures missed their target")
     return TARGET_MISSED if missed else OK

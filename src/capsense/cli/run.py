@@ -203,7 +203,7 @@ def report(summary: dict[str, Any], folder: Path) -> str:
         times = [f"{name} {seconds(step[key])}" for name, key in _STEP_TIMES]
         lines.append(("step time", ", ".join(times)))
         error = summary["largest_error_estimate_F"]
-        lines.append(("error", f"at most {error:.2g} F estimated"))
+        lines.append(("error", f"{error:.2g} F, the largest of the estimates"))
     blocks = [facts(lines)]
     channels = summary["channels"]
     if step is not None:

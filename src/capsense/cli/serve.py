@@ -72,7 +72,6 @@ def execute(args: argparse.Namespace) -> int:
     """Serve until told to stop, and return the exit code."""
     import asyncio
 
-    from capsense.cli.interrupt import Interrupt
     from capsense.cli.main import OK
     from capsense.cli.progress import BuildProgress
     from capsense.server.options import Options
@@ -83,7 +82,7 @@ def execute(args: argparse.Namespace) -> int:
         tuple(args.origin), _limits(args), args.watch,
     )  # fmt: skip
     logger = _logger(quiet=args.quiet)
-    with Interrupt(), BuildProgress(shown=not args.quiet and sys.stderr.isatty()) as progress:
+    with BuildProgress(shown=not args.quiet and sys.stderr.isatty()) as progress:
         server = Server(options, progress=progress, logger=logger)
     sys.setswitchinterval(SWITCH_INTERVAL)
     asyncio.run(_run(server))

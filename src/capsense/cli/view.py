@@ -60,29 +60,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Show it until told to stop, and return the exit code."""
-    from capsense.cli.interrupt import Interrupt
     from capsense.cli.main import OK
     from capsense.viewer.view import View, check_address
 
     _check(args)
     check_address(args.host, args.port)
-    with Interrupt():
-        player = _player(args)
+    player = _player(args)
+    try:
+        view = View(player, host=args.host, port=args.port)
         try:
-            view = View(player, host=args.host, port=args.port)
-            try:
-                _announce(view, args)
-                if args.paused:
-                    player.pause()
-                else:
-                    player.play()
-                view.run(threading.Event())
-            except KeyboardInterrupt:  # its proper end
-                pass
-            finally:
-                view.stop()
+            _announce(view, args)
+            if args.paused:
+                player.pause()
+            else:
+                player.play()
+            view.run(threading.Event())
+        except KeyboardInterrupt:  # its proper end
+            pass
         finally:
-            player.stop()
+            view.stop()
+    finally:
+        player.stop()
     return OK
 
 

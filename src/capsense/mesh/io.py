@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
-from xml.etree.ElementTree import ParseError
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import MeshError, MissingDependencyError
+from capsense.mesh.mat_reader import parse_mat
 from capsense.mesh.msh_reader import parse_msh
 from capsense.mesh.msh_writer import MshVersion, write_msh
 from capsense.mesh.tetmesh import GROUND, IntArray, TetMesh
@@ -61,7 +61,13 @@ def load_mesh(path: str | Path, unit: Unit | None = None) -> TetMesh:
     if not path.is_file():
         raise MeshError(f"there is no mesh file {path}")
     load = {".msh": _load_msh, ".vtu": _load_vtu, ".mat": _load_mat}[suffix]
-    return load(path, scale)
+    try:
+        return load(path, scale)
+    except MissingDependencyError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever readers of others make of damage
+        why = str(error) or repr(error)
+        raise MeshError(f"{path} is not a readable {suffix} file: {why}") from error
 
 
 def save_mesh(
@@ -152,34 +158,28 @@ def _compact(
 
 
 def _load_msh(path: Path, scale: float) -> TetMesh:
-    try:
-        data = parse_msh(path.read_bytes())
-    except (MeshError, ValueError, IndexError, OverflowError, OSError) as error:
-        raise MeshError(f"{path} is not a readable .msh file: {error}") from error
+    data = parse_msh(path.read_bytes())
     if len(data.tets) == 0:
-        raise MeshError(f"{path} holds no tetrahedra")
+        raise MeshError("it holds no tetrahedra")
     return _compact(data.points * scale, data.tets, data.nodes, data.cells)
 
 
-def _tetrahedra(data: Any, path: Path) -> NDArray[np.integer]:
+def _tetrahedra(data: Any) -> NDArray[np.integer]:
     counts = Counter({block.type: len(block.data) for block in data.cells})
     if others := {kind: n for kind, n in counts.items() if kind in _OTHER_SOLIDS}:
-        raise MeshError(f"{path} holds solids that are not tetrahedra: {others}")
+        raise MeshError(f"it holds solids that are not tetrahedra: {others}")
     blocks = [block.data[:, :4] for block in data.cells if block.type in _TETRAHEDRA]
     if not blocks:
-        raise MeshError(f"{path} holds no tetrahedra (it holds: {', '.join(counts) or 'nothing'})")
+        raise MeshError(f"it holds no tetrahedra (it holds: {', '.join(counts) or 'nothing'})")
     return np.concatenate(blocks)
 
 
 def _load_vtu(path: Path, scale: float) -> TetMesh:
     meshio = _meshio()
-    try:
-        data = meshio.read(path)
-    except (meshio.ReadError, ParseError, ValueError, KeyError, IndexError, OSError) as error:
-        raise MeshError(f"{path} is not a readable .vtu file: {error}") from error
-    except SystemExit as error:  # meshio leaves the interpreter on some malformed files
-        raise MeshError(f"{path} is not a readable .vtu file") from error
-    tets = _tetrahedra(data, path)
+    if b"vtkLZMADataCompressor" in path.read_bytes():
+        raise MeshError("it is compressed by LZMA, to a size that nothing tells; save it by zlib")
+    data = meshio.read(path)
+    tets = _tetrahedra(data)
     kept = [i for i, block in enumerate(data.cells) if block.type in _TETRAHEDRA]
     return _compact(
         np.asarray(data.points, dtype=float) * scale,
@@ -231,32 +231,26 @@ def _save_vtu(
 
 
 def _load_mat(path: Path, scale: float) -> TetMesh:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        data = loadmat(path)
-    except (MatReadError, ValueError, TypeError, NotImplementedError, OSError) as error:
-        raise MeshError(f"{path} is not a readable .mat file: {error}") from error
+    data: dict[str, Any] = parse_mat(path.read_bytes())
     needed = ("node", "inzid", "AllNodes", "elecNodes")
     if missing := [name for name in needed if name not in data]:
-        raise MeshError(f"{path} lacks the variables {', '.join(missing)}")
+        raise MeshError(f"it lacks the variables {', '.join(missing)}")
     points = np.asarray(data["node"], dtype=float)
     tets = _zero_based(data["inzid"])
     if tets.ndim != 2 or tets.shape[1] != 4 or points.ndim != 2 or points.shape[1] != 3:
-        raise MeshError(f"{path}: inzid must have shape (k, 4) and node (n, 3)")
+        raise MeshError("inzid must have shape (k, 4) and node (n, 3)")
     for name, count in (("NrElements", len(tets)), ("NrNodes", len(points))):
         if name in data and int(data[name].ravel()[0]) != count:
-            raise MeshError(f"{path}: {name} says {data[name].ravel()[0]}, but there are {count}")
+            raise MeshError(f"{name} says {data[name].ravel()[0]}, but there are {count}")
     electrodes = {
         f"E{number}": _zero_based(members).ravel()
-        for number, members in enumerate(data["elecNodes"].ravel(), start=1)
+        for number, members in enumerate(data["elecNodes"], start=1)
     }
     driven = np.concatenate([np.empty(0, np.int64), *electrodes.values()])
     nodes = {GROUND: np.setdiff1d(_zero_based(data["AllNodes"]).ravel(), driven), **electrodes}
     for name, members in nodes.items():
         if members.size and (members.min() < 0 or members.max() >= len(points)):
-            raise MeshError(f"{path}: nodes of {name} outside 1…{len(points)}")
+            raise MeshError(f"nodes of {name} outside 1…{len(points)}")
     return _compact(points * scale, tets, nodes, {})
 
 

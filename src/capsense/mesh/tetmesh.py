@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,6 +93,10 @@ class TetMesh:
         object.__setattr__(self, "tets", tets)
         object.__setattr__(self, "node_groups", MappingProxyType(node_groups))
         object.__setattr__(self, "cell_groups", MappingProxyType(cell_groups))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        groups = dict(self.node_groups), dict(self.cell_groups)
+        return TetMesh, (self.points, self.tets, *groups)
 
     @property
     def n_points(self) -> int:

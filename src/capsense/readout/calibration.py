@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,9 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsense.errors import ReadOutError
-from capsense.readout.checks import Array, Ints, finite, per_channel, require
+from capsense.readout.checks import Array, Bools, Ints, finite, per_channel, require
 from capsense.readout.noise import Flicker
 from capsense.readout.stage import Context, Process
+
+_EXCESS = 2.0
+"""Residuals that are so many times what noise explains are in doubt; of few samples, more."""
+_OF_NORMAL = 1.4826**2
+"""Variance of normal noise over the square of its median absolute deviation."""
+_SMALL = 1e-3
+"""Not where they are less than this part of what the channel changed by."""
 
 
 def base_capacitance(values: ArrayLike) -> Array:
@@ -176,10 +184,17 @@ class Calibration(LinearSensor):
 
     covariance: Array
     """Of (gain, offset, drift) of each channel, shape (K, 3, 3); zero where drift is not fitted."""
+    residuals: Array
+    """Measured values less the fit [F], NaN for samples that were left out, shape (n, K)."""
     residual: Array
     """Standard deviation about the fit [F], shape (K,)."""
-    samples: int
-    """Number of samples fitted."""
+    samples: Ints
+    """Number of samples fitted, shape (K,)."""
+    excess: Array
+    """``residual`` over what the noise of most samples, or between neighbours, and the floor
+    explain, shape (K,): about 1 where the model holds."""
+    doubtful: Bools
+    """Whether it is so large that a channel's figures are not to be believed, shape (K,)."""
 
     @property
     def uncertainty(self) -> Array:
@@ -187,9 +202,13 @@ class Calibration(LinearSensor):
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
+class CalibrationWarning(UserWarning):
+    """A sensor does not measure as the fit says."""
+
+
 def calibrate(
-    true: ArrayLike, measured: ArrayLike, time: ArrayLike | None = None, *, drift: bool = True,
-    floor: float = 0.0,
+    true: ArrayLike, measured: ArrayLike, time: ArrayLike | None = None, *,
+    flags: ArrayLike | None = None, drift: bool = True, floor: float = 0.0,
 ) -> Calibration:  # fmt: skip
     """Fit gain, offset and drift of each channel to a recording with known poses.
 
@@ -198,8 +217,11 @@ def calibrate(
     is: with flicker they come out several times too small, that of the drift most. With the floor
     of the sensor's Allan plot, taken at rest, uncertainties hold for white noise and flicker
     together, ``A (s² + Σ) Aᵀ`` with A = (XᵀX)⁻¹Xᵀ, Σ being the covariance of
-    :class:`~capsense.readout.noise.Flicker` at the samples' times. Leave out samples that were out
-    of the converter's range.
+    :class:`~capsense.readout.noise.Flicker` at the samples' times.
+
+    Where residuals are much larger than neighbouring samples differ, in time or in the order of
+    their true values, or than most of them are, the sensor is not linear, or was out of its range,
+    or somewhere else: the channel is ``doubtful``, and a :class:`CalibrationWarning` says so.
 
     Args:
         true: Capacitances that the simulator gives at the poses and times of the recording [F],
@@ -207,6 +229,8 @@ def calibrate(
         measured: What the sensor reported [F], shape (n, K).
         time: Times of the samples [s], shape (n,), or (n, K) where channels have instants of their
             own; needed for drift.
+        flags: Samples to leave out, such as ``counts.table("flags")[1]``, which tells those that
+            were out of the converter's range: any number but 0, shape (n, K).
         drift: Whether to fit a drift that is linear in time.
         floor: Allan deviation of the flicker floor [F]; needs times that rise.
 
@@ -222,20 +246,69 @@ def calibrate(
     t = _times(time, n, k, drift or floor > 0)
     if floor > 0 and (np.diff(t, axis=0) <= 0).any():
         raise ReadOutError("with a floor, times must rise; sort the samples")
-    unknowns = 3 if drift else 2
-    if n <= unknowns:
-        raise ReadOutError(f"{n} samples for {unknowns} unknowns a channel; record more")
+    unknowns, kept = 3 if drift else 2, _kept(flags, c)
     epoch = float(t.mean())
-    figures = np.zeros((k, 3))
-    covariance = np.zeros((k, 3, 3))
-    residual = np.zeros(k)
+    figures, covariance = np.zeros((k, 3)), np.zeros((k, 3, 3))
+    residuals, excess = np.full((n, k), np.nan), np.zeros(k)
     for channel in range(k):
-        at = t[:, channel]
-        columns = [c[:, channel], np.ones(n), at - epoch][:unknowns]
-        fit = _least_squares(np.stack(columns, axis=1), m[:, channel], channel, at, floor)
+        used = kept[:, channel]
+        at, x, y = (values[used, channel] for values in (t, c, m))
+        if len(at) <= unknowns:
+            raise ReadOutError(
+                f"channel {channel}: {len(at)} samples for {unknowns} unknowns; record more"
+            )
+        columns = np.stack([x, np.ones(len(at)), at - epoch][:unknowns], axis=1)
+        fit = _least_squares(columns, y, channel, at, floor)
         figures[channel, :unknowns], covariance[channel, :unknowns, :unknowns] = fit[:2]
-        residual[channel] = fit[2]
-    return Calibration(figures[:, 0], figures[:, 1], figures[:, 2], epoch, covariance, residual, n)
+        residuals[used, channel] = rest = y - columns @ fit[0]
+        excess[channel] = _excess(rest, x, at, fit[2])
+    samples = kept.sum(axis=0)
+    residual = np.sqrt(np.nansum(residuals**2, axis=0) / (samples - unknowns))
+    doubtful = (excess > _EXCESS * (1 + 8 / np.sqrt(samples))) & (
+        residual > _SMALL * np.nanstd(np.where(kept, m, np.nan), axis=0)
+    )
+    _warn(excess, doubtful)
+    return Calibration(
+        figures[:, 0], figures[:, 1], figures[:, 2], epoch, covariance, residuals, residual,
+        samples, excess, doubtful,
+    )  # fmt: skip
+
+
+def _kept(flags: ArrayLike | None, values: Array) -> Bools:
+    """Samples that are not flagged, shape (n, K)."""
+    if flags is None:
+        return np.ones(values.shape, np.bool_)
+    given = np.asarray(flags)
+    if given.shape != values.shape:
+        raise ReadOutError(
+            f"flags have shape {given.shape}, measured {values.shape}; make them one"
+        )
+    return given == 0
+
+
+def _excess(residuals: Array, true: Array, time: Array, slow: float) -> float:
+    """Residuals over what noise explains: see :attr:`Calibration.excess`.
+
+    Args:
+        residuals, true, time: Of a channel, shape (n,).
+        slow: Sum of the residuals' squares that the floor explains [F²].
+    """
+    orders = np.lexsort((true, time)), np.lexsort((time, true))
+    white = [0.5 * float((np.diff(residuals[order]) ** 2).mean()) for order in orders]
+    white.append(_OF_NORMAL * float(np.median(np.abs(residuals - np.median(residuals)))) ** 2)
+    explained = min(white) * len(residuals) + slow
+    return math.sqrt(float(residuals @ residuals) / explained) if explained > 0 else 0.0
+
+
+def _warn(excess: Array, doubtful: Bools) -> None:
+    for channel in np.flatnonzero(doubtful).tolist():
+        warnings.warn(
+            f"channel {channel}: residuals are {excess[channel]:.1f} times as large as noise "
+            "explains, so gain, offset and their uncertainties are not to be believed; leave out "
+            "samples out of range (flags=), check poses and times, or give the flicker's floor",
+            CalibrationWarning,
+            stacklevel=3,
+        )
 
 
 def _times(time: ArrayLike | None, count: int, channels: int, needed: bool) -> Array:
@@ -256,7 +329,7 @@ def _times(time: ArrayLike | None, count: int, channels: int, needed: bool) -> A
 def _least_squares(
     design: Array, seen: Array, channel: int, time: Array, floor: float
 ) -> tuple[Array, Array, float]:
-    """Figures, their covariance and the residual's deviation, in columns scaled to one."""
+    """Figures, their covariance, and squares of residuals that flicker explains [F²]."""
     scale = np.sqrt((design**2).mean(axis=0))
     # A column that is a constant, or a multiple of another one, tells nothing of its own.
     if (scale == 0).any() or np.linalg.cond(design / np.where(scale > 0, scale, 1.0)) > 1e6:
@@ -277,7 +350,7 @@ def _least_squares(
     # The residuals hold the white noise, and what of the flicker the fit did not follow.
     white = max(0.0, squares - total + float(np.trace(slow))) / (n - p)
     covariance = root @ (white * np.eye(p) + slow) @ root.T / np.outer(scale, scale)
-    return figures / scale, covariance, math.sqrt(squares / (n - p))
+    return figures / scale, covariance, total - float(np.trace(slow))
 
 
 def _flicker_covariance(columns: Array, time: Array, floor: float) -> tuple[Array, float]:

@@ -12,6 +12,7 @@ from capsense.errors import ReadOutError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 def require(

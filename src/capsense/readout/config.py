@@ -23,6 +23,7 @@ from capsense.readout.wiring import Wiring
 TOP_KEYS = (
     "chip", "rate", "period", "latency", "seed", "random", "expected", "capdac", "mode", "pairs",
     "rest", "channel", "tank", "front_end", "wiring", "noise", "climate", "detector", "calibration",
+    "nonlinearity",
 )  # fmt: skip
 
 
@@ -103,7 +104,7 @@ def parse_readout(
     options: dict[str, Any] = {"patterns": _patterns(top, chip.mode, electrodes)}
     limits = {
         "rate": (1e-3, 1e7, "Hz"), "period": (1e-6, 1e6, "s"), "latency": (0.0, 1e3, "s"),
-        "expected": (1e-15, 1e-6, "F"),
+        "expected": (1e-15, 1e-6, "F"), "nonlinearity": (-0.1, 0.1, ""),
     }  # fmt: skip
     options.update(_given(top, limits))
     if "capdac" in top:

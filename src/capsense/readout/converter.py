@@ -10,12 +10,17 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._validate import as_number
 from capsense.errors import ReadOutError
 from capsense.readout.checks import Array, Ints, require, require_whole
 from capsense.readout.front_end import ShuntFrontEnd
 from capsense.readout.stage import rounds
 
 Flags = NDArray[np.uint8]
+
+
+_MOST_CURVED = 0.1
+"""Larger deviations from a straight line are refused; beyond 0.25 codes would fall again."""
 
 
 class Range(IntFlag):
@@ -60,15 +65,27 @@ class LinearLaw:
     high: int
     zero: int = 0
     """Code at 0 F."""
+    nonlinearity: float = 0.0
+    """Largest deviation of the codes from the straight line through the ends of their range, over
+    the range: a parabola, up where it is positive. Its user does not know of it."""
     rising = True
 
     def __post_init__(self) -> None:
         require("linear law", "lsb", self.lsb, 0.0, "F", open_=True)
         _require_codes(self.low, self.high)
+        if not abs(as_number(self.nonlinearity)) <= _MOST_CURVED:
+            raise ReadOutError(
+                f"linear law: nonlinearity is {self.nonlinearity!r}; give a share of the range, up "
+                f"to {_MOST_CURVED} of it"
+            )
 
     def level(self, capacitance: Array) -> Array:
         """Code before rounding."""
-        return capacitance / self.lsb + self.zero
+        code = capacitance / self.lsb + self.zero
+        if not self.nonlinearity:
+            return code
+        share = np.clip((code - self.low) / (self.high - self.low), 0.0, 1.0)
+        return code + 4.0 * self.nonlinearity * (self.high - self.low) * share * (1.0 - share)
 
     def capacitance(self, code: Ints) -> Array:
         """Capacitance of a code [F]."""

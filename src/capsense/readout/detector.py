@@ -12,14 +12,11 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capsense._validate import as_number
 from capsense.errors import ReadOutError
-from capsense.readout.checks import Array, Ints, require, require_whole
+from capsense.readout.checks import Array, Bools, Ints, require, require_whole
 from capsense.readout.stage import rounds
-
-Bools = NDArray[np.bool_]
 
 
 class TrackerProcess(Protocol):

@@ -15,7 +15,7 @@ from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, sel
 from capsense.readout.checks import Array, require
 from capsense.readout.chip import Chip
 from capsense.readout.chips import CHIPS, MPR121_CURRENTS, MPR121_SUPPLY, MPR121_TIMES
-from capsense.readout.converter import CapDac, Law, ReciprocalLaw, ShuntLaw
+from capsense.readout.converter import CapDac, Law, LinearLaw, ReciprocalLaw, ShuntLaw
 from capsense.readout.detector import Detector
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.read_out import ReadOut
@@ -73,6 +73,9 @@ class Options:
     """Offset DAC at the start; by default the step nearest to each channel's first sample."""
     law: Law | None = None
     """The converter's law, instead of the chip's: another tank, another front end."""
+    nonlinearity: float = 0.0
+    """Deviation from a straight line over the range, see :class:`LinearLaw`; those that data
+    sheets state are among a chip's facts."""
     stages: Sequence[Stage] = ()
     """Further analogue stages, before the chip's noise."""
     detector: Detector | None = None
@@ -177,6 +180,13 @@ def law_of(chip: Chip, options: Options, channels: int) -> Law:
     to ground, their mean: there is one front end for all.
     """
     law = options.law or chip.law
+    if options.nonlinearity:
+        if not isinstance(law, LinearLaw):
+            raise ReadOutError(
+                f"nonlinearity is {options.nonlinearity!r}, but the law of the {chip.name} is "
+                "curved by itself; leave it out"
+            )
+        return dataclasses.replace(law, nonlinearity=options.nonlinearity)
     if isinstance(law, ShuntLaw) and options.wiring is not None:
         load = law.front_end.parasitic + float(options.wiring.ground(channels).mean())
         loaded = dataclasses.replace(law.front_end, parasitic=load)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from capsense.errors import ReadOutError
 from capsense.readout.channels import ChannelBank, Pattern
 from capsense.readout.checks import Array
+
+_MOST = 4_000_000_000
+"""More than this is not unpacked [bytes]: small files may hold very large arrays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +154,10 @@ def _check(recording: Recording) -> None:
 
 def _load_arrays(path: Path) -> Recording:
     try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > _MOST:
+            raise ReadOutError(f"{path} would take up {size:,} bytes of memory; it is damaged")
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         names = tuple(str(n) for n in arrays["electrode_names"])
@@ -170,11 +177,13 @@ def _load_arrays(path: Path) -> Recording:
         columns.update(zip(channels, arrays["channels"].T, strict=True))
         empty.update(zip(channels, arrays["channel_baseline"].tolist(), strict=True))
         return Recording(path, arrays["time"], names, columns, empty)
+    except ReadOutError:
+        raise
     except KeyError as error:
         raise ReadOutError(
             f"{path} is no readings.npz of this version: it lacks {error}; run it again"
         ) from None
-    except (IndexError, ValueError, OSError, BadZipFile, EOFError) as error:
+    except Exception as error:  # zip, inflate and numpy's reader each complain differently
         raise ReadOutError(f"{path} is no readings.npz of capsense run: {error}") from None
 
 

@@ -76,7 +76,7 @@ def design_from_json(text: str | bytes) -> Design:
             build=data["build"],
         )
         whole = design.content_hash() == data["content_hash"]
-    except (KeyError, TypeError, ValueError, shapely.errors.ShapelyError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError, shapely.errors.ShapelyError) as error:
         raise RecordingError(f"the recorded design is damaged: {error!r}") from None
     if not whole:
         raise RecordingError("the recorded design is damaged: its content hash differs")

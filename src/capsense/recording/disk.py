@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from pathlib import Path
 
 from capsense.errors import RecordingError
@@ -33,8 +34,9 @@ def _taken(path: Path) -> RecordingError:
 class Disk:
     """What an MCAP writer takes for a stream.
 
-    Writing only keeps the bytes; :meth:`drain` puts them into the file. If that fails, the file is
-    cut back to what it held before, the bytes are kept, and draining can be tried again.
+    Writing only keeps the bytes; :meth:`drain` puts them into the file. If that fails, the file
+    ends with the last bytes that were written together and fit; the others are kept, and draining
+    can be tried again.
 
     Args:
         path: The file.
@@ -55,7 +57,7 @@ class Disk:
             raise RecordingError(
                 f"{path} cannot be written to: {error.strerror}; give another place"
             ) from None
-        self._pending: list[bytes] = []
+        self._pending: deque[bytes] = deque()
         self._on_disk = 0
         self._end = 0
 
@@ -76,19 +78,18 @@ class Disk:
         """Put what is kept into the file.
 
         Raises:
-            OSError: That failed; the file is as before, and nothing is forgotten.
+            OSError: That failed; the file ends with whole records, and nothing is forgotten.
         """
-        rest = memoryview(b"".join(self._pending))
-        size = len(rest)
-        try:
-            while rest:
-                rest = rest[os.write(self._file, rest) :]
-        except OSError:
-            os.ftruncate(self._file, self._on_disk)
-            os.lseek(self._file, self._on_disk, os.SEEK_SET)
-            raise
-        self._on_disk += size
-        self._pending.clear()
+        while self._pending:
+            rest = memoryview(self._pending[0])
+            try:
+                while rest:
+                    rest = rest[os.write(self._file, rest) :]
+            except OSError:
+                os.ftruncate(self._file, self._on_disk)
+                os.lseek(self._file, self._on_disk, os.SEEK_SET)
+                raise
+            self._on_disk += len(self._pending.popleft())
 
     def close(self) -> None:
         """Close the file; what is still kept is lost."""

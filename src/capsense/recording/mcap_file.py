@@ -12,6 +12,8 @@ from capsense.recording.messages import Messages
 
 FLUSH_EVERY = 0.5
 """Longest time that a message waits before it is written to the file [s]."""
+CHUNK = 65536
+"""Messages are packed together up to so many bytes: a chunk is in the file wholly or not at all."""
 
 
 class McapFile:
@@ -36,7 +38,7 @@ class McapFile:
         self.failure: OSError | None = None
         """Why the file could not be written the last time that was tried, if it failed."""
         self._disk = Disk(path, overwrite=overwrite)
-        self._writer = Writer(self._disk)  # type: ignore[arg-type]
+        self._writer = Writer(self._disk, chunk_size=CHUNK)  # type: ignore[arg-type]
         self._writer.start(profile="ros2", library="capsense")
         self._lock = threading.Lock()
         self._closing = threading.Event()

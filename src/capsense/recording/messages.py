@@ -6,6 +6,7 @@ module. Stored schemas hold the definition and those of all messages in it, as R
 
 from __future__ import annotations
 
+from functools import cache
 from importlib import resources
 from typing import Any
 
@@ -31,16 +32,23 @@ def require() -> None:
         ) from None
 
 
+@cache
+def _store() -> Any:
+    """All types, the standard ones and our own."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name in OWN:
+        text = (resources.files("capsense.recording") / "msg" / f"{name}.msg").read_text()
+        store.register(get_types_from_msg(text, f"{PACKAGE}/{name}"))
+    return store
+
+
 class Messages:
     """Makes, encodes and decodes messages by the names of their types."""
 
     def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
-        for name in OWN:
-            text = (resources.files("capsense.recording") / "msg" / f"{name}.msg").read_text()
-            self._store.register(get_types_from_msg(text, f"{PACKAGE}/{name}"))
+        self._store = _store()
         self._types: dict[str, Any] = self._store.types
 
     def make(self, type_name: str, **fields: Any) -> Any:

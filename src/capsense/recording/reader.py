@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from capsense.errors import RecordingError, SceneError
+from capsense.reading import Reading, StepStats
 from capsense.readout.counts import Counts
 from capsense.recording.design_json import design_from_json
 from capsense.recording.messages import PACKAGE, Messages, require
 from capsense.recording.parts import CHANGING, read_body, read_rest, read_shape
 from capsense.recording.session import DESIGN, NAME, SESSION, Session, read_session, reading_of
 from capsense.scene import Body, Pose, RestSurface, Scene, Shape
-from capsense.simulator import Reading, StepStats
 
 
 @dataclass(frozen=True, eq=False)

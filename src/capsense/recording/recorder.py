@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import errno
+import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 
 from capsense.adapters.attached import AttachedSensor
 from capsense.errors import ReadOutError, RecordingError
+from capsense.reading import Reading
 from capsense.readout.config import file_content, parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.recording.design_json import design_to_json
@@ -24,7 +26,9 @@ from capsense.recording.steps import Moment, StepMessages
 from capsense.scenario.channels import Excitation
 from capsense.scenario.model import Scenario
 from capsense.scene import DepthFrame, Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
+
+_log = logging.getLogger(__name__)
 
 _SECOND = 10**9
 
@@ -68,14 +72,15 @@ class Recorder:
     ) -> None:
         require()
         self.path = Path(path)
+        self._told = False
         self.count = 0
         """Steps recorded so far."""
         self._sensor = source if isinstance(source, AttachedSensor) else None
         self._simulator = source if isinstance(source, Simulator) else source.simulator
         check_name(name)
-        if readout is not None and self._sensor is not None and self._sensor.readout is not None:
+        if readout is not None and source.readout is not None:
             raise ReadOutError("the sensor has a read-out of its own; leave out readout=")
-        empty = self._simulator.step(Scene())
+        empty = self._simulator.empty
         self._readout, config = make_readout(readout, self._simulator.electrode_names, empty)
         self.reset()
         self._live = None if ros_domain is None else LiveTopics(ros_domain)
@@ -93,7 +98,7 @@ class Recorder:
             self._begin(self.session)
         except OSError as error:
             raise self._unwritten(error) from None
-        atexit.register(self._file.close)
+        atexit.register(self._close_late)
 
     def step(self, world: Scene | DepthFrame, time: float) -> Reading:
         """Step the simulator, record, and return the reading.
@@ -110,7 +115,7 @@ class Recorder:
         """
         self._check(time)
         scene = _scene(world)
-        return self._write(time, world, scene, self._simulator.step(scene))
+        return self._write(time, world, scene, self._simulator.step(scene, time=time))
 
     def read(self, time: float | None = None) -> Reading:
         """Read the attached sensor, record, and return the reading.
@@ -199,7 +204,16 @@ class Recorder:
             self._file.close()
         except OSError as error:
             raise self._unwritten(error) from None
-        atexit.unregister(self._file.close)
+        atexit.unregister(self._close_late)
+
+    def _close_late(self) -> None:
+        """Close when the process ends; a failure that nobody was told of goes to the log."""
+        told = self._told
+        try:
+            self.close()
+        except OSError as error:
+            if not told:
+                _log.warning("a recording could not be closed: %s", error)
 
     def __enter__(self) -> Recorder:
         return self
@@ -236,6 +250,7 @@ class Recorder:
         return self._base + now
 
     def _unwritten(self, error: OSError) -> OSError:
+        self._told = True
         why = error.strerror or str(error)
         return OSError(
             error.errno or errno.EIO,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
@@ -12,7 +12,7 @@ from typing import BinaryIO
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import get_chunk_data_stream
 
 from capsense.errors import RecordingError
 
@@ -20,7 +20,16 @@ MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 _CRC = struct.Struct("<I")
 
+_MOST = 256_000_000
+"""Chunks may not be larger [bytes]; a recorder's hold a megabyte, or one larger message."""
+
 Record = Attachment | Channel | Message | Metadata | Schema
+_READERS: dict[int, Callable[[ReadDataStream, int], Record]] = {
+    Opcode.SCHEMA: lambda stream, _: Schema.read(stream),
+    Opcode.CHANNEL: lambda stream, _: Channel.read(stream),
+    Opcode.MESSAGE: Message.read,
+}
+"""What a chunk may hold."""
 
 
 def ends_well(path: Path) -> bool:
@@ -78,10 +87,10 @@ def _next(file: BinaryIO, size: int) -> tuple[int, bytes, int] | None:
     return opcode, file.read(length), place
 
 
-def _parse(opcode: int, content: bytes) -> list[Record]:
+def _parse(opcode: int, content: bytes) -> Iterable[Record]:
     stream = ReadDataStream(BytesIO(content))
     if opcode == Opcode.CHUNK:
-        return breakup_chunk(Chunk.read(stream), validate_crc=True)  # type: ignore[return-value]
+        return _chunk(Chunk.read(stream))
     if opcode == Opcode.ATTACHMENT:
         (expected,) = _CRC.unpack(content[-_CRC.size :])
         if expected and expected != zlib.crc32(content[: -_CRC.size]):
@@ -89,4 +98,28 @@ def _parse(opcode: int, content: bytes) -> list[Record]:
         return [Attachment.read(stream)]
     if opcode == Opcode.METADATA:
         return [Metadata.read(stream)]
-    return []
+    return ()
+
+
+def _chunk(chunk: Chunk) -> Iterator[Record]:
+    """The records of a chunk, of which there are three kinds."""
+    size = _inflated_size(chunk)
+    if size > _MOST:
+        raise ValueError(f"its content would take up {size:,} bytes of memory")
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    while stream.count < size:
+        opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
+        end = stream.count + length
+        if end > size or opcode not in _READERS:
+            raise ValueError(f"a record of kind {opcode} and {length} bytes is in a chunk")
+        yield _READERS[opcode](stream, length)
+        stream.read(end - stream.count)
+
+
+def _inflated_size(chunk: Chunk) -> int:
+    """Size that a chunk's content says it has [bytes]; LZ4 keeps to 255 times the file's."""
+    if chunk.compression != "zstd":
+        return chunk.uncompressed_size
+    import zstandard
+
+    return max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data))

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import RecordingError
+from capsense.reading import Reading
 from capsense.readout.counts import Counts
 from capsense.recording.reader import Recording, open_recording
 from capsense.recording.session import Session, shield_coupling
 from capsense.recording.versions import versions
-from capsense.simulator import Method, Reading
+from capsense.simulator import Method
 
 Array = NDArray[np.float64]
 

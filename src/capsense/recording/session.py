@@ -15,12 +15,13 @@ from capsense.design.model import Design
 from capsense.errors import RecordingError
 from capsense.field.background import BuildSettings
 from capsense.mesh.settings import MeshSettings
+from capsense.reading import Reading, StepStats
 from capsense.readout.config import parse_readout
 from capsense.readout.read_out import ReadOut
 from capsense.recording.versions import versions
 from capsense.scenario.channels import Channel, Excitation, channels_of
 from capsense.scenario.model import METHODS
-from capsense.simulator import Method, PresetName, Reading, Simulator, StepStats
+from capsense.simulator import Method, PresetName, Simulator
 
 Array = NDArray[np.float64]
 
@@ -180,7 +181,7 @@ def read_session(text: bytes, design: Design) -> Session:
             _read_settings(data["settings"]), empty, Excitation(data["excitation"]),
             tuple((a, b) for a, b in data["pairs"]), data["readout"], data["versions"],
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         if isinstance(error, RecordingError):
             raise
         raise RecordingError(f"the recording's settings are damaged: {error!r}") from None

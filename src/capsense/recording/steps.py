@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from capsense.design.model import Design
+from capsense.reading import Reading
 from capsense.readout.counts import Counts
 from capsense.recording.messages import PACKAGE, Messages
 from capsense.recording.parts import CHANGING, body_fields, shape_fields
 from capsense.recording.ros import WORLD, Composer
 from capsense.recording.session import shield_coupling
 from capsense.scene import Body, DepthFrame, Pose, RestSurface, Scene, Shape, SurfaceMesh
-from capsense.simulator import Reading
 
 Topics = list[tuple[str, Any]]
 """Messages in the order in which they are written, each with its topic."""

@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from capsense.simulator import Reading
+    from capsense.reading import Reading
 
 
 class Excitation(StrEnum):

@@ -10,7 +10,8 @@ from capsense.scenario.model import Scenario
 from capsense.scene import Scene
 
 if TYPE_CHECKING:
-    from capsense.simulator import Reading, Simulator
+    from capsense.reading import Reading
+    from capsense.simulator import Simulator
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,7 +93,7 @@ def checked_grounding(grounding: object) -> Grounding:
         raise SceneError(f"grounding is {grounding!r}; {mend}")
     try:
         farads = float(grounding)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f"grounding is {grounding!r}; {mend}") from None
     if not (math.isfinite(farads) and farads > 0):
         raise SceneError(f"grounding is {farads} F, not a positive finite capacitance; {mend}")

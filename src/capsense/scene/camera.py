@@ -50,7 +50,7 @@ class OrthographicCamera:
             value = getattr(self, name)
             try:
                 number = float(value)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 number = math.nan
             if not math.isfinite(number) or number < 0 or (number == 0 and name != "near"):
                 raise SceneError(

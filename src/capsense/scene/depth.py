@@ -222,7 +222,7 @@ class DepthFrame:
 def _checked_depth(depth: ArrayLike) -> Array:
     try:
         d = np.array(depth, dtype=float, order="C")
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError("DepthFrame: depth is not made of numbers; give metres") from None
     if d.ndim not in (2, 3) or not d.size:
         raise SceneError(
@@ -247,7 +247,7 @@ def _checked_eps(eps_r: Any, shape: tuple[int, ...]) -> Array:
                                 else e)  # fmt: skip
     try:
         e = np.ascontiguousarray(e, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f"DepthFrame: eps_r is {eps_r!r}; give numbers or a material") from None
     if e.ndim == 0 or e.size == 1:
         return e.reshape(1, 1, 1)
@@ -275,7 +275,7 @@ def _backs(back: Back, depth: Array) -> Array:
         return np.full(depth.shape, _FILL)
     try:
         b = np.asarray(back, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f'DepthFrame: back is {back!r}; give "fill", metres or depths') from None
     if b.ndim == 0:
         if not (np.isfinite(b) and b > 0):

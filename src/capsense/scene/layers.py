@@ -46,6 +46,8 @@ class Layers(Shape):
     """Depths [m] at which they end, same shape, read-only."""
     size: tuple[float, float]
     """Width and height of the image [m]."""
+    _reach: Array = field(repr=False)
+    """Least and greatest column, row and depth [m] of the intervals, shape (2, 3)."""
 
     kind = ShapeKind.LAYERS
 
@@ -102,7 +104,7 @@ class Layers(Shape):
         return float(np.nansum(depth)) * self.pixel[0] * self.pixel[1]
 
     def bounds(self) -> Array:
-        low, high = self.__dict__["_reach"]
+        low, high = self._reach
         scale = np.array([*self.pixel, 1.0])
         shift = np.array([0.5 * self.size[0], 0.5 * self.size[1], 0.0])
         return np.array([low * scale - shift, high * scale - shift])

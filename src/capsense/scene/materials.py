@@ -50,7 +50,7 @@ class Material:
             value = getattr(self, key)
             try:
                 number = float(value)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 number = math.nan
             if not math.isfinite(number) or number < low:
                 raise SceneError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -88,6 +88,8 @@ class TriMesh(Triangles):
     """Cleaned vertices [m], shape (n, 3), read-only."""
     faces: NDArray[np.int64]
     """Cleaned faces, shape (m, 3), read-only; normals out where the mesh is closed."""
+    _flaw: str = field(repr=False)
+    """Why the mesh has no inside; empty where it has one."""
 
     kind = ShapeKind.MESH
 
@@ -103,7 +105,7 @@ class TriMesh(Triangles):
     @property
     def closed(self) -> bool:
         """Whether the mesh has an inside."""
-        return not self.__dict__["_flaw"]
+        return not self._flaw
 
     @cached_property
     def parts(self) -> int:
@@ -138,7 +140,7 @@ class TriMesh(Triangles):
         return out
 
     def _require_inside(self, what: str) -> None:
-        flaw = self.__dict__["_flaw"]
+        flaw = self._flaw
         if flaw:
             raise SceneError(
                 f"TriMesh: {flaw}, so it has no inside, and no {what}; conductors need none; else "

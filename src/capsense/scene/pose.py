@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
 
 Array = NDArray[np.float64]
@@ -24,7 +25,7 @@ def checked_floats(values: object, count: int, what: str, mend: str) -> tuple[fl
     """Turn ``values`` into ``count`` finite floats, or raise :class:`SceneError`."""
     try:
         out = tuple([float(v) for v in values])  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f"{what} is {values!r}; {mend}") from None
     if len(out) != count:
         raise SceneError(f"{what} has {len(out)} entries; {mend}")
@@ -35,7 +36,7 @@ def checked_floats(values: object, count: int, what: str, mend: str) -> tuple[fl
 
 
 @dataclass(frozen=True, init=False)
-class Pose:
+class Pose(Frozen):
     """A rotation followed by a translation: ``x_sensor = R x_local + position``.
 
     Poses are immutable, hashable and cheap to make, because bodies move at every step.

@@ -101,7 +101,7 @@ def _checked_thickness(thickness: float | None) -> float:
         return 0.0
     try:
         number = float(thickness)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not (np.isfinite(number) and number > 0):
         raise SceneError(
@@ -120,7 +120,7 @@ def _checked_resolution(resolution: object) -> tuple[int, int]:
     try:
         rows, columns = (int(n) for n in resolution)  # type: ignore[attr-defined]
         whole = (rows, columns) == tuple(resolution)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         whole, rows, columns = False, 0, 0
     if not (whole and rows > 0 and columns > 0 and rows * columns <= 4_000_000):
         raise SceneError(
@@ -159,7 +159,7 @@ def checked_vertices(vertices: ArrayLike) -> Array:
     """
     try:
         v = np.array(vertices, dtype=float, order="C")
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError("vertices are not numbers; give shape (n, 3), metres") from None
     if v.ndim != 2 or v.shape[1] != 3:
         raise SceneError(f"vertices have shape {v.shape}; give (n, 3), metres")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class ShapeKind(IntEnum):
     """Half edge lengths of the local bounding box."""
 
 
-class Shape(ABC):
+class Shape(Frozen, ABC):
     """A solid or a surface in its own frame."""
 
     kind: ClassVar[ShapeKind]

@@ -100,7 +100,7 @@ def connected_parts(faces: Faces, n: int) -> Faces:
 def _checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, Faces]:
     try:
         v = np.array(vertices, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError("TriMesh: vertices are not numbers; give shape (n, 3), metres") from None
     f = np.asarray(faces)
     if v.ndim != 2 or v.shape[1] != 3:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
 from capsense.scene.mesh_shape import Triangles
 from capsense.scene.raster import checked_mesh, checked_vertices
@@ -21,7 +22,7 @@ SHEET_THICKNESS = 1e-3
 
 
 @dataclass(frozen=True, init=False, eq=False)
-class RestSurface:
+class RestSurface(Frozen):
     """What a surface keeps while it deforms; shared by the shapes it takes on.
 
     Args:

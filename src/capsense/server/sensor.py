@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ProtocolError, ReadOutError
+from capsense.reading import Reading
 from capsense.readout.counts import Counts
 from capsense.readout.read_out import ReadOut
 from capsense.scene import Body, Scene
@@ -25,7 +26,7 @@ from capsense.server.frames import (
     pack_reading,
 )
 from capsense.server.messages import Bodies, Open, Poses
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 
 MAX_CONVERSIONS = 10_000
 """A step in time that spans more conversions of the read-out than this is refused."""

@@ -21,7 +21,6 @@ from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ProtocolError, ServerError
 from capsense.readout.config import choose_readout, file_content, parse_readout
 from capsense.readout.read_out import SEED_STRIDE, ReadOut
-from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
 from capsense.server.frames import PROTOCOL
 from capsense.server.messages import Open, Watch
@@ -257,7 +256,7 @@ class Server:
         choice = self.options.readout
         if choice is None:
             return None
-        readout = choose_readout(choice, simulator.electrode_names, simulator.step(Scene()))
+        readout = choose_readout(choice, simulator.electrode_names, simulator.empty)
         readout.reset(seed=readout.seed + number * SEED_STRIDE)
         return readout
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from capsense.design import Design
 from capsense.errors import RecordingError
+from capsense.reading import Reading
 from capsense.recording.session import GONE
 from capsense.scenario import Channel, Scenario
 from capsense.scene import Scene
-from capsense.simulator import Reading, Simulator
+from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
     from capsense.field.green import GreenFunction
@@ -104,7 +105,7 @@ class ScenarioSource:
         self.title, self.design = scenario.name, scenario.design
         self.times, self.channels = scenario.times, scenario.channels
         self._scenario, self._simulator = scenario, simulator
-        self.empty = simulator.step(Scene())
+        self.empty = simulator.empty
         self.green = green_of(simulator)
 
     def shot(self, index: int, plane: Plane | None = None) -> Shot:

@@ -17,6 +17,8 @@ from capsense.viewer.stage import Stage
 
 try:
     from viser import ViserServer
+
+    from capsense.viewer.visitors import guarded
 except ImportError as error:
     raise MissingDependencyError(
         'the view needs viser; install it with: pip install "capsense[view]"'
@@ -41,7 +43,7 @@ class View:
     def __init__(self, player: Playback, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         check_address(host, port)
         self._player = player
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's words
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host):  # viser's words
             self._server = _Server(host=host, port=port, verbose=False)
         gui, source = self._server.gui, player.source
         gui.configure_theme(show_logo=False, show_share_button=False)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ProtocolError, ServerError
+from capsense.reading import Reading, StepStats
 from capsense.recording.design_json import design_from_json
 from capsense.recording.session import reading_of
 from capsense.scenario.channels import Excitation, channels_of
@@ -18,7 +19,7 @@ from capsense.scene import Body, DepthFrame, Scene
 from capsense.server.client import Client
 from capsense.server.frames import DepthMessage, ReadingMessage
 from capsense.server.messages import Open, Table, read_open, read_scene
-from capsense.simulator import Reading, Simulator, StepStats
+from capsense.simulator import Simulator
 from capsense.viewer.source import Shot, green_of
 
 if TYPE_CHECKING:

@@ -1,0 +1,63 @@
+"""What a sensor reads at an instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from capsense.readout.counts import Counts
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StepStats:
+    """How a step was solved."""
+
+    error_estimate: float
+    """Estimated error of a capacitance that more unknowns or iterations would remove [F]."""
+    wall_time: float
+    """Time the step took [s]."""
+    unknowns: int = 0
+    """Charge functions that were solved for, or free nodes of the paper's scheme."""
+    iterations: int = 0
+    """Iterations of the linear solver; 0 with ``"surface"``, which solves directly."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """The capacitances of one instant."""
+
+    capacitance: Array
+    """Maxwell capacitance matrix of the electrodes, shields at ground [F], shape (M, M)."""
+    delta: Array
+    """Change against the empty domain, ``capacitance - baseline`` [F], shape (M, M)."""
+    stats: StepStats
+    electrode_names: tuple[str, ...]
+    _shield_coupling: Array = field(repr=False)
+    counts: Counts | None = None
+    """What the chip has reported since the reading before, where a read-out is configured."""
+    jacobian: Array | None = None
+    """How ``capacitance`` changes as each body of the scene moves along the sensor frame's x, y, z
+    [F/m], then turns about axes parallel to these through its own origin [F/rad], where it was
+    asked for, shape (bodies, M, M, 6)."""
+
+    @property
+    def self_capacitance(self) -> Array:
+        """What a self-mode channel measures [F], shape (M,).
+
+        Electrode i is driven, shields are driven with it, all other electrodes are grounded:
+        the diagonal of the Maxwell matrix plus the (negative) coupling to the shields.
+        """
+        return np.diag(self.capacitance) + self._shield_coupling
+
+    @property
+    def mutual_capacitance(self) -> Array:
+        """Mutual capacitances ``-C_ij`` [F] off the diagonal, zero on it, shape (M, M)."""
+        out = -self.capacitance
+        np.fill_diagonal(out, 0.0)
+        return out

@@ -1,0 +1,88 @@
+"""What a reading says of its own error, for signals of every strength."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import capsense as cs
+from capsense.design.model import Domain
+from capsense.surface.solver import Preset, SurfaceSolver
+
+Pair = tuple[cs.Simulator, cs.Simulator]
+
+
+@pytest.fixture(params=["six_patch", "stripe"])
+def pair(request: pytest.FixtureRequest, simulators: Callable[..., cs.Simulator]) -> Pair:
+    """A sensor, and one that solves for all charge functions that count to a thousandth of it."""
+    sim = simulators(request.param)
+    whole = sim.sibling()
+    whole._solver = SurfaceSolver(sim.background.green, sim.design, preset=Preset(threshold=1e-5))
+    return sim, whole
+
+
+def a_scene(rng: np.random.Generator, domain: Domain) -> cs.Scene:
+    """One body or two, 1 to 50 mm large, anywhere above 20 mm."""
+
+    def body() -> cs.Body:
+        size = 10 ** rng.uniform(-2.3, -1.3)
+        shape = [cs.Sphere(size), cs.Capsule(size, 4 * size), cs.Box((size, 2 * size, 3 * size))]
+        place = *rng.uniform(-0.12, 0.12, 2), rng.uniform(0.02, 0.8 * domain.upper[2])
+        return cs.Body(
+            shape[rng.integers(3)], cs.Pose(place, rng.normal(size=4)),
+            str(rng.choice(["steel", "glass", "water"])),
+            grounding=str(rng.choice(["grounded", "floating"])),
+        )  # fmt: skip
+
+    return cs.Scene([body() for _ in range(rng.integers(1, 3))])
+
+
+def test_it_is_that_of_weak_signals_too(pair: Pair) -> None:
+    """Against a solve for a thousand times finer functions, over signals from 1e-20 to 1e-12 F."""
+    sim, whole = pair
+    rng = np.random.default_rng(5)
+    found = []
+    for _ in range(60):
+        scene = a_scene(rng, sim.design.domain)
+        reading, best = sim.step(scene), whole.step(scene)
+        error = np.abs(reading.delta - best.delta).max()
+        found.append((error / reading.stats.error_estimate, np.abs(best.delta).max(), error))
+    share, signal, error = np.array(found).T
+    weak = signal < 1e-16
+    assert weak.sum() > 30
+    assert np.median(share) < 1.0
+    assert np.quantile(share, 0.95) < 5.0
+    assert share.max() < 20.0
+    assert np.median(error[weak] / signal[weak]) < 0.01
+
+
+def test_a_weak_signal_does_not_depend_on_what_was_read_before(pair: Pair) -> None:
+    """To the last bit: a ball of 30 mm, 130 mm above the sensor, after other scenes."""
+    sim, whole = pair
+    scene = cs.Scene([cs.Body(cs.Sphere(0.03), cs.Pose((0.05, 0.0, 0.13)))])
+    reading = sim.step(scene)
+    plate = cs.Body(cs.Box((0.3, 0.3, 0.01)), cs.Pose((0, 0, 0.02)), grounding="floating")
+    sim.step(cs.Scene([plate]))
+    np.testing.assert_array_equal(sim.step(scene).delta, reading.delta)
+    error = np.abs(whole.step(scene).delta - reading.delta).max()
+    assert error < 2 * reading.stats.error_estimate
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-10])
+def test_it_does_not_depend_on_what_a_large_body_is_tied_to(pair: Pair, grounding: object) -> None:
+    """A plate of 0.3 m at ten places: errors of floating ones are estimated as well as others."""
+    sim, whole = pair
+    rng = np.random.default_rng(2)
+    share = []
+    for _ in range(10):
+        place = *rng.uniform(-0.08, 0.08, 2), rng.uniform(0.03, 0.15)
+        plate = cs.Body(cs.Box((0.3, 0.3, 0.01)), cs.Pose(place), grounding=grounding)  # type: ignore[arg-type]
+        scene = cs.Scene([plate])
+        reading = sim.step(scene)
+        error = np.abs(reading.delta - whole.step(scene).delta).max()
+        share.append(error / reading.stats.error_estimate)
+        assert reading.stats.error_estimate < 0.05 * np.abs(reading.delta).max()
+    assert np.median(share) < 1.0
+    assert max(share) < 5.0

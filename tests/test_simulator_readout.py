@@ -1,0 +1,136 @@
+"""A simulator that reports through a chip."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capsense as cs
+from capsense.errors import ReadOutError
+
+Make = Callable[..., cs.Simulator]
+COLUMNS = ("time", "channel", "code", "capacitance", "flags")
+TIMES = np.arange(0.0, 0.3, 0.02)
+
+
+@pytest.fixture
+def make(simulators: Callable[..., cs.Simulator]) -> Make:
+    """``make(readout=…)``: a sensor of its own that shares the field."""
+    shared = simulators("six_patch")
+    return lambda **options: cs.Simulator(shared.design, background=shared.background, **options)
+
+
+def scene_at(time: float) -> cs.Scene:
+    """A ball that comes nearer."""
+    return cs.Scene([cs.Body(cs.Sphere(0.02), cs.Pose((0.0, 0.0, 0.1 - 0.1 * time)))])
+
+
+def by_hand(sim: cs.Simulator, seed: int = 0, start: float = 0.0) -> list[cs.Counts]:
+    """What the chip reports when it is told every reading."""
+    chip = cs.ReadOut.preset("fdc1004", sim.electrode_names)
+    chip.reset(seed=seed, start=start)
+    return [chip.sample(start + t, sim.step(scene_at(t))) for t in TIMES]
+
+
+def same(found: list[cs.Counts], expected: list[cs.Counts]) -> bool:
+    """Whether all columns agree to the last bit."""
+    assert sum(map(len, expected)) > 10
+    return all(
+        np.array_equal(getattr(a, c), getattr(b, c))
+        for a, b in zip(found, expected, strict=True)
+        for c in COLUMNS
+    )
+
+
+@pytest.mark.parametrize("method", ["surface", "masked"])
+def test_counts_are_those_of_the_chip(make: Make, method: str) -> None:
+    """Differential: a chip's name, or a read-out; and again after a reset, or with other noise."""
+    plain = make(method=method)
+    expected = by_hand(plain)
+    for choice in ("fdc1004", cs.ReadOut.preset("fdc1004", plain.electrode_names)):
+        sim = make(method=method, readout=choice)
+        for _ in range(2):
+            found = [sim.step(scene_at(t), time=t).counts for t in TIMES]
+            assert same(found, expected)
+            sim.reset()
+    sim.reset(seed=3, start=7.0)
+    found = [sim.step(scene_at(t), time=7.0 + t).counts for t in TIMES]
+    plain.reset()
+    assert same(found, by_hand(plain, 3, 7.0))
+    assert not same(found, expected)
+
+
+def test_copies_go_on(make: Make) -> None:
+    """A pickled sensor reports what the original does; siblings and batches have no chip."""
+    sim = make(readout="fdc1004")
+    for t in TIMES[:5]:
+        sim.step(scene_at(t), time=t)
+    twin = pickle.loads(pickle.dumps(sim))
+    rest = [[s.step(scene_at(t), time=t).counts for t in TIMES[5:]] for s in (sim, twin)]
+    assert same(*rest)
+    assert sim.sibling().readout is None
+    assert all(r.counts is None for r in sim.step_batch([scene_at(t) for t in TIMES]))
+    sim.use_readout(None)
+    assert sim.step(scene_at(0.0)).counts is None
+
+
+def test_refused(make: Make, tmp_path: Path) -> None:
+    """By name, before anything is solved."""
+    sim = make(readout="fdc1004")
+    with pytest.raises(ReadOutError, match=r"write step\(scene, time=…\)"):
+        sim.step(scene_at(0.0))
+    assert sim.steps == 0
+    sim.step(scene_at(0.0), time=1.0)
+    with pytest.raises(ReadOutError, match="time must not go back"):
+        sim.step(scene_at(0.0), time=0.5)
+    for choice in ("fdc1005", tmp_path / "none.toml", 3):
+        with pytest.raises(ReadOutError):
+            make(readout=choice)
+
+
+def test_the_empty_reading(make: Make) -> None:
+    """That of a step without bodies, to the last bit; nothing is solved for it."""
+    sim = make()
+    empty, step = sim.empty, sim.step(cs.Scene())
+    assert sim.steps == 1
+    for name in ("capacitance", "delta", "self_capacitance", "mutual_capacitance"):
+        np.testing.assert_array_equal(getattr(empty, name), getattr(step, name))
+    np.testing.assert_array_equal(empty.capacitance, sim.baseline)
+
+
+def test_recorded(make: Make, tmp_path: Path) -> None:
+    """The sensor's own chip is recorded; a second one is refused."""
+    pytest.importorskip("mcap", reason="needs pip install 'capsense[record]'")
+    sim = make(readout="fdc1004")
+    expected = by_hand(make())
+    with cs.record(tmp_path / "a.mcap", sim) as run:
+        found = [run.step(scene_at(t), t).counts for t in TIMES]
+    assert same(found, expected)
+    steps = list(cs.open_recording(tmp_path / "a.mcap").steps())
+    there = [s.reading.counts for s in steps if s.reading.counts is not None]
+    assert same([c for c in there if len(c)], [c for c in expected if len(c)])
+    with pytest.raises(ReadOutError, match="read-out of its own"):
+        cs.record(tmp_path / "b.mcap", sim, readout="fdc1004")
+
+
+def test_attached(make: Make) -> None:
+    """A sensor on a robot takes the simulator's chip over; one of its own comes first."""
+    mujoco = pytest.importorskip("mujoco", reason='needs pip install "capsense[mujoco]"')
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><site name='s'/></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    sim = make(readout="fdc1004")
+    sensor = cs.mujoco.attach(model, data, site="s", design=sim)
+    assert sim.readout is None
+    sensor.read(0.0)
+    assert len(sensor.read(0.1).counts) > 10
+    sim.use_readout("fdc1004")
+    other = cs.mujoco.attach(model, data, site="s", design=sim, readout="mpr121")
+    assert "mpr121" in repr(other.readout).lower()
+    assert sim.step(cs.Scene()).counts is None
