@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
@@ -997,3 +999,16 @@ def test_losses_elsewhere_leave_joined_conductors_alone(grounding: str | float) 
     row = [cube(-0.5, grounding), cube(0.5, grounding)]
     speck = cs.Body(cs.Sphere(0.002), cs.Pose((0.0, 0.1, 0.25)), cs.Material("wet", 5.0, 1e-5))
     assert apart(reading(*row, speck), reading(*row)) < 9e-3
+
+
+def test_threads_that_meet_a_shape_share_its_arrays() -> None:
+    """Invariant: records hold addresses, so no thread may replace what another points to."""
+    shape = rigid_shape(panels_of(cs.Box((0.02, 0.03, 0.04)), 100), apart=True)
+    start = threading.Barrier(4)
+
+    def met(_: int) -> tuple[int, int]:
+        start.wait()
+        return shape.impedance.ctypes.data, shape.own.ctypes.data
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(met, range(4)))) == 1

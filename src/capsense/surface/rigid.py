@@ -7,6 +7,7 @@ charge. All but the first are without net charge.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -83,10 +84,10 @@ class RigidShape:
     capacitance: float
     """Capacitance in free space over 4π eps0 [m]."""
 
-    @cached_property
+    @property
     def own(self) -> Array:
         """Diagonal of ``energy`` [1/m], shape (n,)."""
-        return np.ascontiguousarray(np.diag(self.energy).astype(float))
+        return self._once("_own", lambda: np.diag(self.energy).astype(float))
 
     @cached_property
     def record(self) -> np.void:
@@ -98,13 +99,21 @@ class RigidShape:
             record[name] = getattr(self.tree, name).ctypes.data
         return record
 
-    @cached_property
+    @property
     def impedance(self) -> Array32:
         """Interior impedance Z of the charge functions [1/m], shape (n, n).
 
         A body of permittivity eps adds ``Z / (eps - 1)`` to ``energy``. That of an open surface is
         not known; it is taken for :data:`INSIDE` times ``energy``.
         """
+        return self._once("_impedance", self._inside)
+
+    def _once(self, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        """An array that threads that meet here share: records point to it."""
+        found = self.__dict__.get(name)
+        return self.__dict__.setdefault(name, make()) if found is None else found
+
+    def _inside(self) -> Array32:
         if not self.panels.closed:
             z = np.float32(INSIDE) * self.energy
             z[0] = z[:, 0] = 0.0
@@ -114,7 +123,7 @@ class RigidShape:
     @property
     def nbytes(self) -> int:
         """Room that the matrices take up [bytes]."""
-        z = self.__dict__.get("impedance")
+        z = self.__dict__.get("_impedance")
         return self.energy.nbytes + (0 if z is None else z.nbytes)
 
     def __getstate__(self) -> dict[str, Any]:
