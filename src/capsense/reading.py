@@ -46,6 +46,11 @@ class Reading:
     [F/m], then turns about axes parallel to these through its own origin [F/rad], where it was
     asked for, shape (bodies, M, M, 6)."""
 
+    conductance: Array | None = None
+    """Conductance matrix G of the electrodes [S], shields at ground, shape (M, M), where matter
+    has losses: their admittance is ``G + 1j * 2π f * capacitance`` at the simulator's frequency
+    f."""
+
     @property
     def self_capacitance(self) -> Array:
         """What a self-mode channel measures [F], shape (M,).

@@ -208,12 +208,18 @@ class Simulator:
         """The reading that a solver's result makes, of a step that began at ``start`` [s]."""
         change = np.minimum(found.matrix, self._screened)
         error = max(found.error, float((found.matrix - change).max()))
+        if found.loss is not None:
+            change = change - 1j * found.loss
         whole = self.background.capacitance + change
         if len(self._floating):
             change = self._without_floating(whole) - self._empty
         stats = StepStats(error, perf_counter() - start, found.unknowns, found.iterations)
         slope = None if found.jacobian is None else self._slope(whole, found.jacobian)
-        return self._reading(change, stats, slope)
+        reading = self._reading(change.real, stats, slope)
+        if found.loss is None:
+            return reading
+        n = len(self._electrodes)
+        return replace(reading, conductance=-2 * np.pi * self.frequency * change.imag[:n, :n])
 
     def _reading(self, change: Array, stats: StepStats, slope: Array | None = None) -> Reading:
         """A reading by the change of the matrix of electrodes and shields [F]."""

@@ -37,6 +37,14 @@ def test_output_solves_the_circuit():
         assert abs(found - amplifier * receiver) <= 1e-12 * abs(found)
 
 
+def test_conductance_turns_the_phase():
+    """Analytic: C and G in parallel, in series with a shunt too small to matter."""
+    front = ShuntFrontEnd(shunt=1e-3)
+    pure, lossy = front.output(1e-12), front.output(1e-12 - 1j * 3e-6 / front.omega)
+    turn = np.angle(lossy / pure)
+    assert turn == pytest.approx(-math.atan2(3e-6, front.omega * 1e-12), rel=1e-6)
+
+
 def test_recovery_is_exact_for_phasors():
     """Round trip over eight decades, far beyond where the shunt's voltage is small."""
     c = np.geomspace(1e-18, 1e-10, 60)

@@ -22,6 +22,9 @@ class Change:
     """Iterations of the linear solver; 0 for a direct one."""
     unknowns: int = 0
     """Unknowns that were solved for, for each terminal."""
+    loss: Array | None = None
+    """Part of the change in quadrature [F], the same shape, where matter has losses: the complex
+    capacitance is ``matrix - 1j * loss``."""
     jacobian: Array | None = None
     """How the matrix changes with the poses of the scene's bodies, where it was asked for, shape
     (bodies, terminals, terminals, 6)."""

@@ -62,9 +62,12 @@ class ShuntFrontEnd:
         return 2 * math.pi * self.frequency
 
     def output(self, capacitance: ArrayLike) -> Phasors:
-        """Phasor at the amplifier's output [V], for capacitances [F] of any shape."""
-        c = np.asarray(capacitance, dtype=float)
-        admittance = 1j * self.omega * c
+        """Phasor at the amplifier's output [V], for capacitances [F] of any shape.
+
+        They may be complex: matter with a conductance G [S] has ``capacitance - 1j * G / ω``, and
+        turns the phase.
+        """
+        admittance = 1j * self.omega * np.asarray(capacitance)
         divider = admittance / (1 / self.shunt + admittance + 1j * self.omega * self.parasitic)
         amplifier = self.gain / (1 + 1j * self.frequency / self.bandwidth)
         return amplifier * self.amplitude * divider

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +134,8 @@ class SurfaceSolver:
             return Change(nothing, 0.0, jacobian=slope)
         self._last = view, solution
         matrix, error = self.in_farads(solution)
-        return Change(matrix, error, unknowns=solution.size, jacobian=slope)
+        loss = -matrix.imag if np.iscomplexobj(matrix) else None
+        return Change(matrix.real, error, unknowns=solution.size, loss=loss, jacobian=slope)
 
     def potentials(self, points: Array) -> Array:
         """Potentials of the last scene at points [V], shape (n, 3) -> (n, terminals)."""
@@ -195,14 +197,16 @@ class SurfaceSolver:
             )
         return bodies, out
 
-    def in_farads(self, solution: Solution) -> tuple[Array, float]:
+    def in_farads(self, solution: Solution) -> tuple[NDArray[Any], float]:
         """Change of the Maxwell matrix of all terminals [F], (terminals, terminals), and its error.
+
+        It is complex, C' - jC'', where matter has losses.
 
         The error is an estimate of that of the largest entry [F]; where bodies lie within each
         other or within the sensor so that the matrix had to be changed, it is all of that entry.
         """
         doubt = solution.delta if solution.shift > _DOUBTFUL else solution.left
-        return UNIT * solution.delta, UNIT * float(np.abs(np.diag(doubt)).max())
+        return UNIT * solution.delta, UNIT * float(np.abs(np.diag(doubt).real).max())
 
     def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
         """How the matrix of all terminals changes with the poses of a scene's bodies.

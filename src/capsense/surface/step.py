@@ -34,7 +34,7 @@ class Solution(NamedTuple):
     """What a scene does to a design; 4π eps0 = 1."""
 
     delta: NDArray[Any]
-    """Change of the Maxwell matrix [m], shape (m, m)."""
+    """Change of the Maxwell matrix [m], shape (m, m); complex where matter has losses."""
     left: NDArray[Any]
     """The part of it that functions outside the system stand for [m], shape (m, m)."""
     charge: NDArray[Any]
@@ -102,7 +102,7 @@ def solve_lossy(
     threshold: float,
     width: float,
 ) -> Solution:
-    """Solve a scene whose energies are complex; what is returned is the part in phase.
+    """Solve a scene whose energies are complex; charges are the part in phase.
 
     Args:
         records: The bodies, whose real softness is not looked at, nor are ties where ``ties`` are
@@ -148,6 +148,6 @@ def solve_lossy(
     delta = phi[:n, :m].T @ solved + left
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     return Solution(
-        np.ascontiguousarray(0.5 * (delta + delta.T).real), np.ascontiguousarray(left.real),
-        charge, leaves.points, leaves.extent, leaves.owner, n, 0.0,
+        0.5 * (delta + delta.T), np.ascontiguousarray(left.real), charge,
+        leaves.points, leaves.extent, leaves.owner, n, 0.0,
     )  # fmt: skip
