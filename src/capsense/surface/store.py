@@ -25,7 +25,7 @@ from capsense.surface.standing import standing
 
 Array = NDArray[np.float64]
 
-VERSION = 3
+VERSION = 4
 """Of stored shapes: to be raised when the same mesh would get other panels or functions."""
 
 _log = logging.getLogger(__name__)
