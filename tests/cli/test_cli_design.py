@@ -59,6 +59,25 @@ def test_drawing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert picture.read_bytes().startswith(magic)
 
 
+def test_guarded_self_capacitance(capsys: pytest.CaptureFixture[str]) -> None:
+    """Designs with a driven shield print what a self-mode channel measures, others nothing more."""
+    reading = cs.Simulator("arm_segment").step(cs.Scene())
+    last = output_of(["design", "arm_segment"], capsys).splitlines()[-1]
+    assert [float(x) for x in last.split()] == pytest.approx(
+        reading.self_capacitance * 1e12, abs=5e-5
+    )
+    assert "shields driven" not in output_of(["design", "six_patch"], capsys)
+
+
+def test_hint_is_a_line_for_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Names with spaces are quoted."""
+    file = tmp_path / "my sensor.toml"
+    library = Path(cs.__file__).parent / "design" / "library"
+    file.write_text((library / "six_patch_bare.toml").read_text())
+    text = output_of(["design", str(file), "--no-build"], capsys)
+    assert f"capsense design '{file}' --no-build" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -281,6 +281,12 @@ def test_units_that_cannot_be_meant(tmp_path: Path) -> None:
     refused(lambda: stl(tmp_path, unit="mm", scale=100), 'electrode "E"', "3 m", "smaller scale")
 
 
+def test_metres_read_as_millimetres(tmp_path: Path) -> None:
+    """A 30 mm sheet, written in metres, is refused with the unit to try."""
+    save(tmp_path, *flat((0.03, 0.02)))
+    refused(lambda: stl(tmp_path), 'electrode "E"', "0.03 mm across", 'did you mean unit = "m"')
+
+
 def test_imprints_are_placed_as_the_domain_or_refused(tmp_path: Path) -> None:
     """Imprinted boxes must be the domain; their parts are picked one by one."""
     keys = {"file": "stripe_geom.stl", "folder": PUBLISHED}

@@ -155,7 +155,7 @@ def test_record_refuses_before_computing(
     monkeypatch.delitem(cs.__dict__, "Simulator", raising=False)
     monkeypatch.setitem(cs.__dict__, "Simulator", None)  # calling it would fail
     (tmp_path / "file").write_text("")
-    for output in (tmp_path, tmp_path / "no" / "a.mcap", tmp_path / "file"):
+    for output in (tmp_path, tmp_path / "no" / "a.mcap", tmp_path / "file", tmp_path / "a.bag"):
         assert main(["record", str(scenario), "-o", str(output)]) == 2
         assert str(output) in capsys.readouterr().err
     output = tmp_path / "a.mcap"

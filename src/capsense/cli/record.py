@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capsense.cli.run import absent_bodies, build_simulator, play_samples, sample_rate
+from capsense.errors import RecordingError
 
 if TYPE_CHECKING:
     from capsense.recording.recorder import Recorder
@@ -66,6 +67,10 @@ def execute(args: argparse.Namespace) -> int:
         scenario = scenario.resampled(args.rate)
     for name in absent_bodies(scenario):
         say(f'warning: body "{name}" never enters the domain; it has no effect')
+    if args.output.suffix != ".mcap":
+        raise RecordingError(
+            f"--output {args.output}: recordings are MCAP files; give a name that ends in .mcap"
+        )
     check_target(args.output, overwrite=args.force)
     check_name(args.name)
     make_readout(args.readout, scenario.design.electrode_names)
