@@ -45,7 +45,7 @@ class GreenSettings:
     wall_grid: int = 5
     """Point charges along each edge of a wall."""
     wall_offset: float = 0.04
-    """Distance of point charges from the walls [m], in a box of up to 0.5 m; more in larger ones."""
+    """Distance of point charges from the walls of a box of up to 0.5 m [m]; more in larger ones."""
     training: int = 800
     """Points that the modes are fitted at, besides three for each near source."""
     wide: int = 1200
