@@ -20,10 +20,11 @@ from field_cases import (
 
 import capsense as cs
 from capsense.constants import EPS0
+from capsense.design.loader import parse_design
 from capsense.design.model import Conductor, Design, Layer, Role
 from capsense.errors import FieldError
 from capsense.field import boundary
-from capsense.field.boundary import Accuracy, BoundarySolution, terminals
+from capsense.field.boundary import Accuracy, BoundarySolution, build_model, terminals
 
 Array = np.ndarray
 
@@ -68,6 +69,25 @@ def test_disc_over_the_floor():
     edge = EPS0 * r * (math.log(16 * math.pi * r / (2 * h)) - 1)
     expected = 2 * (EPS0 * math.pi * r**2 / (2 * h) + edge)
     assert abs(got / expected - 1) < 0.01
+
+
+@pytest.mark.parametrize("box", [1.0, 2.0, 5.0])
+def test_disc_in_a_large_box(box):
+    """Analytic: 8 eps0 a, and the potential that a charge's images in a cube make in its middle,
+    which is that of a charge in a cubic lattice of alternating ones, 1.7476 / L.
+    """
+    radius = 0.02
+    design = parse_design(
+        {
+            "name": "disc",
+            "domain": {"size": [box] * 3, "backplane": box / 2},
+            "electrode": [{"name": "E1", "shape": "disc", "radius": radius}],
+        }
+    )
+    free = 2 * radius / math.pi  # over 4π eps0
+    wanted = 4 * math.pi * EPS0 * free / (1 - 1.7476 * free / box)
+    assert capacitance(design)[0, 0] == pytest.approx(wanted, rel=2e-3)
+    assert len(build_model(design).panels) < 1200
 
 
 def test_two_stripes():

@@ -69,6 +69,11 @@ def eps_at(design: Design, points: Array) -> Array:
     return eps
 
 
+def room_scale(design: Design) -> float:
+    """How many times as large as one of 0.5 m the box is, at least 1; walls are so much coarser."""
+    return max(1.0, float(min(design.domain.size)) / 0.5)
+
+
 def terminals(design: Design) -> list[str]:
     """Names of the conductors that can be driven: electrodes, then shields, then floating."""
     extra = [
@@ -121,14 +126,14 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
         width = 2 * facet.polygon.area / facet.polygon.length
         edge = accuracy.scale * max(min(0.02 * width, 0.15 * gap, 1e-4), 1e-5)
-        largest = accuracy.scale * min(0.005, max(2 * spacing, 0.001))
+        largest = accuracy.scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
         add(facet, owner, _grading(facet, edge, largest, accuracy.scale), 2.5 * spacing)
     for facet, thickness in _interfaces(design, sheets):
         edge = accuracy.scale * min(3e-4, 0.3 * thickness)
         largest = accuracy.scale * min(0.006, max(3 * thickness, 0.002))
         add(facet, INTERFACE, _grading(facet, edge, largest, accuracy.scale), reach)
     for facet in _walls(design):
-        add(facet, GROUND, Grading(0.01, largest=accuracy.scale * 0.04), 0.0)
+        add(facet, GROUND, Grading(0.01, largest=accuracy.scale * 0.04 * room_scale(design)), 0.0)
 
     panels = concatenate(parts)
     if len(panels) > _MAX_PANELS:

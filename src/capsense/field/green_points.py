@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from capsense.design.model import Design
-from capsense.field.boundary import INTERFACE, BoundaryModel
+from capsense.field.boundary import INTERFACE, BoundaryModel, room_scale
 from capsense.field.openness import free_path, openness
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ class GreenSettings:
     wall_grid: int = 5
     """Point charges along each edge of a wall."""
     wall_offset: float = 0.04
-    """Distance of point charges from the walls [m]."""
+    """Distance of point charges from the walls of a box of up to 0.5 m [m]; more in larger ones."""
     training: int = 800
     """Points that the modes are fitted at, besides three for each near source."""
     wide: int = 1200
@@ -196,7 +196,7 @@ def reachable_points(surface: Surroundings, sources: Array, clearance: float, co
 def wall_sources(design: Design, settings: GreenSettings) -> Array:
     """Points outside of the ceiling and the side walls [m], shape (n, 3)."""
     lower, upper = design.domain.lower, design.domain.upper
-    off, k = settings.wall_offset, settings.wall_grid
+    off, k = settings.wall_offset * room_scale(design), settings.wall_grid
     low, high = lower - [off, off, 0.0], upper + off
     x, y, z = (a + (np.arange(k) + 0.5) / k * (b - a) for a, b in zip(low, high, strict=True))
     faces = []
