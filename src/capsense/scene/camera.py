@@ -18,6 +18,14 @@ _HALF_TURN = Pose(quaternion=(1.0, 0.0, 0.0, 0.0))
 """From the camera frame used here to that of OpenGL: y and z change sign."""
 
 
+def _number(value: object) -> float:
+    """A value as a float, NaN if it is none."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
 @dataclass(frozen=True)
 class OrthographicCamera:
     """A camera with parallel rays.
@@ -48,10 +56,7 @@ class OrthographicCamera:
     def __post_init__(self) -> None:
         for name in ("width", "height", "near", "far"):
             value = getattr(self, name)
-            try:
-                number = float(value)
-            except (TypeError, ValueError, OverflowError):
-                number = math.nan
+            number = _number(value)
             if not math.isfinite(number) or number < 0 or (number == 0 and name != "near"):
                 raise SceneError(
                     f"OrthographicCamera: {name} is {value!r}; give a length in metres"
@@ -108,8 +113,8 @@ class OrthographicCamera:
         if not np.allclose(m[3], (0.0, 0.0, 0.0, 1.0)):
             raise SceneError(
                 f"OrthographicCamera: the projection matrix ends in the row {m[3].tolist()}, so it "
-                "is not orthographic; depth frames need parallel rays, with last row 0, 0, 0, 1; turn a "
-                "perspective image to points: PerspectiveCamera"
+                "is not orthographic; depth frames need parallel rays, with last row 0, 0, 0, 1; "
+                "PerspectiveCamera makes points of a perspective image"
             )
         scale = np.diag(m)[:3]
         off = m[:3, :3] - np.diag(scale)
@@ -175,13 +180,15 @@ class PerspectiveCamera:
     """Depths from this on [m] are not seen."""
 
     def __post_init__(self) -> None:
-        numbers = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy", "near", "far")}
-        for name, value in numbers.items():
-            if not (np.isscalar(value) and math.isfinite(value)) or (name[0] == "f" and value <= 0):
+        for name in ("fx", "fy", "cx", "cy", "near", "far"):
+            value = getattr(self, name)
+            number, above = _number(value), name in ("fx", "fy", "far")
+            if not math.isfinite(number) or (above and number <= 0):
                 raise SceneError(
                     f"PerspectiveCamera: {name} is {value!r}; give a finite number"
-                    + (" above zero" if name[0] == "f" else "")
+                    + (" above zero" if above else "")
                 )
+            object.__setattr__(self, name, number)
         if self.far <= self.near:
             raise SceneError(
                 f"PerspectiveCamera: far is {self.far:g} m; it must exceed near, {self.near:g} m"
