@@ -7,6 +7,7 @@ this machine, one process, as found.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,7 +17,7 @@ BODIES = {
     "forearm, 45 mm radius": (cs.Capsule(0.045, 0.2), (0, np.pi / 2, 0.3), 0.045),
     "ball, 40 mm radius": (cs.Sphere(0.04), (0, 0, 0), 0.04),
 }
-GAPS = (0.005, 0.01, 0.02, 0.05)
+GAPS = (0.002, 0.005, 0.01, 0.02, 0.05)
 FEW, MANY = 2000, 50_000
 PIXELS = (64, 128)
 SPACING = 0.004
@@ -96,23 +97,33 @@ def main() -> None:
             if gap == GAPS[0]:
                 print("| body | gap |", " | ".join(worst), "|")
             print(f"| {name} | {gap * 1e3:g} mm | {cells} |")
-    scan = surface_points(cs.Body(cs.Sphere(0.04), cs.Pose((0, 0, 0.05))), MANY)
+    body = cs.Body(cs.Sphere(0.04), cs.Pose((0, 0, 0.05)))
+    scan = surface_points(body, MANY)
     for pitch in PITCHES:
-        times = []
-        for _ in range(9):
-            start = time.perf_counter()
-            cloud = cs.point_surface(*scan, spacing=pitch)
-            made = time.perf_counter()
-            scene = cs.Scene([cs.Body(cloud)])
-            sim.step(scene)
-            first = time.perf_counter()
-            sim.step(scene)
-            times.append((made - start, first - made, time.perf_counter() - first))
-        a, b, c = 1e3 * np.median(times, axis=0)
-        print(
-            f"ball, {pitch * 1e3:g} mm, {len(cloud.faces)} pieces: shape {a:.1f} ms, "
-            f"first step {b:.1f} ms, the next {c:.1f} ms"
-        )
+        timed(sim, f"scan, {pitch * 1e3:g} mm", lambda p=pitch: cs.point_surface(*scan, spacing=p))
+    for n in PIXELS:
+        behind = camera(n, 0.0, -0.15, 0.0)
+        image = perspective_depth(body, behind, n)
+        timed(sim, f"camera, {n}²", lambda b=behind, i=image: cs.point_surface(b.points(i)))
+
+
+def timed(sim: cs.Simulator, name: str, make: Callable[[], cs.Shape]) -> None:
+    """Print how long a ball takes to be made of points, and to be read."""
+    times = []
+    for _ in range(9):
+        start = time.perf_counter()
+        cloud = make()
+        made = time.perf_counter()
+        scene = cs.Scene([cs.Body(cloud)])
+        sim.step(scene)
+        first = time.perf_counter()
+        sim.step(scene)
+        times.append((made - start, first - made, time.perf_counter() - first))
+    a, b, c = 1e3 * np.median(times, axis=0)
+    print(
+        f"ball, {name}, {len(cloud.faces)} pieces: shape {a:.1f} ms, first step {b:.1f} ms, "
+        f"the next {c:.1f} ms"
+    )
 
 
 if __name__ == "__main__":

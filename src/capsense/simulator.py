@@ -138,7 +138,7 @@ class Simulator:
         )
         self._rest = rest
         self._empty = self._without_floating(rest)
-        self._screened = -rest
+        self._screened = np.maximum(-rest, 0.0)  # coarse meshes may have them the other way
         """At most so much changes [F]: terminals screened from each other do not couple."""
         np.fill_diagonal(self._screened, np.inf)
         self.baseline: Array = self._empty[:n, :n].copy()
@@ -164,7 +164,7 @@ class Simulator:
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)
             scenes = MaskedScenes(sensor, self.frequency)
-            return scenes, scenes.empty if self.mesh else self.background.capacitance
+            return scenes, self.background.capacitance if self.mesh is None else scenes.empty
         from capsense.surface.solver import PRESETS, SurfaceSolver
 
         field = self.background

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
 import capsense as cs
 from capsense.constants import EPS0
@@ -83,6 +84,20 @@ def test_own_boundary_values() -> None:
     x = 100 * at[mesh.node_groups["wall"], 0]
     sim = cs.Simulator(mesh=MeshSensor(mesh, ["wall"], (), profiles={"wall": x + 2}))
     assert sim.baseline[0, 0] == pytest.approx(EPS0 * 0.04**2 * 0.02 * 100**2, rel=1e-9)
+
+
+def test_an_empty_scene_changes_nothing_on_a_poor_mesh() -> None:
+    """Invariant: links of negative weight may turn the sign of a coupling; it stays as it is."""
+    rng = np.random.default_rng(5)
+    corners = np.array(np.meshgrid(*[[-0.1, 0.1]] * 3)).reshape(3, 8).T
+    points = np.concatenate([corners, rng.uniform(-0.1, 0.1, (60, 3))])
+    tets = Delaunay(points).simplices
+    sides = points[tets[:, 1:]] - points[tets[:, :1]]
+    tets = tets[np.abs(np.linalg.det(sides)) > 1e-9]
+    groups = {"ground": np.arange(8), "a": [10], "b": [20], "c": [30]}
+    sim = cs.Simulator(mesh=TetMesh(points, tets, groups))
+    assert sim.baseline[0, 1] > 1e-14
+    np.testing.assert_allclose(sim.step(cs.Scene()).delta, 0.0, atol=1e-18)
 
 
 @pytest.mark.parametrize(

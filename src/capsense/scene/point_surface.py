@@ -75,15 +75,16 @@ def _merged(p: Array, n: Array | None, spacing: float) -> tuple[Array, Array | N
     """Means of the points, and of their unit normals, in each cell of a grid."""
     if not (np.isfinite(spacing) and spacing > 0):
         raise SceneError(f"spacing is {spacing!r}; give a positive length in metres")
-    _, cell, count = np.unique(
-        np.floor(p / spacing).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    out = []
-    for values in (p,) if n is None else (p, _unit(n)):
-        total = np.zeros((len(count), 3))
-        np.add.at(total, cell.reshape(-1), values)
-        out.append(total / count[:, None])
-    return out[0], None if n is None else out[1]
+    key = np.zeros(len(p), np.int64)
+    for along in np.floor(p / spacing).T:
+        levels, level = np.unique(along, return_inverse=True)
+        key = key * len(levels) + level
+    _, cell, count = np.unique(key, return_inverse=True, return_counts=True)
+
+    def means(values: Array) -> Array:
+        return np.column_stack([np.bincount(cell, v) for v in values.T]) / count[:, None]
+
+    return means(p), None if n is None else means(_unit(n))
 
 
 def _fitted(p: Array, near: NDArray[np.intp]) -> Array:
