@@ -58,6 +58,11 @@ class MaskedScenes:
                     f"body {body.name or i} is tied to ground through {body.grounding} F; method "
                     "'masked' knows only grounded and floating bodies"
                 )
+            if not getattr(body.shape, "closed", True):
+                raise SceneError(
+                    f"body {body.name or i} is an open surface, and method 'masked' needs an "
+                    "inside: close it, give a DepthFrame, or use method 'surface'"
+                )
             local = body.pose.inverse().apply(self._centroids)
             within = body.shape.signed_distance(local) < 0
             conducts = body.material.is_conductor(self._frequency)
