@@ -7,6 +7,7 @@ from peers_iterative import TOLERANCE
 from peers_task import DESIGN, SIZE, Array, bar_corners, design, within
 
 import capsense as cs
+from capsense.masked.mesh_sensor import lattice_sensor
 from capsense.masked.planes import plan_axes
 from capsense.masked.scenes import MaskedScenes
 from capsense.masked.solver import GROUNDED, MaskedSolver
@@ -81,9 +82,8 @@ class PaperOnLattice:
         self.name, self.settings = _named(
             "the paper's scheme, CapSense's planes", warm_start, PUBLISHED_TOLERANCE
         )
-        self._scenes = MaskedScenes(
-            design(), sim.background, sim.settings, sim.frequency, warm_start=warm_start
-        )
+        sensor = lattice_sensor(design(), sim.background.terminals, sim.settings.mesh)
+        self._scenes = MaskedScenes(sensor, sim.frequency, warm_start=warm_start)
         planes = np.array([len(axis) for axis in plan_axes(design(), MeshSettings())])
         self.n_tets, self.unknowns = int(6 * (planes - 1).prod()), int(planes.prod())
 

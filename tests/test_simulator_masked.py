@@ -73,6 +73,13 @@ def test_impedances_are_refused(masked):
         masked.step(cs.Scene([bar(0.02, grounding=1e-12)]))
 
 
+def test_open_surfaces_are_refused(masked):
+    """Invariant: what has no inside masks nothing, and is an error that says so."""
+    cloud = cs.point_surface(np.random.default_rng(0).uniform(0.02, 0.05, (50, 3)))
+    with pytest.raises(SceneError, match=r"body 0 is an open surface.*give a DepthFrame"):
+        masked.step(cs.Scene([cs.Body(cloud)]))
+
+
 def test_outside_bodies_change_nothing(masked):
     """Invariant: nothing masked, nothing changed."""
     delta = masked.step(cs.Scene([cs.Body(cs.Sphere(0.05), cs.Pose((0.5, 0, 0.1)))])).delta

@@ -43,12 +43,13 @@ if TYPE_CHECKING:
     from capsense.recording.replay import replay
     from capsense.scenario import Scenario, load_scenario
     from capsense.scene.body import Body
-    from capsense.scene.camera import OrthographicCamera
+    from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
     from capsense.scene.deformable import DeformableSurface
     from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
     from capsense.scene.layers import Layers
     from capsense.scene.materials import MATERIALS, Material
     from capsense.scene.mesh_shape import TriMesh
+    from capsense.scene.point_surface import point_surface
     from capsense.scene.pose import Pose
     from capsense.scene.raster import rasterise
     from capsense.scene.scene import Scene
@@ -78,6 +79,7 @@ __all__ = [
     "MeshError",
     "MissingDependencyError",
     "OrthographicCamera",
+    "PerspectiveCamera",
     "Pose",
     "ProtocolError",
     "ReadOut",
@@ -109,6 +111,7 @@ __all__ = [
     "load_scenario",
     "mujoco",
     "open_recording",
+    "point_surface",
     "pybullet",
     "rasterise",
     "record",
@@ -144,12 +147,13 @@ _HOMES = {
     "capsense.recording.replay": ("replay",),
     "capsense.scenario": ("Scenario", "load_scenario"),
     "capsense.scene.body": ("Body",),
-    "capsense.scene.camera": ("OrthographicCamera",),
+    "capsense.scene.camera": ("OrthographicCamera", "PerspectiveCamera"),
     "capsense.scene.deformable": ("DeformableSurface",),
     "capsense.scene.depth": ("DepthFrame", "decode_permittivity", "encode_permittivity"),
     "capsense.scene.layers": ("Layers",),
     "capsense.scene.materials": ("MATERIALS", "Material"),
     "capsense.scene.mesh_shape": ("TriMesh",),
+    "capsense.scene.point_surface": ("point_surface",),
     "capsense.scene.pose": ("Pose",),
     "capsense.scene.raster": ("rasterise",),
     "capsense.scene.scene": ("Scene",),

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Literal, Protocol, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,8 @@ from capsense.scene.depth import DepthFrame
 from capsense.scene.shape import as_points
 
 if TYPE_CHECKING:
+    from capsense.masked import MeshSensor
+    from capsense.mesh import TetMesh
     from capsense.readout.read_out import ReadOut
 
 Array = NDArray[np.float64]
@@ -52,7 +54,8 @@ class Simulator:
     Args:
         design: A design, a packaged name, or the path of a design file.
         method: ``"surface"``: charges on the surfaces of the bodies. ``"masked"``: the scheme of
-            Schöffmann et al. 2022, where objects are staircases of tetrahedra.
+            Schöffmann et al. 2022, where objects are staircases of tetrahedra. By default
+            ``"masked"`` on a mesh, else ``"surface"``.
         preset: How finely surfaces are resolved: ``"standard"``, ``"learning"`` (faster, some
             3 % rms) or ``"fine"``.
         frequency: Excitation frequency [Hz]; decides which materials conduct.
@@ -62,18 +65,23 @@ class Simulator:
         background: The field of this design with these settings, if it is at hand; it is shared,
             not copied. :meth:`sibling` passes its own.
         readout: What steps report through, as :meth:`use_readout` takes it.
+        mesh: In place of a design, for ``"masked"``: a tetrahedral mesh, or a
+            :class:`~capsense.masked.MeshSensor`, which tells how its node groups are held. The
+            baseline is then that of the mesh.
 
     Raises:
         DesignError: The design is wrong.
+        MeshError: The mesh is not around the sensor frame's origin, or lacks a node group.
+        ValueError: Neither or both of design and mesh are given, or an option is wrong.
         ReadOutError: There is no such chip or file, or the file is wrong.
         FieldError: The background field could not be built, or ``background`` is of another design.
     """
 
     def __init__(
         self,
-        design: Design | str | Path,
+        design: Design | str | Path | None = None,
         *,
-        method: Method = "surface",
+        method: Method | None = None,
         preset: PresetName = "standard",
         frequency: float = 250e3,
         settings: BuildSettings | None = None,
@@ -81,7 +89,9 @@ class Simulator:
         progress: Callable[[str, float], None] | None = None,
         background: BackgroundField | None = None,
         readout: ReadOut | str | Path | None = None,
+        mesh: TetMesh | MeshSensor | None = None,
     ) -> None:
+        method = method or ("surface" if mesh is None else "masked")
         for what, chosen, known in (
             ("method", method, get_args(Method)), ("preset", preset, get_args(PresetName)),
         ):  # fmt: skip
@@ -91,39 +101,44 @@ class Simulator:
                 )
         if not (np.isfinite(frequency) and frequency > 0):
             raise ValueError(f"frequency is {frequency!r}; give a positive number")
-        self.design = design if isinstance(design, Design) else load_design(design)
         self.method: Method = method
         self.preset: PresetName = preset
         self.frequency = frequency
+        if (mesh is None) == (design is None):
+            raise ValueError("give either a design or mesh=…, a TetMesh or a MeshSensor")
+        self.mesh = None if mesh is None else self._on_mesh(mesh)
+        """The mesh that was given in place of a design, or None."""
+        given = self.mesh.design if self.mesh is not None else cast("Design | str | Path", design)
+        self.design = given if isinstance(given, Design) else load_design(given)
         self.settings = settings or default_settings(self.design)
         """Numerical settings of the background field."""
         self.steps = 0
         """Steps since the last reset, one that failed included."""
-        if background is None:
+        names = tuple(terminals(self.design))
+        if background is None and self.mesh is None:
             background = load_or_build(
                 self.design, self.settings, cache_dir=cache_dir, progress=progress
             )
-        elif background.terminals != tuple(terminals(self.design)):
+        elif background is not None and background.terminals != names:
             raise FieldError(
                 f"the background field is of terminals {background.terminals}, but design "
-                f"{self.design.name!r} has {tuple(terminals(self.design))}; leave it out"
+                f"{self.design.name!r} has {names}; leave it out"
             )
-        self.background: BackgroundField = background
-        """Field of the empty domain; never changed, so that it can be shared."""
-        self._solver = self._make_solver()
+        self._background = background
+        self._solver, rest = self._make_solver()
         self._one = OneAtATime()
         self._idle: deque[Simulator] = deque()  # sensors for the threads of batches
         n = len(self.design.electrodes)
         floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
-        names = self.background.terminals
         self._names = self.design.electrode_names
         self._electrodes = np.arange(n)
         self._floating = np.array([names.index(f) for f in floating], dtype=np.int64)
         self._shields = np.array(
             [k for k in range(n, len(names)) if names[k] not in floating], dtype=np.int64
         )
-        self._empty = self._without_floating(self.background.capacitance)
-        self._screened = -self.background.capacitance
+        self._rest = rest
+        self._empty = self._without_floating(rest)
+        self._screened = np.maximum(-rest, 0.0)  # coarse meshes may have them the other way
         """At most so much changes [F]: terminals screened from each other do not couple."""
         np.fill_diagonal(self._screened, np.inf)
         self.baseline: Array = self._empty[:n, :n].copy()
@@ -133,17 +148,40 @@ class Simulator:
         """The chip that turns capacitances into counts, if any."""
         self.use_readout(readout)
 
-    def _make_solver(self) -> _Solver:
+    def _on_mesh(self, mesh: TetMesh | MeshSensor) -> MeshSensor:
+        from capsense.masked.mesh_sensor import mesh_sensor
+
+        if self.method != "masked":
+            raise ValueError(f'method {self.method!r} takes a design, not a mesh; use "masked"')
+        return mesh_sensor(mesh)
+
+    def _make_solver(self) -> tuple[_Solver, Array]:
+        """The solver, and the matrix of all terminals in the empty domain [F]."""
         if self.method == "masked":
+            from capsense.masked.mesh_sensor import lattice_sensor
             from capsense.masked.scenes import MaskedScenes
 
-            return MaskedScenes(self.design, self.background, self.settings, self.frequency)
+            names = terminals(self.design)
+            sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)
+            scenes = MaskedScenes(sensor, self.frequency)
+            return scenes, self.background.capacitance if self.mesh is None else scenes.empty
         from capsense.surface.solver import PRESETS, SurfaceSolver
 
+        field = self.background
         return SurfaceSolver(
-            self.background.green, self.design, frequency=self.frequency,
-            preset=PRESETS[self.preset],
-        )  # fmt: skip
+            field.green, self.design, frequency=self.frequency, preset=PRESETS[self.preset]
+        ), field.capacitance
+
+    @property
+    def background(self) -> BackgroundField:
+        """Field of the empty domain; never changed, so that it can be shared.
+
+        Raises:
+            FieldError: The sensor is given by a mesh, which needs none.
+        """
+        if self._background is None:
+            raise FieldError("a simulator on a mesh has no background field; see its baseline")
+        return self._background
 
     @property
     def electrode_names(self) -> tuple[str, ...]:
@@ -210,7 +248,7 @@ class Simulator:
         error = max(found.error, float((found.matrix - change).max()))
         if found.loss is not None:
             change = change - 1j * found.loss
-        whole = self.background.capacitance + change
+        whole = self._rest + change
         if len(self._floating):
             change = self._without_floating(whole) - self._empty
         stats = StepStats(error, perf_counter() - start, found.unknowns, found.iterations)
@@ -312,8 +350,9 @@ class Simulator:
         It has no read-out: a chip belongs to one sensor.
         """
         return Simulator(
-            self.design, method=self.method, preset=self.preset, frequency=self.frequency,
-            settings=self.settings, background=self.background,
+            None if self.mesh else self.design, method=self.method, preset=self.preset,
+            frequency=self.frequency, settings=self.settings, background=self._background,
+            mesh=self.mesh,
         )  # fmt: skip
 
     def reset(self, *, seed: int | None = None, start: float = 0.0) -> None:
@@ -334,15 +373,17 @@ class Simulator:
 
     def describe(self) -> dict[str, float | int | str]:
         """Return the figures of the design's field."""
-        green = self.background.green
-        return {
-            "design": self.design.name,
-            "electrodes": len(self.design.electrodes),
+        told: dict[str, float | int | str] = {
+            "design": self.design.name, "electrodes": len(self.design.electrodes),
             "method": self.method,
+        }  # fmt: skip
+        if self.mesh is not None:
+            return told | {"tetrahedra": self.mesh.mesh.n_tets, "nodes": self.mesh.mesh.n_points}
+        green = self.background.green
+        return told | {
             "boundary panels": self.background.n_panels,
-            "point charges": len(green.near_sources),
-            "modes": green.n_modes,
-        }
+            "point charges": len(green.near_sources), "modes": green.n_modes,
+        }  # fmt: skip
 
     def _without_floating(self, matrix: Array) -> Array:
         """Eliminate the design's floating conductors; electrodes and shields remain."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import cast
-
 import numpy as np
 import pytest
 from field_cases import patches, rectangle, sheet
@@ -12,10 +9,9 @@ from field_cases import patches, rectangle, sheet
 from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Conductor, Design, Electrode, Layer, Role
 from capsense.errors import SceneError
-from capsense.field.background import BackgroundField, BuildSettings
 from capsense.masked.held_nodes import FREE, WALL, hold_nodes
+from capsense.masked.mesh_sensor import lattice_sensor
 from capsense.masked.planes import plan_axes
-from capsense.masked.scenes import MaskedScenes
 from capsense.mesh.settings import MeshSettings
 
 DESIGN = patches(
@@ -92,8 +88,7 @@ def test_an_electrode_without_nodes_is_named() -> None:
     """Edges that share a plane leave narrow strips beside it; a finer mesh has nodes on both."""
     strips = (rectangle((5e-5, 0.0), (1e-4, 0.02)), rectangle((6.75e-4, 0.0), (1.5e-4, 0.02)))
     design = patches(*strips, size=0.1, backplane=0.02)
-    background = cast(BackgroundField, SimpleNamespace(terminals=("E1", "E2")))
     with pytest.raises(SceneError, match=r"'E1' has none: raise \[build\] resolution"):
-        MaskedScenes(design, background, BuildSettings(), 250e3)
+        lattice_sensor(design, ("E1", "E2"), MeshSettings())
     owner = hold_nodes(design, plan_axes(design, MeshSettings().refined(2.0)))
     assert {0, 1} <= set(owner.ravel().tolist())

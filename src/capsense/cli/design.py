@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from capsense.errors import DesignError
 
 if TYPE_CHECKING:
@@ -163,6 +161,8 @@ def _area(surface: Surface) -> str:
 
 def describe_field(simulator: Simulator) -> str:
     """Figures of the field and baseline matrix, as text."""
+    import numpy as np
+
     from capsense.cli.tables import facts, field_figures, grouped, table
     from capsense.scene import Scene
 

@@ -5,21 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.change import Change
-from capsense.masked.held_nodes import WALL, hold_nodes
-from capsense.masked.planes import plan_axes
+from capsense.masked.mesh_sensor import MeshSensor
 from capsense.masked.solver import GROUNDED, MaskedSolver
-from capsense.mesh import TetMesh, kuhn_tets
 from capsense.scene import Scene
 
 Array = NDArray[np.float64]
 
 
 class MaskedScenes:
-    """Masks the Kuhn tetrahedra of a graded mesh with a scene's bodies and solves in full.
+    """Masks the tetrahedra of a mesh with a scene's bodies and solves in full.
 
     Floating conductors are met by a large permittivity, as a scheme that knows only permittivity
     must; impedances to ground cannot be represented and are refused. Each scene is solved from the
@@ -28,42 +24,16 @@ class MaskedScenes:
 
     FLOATING_EPS_R = 1e4
 
-    def __init__(
-        self,
-        design: Design,
-        background: BackgroundField,
-        settings: BuildSettings,
-        frequency: float,
-        *,
-        warm_start: bool = True,
-    ) -> None:
+    def __init__(self, sensor: MeshSensor, frequency: float, *, warm_start: bool = True) -> None:
         self._frequency = frequency
-        axes = plan_axes(design, settings.mesh)
-        mesh = kuhn_tets(*axes)
-        owner = hold_nodes(design, axes).ravel()
-        groups = {
-            name: np.flatnonzero(owner == k).astype(np.int32)
-            for k, name in enumerate(background.terminals)
-        }
-        missing = [name for name, nodes in groups.items() if not len(nodes)]
-        if missing:
-            raise SceneError(
-                f"method 'masked' needs mesh nodes on every electrode; {missing[0]!r} has none: "
-                "raise [build] resolution, or use method 'surface'"
-            )
-        groups["ground"] = np.flatnonzero(owner == WALL).astype(np.int32)
-        self._mesh = TetMesh(mesh.points, mesh.tets, node_groups=groups)
-        self._centroids = self._mesh.centroids
-        eps = np.ones(self._mesh.n_tets)
-        for layer in design.layers:
-            inside = (self._centroids > layer.lower) & (self._centroids < layer.upper)
-            eps[inside.all(axis=1)] = layer.eps_r
+        self._mesh = sensor.mesh
+        self._centroids = sensor.mesh.centroids
         self._solver = MaskedSolver(
-            self._mesh, list(background.terminals), ("ground",), eps_background=eps,
+            sensor.mesh, sensor.names, sensor.ground, sensor.eps_r, profiles=sensor.profiles,
             warm_start=warm_start,
         )  # fmt: skip
-        empty = np.full(self._mesh.n_tets, -1, dtype=np.int64)
-        self._empty = self._solver.step(empty, [])
+        self.empty: Array = self._solver.step(np.full(self._mesh.n_tets, -1), [])
+        """Maxwell matrix of the empty mesh [F], shape (terminals, terminals)."""
 
     def reset(self) -> None:
         """Forget the last solution."""
@@ -88,6 +58,11 @@ class MaskedScenes:
                     f"body {body.name or i} is tied to ground through {body.grounding} F; method "
                     "'masked' knows only grounded and floating bodies"
                 )
+            if not getattr(body.shape, "closed", True):
+                raise SceneError(
+                    f"body {body.name or i} is an open surface, and method 'masked' needs an "
+                    "inside: close it, give a DepthFrame, or use method 'surface'"
+                )
             local = body.pose.inverse().apply(self._centroids)
             within = body.shape.signed_distance(local) < 0
             conducts = body.material.is_conductor(self._frequency)
@@ -103,4 +78,4 @@ class MaskedScenes:
         stats = self._solver.stats
         goal = self._solver.tolerance * float(np.abs(matrix).max())
         free = self._mesh.n_points - stats.grounded_nodes
-        return Change(matrix - self._empty, goal, int(stats.iterations), free)
+        return Change(matrix - self.empty, goal, int(stats.iterations), free)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -80,6 +80,7 @@ class MaskedSolver:
         tolerance: float = 1e-5,
         max_iterations: int = 5000,
         warm_start: bool = True,
+        profiles: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         """Assemble the empty domain.
 
@@ -101,11 +102,14 @@ class MaskedSolver:
             CG iterations after which a step fails.
         warm_start
             Whether CG starts from the potentials of the step before, or from zero.
+        profiles
+            Potential [V] of each node of an electrode that is driven with 1 V, by its group, each
+            of shape (g,); 1 where none is given.
 
         Raises
         ------
         MeshError
-            If a group is unknown or empty, or electrodes share nodes.
+            If a group is unknown or empty, electrodes share nodes, or a profile does not fit.
         FieldError
             If `eps_background` does not fit the mesh.
         SolveError
@@ -123,7 +127,9 @@ class MaskedSolver:
         self.tolerance = tolerance
         self.max_iterations = max_iterations
         self.warm_start = warm_start
-        self._dirichlet, self._free = unit_potentials(mesh, electrode_groups, ground_groups)
+        self._dirichlet, self._free = unit_potentials(
+            mesh, electrode_groups, ground_groups, profiles
+        )
         self._background = check_eps_r(mesh, eps_background)
         self._map = StiffnessMap(mesh)
         self._stats = MaskedStats(0, 0, 0, 0.0, 0.0, 0.0)

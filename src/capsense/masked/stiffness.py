@@ -10,7 +10,7 @@ Everything here is written to be read and compared against, not to be run at eve
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -182,25 +182,31 @@ class StiffnessMap:
 
 
 def unit_potentials(
-    mesh: TetMesh, electrode_groups: Sequence[str], ground_groups: Iterable[str]
+    mesh: TetMesh,
+    electrode_groups: Sequence[str],
+    ground_groups: Iterable[str],
+    profiles: Mapping[str, ArrayLike] | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Dirichlet values of the M unit problems, and which nodes are free.
 
     Returns
     -------
     values
-        1 V on electrode j in column j and 0 V elsewhere, shape (n, M).
+        1 V, or the profile given, on electrode j in column j and 0 V elsewhere, shape (n, M).
     free
         Nodes on no electrode and not on ground, shape (n,).
 
     Raises
     ------
     MeshError
-        If a group is unknown or empty, or an electrode shares nodes with another or ground.
+        If a group is unknown or empty, an electrode shares nodes with another or ground, or a
+        profile is of no electrode, of another shape, negative or not finite.
     """
-    electrodes = list(electrode_groups)
+    electrodes, shapes = list(electrode_groups), dict(profiles or {})
     if not electrodes:
         raise MeshError("at least one electrode group is needed")
+    if strange := sorted(set(shapes) - set(electrodes)):
+        raise MeshError(f"profile {strange[0]!r} is of no electrode; there are {electrodes}")
     owner = np.full(mesh.n_points, -1)
     values = np.zeros((mesh.n_points, len(electrodes)))
     owner[mesh.group_nodes(ground_groups)] = len(electrodes)
@@ -211,8 +217,23 @@ def unit_potentials(
         if shared := int((owner[members] >= 0).sum()):
             raise MeshError(f"electrode group {name!r} shares {shared} nodes with another group")
         owner[members] = column
-        values[members, column] = 1.0
+        values[members, column] = _profile(name, shapes.get(name, 1.0), len(members))
     return values, owner < 0
+
+
+def _profile(name: str, given: ArrayLike, count: int) -> Array:
+    potential = np.asarray(given, dtype=np.float64)
+    if potential.shape not in ((), (count,)):
+        raise MeshError(
+            f"profile {name!r} has shape {potential.shape}; give one potential for each of the "
+            f"group's {count} nodes"
+        )
+    if not (np.isfinite(potential) & (potential >= 0)).all() or not potential.any():
+        raise MeshError(
+            f"profile {name!r} must be finite, from 0 V on and not zero everywhere; drive the "
+            "electrode with a negative voltage instead, or split its group in two"
+        )
+    return potential
 
 
 def capacitance_p1(

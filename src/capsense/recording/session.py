@@ -148,8 +148,14 @@ def describe(
     pairs: tuple[tuple[str, str], ...] = (),
     empty: Reading,
 ) -> Session:
-    """The session of a simulator as it is."""
+    """The session of a simulator as it is.
+
+    Raises:
+        RecordingError: Its sensor is given by a mesh, which recordings do not hold.
+    """
     s = simulator
+    if s.mesh is not None:
+        raise RecordingError("a simulator on a mesh cannot be recorded; use one of a design")
     return Session(
         name, title, s.design, s.method, s.preset, s.frequency, s.settings, empty, excitation,
         pairs, readout, versions(),

@@ -1,12 +1,13 @@
 """What stands in front of the sensor: materials, shapes, poses, bodies and scenes."""
 
 from capsense.scene.body import Body
-from capsense.scene.camera import OrthographicCamera
+from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
 from capsense.scene.deformable import DeformableSurface
 from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
 from capsense.scene.layers import Layers
 from capsense.scene.materials import MATERIALS, Material, material
 from capsense.scene.mesh_shape import TriMesh
+from capsense.scene.point_surface import point_surface
 from capsense.scene.pose import Pose
 from capsense.scene.raster import Raster, rasterise
 from capsense.scene.scene import PackedScene, Scene
@@ -27,6 +28,7 @@ __all__ = [
     "Material",
     "OrthographicCamera",
     "PackedScene",
+    "PerspectiveCamera",
     "Pose",
     "Raster",
     "RestSurface",
@@ -39,5 +41,6 @@ __all__ = [
     "decode_permittivity",
     "encode_permittivity",
     "material",
+    "point_surface",
     "rasterise",
 ]

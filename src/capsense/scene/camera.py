@@ -1,4 +1,4 @@
-"""Orthographic cameras: where the pixels of a depth image stand in the sensor frame."""
+"""Depth cameras: where the pixels of their images stand in the sensor frame."""
 
 from __future__ import annotations
 
@@ -16,6 +16,14 @@ Array = NDArray[np.float64]
 
 _HALF_TURN = Pose(quaternion=(1.0, 0.0, 0.0, 0.0))
 """From the camera frame used here to that of OpenGL: y and z change sign."""
+
+
+def _number(value: object) -> float:
+    """A value as a float, NaN if it is none."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 @dataclass(frozen=True)
@@ -48,10 +56,7 @@ class OrthographicCamera:
     def __post_init__(self) -> None:
         for name in ("width", "height", "near", "far"):
             value = getattr(self, name)
-            try:
-                number = float(value)
-            except (TypeError, ValueError, OverflowError):
-                number = math.nan
+            number = _number(value)
             if not math.isfinite(number) or number < 0 or (number == 0 and name != "near"):
                 raise SceneError(
                     f"OrthographicCamera: {name} is {value!r}; give a length in metres"
@@ -108,7 +113,8 @@ class OrthographicCamera:
         if not np.allclose(m[3], (0.0, 0.0, 0.0, 1.0)):
             raise SceneError(
                 f"OrthographicCamera: the projection matrix ends in the row {m[3].tolist()}, so it "
-                "is not orthographic; depth frames need parallel rays, with last row 0, 0, 0, 1"
+                "is not orthographic; depth frames need parallel rays, with last row 0, 0, 0, 1; "
+                "PerspectiveCamera makes points of a perspective image"
             )
         scale = np.diag(m)[:3]
         off = m[:3, :3] - np.diag(scale)
@@ -143,3 +149,91 @@ class OrthographicCamera:
         if self.rows == "-y":
             image = image[..., ::-1, :]
         return image if self.columns == "+x" else image[..., ::-1]
+
+
+@dataclass(frozen=True)
+class PerspectiveCamera:
+    """A pinhole camera, as most real depth cameras are; its image becomes a cloud of points.
+
+    In its own frame it looks along +z, x runs along the rows of the image and y down its columns,
+    as in OpenCV and the optical frames of ROS. A point (x, y, z) is seen in column
+    ``cx + fx x / z`` and row ``cy + fy y / z``, counted from 0 at the middle of the first pixel.
+
+    Raises:
+        SceneError: A number is not finite, a focal length is not positive, or ``far`` does not
+            exceed ``near``.
+    """
+
+    fx: float
+    """Focal length along the columns' number [pixels]."""
+    fy: float
+    """Focal length along the rows' number [pixels]."""
+    cx: float
+    """Column of the optical axis [pixels]."""
+    cy: float
+    """Row of the optical axis [pixels]."""
+    pose: Pose = field(default_factory=Pose)
+    """The camera's frame in the sensor frame."""
+    near: float = 0.0
+    """Depths up to this [m] are not seen."""
+    far: float = 0.5
+    """Depths from this on [m] are not seen."""
+
+    def __post_init__(self) -> None:
+        for name in ("fx", "fy", "cx", "cy", "near", "far"):
+            value = getattr(self, name)
+            number, above = _number(value), name in ("fx", "fy", "far")
+            if not math.isfinite(number) or (above and number <= 0):
+                raise SceneError(
+                    f"PerspectiveCamera: {name} is {value!r}; give a finite number"
+                    + (" above zero" if above else "")
+                )
+            object.__setattr__(self, name, number)
+        if self.far <= self.near:
+            raise SceneError(
+                f"PerspectiveCamera: far is {self.far:g} m; it must exceed near, {self.near:g} m"
+            )
+        if not isinstance(self.pose, Pose):
+            raise SceneError(f"PerspectiveCamera: pose is {self.pose!r}; give a Pose")
+
+    @classmethod
+    def opengl(
+        cls, fovy: float, resolution: tuple[int, int], pose: Pose, **options: Any
+    ) -> PerspectiveCamera:
+        """A camera as in OpenGL, MuJoCo and PyBullet: looks along −z, y up, first row on top.
+
+        Args:
+            fovy: Full angle of view from top to bottom [rad].
+            resolution: Rows and columns.
+            pose: Frame of the OpenGL camera in the sensor frame.
+            options: ``near`` and ``far``, as for the class.
+
+        Raises:
+            SceneError: The angle is not between 0 and π; as for the class.
+        """
+        if not 0 < fovy < math.pi:
+            raise SceneError(f"PerspectiveCamera: fovy is {fovy!r} rad; give one from 0 to 3.14")
+        rows, columns = resolution
+        f = rows / (2 * math.tan(fovy / 2))
+        return cls(f, f, (columns - 1) / 2, (rows - 1) / 2, pose @ _HALF_TURN, **options)
+
+    def points(self, depth: ArrayLike) -> Array:
+        """What a depth image shows, as points in the sensor frame.
+
+        Args:
+            depth: Depth along the optical axis, not along the ray [m], shape (rows, columns);
+                pixels that are not finite, not beyond ``near`` or not before ``far`` are left out.
+
+        Returns:
+            Points [m], shape (n, 3), row by row.
+
+        Raises:
+            SceneError: The image has another number of axes.
+        """
+        z = np.asarray(depth, dtype=float)
+        if z.ndim != 2:
+            raise SceneError(f"PerspectiveCamera: depth has shape {z.shape}; give (rows, columns)")
+        row, column = np.nonzero((z > self.near) & (z < self.far))
+        z = z[row, column]
+        x, y = (column - self.cx) / self.fx * z, (row - self.cy) / self.fy * z
+        return self.pose.apply(np.column_stack([x, y, z]))
