@@ -32,7 +32,7 @@ class GreenSettings:
     """Largest number of point charges behind the sensor, near representation."""
     near_spacing: float = 2.4e-3
     """Smallest distance of neighbouring point charges, near representation [m]."""
-    far_sources: int = 180
+    far_sources: int = 220
     """As ``near_sources``, far representation."""
     far_spacing: float = 4.5e-3
     """As ``near_spacing``, far representation [m]."""
