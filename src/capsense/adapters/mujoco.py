@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import GeometrySensor, check_world, make_simulator
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
+from capsense.adapters.mujoco_spec import add_sensor
 from capsense.adapters.rules import Rules
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
@@ -28,7 +29,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-__all__ = ["AttachedSkin", "MujocoDepthSensor", "MujocoSensor", "attach", "attach_skin"]
+__all__ = [
+    "AttachedSkin", "MujocoDepthSensor", "MujocoSensor", "add_sensor", "attach", "attach_skin",
+]  # fmt: skip
 
 _SCALAR_LAST = [1, 2, 3, 0]
 
