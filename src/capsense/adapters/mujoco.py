@@ -122,6 +122,7 @@ def attach(
             checked_grounding(default_grounding), back,
         )  # fmt: skip
         sensor.use_readout(readout)
+        sensor.warn()
         return sensor
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
@@ -129,6 +130,7 @@ def attach(
     source = ModelSource(model, data, rules, groups)
     sensor = MujocoSensor(source, number, make_simulator(design), exclude_own=exclude_own)
     sensor.use_readout(readout)
+    sensor.warn()
     return sensor
 
 
@@ -192,7 +194,9 @@ def attach_skin(
         site: MujocoSensor(source, number, simulators[site], exclude_own=exclude_own)
         for site, number in numbers.items()
     }
-    return AttachedSkin(sensors, readout, threads)
+    skin = AttachedSkin(sensors, readout, threads)
+    skin.warn()
+    return skin
 
 
 class MujocoSensor(GeometrySensor):

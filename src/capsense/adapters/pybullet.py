@@ -129,10 +129,12 @@ def attach(
             exclude_own=exclude_own, size=size, resolution=resolution, back=back,
         )  # fmt: skip
         sensor.use_readout(readout)
+        sensor.warn()
         return sensor
     source = ClientSource(number, rules, shapes)
     sensor = PybulletSensor(source, body, index, pose_in_link, simulator, exclude_own=exclude_own)
     sensor.use_readout(readout)
+    sensor.warn()
     return sensor
 
 
@@ -199,7 +201,9 @@ def attach_skin(
         name: PybulletSensor(source, body, *mount, simulators[name], exclude_own=exclude_own)
         for name, mount in links.items()
     }
-    return AttachedSkin(sensors, readout, threads)
+    skin = AttachedSkin(sensors, readout, threads)
+    skin.warn()
+    return skin
 
 
 class PybulletSensor(GeometrySensor):

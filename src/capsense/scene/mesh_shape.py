@@ -43,10 +43,32 @@ class Triangles(Shape):
         Raises:
             SceneError: The points do not have shape (n, 3), or the surface is not closed.
         """
-        p = as_points(points)
         self._require_inside("signed distances")
+        return self._distances(points)
+
+    def distance(self, points: ArrayLike) -> Array:
+        """Exact distance to the nearest triangle [m], of open surfaces too.
+
+        Args:
+            points: Points [m] in the local frame, shape (n, 3).
+
+        Returns:
+            Shape (n,), nowhere negative.
+
+        Raises:
+            SceneError: The points do not have shape (n, 3).
+        """
+        return np.abs(self._distances(points))
+
+    @property
+    @abstractmethod
+    def closed(self) -> bool:
+        """Whether the surface has an inside."""
+
+    def _distances(self, points: ArrayLike) -> Array:
         from capsense.scene.distance_kernels import signed_distances
 
+        p = as_points(points)
         out = np.empty(len(p))
         signed_distances(self._boxes, np.ascontiguousarray(p), out)
         return out
