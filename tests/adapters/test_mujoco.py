@@ -201,13 +201,73 @@ def test_wrong_calls_are_refused(tiny_simulator: cs.Simulator) -> None:
         cs.mujoco.attach(sensor.model, sensor.data, "pad", "six_pach")
 
 
-def test_sizes_changed_later_are_taken_by_refresh(tiny_simulator: cs.Simulator) -> None:
-    """Shapes are taken once; ``refresh`` takes them again."""
-    sensor = sensor_in('<geom name="ball" size=".01" pos="0 0 .04"/>', tiny_simulator)
-    sensor.model.geom("ball").size[0] = 0.012
-    assert sensor.scene()[0].shape == cs.Sphere(0.01)
-    sensor.refresh()
-    assert sensor.scene()[0].shape == cs.Sphere(0.012)
+def test_geoms_changed_later_are_followed(tiny_simulator: cs.Simulator) -> None:
+    """Differential: what domain randomisation changes is as if the model had been made so."""
+    world = '<geom name="ball" size="{}" pos="{}"/><geom name="box" type="box" size=".01 .01 .01" '
+    world += (
+        'pos=".02 0 .04" quat="{}"/><geom name="hill" type="hfield" hfield="hill" pos="0 0 .06"/>'
+    )
+    top = '<asset><hfield name="hill" nrow="3" ncol="3" size=".04 .04 .02 .01" '
+    top += 'elevation="{}"/></asset>'
+    flat, rough = "0 0 0 0 1 0 0 0 0", "0 0 0 1 1 0 0 0 0"
+    sensor = sensor_in(
+        world.format(".01", "0 0 .04", "1 0 0 0"), tiny_simulator, top=top.format(flat)
+    )
+    first, box = sensor.read().delta, sensor.scene()["world/box"].shape
+    model = sensor.model
+    model.geom("ball").size[0] = 0.012
+    model.geom("ball").pos[:] = (0.01, 0.0, 0.03)
+    model.geom("box").quat[:] = (0.8, 0.6, 0.0, 0.0)
+    model.hfield_data[3] = 1.0
+    mujoco.mj_forward(model, sensor.data)
+    made = sensor_in(
+        world.format(".012", ".01 0 .03", ".8 .6 0 0"), tiny_simulator, top=top.format(rough)
+    )
+    found = sensor.read().delta
+    assert np.array_equal(found, made.read().delta)
+    assert np.abs(found - first).max() > 1e-16
+    assert sensor.scene()["world/box"].shape == box
+
+
+def test_a_diverged_simulation_is_told(tiny_simulator: cs.Simulator) -> None:
+    """MuJoCo sets it back on its own, or leaves bad numbers; neither is read silently."""
+    world = '<body name="ball" pos="0 0 .05"><freejoint/><geom size=".01"/></body>'
+    sensor = sensor_in(world, tiny_simulator)
+    sensor.read()
+    for _ in range(2):
+        for _ in range(3):
+            mujoco.mj_step(sensor.model, sensor.data)
+        sensor.read()
+        sensor.data.qvel[:] = np.nan
+        mujoco.mj_step(sensor.model, sensor.data)
+        with pytest.raises(cs.SceneError, match=r"has diverged .* MuJoCo has set it back"):
+            sensor.read()
+        sensor.reset()
+        sensor.read()
+    sensor.data.qpos[:] = np.nan
+    mujoco.mj_forward(sensor.model, sensor.data)
+    with pytest.raises(cs.SceneError, match=r"the simulation has diverged: 'ball/.*' stands"):
+        sensor.read()
+    mujoco.mj_resetData(sensor.model, sensor.data)
+    mujoco.mj_forward(sensor.model, sensor.data)
+    sensor.read()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"site": 0}, "site is 0; give the site's name"),
+        ({"groups": 0}, r"groups is 0; give the numbers of geom groups, like \[0, 2\]"),
+        ({"groups": "0"}, "groups is '0'"),
+        ({"groups": []}, "groups is empty"),
+    ],
+)
+def test_numbers_in_the_place_of_names(
+    options: dict[str, Any], message: str, tiny_simulator: cs.Simulator
+) -> None:
+    """Each says what to give."""
+    with pytest.raises(cs.SceneError, match=message):
+        sensor_in("", tiny_simulator, **options)
 
 
 def test_readings_follow_the_simulation(tiny_simulator: cs.Simulator) -> None:

@@ -241,3 +241,62 @@ def test_wrong_calls_are_refused(
         call = {"client": client, "body": sensor.body, "design": tiny_simulator, **options}
         with pytest.raises(cs.SceneError, match=message):
             cs.pybullet.attach(**call)
+
+
+def test_named_bodies_may_leave(client: int, tiny_simulator: cs.Simulator) -> None:
+    """A pattern must fit something at attach; what it fits may go and come back."""
+    pad = p.createMultiBody(0, physicsClientId=client)
+
+    def ball() -> int:
+        shape = p.createCollisionShape(p.GEOM_SPHERE, radius=0.01, physicsClientId=client)
+        body = p.createMultiBody(0, shape, basePosition=[0, 0, 0.04], physicsClientId=client)
+        p.addUserData(body, "capsense.body", "ball", physicsClientId=client)
+        return int(body)
+
+    first = ball()
+    for world in ("geometry", "depth"):
+        sensor = cs.pybullet.attach(
+            client, pad, design=tiny_simulator, world=world, materials={"ball": "human"}
+        )
+        there = sensor.read().delta
+        p.removeBody(first, physicsClientId=client)
+        assert np.abs(sensor.read().delta).max() == 0.0
+        first = ball()
+        assert np.array_equal(sensor.read().delta, there)
+    p.removeBody(pad, physicsClientId=client)
+    with pytest.raises(cs.SceneError, match="which carries the sensor, has left the world"):
+        sensor.read()
+
+
+@pytest.mark.parametrize("world", ["geometry", "depth"])
+def test_a_world_that_was_reset(world: str, client: int, tiny_simulator: cs.Simulator) -> None:
+    """Bodies of the same numbers are others then."""
+
+    def fill(radius: float) -> int:
+        p.resetSimulation(physicsClientId=client)
+        pad = p.createMultiBody(0, physicsClientId=client)
+        make = {"radius": radius, "physicsClientId": client}
+        shapes = (
+            p.createCollisionShape(p.GEOM_SPHERE, **make),
+            p.createVisualShape(p.GEOM_SPHERE, **make),
+        )
+        p.createMultiBody(0, *shapes, basePosition=[0, 0, 0.04], physicsClientId=client)
+        return int(pad)
+
+    sensor = cs.pybullet.attach(client, fill(0.01), design=tiny_simulator, world=world)
+    small = sensor.read().delta[0, 0]
+    fill(0.02)
+    assert sensor.read().delta[0, 0] > 1.5 * small
+    fill(0.01)
+    assert sensor.read().delta[0, 0] == small
+
+
+def test_a_client_that_is_gone(tiny_simulator: cs.Simulator) -> None:
+    """The error says so."""
+    client = p.connect(p.DIRECT)
+    sensor = cs.pybullet.attach(
+        client, p.createMultiBody(0, physicsClientId=client), design=tiny_simulator
+    )
+    p.disconnect(client)
+    with pytest.raises(cs.SceneError, match="is not connected any more"):
+        sensor.read()

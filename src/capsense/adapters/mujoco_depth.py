@@ -135,6 +135,7 @@ def find_site(model: mujoco.MjModel, name: str) -> int:
     """
     import mujoco
 
+    _require_name("site", name)
     site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), name)
     if site < 0:
         raise refuse_missing("site", name, [model.site(i).name for i in range(model.nsite)])
@@ -149,6 +150,7 @@ def find_camera(model: mujoco.MjModel, name: str) -> Eye:
     """
     import mujoco
 
+    _require_name("camera", name)
     number = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_CAMERA), name)
     if number < 0:
         raise refuse_missing("camera", name, [model.camera(i).name for i in range(model.ncam)])
@@ -173,6 +175,11 @@ def find_camera(model: mujoco.MjModel, name: str) -> Eye:
         f'nothing reads the depths of camera {name!r}; add <rangefinder camera="{name}" '
         'data="depth"/> to the <sensor> section'
     )
+
+
+def _require_name(what: str, name: object) -> None:
+    if not isinstance(name, str):
+        raise SceneError(f"{what} is {name!r}; give the {what}'s name, like 'wrist_pad'")
 
 
 def check_stepped(data: mujoco.MjData, site: int) -> None:

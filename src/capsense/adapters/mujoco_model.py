@@ -34,6 +34,8 @@ _SCALAR_LAST = [1, 2, 3, 0]
 MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
+_HEIGHT_FIELD = 1
+"""Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
 """Flexes are no thinner than this [m], whatever their radius."""
 
@@ -202,6 +204,15 @@ class ModelReader:
         return solid_mesh(vertices, faces, names[-1])
 
 
+def _check_groups(groups: Any) -> None:
+    if groups is None:
+        return
+    if isinstance(groups, str) or not isinstance(groups, Collection):
+        raise SceneError(f"groups is {groups!r}; give the numbers of geom groups, like [0, 2]")
+    if not groups:
+        raise SceneError("groups is empty, so that nothing is seen; leave it out to see all")
+
+
 class ModelSource(WorldSource):
     """The solids of a MuJoCo model; frames are its bodies.
 
@@ -223,9 +234,14 @@ class ModelSource(WorldSource):
         rules: Rules,
         groups: Collection[int] | None,
     ) -> None:
+        import mujoco
+
         self.model = model
         self.data = data
         self._rules = rules
+        _check_groups(groups)
+        kinds = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+        self._warnings = [int(getattr(mujoco.mjtWarning, kind)) for kind in kinds]
         there = {int(g) for g in (*model.geom_group, *model.flex_group)}
         for group in () if groups is None else groups:
             if group not in there:
@@ -241,6 +257,8 @@ class ModelSource(WorldSource):
         super().refresh()
         self._reader = ModelReader(self.model, self._rules)
         self._made: dict[int, Solid | None] = {}
+        self._known = self._sizes()
+        self._set_back = self._bad_numbers()
 
     def solids(self, own: int | None) -> list[Solid]:
         out = []
@@ -257,7 +275,38 @@ class ModelSource(WorldSource):
         return [s for s in soft if s is not None]
 
     def links(self) -> tuple[Array, Array]:
+        (bad, time), self._set_back = self._set_back, self._bad_numbers()
+        if self._set_back[0] > bad or (bad and self._set_back[0] and self._set_back[1] < time):
+            raise SceneError(
+                "the simulation has diverged (a bad number in its positions, velocities or "
+                "accelerations) and MuJoCo has set it back to its start; take a smaller time step "
+                "or gentler controls, and call reset()"
+            )
+        self._follow()
         return self.data.xpos, self.data.xquat[:, _SCALAR_LAST]
+
+    def _follow(self) -> None:
+        """Take over geoms that were moved on their bodies, or resized, since the last reading."""
+        now = self._sizes()
+        if all(map(np.array_equal, now, self._known)):
+            return
+        *geoms, terrain = zip(now, self._known, strict=True)
+        changed = np.any([(a != b).any(axis=1) for a, b in geoms], axis=0)
+        if not np.array_equal(*terrain):
+            changed |= self.model.geom_type == _HEIGHT_FIELD
+        for geom in np.flatnonzero(changed).tolist():
+            self._made.pop(geom, None)
+        self._known = now
+        self.version += 1
+
+    def _sizes(self) -> tuple[Array, ...]:
+        """What a simulation may change of its geoms, as domain randomisation does; copied."""
+        m = self.model
+        return tuple(a.copy() for a in (m.geom_pos, m.geom_quat, m.geom_size, m.hfield_data))
+
+    def _bad_numbers(self) -> tuple[int, float]:
+        """Warnings that a diverged simulation was set back, since the last reset; and the time."""
+        return int(self.data.warning.number[self._warnings].sum()), float(self.data.time)
 
 
 def _part(array: Any, start: Any, count: int) -> NDArray[np.int32]:

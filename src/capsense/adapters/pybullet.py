@@ -16,8 +16,9 @@ from capsense.adapters.attached import (
     make_simulator,
     refuse_missing,
 )
+from capsense.adapters.pybullet_bodies import body_numbers, links_of
 from capsense.adapters.pybullet_depth import PybulletDepthSensor
-from capsense.adapters.pybullet_model import ClientSource, body_numbers, links_of
+from capsense.adapters.pybullet_model import ClientSource
 from capsense.adapters.rules import Rules
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames

@@ -73,7 +73,7 @@ class Frames:
     """Unit quaternion of the sensor frame, shape (4,)."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class World:
     """All solids that a sensor may see.
 
@@ -136,12 +136,11 @@ class World:
             frames.sensor_position, frames.sensor_quaternion, self._lower, self._upper,
             self._position, self._quaternion, self._seen,
         )  # fmt: skip
+        if not np.isfinite(frames.sensor_position.sum() + frames.sensor_quaternion.sum()):
+            raise _diverged("the sensor's link")
         if not np.isfinite(self._position.sum() + self._quaternion.sum()):
             bad = ~np.isfinite(self._position.sum(axis=1) + self._quaternion.sum(axis=1))
-            label = self.solids[int(np.flatnonzero(bad)[0])].label
-            raise SceneError(
-                f"{label!r} stands at a place that is not finite; has the simulation diverged?"
-            )
+            raise _diverged(repr(self.solids[int(np.flatnonzero(bad)[0])].label))
         seen = np.flatnonzero(self._seen)
         sharing = self._sharing[seen]
         bodies = [self._bodies[i] for i in seen.tolist()]
@@ -162,6 +161,8 @@ class World:
         for k, soft in enumerate(self.soft):
             vertices = (soft.vertices() - frames.sensor_position) @ rotation
             low, high = vertices.min(axis=0), vertices.max(axis=0)
+            if not np.isfinite(low.sum() + high.sum()):
+                raise _diverged(repr(soft.label))
             if np.any(low >= self._upper) or np.any(high <= self._lower):
                 continue
             surface = self._surfaces[k]
@@ -186,3 +187,10 @@ class World:
             assert not isinstance(b.grounding, str)
             self._tied[key] = Body(b.shape, b.pose, b.material, b.grounding / count, b.name)
         return self._tied[key]
+
+
+def _diverged(what: str) -> SceneError:
+    return SceneError(
+        f"the simulation has diverged: {what} stands at a place that is not finite; set the "
+        "simulation back, and take a smaller time step or gentler controls"
+    )

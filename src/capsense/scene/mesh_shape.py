@@ -31,6 +31,10 @@ class Triangles(Shape):
     faces: NDArray[np.int64]
     """Vertex indices, shape (m, 3), read-only."""
 
+    def __repr__(self) -> str:
+        size = " × ".join(f"{v:.3g}" for v in np.ptp(self.vertices, axis=0))
+        return f"<{type(self).__name__}: {len(self.faces)} triangles, {size} m>"
+
     def signed_distance(self, points: ArrayLike) -> Array:
         """Exact distance to the nearest triangle [m], negative inside.
 
@@ -89,7 +93,7 @@ class Triangles(Shape):
         """Raise a SceneError that says why there is no ``what``, if the surface is not closed."""
 
 
-@dataclass(frozen=True, init=False, eq=False)
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class TriMesh(Triangles):
     """A triangle mesh, moved rigidly.
 
