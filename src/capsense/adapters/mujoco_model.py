@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,18 @@ _HEIGHT_FIELD = 1
 """Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
 """Flexes are no thinner than this [m], whatever their radius."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlexVertices:
+    """Gives the vertices of a flex at present; a copy of a sensor gives those of its own data."""
+
+    data: mujoco.MjData
+    own: slice
+    """Its part of all vertices."""
+
+    def __call__(self) -> Array:
+        return self.data.flexvert_xpos[self.own]
 
 
 class ModelReader:
@@ -111,7 +124,7 @@ class ModelReader:
         return SoftSolid(
             label=label,
             faces=faces.reshape(-1, 3).astype(np.int64),
-            vertices=lambda: data.flexvert_xpos[own],
+            vertices=FlexVertices(data, own),
             material=material,
             tie=tie,
             thickness=max(2 * float(m.flex_radius[flex]), _THINNEST),
