@@ -129,9 +129,9 @@ def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (0.6, 0, 0.8), (0, 1, 0)])
 def test_planes(normal: Any, client: int, attach: Callable[..., Any]) -> None:
-    """A plane fills its back side."""
+    """A plane of wood fills its back side."""
     place(client, cs.Pose((0.01, 0.01, 0.05)), shapeType=p.GEOM_PLANE, planeNormal=normal)
-    (body,) = attach().scene()
+    (body,) = attach(default_material="wood").scene()
     points = np.random.default_rng(0).uniform((-0.05, -0.05, 0), (0.05, 0.05, 0.09), (200, 3))
     side = (points - (0.01, 0.01, 0.05)) @ np.array(normal)
     inside = body.shape.signed_distance(body.pose.inverse().apply(points))

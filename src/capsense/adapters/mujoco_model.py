@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import WorldSource
 from capsense.adapters.meshes import height_field, solid_mesh
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
+from capsense.adapters.terrain import Terrain
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
 from capsense.scene import (
@@ -35,6 +36,8 @@ _SCALAR_LAST = [1, 2, 3, 0]
 MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
+_WIDE = 0.4
+"""Terrains of larger half extents [m] are given out in tiles."""
 _HEIGHT_FIELD = 1
 """Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
@@ -88,7 +91,7 @@ class ModelReader:
         w, x, y, z = self.model.geom_quat[geom].tolist()
         return Solid(
             label=names[-1],
-            shape=self._shape(geom, names),
+            shape=self._shape(geom, names, material),
             frame=int(self.model.geom_bodyid[geom]),
             pose=Pose(self.model.geom_pos[geom].tolist(), (x, y, z, w)),
             material=material,
@@ -169,7 +172,7 @@ class ModelReader:
             if not any(matches(pattern, names) for names in (*self._names, *self._flex_names)):
                 raise SceneError(f"the model's capsense texts: no geom or body fits {pattern!r}")
 
-    def _shape(self, geom: int, names: Names) -> Shape | HalfSpace:
+    def _shape(self, geom: int, names: Names, material: Material) -> Shape | HalfSpace | Terrain:
         import mujoco
 
         kinds = mujoco.mjtGeom
@@ -190,7 +193,8 @@ class ModelReader:
         if kind in (int(kinds.mjGEOM_MESH), int(kinds.mjGEOM_SDF)):
             return self._mesh(int(self.model.geom_dataid[geom]), names)
         if kind == int(kinds.mjGEOM_HFIELD):
-            return self._terrain(int(self.model.geom_dataid[geom]), names)
+            solid = not material.is_conductor()
+            return self._terrain(int(self.model.geom_dataid[geom]), names, solid)
         raise SceneError(
             f"geom {names[-1]!r} is of a type that cannot be sensed ({kinds(kind).name}); leave "
             f"it out with exclude=[{names[-1]!r}]"
@@ -207,12 +211,14 @@ class ModelReader:
             self._meshes[mesh, hull] = solid_mesh(vertices, faces, names[-1], hull=hull)
         return self._meshes[mesh, hull]
 
-    def _terrain(self, field: int, names: Names) -> TriMesh:
+    def _terrain(self, field: int, names: Names, solid: bool) -> TriMesh | Terrain:
         m = self.model
         rows, columns = int(m.hfield_nrow[field]), int(m.hfield_ncol[field])
         start = int(m.hfield_adr[field])
         half_x, half_y, top, base = m.hfield_size[field].tolist()
         heights = top * m.hfield_data[start : start + rows * columns].reshape(rows, columns)
+        if max(half_x, half_y) > _WIDE:
+            return Terrain(heights, (half_x, half_y), base, solid, names[-1])
         vertices, faces = height_field(heights, (half_x, half_y), base)
         return solid_mesh(vertices, faces, names[-1])
 
