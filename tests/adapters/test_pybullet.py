@@ -300,3 +300,57 @@ def test_a_client_that_is_gone(tiny_simulator: cs.Simulator) -> None:
     p.disconnect(client)
     with pytest.raises(cs.SceneError, match="is not connected any more"):
         sensor.read()
+
+
+@pytest.mark.parametrize("shapes", ["collision", "visual"])
+@pytest.mark.parametrize(
+    "geometry",
+    ['<box size="0 0 0"/>', '<sphere radius="0"/>', '<cylinder radius="0.01" length="0"/>'],
+)
+def test_shapes_without_volume_are_left_out(
+    geometry: str, shapes: str, client: int, attach: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Real robots have such boxes; they are named once, and the rest is read."""
+    load(client, urdf("robot", geometry), cs.Pose(AHEAD), tmp_path)
+    shape = {"radius": 0.01, "physicsClientId": client}
+    ball = (f(p.GEOM_SPHERE, **shape) for f in (p.createCollisionShape, p.createVisualShape))
+    p.createMultiBody(0, *ball, basePosition=AHEAD, physicsClientId=client)
+    with pytest.warns(UserWarning, match=r"sensor: 'robot/robot_link' .*\(left out\)$"):
+        sensor = attach(shapes=shapes)
+    (body,) = sensor.scene()
+    assert body.shape == cs.Sphere(0.01)
+
+
+def test_a_mesh_that_cannot_be_read(
+    client: int, attach: Callable[..., Any], tmp_path: Path
+) -> None:
+    """As without the reader of its format: the link's collision shape is taken, and told."""
+    file = tmp_path / "hand.dae"
+    file.write_text("no mesh at all")
+    drawn = p.createVisualShape(p.GEOM_MESH, fileName=str(file), physicsClientId=client)
+    solid = p.createCollisionShape(p.GEOM_SPHERE, radius=0.01, physicsClientId=client)
+    p.createMultiBody(0, solid, drawn, basePosition=AHEAD, physicsClientId=client)
+    with pytest.warns(UserWarning, match=r"hand\.dae cannot be read: (.|\n)*collision shapes are"):
+        sensor = attach(shapes="visual")
+    assert [b.shape for b in sensor.scene()] == [cs.Sphere(0.01)]
+
+
+@pytest.mark.parametrize("shapes", ["collision", "visual"])
+@pytest.mark.parametrize(
+    ("robot", "link"), [("kuka_iiwa/model.urdf", 6), ("franka_panda/panda.urdf", "panda_hand")]
+)
+def test_real_robots_are_read_at_once(
+    robot: str, link: int | str, shapes: str, client: int, tiny_simulator: cs.Simulator
+) -> None:
+    """The robots of pybullet_data, with their open and crossing meshes, and a hand before them."""
+    import pybullet_data
+
+    file = f"{pybullet_data.getDataPath()}/{robot}"
+    body = p.loadURDF(file, useFixedBase=True, physicsClientId=client)
+    pad = cs.Pose((0.0, 0.0, 0.15))
+    sensor = cs.pybullet.attach(client, body, link, pad, tiny_simulator, shapes=shapes)
+    empty = sensor.read().delta
+    assert np.isfinite(empty).all()
+    pose = sensor.pose @ cs.Pose((0, 0, 0.04))
+    place(client, pose, shapeType=p.GEOM_SPHERE, radius=0.01)
+    assert np.abs(sensor.read().delta - empty).max() > 1e-16

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from capsense.adapters.attached import WorldSource
 from capsense.adapters.meshes import (
+    UnusableShape,
     is_flat,
     joined_hulls,
     load_triangles,
@@ -105,6 +107,8 @@ class WorldReader:
         self.links = links
         self.rules = rules
         self.shapes = shapes
+        self.notes: list[str] = []
+        """What was left out or replaced, and why."""
         self._meshes: dict[tuple[object, ...], Shape] = {}
 
     def solids(self, index: int) -> Iterator[Solid]:
@@ -151,20 +155,46 @@ class WorldReader:
             raise _refuse(link, "is a height field, of which PyBullet tells nothing but its bounds")
         if self.shapes == "visual":
             to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
-            flat = False
+            flat = lost = False
             for entry in drawn:
-                shape = self._visual(link, entry)
+                if self._is_nothing(link, entry):
+                    continue
+                try:
+                    shape = self._visual(link, entry)
+                except UnusableShape as error:
+                    self.notes.append(f"{error} (its link's collision shapes are taken)")
+                    lost = True
+                    continue
                 flat = flat or shape is None
                 if shape is not None:
                     yield shape, to_mass @ Pose(entry[5], entry[6])
-            if not flat:
+            if not (flat or lost):
                 return
         # entries 0 and 1 are sound in the first record of a link only
         data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
-        if self.shapes == "visual" and not data:
+        if self.shapes == "visual" and not data and flat:
             raise _refuse(link, "has a flat visual mesh, without an inside, and no collision shape")
         for number, entry in enumerate(data):
-            yield self._collision(link, number, entry)
+            if self._is_nothing(link, entry):
+                continue
+            try:
+                yield self._collision(link, number, entry)
+            except UnusableShape as error:
+                self.notes.append(f"{error} (left out)")
+
+    def _is_nothing(self, link: Link, entry: Any) -> bool:
+        """Whether a shape has no volume, as the empty boxes that some URDFs hold."""
+        import pybullet as p
+
+        kind, (a, b, c) = entry[2], entry[3]
+        least = {
+            p.GEOM_BOX: min(a, b, c), p.GEOM_SPHERE: a, p.GEOM_CAPSULE: b,
+            p.GEOM_CYLINDER: min(a, b),
+        }.get(kind, 1.0)  # fmt: skip
+        if least > 0:
+            return False
+        self.notes.append(f"{link.names[-1]!r} has a shape of sizes {a:g}, {b:g}, {c:g} (left out)")
+        return True
 
     def _visual(self, link: Link, entry: Any) -> Shape | None:
         """A visual shape; None for a flat mesh, such as that of a drawn floor."""
@@ -267,6 +297,9 @@ class ClientSource(WorldSource):
             if i not in self._made:
                 self._made[i] = list(self._reader.solids(i))
             out += self._made[i]
+        notes, self._reader.notes = self._reader.notes, []
+        if notes:
+            warnings.warn("sensor: " + ";\n".join(dict.fromkeys(notes)), stacklevel=2)
         return out
 
     def soft(self, own: int | None) -> list[SoftSolid]:
