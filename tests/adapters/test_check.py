@@ -34,7 +34,7 @@ def test_a_sound_sensor_warns_of_nothing(shapes_in: SensorIn) -> None:
     [
         ((0.0, 0.0, 0.01), r"electrodes 'A', 'B' lie inside '.*ball.*', up to .* mm deep"),
         ((-0.01, 0.0, 0.02), r"touch(es)? '.*ball.*', as a short circuit would"),
-        ((0.0, 0.0, -0.06), r"nothing is in view, but '.*ball.*' would be if the sensor faced"),
+        ((0.0, 0.0, -0.06), r"nothing is in view, .*, but '.*ball.*' would be if the sensor faced"),
         ((9.0, 0.0, 0.0), r"nothing is in view, .* exactly 0: the sensor sees 0\.1 × 0\.1 × 0\.1"),
     ],
 )

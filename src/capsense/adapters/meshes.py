@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,9 @@ def solid_mesh(vertices: ArrayLike, faces: ArrayLike, label: str, *, hull: bool 
     if hull:
         vertices, faces = _hull(np.asarray(vertices, dtype=float), label)
     try:
-        return TriMesh(vertices, faces)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # faces of no area are usual, and harmless
+            return TriMesh(vertices, faces)
     except SceneError as error:
         raise SceneError(
             f"{label!r}: {error}; or take its convex hull with hull=[{label!r}], or leave it "

@@ -276,7 +276,7 @@ class ModelSource(WorldSource):
         super().refresh()
         self._reader = ModelReader(self.model, self._rules)
         self._made: dict[int, Solid | None] = {}
-        self._known = self._sizes()
+        self._known = [a.copy() for a in self._sizes()]
         self._set_back = self._bad_numbers()
 
     def solids(self, own: int | None) -> list[Solid]:
@@ -315,13 +315,13 @@ class ModelSource(WorldSource):
             changed |= self.model.geom_type == _HEIGHT_FIELD
         for geom in np.flatnonzero(changed).tolist():
             self._made.pop(geom, None)
-        self._known = now
+        self._known = [a.copy() for a in now]
         self.version += 1
 
     def _sizes(self) -> tuple[Array, ...]:
-        """What a simulation may change of its geoms, as domain randomisation does; copied."""
+        """What a simulation may change of its geoms, as domain randomisation does."""
         m = self.model
-        return tuple(a.copy() for a in (m.geom_pos, m.geom_quat, m.geom_size, m.hfield_data))
+        return m.geom_pos, m.geom_quat, m.geom_size, m.hfield_data
 
     def _bad_numbers(self) -> tuple[int, float]:
         """Warnings that a diverged simulation was set back, since the last reset; and the time."""
