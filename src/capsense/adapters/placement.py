@@ -48,8 +48,8 @@ def turned_round(names: list[str]) -> str:
     listed = ", ".join(map(repr, names[:4])) + (", …" if len(names) > 4 else "")
     return (
         f"nothing is in view, so that every change is exactly 0, but {listed} would be if the "
-        "sensor faced the other way: its z must point out of the sensor; if it should see that, turn "
-        'its frame half round about x (quaternion (1, 0, 0, 0), in MJCF euler="180 0 0")'
+        "sensor faced the other way: its z must point out of the sensor; if it should see that, "
+        'turn its frame half round about x (quaternion (1, 0, 0, 0), in MJCF euler="180 0 0")'
     )
 
 
