@@ -51,9 +51,19 @@ class Crew:
             raise SceneError(f"threads is {threads!r}; give a whole number from 1")
         self.threads = threads
         """How many threads read, the calling one included."""
-        self._pool = (
-            ThreadPoolExecutor(threads - 1, thread_name_prefix="capsense") if threads > 1 else None
-        )
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0
+
+    def __reduce__(self) -> tuple[type[Crew], tuple[int]]:
+        """A copy has threads of its own."""
+        return Crew, (self.threads,)
+
+    def _helpers(self) -> ThreadPoolExecutor:
+        """The other threads; a forked process inherits none, so that it starts its own."""
+        if self._pool is None or self._process != os.getpid():
+            self._pool = ThreadPoolExecutor(self.threads - 1, thread_name_prefix="capsense")
+            self._process = os.getpid()
+        return self._pool
 
     def run(
         self, tasks: Mapping[Key, Callable[[], Result]]
@@ -78,7 +88,7 @@ class Crew:
                     failures[key] = error
 
         helpers = min(self.threads, len(tasks)) - 1
-        futures = [self._pool.submit(work) for _ in range(helpers)] if self._pool else []
+        futures = [self._helpers().submit(work) for _ in range(helpers)]
         try:
             work()
         finally:

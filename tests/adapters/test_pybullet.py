@@ -129,9 +129,9 @@ def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (0.6, 0, 0.8), (0, 1, 0)])
 def test_planes(normal: Any, client: int, attach: Callable[..., Any]) -> None:
-    """A plane fills its back side."""
+    """A plane of wood fills its back side."""
     place(client, cs.Pose((0.01, 0.01, 0.05)), shapeType=p.GEOM_PLANE, planeNormal=normal)
-    (body,) = attach().scene()
+    (body,) = attach(default_material="wood").scene()
     points = np.random.default_rng(0).uniform((-0.05, -0.05, 0), (0.05, 0.05, 0.09), (200, 3))
     side = (points - (0.01, 0.01, 0.05)) @ np.array(normal)
     inside = body.shape.signed_distance(body.pose.inverse().apply(points))
@@ -241,3 +241,116 @@ def test_wrong_calls_are_refused(
         call = {"client": client, "body": sensor.body, "design": tiny_simulator, **options}
         with pytest.raises(cs.SceneError, match=message):
             cs.pybullet.attach(**call)
+
+
+def test_named_bodies_may_leave(client: int, tiny_simulator: cs.Simulator) -> None:
+    """A pattern must fit something at attach; what it fits may go and come back."""
+    pad = p.createMultiBody(0, physicsClientId=client)
+
+    def ball() -> int:
+        shape = p.createCollisionShape(p.GEOM_SPHERE, radius=0.01, physicsClientId=client)
+        body = p.createMultiBody(0, shape, basePosition=[0, 0, 0.04], physicsClientId=client)
+        p.addUserData(body, "capsense.body", "ball", physicsClientId=client)
+        return int(body)
+
+    first = ball()
+    for world in ("geometry", "depth"):
+        sensor = cs.pybullet.attach(
+            client, pad, design=tiny_simulator, world=world, materials={"ball": "human"}
+        )
+        there = sensor.read().delta
+        p.removeBody(first, physicsClientId=client)
+        assert np.abs(sensor.read().delta).max() == 0.0
+        first = ball()
+        assert np.array_equal(sensor.read().delta, there)
+    p.removeBody(pad, physicsClientId=client)
+    with pytest.raises(cs.SceneError, match="which carries the sensor, has left the world"):
+        sensor.read()
+
+
+@pytest.mark.parametrize("world", ["geometry", "depth"])
+def test_a_world_that_was_reset(world: str, client: int, tiny_simulator: cs.Simulator) -> None:
+    """Bodies of the same numbers are others then."""
+
+    def fill(radius: float) -> int:
+        p.resetSimulation(physicsClientId=client)
+        pad = p.createMultiBody(0, physicsClientId=client)
+        make = {"radius": radius, "physicsClientId": client}
+        shapes = (
+            p.createCollisionShape(p.GEOM_SPHERE, **make),
+            p.createVisualShape(p.GEOM_SPHERE, **make),
+        )
+        p.createMultiBody(0, *shapes, basePosition=[0, 0, 0.04], physicsClientId=client)
+        return int(pad)
+
+    sensor = cs.pybullet.attach(client, fill(0.01), design=tiny_simulator, world=world)
+    small = sensor.read().delta[0, 0]
+    fill(0.02)
+    assert sensor.read().delta[0, 0] > 1.5 * small
+    fill(0.01)
+    assert sensor.read().delta[0, 0] == small
+
+
+def test_a_client_that_is_gone(tiny_simulator: cs.Simulator) -> None:
+    """The error says so."""
+    client = p.connect(p.DIRECT)
+    sensor = cs.pybullet.attach(
+        client, p.createMultiBody(0, physicsClientId=client), design=tiny_simulator
+    )
+    p.disconnect(client)
+    with pytest.raises(cs.SceneError, match="is not connected any more"):
+        sensor.read()
+
+
+@pytest.mark.parametrize("shapes", ["collision", "visual"])
+@pytest.mark.parametrize(
+    "geometry",
+    ['<box size="0 0 0"/>', '<sphere radius="0"/>', '<cylinder radius="0.01" length="0"/>'],
+)
+def test_shapes_without_volume_are_left_out(
+    geometry: str, shapes: str, client: int, attach: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Real robots have such boxes; they are named once, and the rest is read."""
+    load(client, urdf("robot", geometry), cs.Pose(AHEAD), tmp_path)
+    shape = {"radius": 0.01, "physicsClientId": client}
+    ball = (f(p.GEOM_SPHERE, **shape) for f in (p.createCollisionShape, p.createVisualShape))
+    p.createMultiBody(0, *ball, basePosition=AHEAD, physicsClientId=client)
+    with pytest.warns(UserWarning, match=r"sensor: 'robot/robot_link' .*\(left out\)$"):
+        sensor = attach(shapes=shapes)
+    (body,) = sensor.scene()
+    assert body.shape == cs.Sphere(0.01)
+
+
+def test_a_mesh_that_cannot_be_read(
+    client: int, attach: Callable[..., Any], tmp_path: Path
+) -> None:
+    """As without the reader of its format: the link's collision shape is taken, and told."""
+    file = tmp_path / "hand.dae"
+    file.write_text("no mesh at all")
+    drawn = p.createVisualShape(p.GEOM_MESH, fileName=str(file), physicsClientId=client)
+    solid = p.createCollisionShape(p.GEOM_SPHERE, radius=0.01, physicsClientId=client)
+    p.createMultiBody(0, solid, drawn, basePosition=AHEAD, physicsClientId=client)
+    with pytest.warns(UserWarning, match=r"hand\.dae cannot be read: (.|\n)*collision shapes are"):
+        sensor = attach(shapes="visual")
+    assert [b.shape for b in sensor.scene()] == [cs.Sphere(0.01)]
+
+
+@pytest.mark.parametrize("shapes", ["collision", "visual"])
+@pytest.mark.parametrize(
+    ("robot", "link"), [("kuka_iiwa/model.urdf", 6), ("franka_panda/panda.urdf", "panda_hand")]
+)
+def test_real_robots_are_read_at_once(
+    robot: str, link: int | str, shapes: str, client: int, tiny_simulator: cs.Simulator
+) -> None:
+    """The robots of pybullet_data, with their open and crossing meshes, and a hand before them."""
+    import pybullet_data
+
+    file = f"{pybullet_data.getDataPath()}/{robot}"
+    body = p.loadURDF(file, useFixedBase=True, physicsClientId=client)
+    pad = cs.Pose((0.0, 0.0, 0.15))
+    sensor = cs.pybullet.attach(client, body, link, pad, tiny_simulator, shapes=shapes)
+    empty = sensor.read().delta
+    assert np.isfinite(empty).all()
+    pose = sensor.pose @ cs.Pose((0, 0, 0.04))
+    place(client, pose, shapeType=p.GEOM_SPHERE, radius=0.01)
+    assert np.abs(sensor.read().delta - empty).max() > 1e-16

@@ -16,7 +16,7 @@ from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import Pattern, self_patterns
 from capsense.readout.chips import CHIPS
 from capsense.readout.converter import CapDac, LinearLaw
-from capsense.readout.counts import join
+from capsense.readout.counts import Counts, join
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.read_out import ReadOut
@@ -441,3 +441,29 @@ def test_misuse_is_refused():
         plain(wiring=Wiring(trace=[1.0, 2.0]))
     with pytest.raises(ReadOutError, match="crosstalk is"):
         plain(wiring=Wiring(crosstalk=[1.0, 2.0]))
+
+
+def test_held_values_are_of_fixed_size() -> None:
+    """Every channel's last conversion and its age, at every call; 0 where there is none yet."""
+    chip = ReadOut.preset("fdc1004", NAMES)
+    counts = chip.sample(0.0, np.zeros((3, 3)))
+    held = counts.held()
+    assert len(counts) == 0
+    assert held.capacitance.tolist() == [0.0] * len(chip.channel_names)
+    assert np.isinf(held.age).all()
+    seen: list[Counts] = []
+    for time in np.arange(1, 60) * 0.7e-3:
+        counts = chip.sample(time, np.eye(3) * (1 + time) * 1e-12)
+        seen.append(counts)
+        held = counts.held()
+        for k, name in enumerate(chip.channel_names):
+            own = [c.of(name) for c in seen if len(c.of(name))]
+            if own:
+                assert held.capacitance[k] == own[-1].capacitance[-1]
+                assert held.code[k] == own[-1].code[-1]
+                assert held.age[k] == pytest.approx(time - own[-1].time[-1])
+            else:
+                assert np.isinf(held.age[k])
+    assert np.isfinite(held.age).all()
+    chip.reset()
+    assert np.isinf(chip.sample(0.0, np.zeros((3, 3))).held().age).all()

@@ -17,6 +17,7 @@ from capsense.scene import (
     Pose,
     Scene,
     Sphere,
+    TriMesh,
 )
 
 POSE = Pose((0.1, -0.2, 0.3), (0.1, -0.2, 0.3, 0.9))
@@ -125,3 +126,14 @@ def test_import_is_light():
 def test_bad_input_is_refused(make, words):
     with pytest.raises(SceneError, match=words):
         make()
+
+
+def test_printing_stays_short() -> None:
+    """A scene of a robot's meshes is a line."""
+    mesh = Sphere(0.1).to_trimesh()
+    shape = TriMesh(mesh.vertices, mesh.faces)
+    scene = Scene([Body(shape, name=f"link{k}") for k in range(100)])
+    assert len(repr(scene)) < 300
+    assert repr(scene).startswith("<Scene of 100: link0 (TriMesh), link1")
+    assert len(repr(scene[0])) < 500
+    assert repr(Scene()) == "<Scene of 0: nothing>"

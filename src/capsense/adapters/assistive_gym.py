@@ -13,7 +13,7 @@ from typing import Any
 
 from capsense.adapters import pybullet
 from capsense.adapters.attached import AttachedSensor, make_simulator, refuse_missing
-from capsense.adapters.pybullet_model import BODY_NAME, LINK_NAME
+from capsense.adapters.pybullet_bodies import BODY_NAME, LINK_NAME
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.readout.read_out import ReadOut

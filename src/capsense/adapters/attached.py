@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from capsense._crew import OneAtATime
 from capsense._validate import suggest
+from capsense.adapters.placement import nothing_seen, placement, turned_round
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
@@ -127,6 +129,34 @@ class AttachedSensor(ABC):
             SceneError: The simulator has not been stepped yet.
         """
 
+    def check(self) -> list[str]:
+        """What is wrong with where the sensor sits and what it sees at the present state.
+
+        Electrodes inside a body or touching one, a sensor that faces the wrong way or sees
+        nothing, meshes and images too coarse, cameras that are set wrongly.
+
+        Returns:
+            A sentence for each finding, with its fix; none where all is well.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+        """
+        scene = self.scene()
+        return placement(scene, self.simulator) if len(scene) else [nothing_seen(self._design)]
+
+    def warn(self) -> None:
+        """Warn of what :meth:`check` finds, if the simulator's state is known yet."""
+        try:
+            found = self.check()
+        except SceneError:
+            return
+        if found:
+            warnings.warn("sensor: " + ";\nand ".join(found), stacklevel=3)
+
+    @property
+    def _design(self) -> Design:
+        return self.simulator.design
+
     @property
     def baseline(self) -> Array:
         """Maxwell matrix with nothing in the domain [F], shape (M, M)."""
@@ -238,6 +268,14 @@ class GeometrySensor(AttachedSensor):
     def pose(self) -> Pose:
         frames = self._now(None)
         return Pose(frames.sensor_position, frames.sensor_quaternion)
+
+    def check(self) -> list[str]:
+        frames = self._now(None)
+        if len(self.world.scene(frames)):
+            return super().check()
+        turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
+        behind = self.world.scene(replace(frames, sensor_quaternion=np.array(turn.quaternion)))
+        return [turned_round([str(b.name) for b in behind])] if len(behind) else super().check()
 
     def refresh(self) -> None:
         """Take the world's solids over again, after their shapes, sizes or number changed.

@@ -61,8 +61,8 @@ def place_solids(
         local_quaternion: Their unit quaternions, shape (n, 4).
         centre: Centres of the solids' own bounding boxes [m], shape (n, 3).
         half: Half edge lengths of those boxes [m], shape (n, 3).
-        depth: Zero for a solid; for a half space below its local plane z = 0, the edge length
-            [m] of the cube that stands for it, shape (n,).
+        depth: Zero for a solid; for a half space below its local plane z = 0, the thickness
+            [m] of the plate that stands for it, shape (n,).
         sensor_position: Origin of the sensor frame [m] in the world, shape (3,).
         sensor_quaternion: Its unit quaternion, shape (4,).
         lower: Lower corner of the domain [m] in the sensor frame, shape (3,).

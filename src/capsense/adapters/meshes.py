@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,10 @@ from capsense.errors import SceneError
 from capsense.scene import Cylinder, TriMesh
 
 Array = NDArray[np.float64]
+
+
+class UnusableShape(SceneError):
+    """A shape of a model that can be left out: it has no volume, or its file cannot be read."""
 
 
 def solid_mesh(vertices: ArrayLike, faces: ArrayLike, label: str, *, hull: bool = False) -> TriMesh:
@@ -28,7 +33,9 @@ def solid_mesh(vertices: ArrayLike, faces: ArrayLike, label: str, *, hull: bool 
     if hull:
         vertices, faces = _hull(np.asarray(vertices, dtype=float), label)
     try:
-        return TriMesh(vertices, faces)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # faces of no area are usual, and harmless
+            return TriMesh(vertices, faces)
     except SceneError as error:
         raise SceneError(
             f"{label!r}: {error}; or take its convex hull with hull=[{label!r}], or leave it "
@@ -57,7 +64,7 @@ def load_triangles(path: str | Path, scale: ArrayLike, label: str) -> tuple[Arra
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
     except Exception as error:  # trimesh's readers raise whatever they meet
-        raise SceneError(f"{label!r}: {file} cannot be read: {error}") from None
+        raise UnusableShape(f"{label!r}: {file} cannot be read: {error}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise SceneError(f"{label!r}: {file} holds no triangles")
     return np.asarray(mesh.vertices) * np.asarray(scale, dtype=float), np.asarray(mesh.faces)
@@ -132,7 +139,7 @@ def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Arr
         all_faces.append(triangles + count)
         count += len(points)
     if not count:
-        raise SceneError(f"{label!r} has no part with a volume; is it flat?")
+        raise UnusableShape(f"{label!r} has no part with a volume; is it flat?")
     return np.concatenate(all_vertices), np.concatenate(all_faces)
 
 
@@ -160,6 +167,6 @@ def _hull(vertices: Array, label: str) -> tuple[Array, Array]:
         hull = ConvexHull(vertices)
     except (QhullError, ValueError) as error:
         reason = str(error).partition("\n")[0]
-        raise SceneError(f"{label!r} has no convex hull with a volume: {reason}") from None
+        raise UnusableShape(f"{label!r} has no convex hull with a volume: {reason}") from None
     kept = np.unique(hull.simplices)
     return vertices[kept], np.searchsorted(kept, hull.simplices)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import GeometrySensor, check_world, make_simulator
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
+from capsense.adapters.mujoco_spec import add_sensor
 from capsense.adapters.rules import Rules
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
@@ -28,7 +29,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-__all__ = ["AttachedSkin", "MujocoDepthSensor", "MujocoSensor", "attach", "attach_skin"]
+__all__ = [
+    "AttachedSkin", "MujocoDepthSensor", "MujocoSensor", "add_sensor", "attach", "attach_skin",
+]  # fmt: skip
 
 _SCALAR_LAST = [1, 2, 3, 0]
 
@@ -119,6 +122,7 @@ def attach(
             checked_grounding(default_grounding), back,
         )  # fmt: skip
         sensor.use_readout(sensor.readout if readout is None else readout)
+        sensor.warn()
         return sensor
     rules = Rules(
         materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
@@ -126,6 +130,7 @@ def attach(
     source = ModelSource(model, data, rules, groups)
     sensor = MujocoSensor(source, number, make_simulator(design), exclude_own=exclude_own)
     sensor.use_readout(sensor.readout if readout is None else readout)
+    sensor.warn()
     return sensor
 
 
@@ -189,7 +194,9 @@ def attach_skin(
         site: MujocoSensor(source, number, simulators[site], exclude_own=exclude_own)
         for site, number in numbers.items()
     }
-    return AttachedSkin(sensors, readout, threads)
+    skin = AttachedSkin(sensors, readout, threads)
+    skin.warn()
+    return skin
 
 
 class MujocoSensor(GeometrySensor):

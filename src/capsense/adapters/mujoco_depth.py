@@ -34,6 +34,8 @@ class Eye:
     columns: int
     height: float
     """Height of the image [m]."""
+    cutoff: float
+    """Depths beyond this [m] are cut to it; 0 where none are."""
 
 
 class MujocoDepthSensor(DepthSensor):
@@ -78,6 +80,32 @@ class MujocoDepthSensor(DepthSensor):
             grounding=self._grounding, back=self._back,
         )  # fmt: skip
 
+    def check(self) -> list[str]:
+        eye, size = self._eye, self._design.domain.size
+        name, far = self.model.camera(eye.number).name, self._camera.far
+        found = []
+        if eye.height > 4 * max(size[:2]):
+            found.append(
+                f"camera {name!r} shows {eye.height:g} m; give it the height of its image in "
+                f'metres, like fovy="{max(size[:2]):g}" (without it, MuJoCo takes 45)'
+            )
+        elif eye.height / eye.rows > max(size[:2]) / 16:
+            found.append(
+                f"camera {name!r} has pixels of {1e3 * eye.height / eye.rows:.0f} mm; give it more "
+                'of them, like resolution="64 64"'
+            )
+        if 0 < eye.cutoff < far:
+            found.append(
+                f"the rangefinder of camera {name!r} is cut off at {eye.cutoff:g} m, where "
+                f"everything beyond seems to stand; leave cutoff out, or let it be {far:g} or more"
+            )
+        if self._camera_now().pose.rotation[2, 2] < 0.5:
+            found.append(
+                f"camera {name!r} does not look along the sensor's z; its frame is the site's, "
+                'turned half round about x (euler="180 0 0")'
+            )
+        return found or super().check()
+
     def _time(self) -> float:
         return float(self.data.time)
 
@@ -107,6 +135,7 @@ def find_site(model: mujoco.MjModel, name: str) -> int:
     """
     import mujoco
 
+    _require_name("site", name)
     site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), name)
     if site < 0:
         raise refuse_missing("site", name, [model.site(i).name for i in range(model.nsite)])
@@ -121,6 +150,7 @@ def find_camera(model: mujoco.MjModel, name: str) -> Eye:
     """
     import mujoco
 
+    _require_name("camera", name)
     number = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_CAMERA), name)
     if number < 0:
         raise refuse_missing("camera", name, [model.camera(i).name for i in range(model.ncam)])
@@ -139,11 +169,17 @@ def find_camera(model: mujoco.MjModel, name: str) -> Eye:
         wanted = (int(mujoco.mjtSensor.mjSENS_RANGEFINDER), int(mujoco.mjtObj.mjOBJ_CAMERA), number)
         if reads == wanted and int(model.sensor_dim[k]) == rows * columns:
             height = float(model.cam_fovy[number])
-            return Eye(int(number), int(model.sensor_adr[k]), rows, columns, height)
+            cutoff = float(model.sensor_cutoff[k])
+            return Eye(int(number), int(model.sensor_adr[k]), rows, columns, height, cutoff)
     raise SceneError(
         f'nothing reads the depths of camera {name!r}; add <rangefinder camera="{name}" '
         'data="depth"/> to the <sensor> section'
     )
+
+
+def _require_name(what: str, name: object) -> None:
+    if not isinstance(name, str):
+        raise SceneError(f"{what} is {name!r}; give the {what}'s name, like 'wrist_pad'")
 
 
 def check_stepped(data: mujoco.MjData, site: int) -> None:

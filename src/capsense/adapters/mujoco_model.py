@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import WorldSource
 from capsense.adapters.meshes import height_field, solid_mesh
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
+from capsense.adapters.terrain import Terrain
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
 from capsense.scene import (
@@ -34,8 +36,24 @@ _SCALAR_LAST = [1, 2, 3, 0]
 MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
+_WIDE = 0.4
+"""Terrains of larger half extents [m] are given out in tiles."""
+_HEIGHT_FIELD = 1
+"""Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
 """Flexes are no thinner than this [m], whatever their radius."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlexVertices:
+    """Gives the vertices of a flex at present; a copy of a sensor gives those of its own data."""
+
+    data: mujoco.MjData
+    own: slice
+    """Its part of all vertices."""
+
+    def __call__(self) -> Array:
+        return self.data.flexvert_xpos[self.own]
 
 
 class ModelReader:
@@ -73,7 +91,7 @@ class ModelReader:
         w, x, y, z = self.model.geom_quat[geom].tolist()
         return Solid(
             label=names[-1],
-            shape=self._shape(geom, names),
+            shape=self._shape(geom, names, material),
             frame=int(self.model.geom_bodyid[geom]),
             pose=Pose(self.model.geom_pos[geom].tolist(), (x, y, z, w)),
             material=material,
@@ -109,7 +127,7 @@ class ModelReader:
         return SoftSolid(
             label=label,
             faces=faces.reshape(-1, 3).astype(np.int64),
-            vertices=lambda: data.flexvert_xpos[own],
+            vertices=FlexVertices(data, own),
             material=material,
             tie=tie,
             thickness=max(2 * float(m.flex_radius[flex]), _THINNEST),
@@ -154,7 +172,7 @@ class ModelReader:
             if not any(matches(pattern, names) for names in (*self._names, *self._flex_names)):
                 raise SceneError(f"the model's capsense texts: no geom or body fits {pattern!r}")
 
-    def _shape(self, geom: int, names: Names) -> Shape | HalfSpace:
+    def _shape(self, geom: int, names: Names, material: Material) -> Shape | HalfSpace | Terrain:
         import mujoco
 
         kinds = mujoco.mjtGeom
@@ -175,7 +193,8 @@ class ModelReader:
         if kind in (int(kinds.mjGEOM_MESH), int(kinds.mjGEOM_SDF)):
             return self._mesh(int(self.model.geom_dataid[geom]), names)
         if kind == int(kinds.mjGEOM_HFIELD):
-            return self._terrain(int(self.model.geom_dataid[geom]), names)
+            solid = not material.is_conductor()
+            return self._terrain(int(self.model.geom_dataid[geom]), names, solid)
         raise SceneError(
             f"geom {names[-1]!r} is of a type that cannot be sensed ({kinds(kind).name}); leave "
             f"it out with exclude=[{names[-1]!r}]"
@@ -192,14 +211,25 @@ class ModelReader:
             self._meshes[mesh, hull] = solid_mesh(vertices, faces, names[-1], hull=hull)
         return self._meshes[mesh, hull]
 
-    def _terrain(self, field: int, names: Names) -> TriMesh:
+    def _terrain(self, field: int, names: Names, solid: bool) -> TriMesh | Terrain:
         m = self.model
         rows, columns = int(m.hfield_nrow[field]), int(m.hfield_ncol[field])
         start = int(m.hfield_adr[field])
         half_x, half_y, top, base = m.hfield_size[field].tolist()
         heights = top * m.hfield_data[start : start + rows * columns].reshape(rows, columns)
+        if max(half_x, half_y) > _WIDE:
+            return Terrain(heights, (half_x, half_y), base, solid, names[-1])
         vertices, faces = height_field(heights, (half_x, half_y), base)
         return solid_mesh(vertices, faces, names[-1])
+
+
+def _check_groups(groups: Any) -> None:
+    if groups is None:
+        return
+    if isinstance(groups, str) or not isinstance(groups, Collection):
+        raise SceneError(f"groups is {groups!r}; give the numbers of geom groups, like [0, 2]")
+    if not groups:
+        raise SceneError("groups is empty, so that nothing is seen; leave it out to see all")
 
 
 class ModelSource(WorldSource):
@@ -223,9 +253,14 @@ class ModelSource(WorldSource):
         rules: Rules,
         groups: Collection[int] | None,
     ) -> None:
+        import mujoco
+
         self.model = model
         self.data = data
         self._rules = rules
+        _check_groups(groups)
+        kinds = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+        self._warnings = [int(getattr(mujoco.mjtWarning, kind)) for kind in kinds]
         there = {int(g) for g in (*model.geom_group, *model.flex_group)}
         for group in () if groups is None else groups:
             if group not in there:
@@ -241,6 +276,8 @@ class ModelSource(WorldSource):
         super().refresh()
         self._reader = ModelReader(self.model, self._rules)
         self._made: dict[int, Solid | None] = {}
+        self._known = [a.copy() for a in self._sizes()]
+        self._set_back = self._bad_numbers()
 
     def solids(self, own: int | None) -> list[Solid]:
         out = []
@@ -257,7 +294,38 @@ class ModelSource(WorldSource):
         return [s for s in soft if s is not None]
 
     def links(self) -> tuple[Array, Array]:
+        (bad, time), self._set_back = self._set_back, self._bad_numbers()
+        if self._set_back[0] > bad or (bad and self._set_back[0] and self._set_back[1] < time):
+            raise SceneError(
+                "the simulation has diverged (a bad number in its positions, velocities or "
+                "accelerations) and MuJoCo has set it back to its start; take a smaller time step "
+                "or gentler controls, and call reset()"
+            )
+        self._follow()
         return self.data.xpos, self.data.xquat[:, _SCALAR_LAST]
+
+    def _follow(self) -> None:
+        """Take over geoms that were moved on their bodies, or resized, since the last reading."""
+        now = self._sizes()
+        if all(map(np.array_equal, now, self._known)):
+            return
+        *geoms, terrain = zip(now, self._known, strict=True)
+        changed = np.any([(a != b).any(axis=1) for a, b in geoms], axis=0)
+        if not np.array_equal(*terrain):
+            changed |= self.model.geom_type == _HEIGHT_FIELD
+        for geom in np.flatnonzero(changed).tolist():
+            self._made.pop(geom, None)
+        self._known = [a.copy() for a in now]
+        self.version += 1
+
+    def _sizes(self) -> tuple[Array, ...]:
+        """What a simulation may change of its geoms, as domain randomisation does."""
+        m = self.model
+        return m.geom_pos, m.geom_quat, m.geom_size, m.hfield_data
+
+    def _bad_numbers(self) -> tuple[int, float]:
+        """Warnings that a diverged simulation was set back, since the last reset; and the time."""
+        return int(self.data.warning.number[self._warnings].sum()), float(self.data.time)
 
 
 def _part(array: Any, start: Any, count: int) -> NDArray[np.int32]:

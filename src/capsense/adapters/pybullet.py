@@ -16,8 +16,9 @@ from capsense.adapters.attached import (
     make_simulator,
     refuse_missing,
 )
+from capsense.adapters.pybullet_bodies import body_numbers, links_of
 from capsense.adapters.pybullet_depth import PybulletDepthSensor
-from capsense.adapters.pybullet_model import ClientSource, body_numbers, links_of
+from capsense.adapters.pybullet_model import ClientSource
 from capsense.adapters.rules import Rules
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
@@ -129,10 +130,12 @@ def attach(
             exclude_own=exclude_own, size=size, resolution=resolution, back=back,
         )  # fmt: skip
         sensor.use_readout(sensor.readout if readout is None else readout)
+        sensor.warn()
         return sensor
     source = ClientSource(number, rules, shapes)
     sensor = PybulletSensor(source, body, index, pose_in_link, simulator, exclude_own=exclude_own)
     sensor.use_readout(sensor.readout if readout is None else readout)
+    sensor.warn()
     return sensor
 
 
@@ -199,7 +202,9 @@ def attach_skin(
         name: PybulletSensor(source, body, *mount, simulators[name], exclude_own=exclude_own)
         for name, mount in links.items()
     }
-    return AttachedSkin(sensors, readout, threads)
+    skin = AttachedSkin(sensors, readout, threads)
+    skin.warn()
+    return skin
 
 
 class PybulletSensor(GeometrySensor):

@@ -6,7 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters.attached import DepthSensor
-from capsense.adapters.pybullet_model import body_numbers, links_of, matter_of
+from capsense.adapters.pybullet_bodies import (
+    BodyWatch,
+    Link,
+    check_patterns,
+    gone,
+    links_of,
+    matter_of,
+)
 from capsense.adapters.rules import Rules
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
@@ -56,16 +63,18 @@ class PybulletDepthSensor(DepthSensor):
         self._near, self._far = _WITHDRAWN + _NEAR, _WITHDRAWN + far
         self._camera = OrthographicCamera(size, size, Pose(), near=_NEAR, far=far)
         self._projection = _projection(size, self._near, self._far, resolution)
-        self._bodies: list[int] = []
+        self._watch = BodyWatch(client)
         self._eps_r: dict[int, float] = {}
-        self._read_materials()
+        check_patterns(rules, self._read_materials())
 
     def frame(self) -> DepthFrame:
         """The depth image of the present state."""
         import pybullet as p
 
-        if body_numbers(self.client) != self._bodies:
-            self._read_materials()
+        if self._watch.changed():
+            links = self._read_materials()
+            if (self.body, self.link) not in [(k.body, k.link) for k in links]:
+                raise gone(self.body)
         n = self._resolution
         view = (self.pose @ _EYE).inverse().matrix.T.ravel().tolist()
         image = p.getCameraImage(
@@ -96,11 +105,9 @@ class PybulletDepthSensor(DepthSensor):
         )
         return Pose(*state[4:6]) @ self._in_link
 
-    def _read_materials(self) -> None:
+    def _read_materials(self) -> list[Link]:
         """What each code of the segmentation mask is made of: 0 for what is not seen."""
-        self._bodies = body_numbers(self.client)
-        links = [link for body in self._bodies for link in links_of(self.client, body)]
-        self._rules.check([k.names for k in links])
+        links = [link for body in self._watch.bodies() for link in links_of(self.client, body)]
         self._eps_r = {}
         for link in links:
             own = (link.body, link.link) == (self.body, self.link)
@@ -111,6 +118,7 @@ class PybulletDepthSensor(DepthSensor):
             matter, _ = matter_of(self.client, link, self._rules)
             conducts = matter.is_conductor()
             self._eps_r[code] = np.inf if conducts else matter.eps_r
+        return links
 
 
 def _projection(size: float, near: float, far: float, resolution: int) -> list[float]:

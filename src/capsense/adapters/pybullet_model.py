@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,89 +11,32 @@ from numpy.typing import NDArray
 
 from capsense.adapters.attached import WorldSource
 from capsense.adapters.meshes import (
+    UnusableShape,
     is_flat,
     joined_hulls,
     load_triangles,
     round_cylinder,
     solid_mesh,
 )
-from capsense.adapters.rules import Names, Rules, Tie, read_grounding, read_material
+from capsense.adapters.pybullet_bodies import (
+    BodyWatch,
+    Link,
+    check_patterns,
+    gone,
+    is_soft,
+    links_of,
+    matter_of,
+)
+from capsense.adapters.rules import Rules
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
-from capsense.scene import Box, Capsule, Cylinder, Material, Pose, Shape, Sphere
+from capsense.scene import Box, Capsule, Cylinder, Pose, Shape, Sphere
 
 Array = NDArray[np.float64]
 
-_SOFT_BODY = 3
-"""Bullet's body type of deformables, entry 10 of ``getDynamicsInfo``."""
 _HEIGHT_FIELD = 9
 """Shape type of height fields."""
 _NO_FILE = b"unknown_file"
-BODY_NAME, LINK_NAME = "capsense.body", "capsense.link"
-"""Keys of user data: the name of a body, at its base, and that of a link."""
-
-
-@dataclass(frozen=True)
-class Link:
-    """One link of one body."""
-
-    body: int
-    link: int
-    """-1 is the base."""
-    name: str
-    names: Names
-
-
-def body_numbers(client: int) -> list[int]:
-    """The numbers of all bodies in the world."""
-    import pybullet as p
-
-    count = p.getNumBodies(physicsClientId=client)
-    return [p.getBodyUniqueId(i, physicsClientId=client) for i in range(count)]
-
-
-def links_of(client: int, body: int) -> list[Link]:
-    """The base and the links of a body, in order, by the names that user data give them, if any."""
-    import pybullet as p
-
-    base, title = (n.decode() for n in p.getBodyInfo(body, physicsClientId=client))
-    title = _user_data(client, body, -1, BODY_NAME) or title or f"body{body}"
-    names = [base or "base"]
-    for joint in range(p.getNumJoints(body, physicsClientId=client)):
-        names.append(p.getJointInfo(body, joint, physicsClientId=client)[12].decode())
-    names = [_user_data(client, body, i - 1, LINK_NAME) or name for i, name in enumerate(names)]
-    return [
-        Link(body, i - 1, name, (name, title, f"{title}/{name}")) for i, name in enumerate(names)
-    ]
-
-
-def matter_of(client: int, link: Link, rules: Rules) -> tuple[Material, Tie]:
-    """What a link is made of, and its tie to ground.
-
-    Raises:
-        SceneError: Its user data name no known material or grounding.
-    """
-    said = _user_data(client, link.body, link.link, "capsense.material")
-    where = f"user data of {link.names[-1]!r}"
-    material = None if said is None else read_material(said, where)
-    said = _user_data(client, link.body, link.link, "capsense.grounding")
-    tie = None if said is None else Tie(read_grounding(said, where), f"body {link.body} {said}")
-    return rules.material_of(link.names, material), rules.tie_of(link.names, tie)
-
-
-def _user_data(client: int, body: int, link: int, key: str) -> str | None:
-    import pybullet as p
-
-    found = p.getUserDataId(body, key, link, physicsClientId=client)
-    return None if found < 0 else p.getUserData(found, physicsClientId=client).decode()
-
-
-def is_soft(client: int, link: Link) -> bool:
-    """Whether a link is a soft body."""
-    import pybullet as p
-
-    dynamics = p.getDynamicsInfo(link.body, link.link, physicsClientId=client)
-    return bool(dynamics[10] == _SOFT_BODY)
 
 
 class SoftMesh:
@@ -157,8 +100,6 @@ class WorldReader:
         rules: What is seen, and what it is made of.
         shapes: ``"collision"`` or ``"visual"``.
 
-    Raises:
-        SceneError: A pattern fits nothing.
     """
 
     def __init__(self, client: int, links: Sequence[Link], rules: Rules, shapes: str) -> None:
@@ -166,8 +107,9 @@ class WorldReader:
         self.links = links
         self.rules = rules
         self.shapes = shapes
+        self.notes: list[str] = []
+        """What was left out or replaced, and why."""
         self._meshes: dict[tuple[object, ...], Shape] = {}
-        rules.check([k.names for k in links])
 
     def solids(self, index: int) -> Iterator[Solid]:
         """The solids of one link.
@@ -213,20 +155,46 @@ class WorldReader:
             raise _refuse(link, "is a height field, of which PyBullet tells nothing but its bounds")
         if self.shapes == "visual":
             to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
-            flat = False
+            flat = lost = False
             for entry in drawn:
-                shape = self._visual(link, entry)
+                if self._is_nothing(link, entry):
+                    continue
+                try:
+                    shape = self._visual(link, entry)
+                except UnusableShape as error:
+                    self.notes.append(f"{error} (its link's collision shapes are taken)")
+                    lost = True
+                    continue
                 flat = flat or shape is None
                 if shape is not None:
                     yield shape, to_mass @ Pose(entry[5], entry[6])
-            if not flat:
+            if not (flat or lost):
                 return
         # entries 0 and 1 are sound in the first record of a link only
         data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
-        if self.shapes == "visual" and not data:
+        if self.shapes == "visual" and not data and flat:
             raise _refuse(link, "has a flat visual mesh, without an inside, and no collision shape")
         for number, entry in enumerate(data):
-            yield self._collision(link, number, entry)
+            if self._is_nothing(link, entry):
+                continue
+            try:
+                yield self._collision(link, number, entry)
+            except UnusableShape as error:
+                self.notes.append(f"{error} (left out)")
+
+    def _is_nothing(self, link: Link, entry: Any) -> bool:
+        """Whether a shape has no volume, as the empty boxes that some URDFs hold."""
+        import pybullet as p
+
+        kind, (a, b, c) = entry[2], entry[3]
+        least = {
+            p.GEOM_BOX: min(a, b, c), p.GEOM_SPHERE: a, p.GEOM_CAPSULE: b,
+            p.GEOM_CYLINDER: min(a, b),
+        }.get(kind, 1.0)  # fmt: skip
+        if least > 0:
+            return False
+        self.notes.append(f"{link.names[-1]!r} has a shape of sizes {a:g}, {b:g}, {c:g} (left out)")
+        return True
 
     def _visual(self, link: Link, entry: Any) -> Shape | None:
         """A visual shape; None for a flat mesh, such as that of a drawn floor."""
@@ -280,7 +248,8 @@ class WorldReader:
 class ClientSource(WorldSource):
     """The solids of a PyBullet world; frames are its links' centres of mass.
 
-    They are taken over again when bodies were added or removed.
+    They are taken over again when bodies were added or removed, or the world was reset. A pattern
+    must fit something at first; what it fits may leave.
 
     Args:
         client: Number of the physics client.
@@ -294,22 +263,31 @@ class ClientSource(WorldSource):
     def __init__(self, client: int, rules: Rules, shapes: str) -> None:
         self.client = client
         self._rules, self._shapes = rules, shapes
+        self._watch = BodyWatch(client)
         super().__init__()
+        check_patterns(rules, self._links)
 
     def refresh(self) -> None:
         super().refresh()
-        self._bodies = body_numbers(self.client)
-        self._links = [link for body in self._bodies for link in links_of(self.client, body)]
+        bodies = self._watch.bodies()
+        self._links = [link for body in bodies for link in links_of(self.client, body)]
         self._groups = [
             (body, [k.link for k in self._links if k.body == body and k.link >= 0])
-            for body in self._bodies
+            for body in bodies
         ]
         self._reader = WorldReader(self.client, self._links, self._rules, self._shapes)
         self._made: dict[int, list[Solid]] = {}
 
     def index(self, body: int, link: int) -> int:
-        """Number of a link's frame."""
-        return [(k.body, k.link) for k in self._links].index((body, link))
+        """Number of a link's frame.
+
+        Raises:
+            SceneError: The link has left the world.
+        """
+        for number, known in enumerate(self._links):
+            if (known.body, known.link) == (body, link):
+                return number
+        raise gone(body)
 
     def solids(self, own: int | None) -> list[Solid]:
         out = []
@@ -319,6 +297,9 @@ class ClientSource(WorldSource):
             if i not in self._made:
                 self._made[i] = list(self._reader.solids(i))
             out += self._made[i]
+        notes, self._reader.notes = self._reader.notes, []
+        if notes:
+            warnings.warn("sensor: " + ";\n".join(dict.fromkeys(notes)), stacklevel=2)
         return out
 
     def soft(self, own: int | None) -> list[SoftSolid]:
@@ -328,7 +309,7 @@ class ClientSource(WorldSource):
     def links(self) -> tuple[Array, Array]:
         import pybullet as p
 
-        if body_numbers(self.client) != self._bodies:
+        if self._watch.changed():
             self.refresh()
         poses: list[Any] = []
         for body, links in self._groups:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
@@ -71,6 +72,31 @@ class AttachedSkin:
             for sensor in self.sensors.values():
                 sensor.catch_up()
             return read_all(self._crew, {name: task(s) for name, s in self.sensors.items()})
+
+    def check(self) -> dict[str, list[str]]:
+        """What is wrong with each sensor, by name; see :meth:`AttachedSensor.check`.
+
+        Raises:
+            SceneError: The simulator has not been stepped yet, or has diverged.
+        """
+        return {name: sensor.check() for name, sensor in self.sensors.items()}
+
+    def warn(self) -> None:
+        """Warn of what :meth:`check` finds; some sensors of a skin may well see nothing."""
+        try:
+            found = self.check()
+            blind = {name for name, s in self.sensors.items() if not len(s.scene())}
+        except SceneError:
+            return
+        listed = [
+            f"sensor {name!r}: {text}"
+            for name, texts in found.items()
+            if name not in blind or len(blind) == len(self)
+            for text in texts
+        ]
+        if listed:
+            more = f";\nand {len(listed) - 4} more, see check()" if len(listed) > 4 else ""
+            warnings.warn(";\n".join(listed[:4]) + more, stacklevel=3)
 
     @property
     def poses(self) -> dict[str, Pose]:

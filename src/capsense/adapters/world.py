@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters.rules import Tie
+from capsense.adapters.terrain import Terrain
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
     from capsense.scene.deformable import DeformableSurface
 
 Array = NDArray[np.float64]
+
+
+_PLATE = 0.1
+"""Thickness over width of the plate that stands for a conducting half space."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class Solid:
 
     label: str
     """What it is called in scenes and messages."""
-    shape: Shape | HalfSpace
+    shape: Shape | HalfSpace | Terrain
     frame: int
     """Index of the frame that carries it, among those the simulator gives at every reading."""
     pose: Pose
@@ -73,7 +78,7 @@ class Frames:
     """Unit quaternion of the sensor frame, shape (4,)."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class World:
     """All solids that a sensor may see.
 
@@ -94,14 +99,14 @@ class World:
         self._frame = np.array([s.frame for s in self.solids], dtype=np.int64)
         self._local_position = np.array([s.pose.position for s in self.solids]).reshape(n, 3)
         self._local_quaternion = np.array([s.pose.quaternion for s in self.solids]).reshape(n, 4)
-        self._depth = np.array([edge * isinstance(s.shape, HalfSpace) for s in self.solids])
+        self._depth = np.array([edge * _thickness(s) for s in self.solids])
         self._bodies = []
         boxes = np.zeros((n, 2, 3))
         taken: dict[str, int] = {}
         for i, solid in enumerate(self.solids):
-            space = isinstance(solid.shape, HalfSpace)
-            shape = Box((edge, edge, edge)) if isinstance(solid.shape, HalfSpace) else solid.shape
-            boxes[i] = 0.0 if space else shape.bounds()
+            boxes[i] = 0.0 if isinstance(solid.shape, HalfSpace) else solid.shape.bounds()
+            plate = Box((edge, edge, edge * (_thickness(solid) or 1.0)))
+            shape = solid.shape if isinstance(solid.shape, Shape) else plate
             count = taken[solid.label] = taken.get(solid.label, 0) + 1
             label = solid.label if count == 1 else f"{solid.label}#{count}"
             self._bodies.append(Body(shape, Pose(), solid.material, solid.tie.grounding, label))
@@ -136,12 +141,11 @@ class World:
             frames.sensor_position, frames.sensor_quaternion, self._lower, self._upper,
             self._position, self._quaternion, self._seen,
         )  # fmt: skip
+        if not np.isfinite(frames.sensor_position.sum() + frames.sensor_quaternion.sum()):
+            raise _diverged("the sensor's link")
         if not np.isfinite(self._position.sum() + self._quaternion.sum()):
             bad = ~np.isfinite(self._position.sum(axis=1) + self._quaternion.sum(axis=1))
-            label = self.solids[int(np.flatnonzero(bad)[0])].label
-            raise SceneError(
-                f"{label!r} stands at a place that is not finite; has the simulation diverged?"
-            )
+            raise _diverged(repr(self.solids[int(np.flatnonzero(bad)[0])].label))
         seen = np.flatnonzero(self._seen)
         sharing = self._sharing[seen]
         bodies = [self._bodies[i] for i in seen.tolist()]
@@ -150,8 +154,26 @@ class World:
             for k in np.flatnonzero(sharing >= 0).tolist():
                 bodies[k] = self._share(int(seen[k]), int(count[k]))
         poses = zip(self._position[seen].tolist(), self._quaternion[seen].tolist(), strict=True)
-        placed = [b.moved(Pose(*p)) for b, p in zip(bodies, poses, strict=True)]
+        placed = [
+            part
+            for i, b, p in zip(seen.tolist(), bodies, poses, strict=True)
+            for part in self._parts(i, b.moved(Pose(*p)))
+        ]
         return Scene(placed + self._soft_bodies(frames) if self.soft else placed)
+
+    def _parts(self, index: int, body: Body) -> list[Body]:
+        """A body that is placed; of a terrain, the tiles that reach into the domain."""
+        terrain = self.solids[index].shape
+        if not isinstance(terrain, Terrain):
+            return [body]
+        middle = body.pose.inverse().apply(0.5 * (self._lower + self._upper))
+        tiles = terrain.near(middle, 0.5 * self._reach)
+        ground = body.grounding
+        tie = ground if isinstance(ground, str) else ground / max(1, len(tiles))
+        return [
+            Body(tile, body.pose, body.material, tie, body.name if k == 0 else f"{body.name}/{k}")
+            for k, tile in enumerate(tiles)
+        ]
 
     def _soft_bodies(self, frames: Frames) -> list[Body]:
         """The deformables that reach into the domain, as they are now."""
@@ -162,6 +184,8 @@ class World:
         for k, soft in enumerate(self.soft):
             vertices = (soft.vertices() - frames.sensor_position) @ rotation
             low, high = vertices.min(axis=0), vertices.max(axis=0)
+            if not np.isfinite(low.sum() + high.sum()):
+                raise _diverged(repr(soft.label))
             if np.any(low >= self._upper) or np.any(high <= self._lower):
                 continue
             surface = self._surfaces[k]
@@ -186,3 +210,20 @@ class World:
             assert not isinstance(b.grounding, str)
             self._tied[key] = Body(b.shape, b.pose, b.material, b.grounding / count, b.name)
         return self._tied[key]
+
+
+def _thickness(solid: Solid) -> float:
+    """Of the plate that stands for a half space, over its width; 0 for any other shape.
+
+    A conductor's charge is on its face: its panels are better spent there than on a cube.
+    """
+    if not isinstance(solid.shape, HalfSpace):
+        return 0.0
+    return _PLATE if solid.material.is_conductor() else 1.0
+
+
+def _diverged(what: str) -> SceneError:
+    return SceneError(
+        f"the simulation has diverged: {what} stands at a place that is not finite; set the "
+        "simulation back, and take a smaller time step or gentler controls"
+    )

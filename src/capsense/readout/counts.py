@@ -17,6 +17,21 @@ COLUMNS = ("time", "channel", "code", "capacitance", "flags", "baseline", "touch
 
 
 @dataclass(frozen=True, eq=False)
+class Held:
+    """The last conversion of every channel, K of them, in the order of the channels.
+
+    A channel that has not reported yet holds 0, as a chip's register does after it is switched on.
+    """
+
+    capacitance: Array
+    """What its user makes of the code and the offset DAC [F], shape (K,)."""
+    code: Ints
+    """What the converter put out, shape (K,)."""
+    age: Array
+    """Time since the result could be read [s], infinite where there is none yet, shape (K,)."""
+
+
+@dataclass(frozen=True, eq=False)
 class Counts:
     """Finished conversions in the order of time, n of them."""
 
@@ -36,6 +51,10 @@ class Counts:
     """Tracked baselines [codes], shape (n,); None without a detector."""
     touched: NDArray[np.bool_] | None = None
     """Touch or proximity states, shape (n,); None without a detector."""
+    until: float | None = None
+    """When the read-out was asked [s]; None for a part, a recording or many instants at once."""
+    earlier: Counts | None = None
+    """The last conversion of each channel that had one before these."""
 
     def __repr__(self) -> str:
         span = f", {self.time[0]:.6g} to {self.time[-1]:.6g} s" if len(self) else ""
@@ -74,6 +93,27 @@ class Counts:
             self.channel_names[k]: float(c)
             for k, c in zip(self.channel.tolist(), self.capacitance, strict=True)
         }
+
+    def last(self) -> Counts:
+        """The last conversion of each channel that has one, these and earlier ones."""
+        whole = self if self.earlier is None else join([self.earlier, self])
+        found = dict(zip(whole.channel.tolist(), range(len(whole)), strict=True))
+        return whole[np.array(sorted(found.values()), dtype=np.int64)]
+
+    def held(self) -> Held:
+        """What a chip's registers hold: the last conversion of every channel, and its age.
+
+        The same size at every reading, whatever has finished meanwhile, as learning wants it.
+        Ages count up to the reading that these conversions came with; without one, to the last of
+        them.
+        """
+        last, k = self.last(), len(self.channel_names)
+        now = self.until if self.until is not None else last.time.max(initial=-np.inf)
+        held = Held(np.zeros(k), np.zeros(k, dtype=np.int64), np.full(k, np.inf))
+        held.capacitance[last.channel] = last.capacitance
+        held.code[last.channel] = last.code
+        held.age[last.channel] = now - last.time
+        return held
 
     def table(self, what: str = "capacitance") -> tuple[Array, NDArray]:
         """Whole cycles side by side.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -153,6 +154,7 @@ class ReadOut:
         self._next_instant = float(plan.instant(np.array(0))) - plan.slack
         self._next_stamp = self._next_instant + plan.lag
         self._none = self._report(-math.inf)
+        self._latest = self._none
 
     def due(self, until: float) -> Array:
         """Instants at which capacitances are wanted next [s], up to ``until`` [s], rising."""
@@ -228,7 +230,10 @@ class ReadOut:
         self._last = (now, values)
         if self._next_instant <= now:
             self._take(now, before, values)
-        return self._report(now)
+        counts = replace(self._report(now), until=float(time), earlier=self._latest)
+        if len(counts):
+            self._latest = counts.last()
+        return counts
 
     def __call__(self, times: ArrayLike, capacitance: Sequence[Reading] | ArrayLike) -> Counts:
         """Read a whole recording, from its first time on; resets before and after.

@@ -12,6 +12,9 @@ from capsense.scene.materials import material as find_material
 from capsense.scene.pose import Pose
 from capsense.scene.shape import Shape
 
+_LARGEST = 1e-3
+"""Capacitances to ground beyond this [F] are slips of the pen."""
+
 Grounding = Literal["grounded", "floating"] | float
 
 
@@ -80,7 +83,7 @@ def checked_grounding(grounding: object) -> Grounding:
     """Check a grounding.
 
     Raises:
-        SceneError: Neither one of the two words nor a positive finite capacitance [F].
+        SceneError: Neither one of the two words nor a positive capacitance up to 1 mF.
     """
     mend = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
     if isinstance(grounding, str):
@@ -97,4 +100,9 @@ def checked_grounding(grounding: object) -> Grounding:
         raise SceneError(f"grounding is {grounding!r}; {mend}") from None
     if not (math.isfinite(farads) and farads > 0):
         raise SceneError(f"grounding is {farads} F, not a positive finite capacitance; {mend}")
+    if farads > _LARGEST:
+        raise SceneError(
+            f"grounding is {farads:g} farads, more than anything has; 100 pF are 100e-12, and a "
+            'body of a large capacitance to ground is "grounded"'
+        )
     return farads

@@ -31,6 +31,10 @@ class Triangles(Shape):
     faces: NDArray[np.int64]
     """Vertex indices, shape (m, 3), read-only."""
 
+    def __repr__(self) -> str:
+        size = " × ".join(f"{v:.3g}" for v in np.ptp(self.vertices, axis=0))
+        return f"<{type(self).__name__}: {len(self.faces)} triangles, {size} m>"
+
     def signed_distance(self, points: ArrayLike) -> Array:
         """Exact distance to the nearest triangle [m], negative inside.
 
@@ -43,10 +47,32 @@ class Triangles(Shape):
         Raises:
             SceneError: The points do not have shape (n, 3), or the surface is not closed.
         """
-        p = as_points(points)
         self._require_inside("signed distances")
+        return self._distances(points)
+
+    def distance(self, points: ArrayLike) -> Array:
+        """Exact distance to the nearest triangle [m], of open surfaces too.
+
+        Args:
+            points: Points [m] in the local frame, shape (n, 3).
+
+        Returns:
+            Shape (n,), nowhere negative.
+
+        Raises:
+            SceneError: The points do not have shape (n, 3).
+        """
+        return np.abs(self._distances(points))
+
+    @property
+    @abstractmethod
+    def closed(self) -> bool:
+        """Whether the surface has an inside."""
+
+    def _distances(self, points: ArrayLike) -> Array:
         from capsense.scene.distance_kernels import signed_distances
 
+        p = as_points(points)
         out = np.empty(len(p))
         signed_distances(self._boxes, np.ascontiguousarray(p), out)
         return out
@@ -67,7 +93,7 @@ class Triangles(Shape):
         """Raise a SceneError that says why there is no ``what``, if the surface is not closed."""
 
 
-@dataclass(frozen=True, init=False, eq=False)
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class TriMesh(Triangles):
     """A triangle mesh, moved rigidly.
 

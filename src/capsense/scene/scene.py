@@ -15,6 +15,10 @@ from capsense.scene.shape import Shape
 Array = NDArray[np.float64]
 
 
+_SHOWN = 8
+"""Bodies that are listed when a scene is printed."""
+
+
 @dataclass(frozen=True, eq=False)
 class PackedScene:
     """The geometry of a scene as flat arrays, in the order of its bodies."""
@@ -66,6 +70,13 @@ class Scene:
                     raise SceneError(f"two bodies are named {body.name!r}; names must differ")
                 names.add(body.name)
         self.__dict__["bodies"] = items
+
+    def __repr__(self) -> str:
+        shown = ", ".join(
+            f"{b.name or 'unnamed'} ({type(b.shape).__name__})" for b in self.bodies[:_SHOWN]
+        )
+        more = f" and {len(self) - _SHOWN} more" if len(self) > _SHOWN else ""
+        return f"<Scene of {len(self)}: {shown or 'nothing'}{more}>"
 
     def __iter__(self) -> Iterator[Body]:
         return iter(self.bodies)

@@ -63,7 +63,7 @@ class RestSurface(Frozen):
         return np.unique(self.faces)
 
 
-@dataclass(frozen=True, init=False, eq=False)
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class SurfaceMesh(Triangles):
     """A surface at one instant, open or closed; an open one is a thin sheet.
 

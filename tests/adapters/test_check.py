@@ -1,0 +1,127 @@
+"""What ``check`` finds, and says at attach: each a trap that would give wrong numbers silently."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from adapter_worlds import Thing
+
+import capsense as cs
+from capsense.adapters.placement import placement
+
+SensorIn = Callable[..., Any]
+BALL = cs.Sphere(0.02)
+
+
+def ball_at(x: float, y: float, z: float) -> list[Thing]:
+    """A ball, its place in the sensor frame."""
+    return [Thing("ball", BALL, cs.Pose((x, y, z)))]
+
+
+def test_a_sound_sensor_warns_of_nothing(shapes_in: SensorIn) -> None:
+    """No finding, no warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert shapes_in(ball_at(0, 0, 0.04), cs.Pose()).check() == []
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ((0.0, 0.0, 0.01), r"electrodes 'A', 'B' lie inside '.*ball.*', up to .* mm deep"),
+        ((-0.01, 0.0, 0.02), r"touch(es)? '.*ball.*', as a short circuit would"),
+        ((0.0, 0.0, -0.06), r"nothing is in view, .*, but '.*ball.*' would be if the sensor faced"),
+        ((9.0, 0.0, 0.0), r"nothing is in view, .* exactly 0: the sensor sees 0\.1 × 0\.1 × 0\.1"),
+    ],
+)
+def test_a_wrong_place_is_told(place: Any, message: str, shapes_in: SensorIn) -> None:
+    """At attach and by check, with the fix."""
+    with pytest.warns(UserWarning, match=message):
+        sensor = shapes_in(ball_at(*place), cs.Pose())
+    (found,) = sensor.check()
+    assert any(fix in found for fix in ("exclude=[", "quaternion (1, 0, 0, 0)", "exclude, groups"))
+
+
+def test_an_open_mesh_is_entered_as_a_closed_one(tiny_simulator: cs.Simulator) -> None:
+    """Differential: the shell of a real robot, a third of it missing at its far end."""
+    ball = cs.Sphere(0.03).to_trimesh()
+    corners = ball.vertices[ball.faces].mean(axis=1)
+    shell = cs.TriMesh(ball.vertices, ball.faces[corners[:, 2] < 0.01])
+    assert not shell.closed
+    for z in (0.0, 0.02, 0.04):
+        whole, part = (
+            placement(cs.Scene([cs.Body(s, cs.Pose((0, 0, z)), name="link")]), tiny_simulator)
+            for s in (cs.Sphere(0.03), shell)
+        )
+        assert [f.partition("up to")[0] for f in whole] == [f.partition("up to")[0] for f in part]
+
+
+def test_a_mesh_too_large_for_its_panels(tiny_simulator: cs.Simulator) -> None:
+    """A room in one mesh."""
+    mesh = cs.Box((3.0, 3.0, 0.1)).to_trimesh()
+    room = cs.Body(cs.TriMesh(mesh.vertices, mesh.faces), cs.Pose((0, 0, 0.1)), name="room")
+    (found,) = placement(cs.Scene([room]), tiny_simulator)
+    assert "'room' is a mesh of 19 m², solved with panels of some 166 mm; cut it" in found
+
+
+@pytest.mark.parametrize(
+    ("camera", "reader", "message"),
+    [
+        ('euler="180 0 0" resolution="32 32"', "", r'shows 45 m; .* like fovy="0\.1"'),
+        ('euler="180 0 0" fovy=".1" resolution="4 4"', "", "has pixels of 25 mm"),
+        ('euler="180 0 0" fovy=".1" resolution="32 32"', 'cutoff=".05"', r"cut off at 0\.05 m"),
+        ('fovy=".1" resolution="32 32"', "", "does not look along the sensor's z"),
+        ('euler="180 0 0" fovy=".1" resolution="32 32" pos="9 0 0"', "", "nothing is in view"),
+    ],
+)
+def test_a_wrong_camera_is_told(
+    camera: str, reader: str, message: str, tiny_simulator: cs.Simulator
+) -> None:
+    """Each would give zeros or a wrong world without an error."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="link"><geom size=".001"/><site name="pad"/>'
+        f'<camera name="pad" projection="orthographic" {camera}/></body>'
+        f'<body pos="0 0 .05"><geom size=".02"/></body></worldbody>'
+        f'<sensor><rangefinder camera="pad" data="depth" {reader}/></sensor></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with pytest.warns(UserWarning, match=message):
+        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator, world="depth")
+    assert len(sensor.check()) == 1
+
+
+def test_a_skin_warns_where_all_are_blind(tiny_simulator: cs.Simulator) -> None:
+    """One that sees nothing is usual in a skin; an electrode within a body never is."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    text = (
+        '<mujoco><worldbody><site name="near"/><site name="far" pos="9 0 0"/>'
+        '<body pos="0 0 {}"><geom name="ball" size=".02"/></body></worldbody></mujoco>'
+    )
+
+    def attach(height: float) -> Any:
+        model = mujoco.MjModel.from_xml_string(text.format(height))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        return cs.mujoco.attach_skin(model, data, ["near", "far"], tiny_simulator)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        skin = attach(0.04)
+    assert [len(found) for found in skin.check().values()] == [0, 1]
+    with pytest.warns(UserWarning, match="^sensor 'near': electrodes 'A', 'B' lie inside"):
+        attach(0.0)
+    with pytest.warns(UserWarning, match="sensor 'far': nothing is in view"):
+        attach(5.0)
+
+
+def test_farads_are_not_picofarads() -> None:
+    """100 F is 100 pF without its exponent."""
+    with pytest.raises(cs.SceneError, match=r"100 farads.* 100 pF are 100e-12"):
+        cs.Body(BALL, grounding=100)
+    assert np.isclose(cs.Body(BALL, grounding=100e-12).grounding, 1e-10)
