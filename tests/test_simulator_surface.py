@@ -385,7 +385,7 @@ def test_a_large_mesh_of_several_parts_reads_as_they_do(sim, grounding):
     )
     slope = (higher - lower) / (2 * step)
     np.testing.assert_allclose(
-        got.jacobian[0, :, :, 2], slope, rtol=0, atol=0.03 * np.abs(slope).max()
+        got.jacobian[0, :, :, 2], slope, rtol=0, atol=0.05 * np.abs(slope).max()
     )
 
 

@@ -51,7 +51,7 @@ def split(features, charges, spatial, order, first, last, kids):
             for i in range(a, b):
                 values[i] = features[order[i], axis]
             _sort(values[a:b], order[a:b])
-            cut = _cut(values[a:b], order[a:b], charges, axis >= 3, spatial, k % 2 == 0)
+            cut = _cut(values[a:b], order[a:b], charges, axis >= 3, spatial, k % 2 == 1)
             kids[k, 0], kids[k, 1] = made, made + 1
             first[made], last[made] = a, a + cut
             first[made + 1], last[made + 1] = a + cut, b
