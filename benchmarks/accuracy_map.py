@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import inspect
 import json
 import sys
 from functools import partial
@@ -75,9 +74,8 @@ def configurations(
     methods: list[str], presets: list[str], settings: list[str]
 ) -> list[Configuration]:
     """Every method, or the default one, with every preset and all settings."""
-    usual = inspect.signature(cs.Simulator).parameters["method"].default
     out = []
-    for method in methods or [usual]:
+    for method in methods or ["surface"]:
         for preset in presets or [""]:
             for text in settings or [""]:
                 label = " ".join(filter(None, (method, preset, text)))

@@ -128,10 +128,10 @@ def error(found: cs.Reading, expected: cs.Reading) -> float:
 def test_a_block_reads_as_its_shape_does(
     eye: Callable[..., Any], tiny_simulator: cs.Simulator
 ) -> None:
-    """Differential: within 5 % at 64 x 64, its thickness known; sensor anywhere in the world."""
+    """Differential: within 7 % at 64 x 64, its thickness known; sensor anywhere in the world."""
     things = [Thing("block", BLOCK, AHEAD)]
     found = eye(things, back=0.01).read()
-    assert error(found, plain_reading(things, cs.Pose(), tiny_simulator)) < 0.05
+    assert error(found, plain_reading(things, cs.Pose(), tiny_simulator)) < 0.07
 
 
 def test_the_image_is_the_right_way_round(eye: Callable[..., Any]) -> None:
