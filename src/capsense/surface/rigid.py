@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.sparse.linalg import LinearOperator, cg
 
 from capsense.errors import SolveError
 from capsense.surface import tree_kernels
@@ -35,6 +34,8 @@ _NORMALS = 0.6
 """How far apart two opposite normals count, as a share of the shape's extent, in splitting."""
 _EXTRA = 0.0, 1e-3, 1e-2, 0.1
 """What is added to the panels' own energies, relative, where some nearly coincide."""
+_LEFT, _MOST_STEPS = 1e-8, 1000
+"""Conjugate gradients end when so little of the residual is left, or after so many steps."""
 _LEAST_CHARGE = 1e-6
 """Smallest charge of a panel, as a part of the largest: those within a cavity have none."""
 
@@ -150,12 +151,45 @@ def rigid_shape(panels: SurfacePanels, *, apart: bool = False) -> RigidShape:
 
 def _equilibrium(free: Array) -> Array:
     """Charges that put all panels at 1 V, by conjugate gradients, free (n, n) -> (n,)."""
-    diagonal = np.diag(free).copy()
-    found, failed = cg(free, np.ones(len(free)), rtol=1e-10, M=LinearOperator(
-        free.shape, matvec=lambda x: x.ravel() / diagonal, dtype=float))  # fmt: skip
-    if failed:
+    charge = np.zeros(len(free))
+    if not _conjugate_gradients(free, charge):
         raise SolveError(f"the charges of {len(free)} panels do not converge")
-    return found
+    return charge
+
+
+@fast
+def _conjugate_gradients(matrix: Array, x: Array) -> bool:
+    """Solve ``matrix @ x = 1``, its diagonal for a preconditioner; False without convergence.
+
+    Compiled, so that bits do not depend on where arrays lie, as those of a BLAS do.
+    """
+    n = x.shape[0]
+    residual, way, product = np.ones(n), np.empty(n), np.empty(n)
+    first = before = 0.0
+    for step in range(_MOST_STEPS):
+        energy = 0.0
+        for i in range(n):
+            energy += residual[i] * residual[i] / matrix[i, i]
+        if step == 0:
+            first = energy
+        elif energy <= _LEFT * _LEFT * first:
+            return True
+        share = energy / before if step > 0 else 0.0
+        for i in range(n):
+            way[i] = residual[i] / matrix[i, i] + (share * way[i] if step > 0 else 0.0)
+        curvature = 0.0
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += matrix[i, j] * way[j]
+            product[i] = total
+            curvature += way[i] * total
+        length = energy / curvature
+        for i in range(n):
+            x[i] += length * way[i]
+            residual[i] -= length * product[i]
+        before = energy
+    return False
 
 
 def _made_definite(free: Array) -> Array:
