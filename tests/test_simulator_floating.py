@@ -86,7 +86,7 @@ def test_touching_bodies_are_one(simulators, overlap, within, grounding):
 
 
 @pytest.mark.parametrize(
-    ("gap", "within"), [(0.002, 0.2), (0.005, 0.1), (0.01, 0.06), (0.02, 0.035), (0.05, 0.015)]
+    ("gap", "within"), [(0.002, 0.23), (0.005, 0.1), (0.01, 0.06), (0.02, 0.035), (0.05, 0.015)]
 )
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_seam_is_hardly_seen(simulators, axis, gap, within):
