@@ -63,12 +63,7 @@ class OrthographicCamera:
                     + (", not negative" if name == "near" else " above zero")
                 )
             object.__setattr__(self, name, number)
-        if self.far <= self.near:
-            raise SceneError(
-                f"OrthographicCamera: far is {self.far:g} m; it must exceed near, {self.near:g} m"
-            )
-        if not isinstance(self.pose, Pose):
-            raise SceneError(f"OrthographicCamera: pose is {self.pose!r}; give a Pose")
+        _require_view(self)
         for name, known in (("rows", ("+y", "-y")), ("columns", ("+x", "-x"))):
             if getattr(self, name) not in known:
                 raise SceneError(
@@ -189,12 +184,7 @@ class PerspectiveCamera:
                     + (" above zero" if above else "")
                 )
             object.__setattr__(self, name, number)
-        if self.far <= self.near:
-            raise SceneError(
-                f"PerspectiveCamera: far is {self.far:g} m; it must exceed near, {self.near:g} m"
-            )
-        if not isinstance(self.pose, Pose):
-            raise SceneError(f"PerspectiveCamera: pose is {self.pose!r}; give a Pose")
+        _require_view(self)
 
     @classmethod
     def opengl(
@@ -237,3 +227,12 @@ class PerspectiveCamera:
         z = z[row, column]
         x, y = (column - self.cx) / self.fx * z, (row - self.cy) / self.fy * z
         return self.pose.apply(np.column_stack([x, y, z]))
+
+
+def _require_view(camera: OrthographicCamera | PerspectiveCamera) -> None:
+    """See that a camera's depths rise and that it stands somewhere."""
+    name = type(camera).__name__
+    if camera.far <= camera.near:
+        raise SceneError(f"{name}: far is {camera.far:g} m; it must exceed near, {camera.near:g} m")
+    if not isinstance(camera.pose, Pose):
+        raise SceneError(f"{name}: pose is {camera.pose!r}; give a Pose")

@@ -8,7 +8,7 @@ charge. All but the first are without net charge.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from capsense._frozen import Frozen
 from capsense.errors import SolveError
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
@@ -75,8 +76,11 @@ class Tree(Clusters):
 
 
 @dataclass(frozen=True, eq=False)
-class RigidShape:
-    """Charge functions of a shape in its own frame; 4π eps0 = 1 in all energies."""
+class RigidShape(Frozen):
+    """Charge functions of a shape in its own frame; 4π eps0 = 1 in all energies.
+
+    A record is good only where its arrays stand, so that no copy takes it along.
+    """
 
     panels: SurfacePanels
     tree: Tree
@@ -126,10 +130,6 @@ class RigidShape:
         """Room that the matrices take up [bytes]."""
         z = self.__dict__.get("_impedance")
         return self.energy.nbytes + (0 if z is None else z.nbytes)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # a record is good only where its arrays stand
-        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def rigid_shape(panels: SurfacePanels, *, apart: bool = False) -> RigidShape:
