@@ -46,3 +46,51 @@ def test_a_container_without_a_writable_place(option: list[str]) -> None:
     folder = Path(found.stdout.strip())
     assert folder.name.startswith("capsense-kernels-")
     assert not folder.exists()
+
+
+CODE = """
+import errno, os, sys
+sys.path.insert(0, sys.argv[1])
+from numba.core import caching
+
+def refuse(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+if len(sys.argv) > 2:
+    caching.IndexDataCacheFile.save = refuse
+import kept_kernels
+print(kept_kernels.outer(3.0).hex())
+"""
+KERNELS = """
+import numpy as np
+from capsense._jit import compiled
+
+@compiled
+def inner(n):
+    x = np.sqrt(np.arange(n * 40.0))
+    total = 0.0
+    for i in range(x.size):
+        total += x[i] / 3.0
+    return total
+
+@compiled
+def outer(n):
+    return inner(n) + inner(n + 1.0)
+"""
+
+
+def test_kernels_that_cannot_be_kept_and_those_that_were(tmp_path: Path) -> None:
+    """A full disk loses no result; bits are the same compiled, kept, and read from the files."""
+    (tmp_path / "kept_kernels.py").write_text(KERNELS)
+    path = os.pathsep.join(
+        [str(Path(capsense.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    )
+    env = {**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    found = []
+    for option in (["full"], [], []):
+        run = [sys.executable, "-c", CODE, str(tmp_path), *option]
+        done = subprocess.run(run, env=env, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        found.append((done.stdout, len(list((tmp_path / "kernels").rglob("*.nbc")))))
+    assert [kept for _, kept in found] == [0, 2, 2]
+    assert len({value for value, _ in found}) == 1

@@ -1,36 +1,32 @@
 """Eight numbers as one value inside compiled code.
 
-Numba's loops over a short last axis stay scalar. The functions below are one LLVM vector
-instruction each, whatever the processor's own width: ``load(x, a)`` is row ``a`` of a C-ordered
-float32 or float64 array of shape (n, 8), ``store(x, a, v)`` writes it, ``splat(s)`` fills all
-lanes, ``madd(s, v, w)`` is ``s v + w`` with a scalar s, ``vmadd(u, v, w)`` is ``u v + w`` lane by
-lane, ``vadd(u, v)`` is ``u + v``; ``widen(v)`` and ``narrow(v)`` turn single into double precision
-and back.
+The functions below are one or a few LLVM instructions each, whatever the processor's own width:
+``splat(s)`` fills all lanes, ``vadd(u, v)`` is ``u + v``, ``madd(s, v, w)`` is ``s v + w`` with a
+scalar s, ``vmadd(u, v, w)`` is ``u v + w`` lane by lane, ``lane_sum(v)`` adds the lanes up, and
+``muladd(a, b, c)`` is ``a b + c`` of scalars.
 
-``at(x, k)`` is element k of a C-ordered array of any shape, ``put(x, k, s)`` writes it, ``span``
-and ``put_span`` do the same with the eight from k on: unlike ``x[k]``, which counts from the end
-where k is negative, they do not look at k.
+``at(x, k)`` is element k of a C-ordered array of any shape, ``span`` is the eight from k on, and
+``put_span`` writes them: unlike ``x[k]``, which counts from the end where k is negative, they do
+not look at k.
+
+Products are fused with the sum that follows wherever the processor can, and sums are taken in the
+order that is written: bits do not depend on what else is compiled.
 
 All work in compiled code only; ``tests/test_simd.py`` holds them against numpy.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core.cgutils import get_or_insert_function
 from numba.extending import intrinsic, models, register_model
-from numpy.typing import NDArray
 
 LANES = 8
-_LINE = 64
-"""Bytes of a cache line."""
 
 _INT = ir.IntType(32)
-_FLAGS = ("contract", "nsz", "reassoc")
 
 
 class _VectorType(types.Type):
@@ -67,11 +63,6 @@ def _from(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -
     return builder.bitcast(place, _CODE[array_type.dtype].as_pointer())
 
 
-def _row(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    offset = builder.mul(index, ir.Constant(index.type, LANES))
-    return _from(context, builder, array_type, array, offset)
-
-
 def _fill(builder: Any, scalar: Any) -> Any:
     blank = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
     first = builder.insert_element(blank, scalar, ir.Constant(_INT, 0))
@@ -79,8 +70,14 @@ def _fill(builder: Any, scalar: Any) -> Any:
     return builder.shuffle_vector(first, blank, zeros)
 
 
-def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    return builder.fadd(builder.fmul(a, b, flags=_FLAGS), c, flags=_FLAGS)
+def multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """Emit ``a b + c`` of scalars or vectors, fused where the processor can."""
+    name = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}
+    kind = a.type
+    suffix = f"v{LANES}{name[kind.element]}" if isinstance(kind, ir.VectorType) else name[kind]
+    signature = ir.FunctionType(kind, [kind] * 3)
+    code = get_or_insert_function(builder.module, signature, f"llvm.fmuladd.{suffix}")
+    return builder.call(code, [a, b, c])
 
 
 def _read(place: Any) -> Any:
@@ -94,39 +91,10 @@ def _read(place: Any) -> Any:
     return code
 
 
-def _write(place: Any) -> Any:
-    """How to write to a place in an array."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        where = place(context, builder, signature.args[0], args[0], args[1])
-        builder.store(args[2], where).align = signature.args[0].dtype.bitwidth // 8
-        return context.get_dummy_value()
-
-    return code
-
-
-@intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """Row ``index`` of an array of shape (n, 8)."""
-    return _of(array.dtype)(array, types.intp), _read(_row)
-
-
-@intrinsic
-def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write row ``index`` of an array of shape (n, 8)."""
-    return types.void(array, types.intp, _of(array.dtype)), _write(_row)
-
-
 @intrinsic
 def at(typing: Any, array: Any, index: Any) -> Any:
     """Element ``index`` of an array as it lies in memory."""
     return array.dtype(array, types.intp), _read(_place)
-
-
-@intrinsic
-def put(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write element ``index`` of an array as it lies in memory."""
-    return types.void(array, types.intp, array.dtype), _write(_place)
 
 
 @intrinsic
@@ -138,7 +106,13 @@ def span(typing: Any, array: Any, index: Any) -> Any:
 @intrinsic
 def put_span(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write eight elements from ``index`` on, as they lie in memory."""
-    return types.void(array, types.intp, _of(array.dtype)), _write(_from)
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        where = _from(context, builder, signature.args[0], args[0], args[1])
+        builder.store(args[2], where).align = signature.args[0].dtype.bitwidth // 8
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _of(array.dtype)), code
 
 
 @intrinsic
@@ -156,7 +130,7 @@ def vadd(typing: Any, left: Any, right: Any) -> Any:
     """``left + right``, lane by lane."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fadd(*args, flags=_FLAGS)
+        return builder.fadd(*args)
 
     return left(left, left), code
 
@@ -166,7 +140,7 @@ def madd(typing: Any, scalar: Any, value: Any, addend: Any) -> Any:
     """``scalar * value + addend`` with a scalar in the precision of the vectors."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _multiply_add(builder, _fill(builder, args[0]), args[1], args[2])
+        return multiply_add(builder, _fill(builder, args[0]), args[1], args[2])
 
     return value(value.element, value, value), code
 
@@ -176,35 +150,68 @@ def vmadd(typing: Any, left: Any, right: Any, addend: Any) -> Any:
     """``left * right + addend``, lane by lane."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _multiply_add(builder, *args)
+        return multiply_add(builder, *args)
 
     return left(left, left, left), code
 
 
 @intrinsic
-def widen(typing: Any, value: Any) -> Any:
-    """Single precision as double."""
+def lane_sum(typing: Any, value: Any) -> Any:
+    """The sum of all lanes."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fpext(args[0], _CODE[types.float64])
+        lanes, width = args[0], LANES
+        while width > 1:
+            width //= 2
+            blank = ir.Constant(lanes.type, ir.Undefined)
+            low, high = (
+                builder.shuffle_vector(
+                    lanes, blank, ir.Constant(ir.VectorType(_INT, width), list(range(k, k + width)))
+                )
+                for k in (0, width)
+            )
+            lanes = builder.fadd(low, high)
+        return builder.extract_element(lanes, ir.Constant(_INT, 0))
 
-    return _DOUBLE(_SINGLE), code
+    return value.element(value), code
 
 
 @intrinsic
-def narrow(typing: Any, value: Any) -> Any:
-    """Double precision rounded to single."""
+def muladd(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """``a * b + c`` of three floats of one precision."""
+    if not a == b == c or a not in _CODE:
+        return None
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fptrunc(args[0], _CODE[types.float32])
+        return multiply_add(builder, *args)
 
-    return _SINGLE(_DOUBLE), code
+    return a(a, a, a), code
 
 
-def aligned_zeros(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-    """Zeros that begin on a cache line, so that a row of eight lies on one or two whole ones."""
-    kind = np.dtype(dtype)
-    size = math.prod(shape) * kind.itemsize
-    raw = np.zeros(size + _LINE, np.uint8)
-    first = -raw.ctypes.data % _LINE
-    return raw[first : first + size].view(kind).reshape(shape)
+@intrinsic
+def rsqrt(typing: Any, value: Any) -> Any:
+    """``1 / sqrt(value)`` in single precision, to 3e-7, for one or eight normal numbers above zero.
+
+    The bits of a float are nearly its logarithm, which gives a first guess; three of Newton's
+    steps follow. Unlike a division and a root this takes a few cycles for many numbers at once.
+    """
+    if value not in (types.float32, _SINGLE):
+        return None
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def each(element: Any, number: float) -> Any:
+            if value == types.float32:
+                return ir.Constant(element, number)
+            return ir.Constant(ir.VectorType(element, LANES), [number] * LANES)
+
+        bits = each(_INT, 1).type
+        half = builder.lshr(builder.bitcast(args[0], bits), each(_INT, 1))
+        y = builder.bitcast(builder.sub(each(_INT, 0x5F375A86), half), args[0].type)
+        single = ir.FloatType()
+        x = builder.fmul(args[0], each(single, -0.5))
+        for _ in range(3):
+            step = multiply_add(builder, x, builder.fmul(y, y), each(single, 1.5))
+            y = builder.fmul(y, step)
+        return y
+
+    return value(value), code

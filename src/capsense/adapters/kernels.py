@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from capsense._jit import compiled
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _multiply(a: Array, b: Array, out: Array) -> None:
     """Quaternion product a b, (x, y, z, w)."""
     x1, y1, z1, w1 = a[0], a[1], a[2], a[3]
@@ -20,7 +21,7 @@ def _multiply(a: Array, b: Array, out: Array) -> None:
     out[3] = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _rotate(q: Array, v: Array, out: Array) -> None:
     """Turn v by the unit quaternion q: v + 2 u × (u × v + w v), with q = (u, w)."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -33,7 +34,7 @@ def _rotate(q: Array, v: Array, out: Array) -> None:
     out[2] = vz + 2.0 * (x * cy - y * cx)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def place_solids(
     frame_position: Array,
     frame_quaternion: Array,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from capsense._jit import compiled
 
 Array = NDArray[np.float64]
 
@@ -14,7 +15,7 @@ MAX_GROUPS = 64
 """Different permittivities that one frame may hold."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def sort_pixels(depth: Array, eps_r: Array, near: float, far: float, conductor: float,
                 group: NDArray[np.int8], known: Array) -> int:  # fmt: skip
     """Number the materials of a frame in order of appearance.
@@ -63,7 +64,7 @@ def sort_pixels(depth: Array, eps_r: Array, near: float, far: float, conductor: 
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def pick(front: Array, back: Array, group: NDArray[np.int8], which: int, flip_rows: bool,
          flip_columns: bool, f: Array, b: Array) -> bool:  # fmt: skip
     """Copy the intervals of one material, the others as NaN, and turn the image upright.

@@ -6,8 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from capsense._jit import compiled
 
 Array = NDArray[np.float64]
 
@@ -36,7 +37,7 @@ def boxed(triangles: Array) -> Boxes:
     return boxes
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sort(centers: Array, levels: int, order: NDArray[np.int64]) -> None:
     """Order triangles so that every box is split across its longest side."""
     count = len(order)
@@ -51,7 +52,7 @@ def _sort(centers: Array, levels: int, order: NDArray[np.int64]) -> None:
             part[:] = part[np.argsort(centers[part, wide])]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _enclose(boxes: Boxes) -> None:
     """Fill in the corners of the boxes."""
     count, levels = len(boxes.triangles), boxes.levels
@@ -73,7 +74,7 @@ def _enclose(boxes: Boxes) -> None:
                     high[axis] = max(high[axis], boxes.triangles[m, corner, axis])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def segment_distance2(px: float, py: float, pz: float, ex: float, ey: float, ez: float) -> float:
     """Squared distance from p to the segment from the origin to e."""
     length2 = ex * ex + ey * ey + ez * ez
@@ -84,7 +85,7 @@ def segment_distance2(px: float, py: float, pz: float, ex: float, ey: float, ez:
     return qx * qx + qy * qy + qz * qz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
     """Squared distance from a point to a triangle, shape (3, 3); slivers are fine."""
     px, py, pz = x - tri[0, 0], y - tri[0, 1], z - tri[0, 2]
@@ -110,7 +111,7 @@ def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def signed_distances(boxes: Boxes, points: Array, out: Array) -> None:
     """Distances [m] to a closed surface, negative inside, at points of shape (n, 3)."""
     stack, least = np.empty(2 * boxes.levels, np.int64), np.empty(2 * boxes.levels)
@@ -120,7 +121,7 @@ def signed_distances(boxes: Boxes, points: Array, out: Array) -> None:
         out[n] = -distance if _winding(boxes, x, y, z, stack) != 0 else distance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
     """Squared distance to a box, zero inside."""
     dx = max(0.0, max(box[0, 0] - x, x - box[1, 0]))
@@ -129,7 +130,7 @@ def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _distance2(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64],
                least: Array) -> float:  # fmt: skip
     """Squared distance to the nearest triangle; ``stack`` and ``least`` are room to work in."""
@@ -158,7 +159,7 @@ def _distance2(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int
     return best
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _winding(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64]) -> int:
     """How often the surface winds around a point, from its crossings of a ray along z."""
     count, levels = len(boxes.triangles), boxes.levels
@@ -184,7 +185,7 @@ def _winding(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _around(tri: Array, x: float, y: float) -> int:
     """Whether a triangle, seen along z, lies around a point: 1, -1 from behind, else 0.
 
@@ -204,7 +205,7 @@ def _around(tri: Array, x: float, y: float) -> int:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _height(tri: Array, x: float, y: float) -> float:
     """Height of a triangle's plane at (x, y), within its own [m]."""
     ux, uy, uz = tri[1, 0] - tri[0, 0], tri[1, 1] - tri[0, 1], tri[1, 2] - tri[0, 2]

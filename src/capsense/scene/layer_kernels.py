@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from capsense._jit import compiled
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def sort_slots(front: Array, back: Array, f: Array32, b: Array32, reach: Array) -> int:
     """Sort the intervals of every pixel, drop what is none, unite what overlaps.
 

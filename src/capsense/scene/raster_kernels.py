@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from capsense._jit import compiled
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -21,7 +22,7 @@ LEAST_COSINE = 0.2
 """A sheet more inclined to the image than this cosine tells is not thickened any further."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _order(
     x0: float, y0: float, x1: float, y1: float, x2: float, y2: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -35,14 +36,14 @@ def _order(
     return x0, y0, x1, y1, x2, y2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _edge_at(x0: float, y0: float, x1: float, y1: float, y: float) -> float:
     """Where an edge, lower end first, crosses the line at y; between its ends to the last bit."""
     x = x0 + (y - y0) * ((x1 - x0) / (y1 - y0))
     return min(max(x, min(x0, x1)), max(x0, x1))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _span(
     x0: float, y0: float, x1: float, y1: float, x2: float, y2: float, y: float
 ) -> tuple[float, float]:
@@ -52,13 +53,13 @@ def _span(
     return min(a, b), max(a, b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _whole(x: float, last: int) -> int:
     """First whole number not below x, from 0 to ``last``."""
     return int(math.ceil(min(max(x, 0.0), float(last))))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Array32,
          count: Ints) -> int:  # fmt: skip
     """Meet every pixel's ray with every triangle.
@@ -109,7 +110,7 @@ def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Arr
     return most
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def pair(met: Array32, count: Ints, sheet: bool, front: Array, back: Array) -> None:
     """Turn the depths that rays met into intervals.
 

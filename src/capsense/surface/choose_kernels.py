@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from capsense._jit import compiled
 from capsense.surface.place_kernels import (
     FAR_LEAST,
     NEAR_FACE,
@@ -19,7 +20,6 @@ from capsense.surface.place_kernels import (
 )
 from capsense.surface.vector_kernels import (
     doubles,
-    fast,
     integers,
     multiply_lanes,
     point_potentials,
@@ -70,7 +70,7 @@ def chosen(bodies, green, threshold, width):
     return choose(bodies, first, scores, threshold, width)
 
 
-@fast
+@compiled
 def score(bodies, first, green, enough, weight, scores):
     """Share of the electrodes' energies that each charge function takes up alone.
 
@@ -116,7 +116,7 @@ def score(bodies, first, green, enough, weight, scores):
         _raise_scores(bodies[b], means[span], met[span], linear[span], weight, scores[span])
 
 
-@fast
+@compiled
 def _mean_potentials(body, green, means, met, crossing, linear):
     """φ⁰ in the middle of clusters that see it as linear or have no parts, from the far sources.
 
@@ -174,7 +174,7 @@ def _mean_potentials(body, green, means, met, crossing, linear):
             means[places[j], i] = inner[j] * phi[j, i]
 
 
-@fast
+@compiled
 def _raise_scores(body, mean, met, linear, weight, scores):
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     count = 2 * body.n - 1
@@ -198,7 +198,7 @@ def _raise_scores(body, mean, met, linear, weight, scores):
                 scores[part] += share * _DECAY * scores[k]
 
 
-@fast
+@compiled
 def choose(bodies, first, scores, threshold, width):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
@@ -232,7 +232,7 @@ def choose(bodies, first, scores, threshold, width):
     return _collect(bodies, first, state, place, fades, above, count, leaves)
 
 
-@fast
+@compiled
 def _collect(bodies, first, state, place, fades, above, count, leaves):
     cut = Cut(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),

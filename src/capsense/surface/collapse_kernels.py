@@ -5,8 +5,9 @@ from __future__ import annotations
 from heapq import heapify, heappop, heappush
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from capsense._jit import compiled
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -25,7 +26,7 @@ _TURN = 0.25
 """Least cosine between the normals of a triangle before and after."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count: int) -> Index:
     """Collapse edges, the cheapest first, until ``count`` triangles are left.
 
@@ -126,7 +127,7 @@ def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count
     return np.flatnonzero(alive)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _cost(vertices: Array, quadrics: Array, u: int, v: int, place: Array) -> float:
     """What it costs to join two vertices, and the place where that is least."""
     q = quadrics[u] + quadrics[v]
@@ -160,7 +161,7 @@ def _cost(vertices: Array, quadrics: Array, u: int, v: int, place: Array) -> flo
     return np.float64(np.float32(max(error, 0.0) + _EVEN * whole * square))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _allowed(
     vertices: Array, faces: Index, alive: NDArray[np.bool_], head: Index, follow: Index,
     mark: Index, number: int, u: int, v: int, place: Array, facing: bool,
@@ -190,7 +191,7 @@ def _allowed(
     return common <= shared
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _keeps_facing(vertices: Array, own: int, i: int, j: int, place: Array) -> bool:
     """Whether a triangle faces alike with a corner elsewhere, and does not become a sliver."""
     edge, to, old = vertices[j] - vertices[i], place - vertices[i], vertices[own] - vertices[i]

@@ -6,44 +6,15 @@ potential at a cluster, a torque that about the origin of the sensor frame.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
 from numba import njit
-from numba.extending import intrinsic
 
-from capsense._simd import LANES, at, madd, put_span, span, splat, vadd, vmadd
+from capsense._jit import compiled
+from capsense._simd import LANES, at, madd, put_span, rsqrt, span, splat, vadd, vmadd
 from capsense.surface.pair_kernels import SOFT, cluster_moments
-from capsense.surface.vector_kernels import fast
 
 
-@intrinsic
-def vector_rsqrt(typing: Any, value: Any) -> Any:
-    """``1 / sqrt(value)`` of eight single-precision numbers above zero, to 3e-7; as ``rsqrt``."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        flags = ("contract", "nsz", "reassoc")
-        integers = ir.VectorType(ir.IntType(32), LANES)
-        singles = ir.VectorType(ir.FloatType(), LANES)
-
-        def each(kind: Any, number: float) -> Any:
-            return ir.Constant(kind, [number] * LANES)
-
-        half = builder.lshr(builder.bitcast(args[0], integers), each(integers, 1))
-        y = builder.bitcast(builder.sub(each(integers, 0x5F375A86), half), singles)
-        x = builder.fmul(args[0], each(singles, -0.5), flags=flags)
-        for _ in range(3):
-            square = builder.fmul(y, y, flags=flags)
-            step = builder.fadd(builder.fmul(x, square, flags=flags), each(singles, 1.5),
-                                flags=flags)  # fmt: skip
-            y = builder.fmul(y, step, flags=flags)
-        return y
-
-    return value(value), code
-
-
-@fast
+@compiled
 def source_lines(points, sources, floor, out):
     """What every source does to the sum over four points (k, 4, 3), each of unit charge.
 
@@ -66,8 +37,8 @@ def source_lines(points, sources, floor, out):
                 z = splat(at(points, o + 2))
                 dz, ez = madd(minus, high, z), madd(minus, low, z)
                 across = vmadd(dx, dx, vmadd(dy, dy, zero))
-                a = vector_rsqrt(vmadd(dz, dz, across))
-                b = vector_rsqrt(vmadd(ez, ez, across))
+                a = rsqrt(vmadd(dz, dz, across))
+                b = rsqrt(vmadd(ez, ez, across))
                 value = vadd(value, madd(minus, b, a))
                 a = vmadd(vmadd(a, a, zero), madd(minus, a, zero), zero)
                 b = vmadd(vmadd(b, b, zero), b, zero)
@@ -79,7 +50,7 @@ def source_lines(points, sources, floor, out):
             _put_six(out, o, layer, value, fx, fy, fz, gx, gy)
 
 
-@fast
+@compiled
 def _put_six(out, place, layer, a, b, c, d, e, f):
     put_span(out, place, a)
     put_span(out, place + layer, b)
@@ -89,7 +60,7 @@ def _put_six(out, place, layer, a, b, c, d, e, f):
     put_span(out, place + 5 * layer, f)
 
 
-@fast
+@compiled
 def wide_moments(points, extent, width):
     """Moments of the clusters, shape (10, width)."""
     out = np.ones((10, width), np.float32)
@@ -100,7 +71,7 @@ def wide_moments(points, extent, width):
     return out
 
 
-@fast
+@compiled
 def weigh(shapes, i, others, n, sign, weight):
     """Give the clusters that cluster i meets by moments the weight ``sign``, others zero."""
     sign, none = np.float32(sign), np.float32(0.0)
@@ -113,7 +84,7 @@ def weigh(shapes, i, others, n, sign, weight):
         weight[j] = none
 
 
-@fast
+@compiled
 def pair_line(shapes, i, others, weight, out, row):
     """Add force and torque on cluster i by others, by moments, to row ``row`` of ``out``."""
     width = others.shape[1]
@@ -132,7 +103,7 @@ def pair_line(shapes, i, others, weight, out, row):
         ex, ey, ez = (
             span(others, 6 * width + j), span(others, 7 * width + j), span(others, 8 * width + j)
         )  # fmt: skip
-        inverse = vector_rsqrt(_dot(dx, dy, dz, dx, dy, dz, splat(np.float32(1e-12))))
+        inverse = rsqrt(_dot(dx, dy, dz, dx, dy, dz, splat(np.float32(1e-12))))
         second = vmadd(inverse, inverse, zero)
         a = madd(ax, dx, madd(ay, dy, madd(az, dz, zero)))
         b = madd(bx, dx, madd(by, dy, madd(bz, dz, zero)))
@@ -175,7 +146,7 @@ def _cross(x, y, u, v):
     return vmadd(x, v, madd(np.float32(-1.0), vmadd(y, u, zero), zero))
 
 
-@fast
+@compiled
 def near_pairs(points, others, extent, i, start, stop, n, weight, near, out, row):
     """The same for clusters without weight, point by point, but those from start to stop.
 
@@ -209,9 +180,9 @@ def near_pairs(points, others, extent, i, start, stop, n, weight, near, out, row
                 dy = madd(minus, span(near, o + width), splat(y))
                 dz = madd(minus, span(near, o + 2 * width), splat(z))
                 s = _dot(dx, dy, dz, dx, dy, dz, zero)
-                u = vector_rsqrt(vmadd(s, s, bound))
+                u = rsqrt(vmadd(s, s, bound))
                 # s / (s s + bound)^(5/4)
-                pull = vmadd(vmadd(u, u, zero), vmadd(u, vector_rsqrt(u), zero), zero)
+                pull = vmadd(vmadd(u, u, zero), vmadd(u, rsqrt(u), zero), zero)
                 pull = vmadd(s, pull, zero)
                 fx, fy, fz = vmadd(pull, dx, fx), vmadd(pull, dy, fy), vmadd(pull, dz, fz)
             gx, gy, gz = vadd(gx, fx), vadd(gy, fy), vadd(gz, fz)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from capsense._jit import compiled
 from capsense.surface.force_kernels import (
     near_pairs,
     pair_line,
@@ -25,13 +26,13 @@ from capsense.surface.force_kernels import (
     wide_moments,
 )
 from capsense.surface.place_kernels import distances, near_share
-from capsense.surface.vector_kernels import WIDTH, fast, multiply, multiply_lanes
+from capsense.surface.vector_kernels import WIDTH, multiply, multiply_lanes
 
 _BLOCK = 32
 """Leaves taken at a time, whose tables stay in the cache."""
 
 
-@fast
+@compiled
 def jacobian(solution, bodies, green):
     """How the Maxwell matrix changes with the pose of each body.
 
@@ -69,7 +70,7 @@ def jacobian(solution, bodies, green):
     return out
 
 
-@fast
+@compiled
 def _add_design(points, charge, bounds, green, work):
     """Add forces and torques by the design's sources, (b, 6, lead, lead)."""
     n, lead, floor = points.shape[0], charge.shape[1], np.float32(green.floor)
@@ -93,7 +94,7 @@ def _add_design(points, charge, bounds, green, work):
     _add_work(far, far_sources, green.far_table, right, work)
 
 
-@fast
+@compiled
 def _padded(sources):
     """Sources (3, s) and more of them that nothing depends on, up to a multiple of 32."""
     out = np.full((3, WIDTH * ((sources.shape[1] + WIDTH - 1) // WIDTH)), np.float32(9.0))
@@ -103,7 +104,7 @@ def _padded(sources):
     return out
 
 
-@fast
+@compiled
 def _source_sums(points, charge, share, bounds, sources, floor):
     """Sums over each body's charges, weighted with ``share``, of what a source does to them.
 
@@ -145,7 +146,7 @@ def _source_sums(points, charge, share, bounds, sources, floor):
     return out
 
 
-@fast
+@compiled
 def _narrowed(table, columns):
     out = np.empty((table.shape[0], columns), np.float32)
     for i in range(table.shape[0]):
@@ -154,14 +155,14 @@ def _narrowed(table, columns):
     return out
 
 
-@fast
+@compiled
 def _add(addend, out):
     for i in range(out.shape[0]):
         for k in range(out.shape[1]):
             out[i, k] += addend[i, k]
 
 
-@fast
+@compiled
 def _add_modes(sums, table, modes):
     """Add the sums of ψ over all charges to ``modes`` (lead, w); those of φ⁰ mean nothing."""
     if sums.shape[0] == 0:
@@ -177,7 +178,7 @@ def _add_modes(sums, table, modes):
     _add(part, modes[:, : table.shape[1]])
 
 
-@fast
+@compiled
 def _add_work(sums, sources, table, right, work):
     """Add forces and torques by sources of coefficients ``table @ right``, shape (s, lead)."""
     count, lead, width = sums.shape[0], sums.shape[2], sums.shape[3]
@@ -204,7 +205,7 @@ def _add_work(sums, sources, table, right, work):
         _add_contracted(own, coefficients, work[b])
 
 
-@fast
+@compiled
 def _add_contracted(sums, coefficients, work):
     """``work += sums @ coefficients``, shapes (6, lead, lead), (6, lead, s) and (s, lead)."""
     lead, width = sums.shape[1], sums.shape[2]
@@ -213,7 +214,7 @@ def _add_contracted(sums, coefficients, work):
     _add(part, work.reshape((6 * lead, lead)))
 
 
-@fast
+@compiled
 def _add_pairs(points, extent, charge, bounds, floor, work):
     """Add forces and torques by other bodies' charges and by all images in the floor."""
     n, lead = charge.shape

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._jit import compiled
 from capsense.surface.place_kernels import (
     FAR_LEAST,
     NEAR_LEAST,
@@ -21,7 +22,7 @@ from capsense.surface.place_kernels import (
     lift,
     near_share,
 )
-from capsense.surface.vector_kernels import doubles, fast, multiply, source_potentials
+from capsense.surface.vector_kernels import doubles, multiply, source_potentials
 
 
 class Leaves(NamedTuple):
@@ -42,7 +43,7 @@ class Leaves(NamedTuple):
     which have energies of their own; shape (l,)."""
 
 
-@fast
+@compiled
 def placed(bodies, cut, green, inside):
     """Place the leaves of a cut in the sensor frame.
 
@@ -85,7 +86,7 @@ def placed(bodies, cut, green, inside):
     return Leaves(points, true, extent, out, owner, within)
 
 
-@fast
+@compiled
 def four_points(a, center, v, out):
     """Four points of equal weight with a centre and the two largest of its second moments.
 
@@ -132,7 +133,7 @@ def four_points(a, center, v, out):
     return math.sqrt(12.0) * long
 
 
-@fast
+@compiled
 def leaf_rows(points, beyond, green):
     """Rows of the leaves, shape (l, w); no wider than those of far points where none is near."""
     distance = distances(points, green)
@@ -181,7 +182,7 @@ def leaf_rows(points, beyond, green):
     return out
 
 
-@fast
+@compiled
 def _add_rows(points, chosen, share, sources, table, floor, least, out):
     values = np.empty((points.shape[0], sources.shape[1]), np.float32)
     source_potentials(points, sources, np.float32(floor), np.float32(least), values)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 
-from capsense.surface.vector_kernels import fast, rsqrt
+from capsense._jit import compiled
+from capsense._simd import muladd, rsqrt
 
 FAR = 0.75
 """Clusters farther apart than so many of their joint extents are met by their moments."""
@@ -22,7 +24,7 @@ that coincide then have less energy between them than each has alone. Coarse one
 not; ``solve_kernels`` raises the diagonal then."""
 
 
-@fast
+@compiled
 def leaf_pairs(leaves, floor):
     """Mean of 1/r between bodies and within changing ones, and of -1/r to all images in the floor.
 
@@ -70,7 +72,7 @@ def leaf_pairs(leaves, floor):
     return out
 
 
-@fast
+@compiled
 def _add_lifted(leaves, out):
     """Add to pairs of a rigid body what they meet each other more for being lifted."""
     points, true = leaves.points, leaves.true
@@ -91,7 +93,7 @@ def _add_lifted(leaves, out):
                 out[j, i] += more
 
 
-@fast
+@compiled
 def cluster_moments(points, extent):
     """Centre, the two arms and the reach of each cluster, a column each, shape (10, l)."""
     out = np.empty((10, points.shape[0]), np.float32)
@@ -104,32 +106,36 @@ def cluster_moments(points, extent):
     return out
 
 
-@fast
+@njit(inline="always")
+def _dot(x, y, z, u, v, w):
+    return muladd(x, u, muladd(y, v, z * w))
+
+
+@compiled
 def _far_means(shapes, i, others, out):
     """Means of 1/r between cluster i and others, by second moments; -1 for those that are near."""
-    half, one = np.float32(0.5), np.float32(1.0)
+    half, three, tiny = np.float32(0.5), np.float32(3.0), np.float32(1e-12)
     x, y, z, reach = shapes[0, i], shapes[1, i], shapes[2, i], shapes[9, i]
     ax, ay, az = shapes[3, i], shapes[4, i], shapes[5, i]
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
-    own = ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz
+    own = _dot(ax, ay, az, ax, ay, az) + _dot(bx, by, bz, bx, by, bz)
     for j in range(out.shape[0]):
         dx, dy, dz = x - others[0, j], y - others[1, j], z - others[2, j]
         cx, cy, cz = others[3, j], others[4, j], others[5, j]
         ex, ey, ez = others[6, j], others[7, j], others[8, j]
-        square = dx * dx + dy * dy + dz * dz
-        inverse = rsqrt(square + np.float32(1e-12))
-        a = ax * dx + ay * dy + az * dz
-        b = bx * dx + by * dy + bz * dz
-        c = cx * dx + cy * dy + cz * dz
-        e = ex * dx + ey * dy + ez * dz
-        whole = own + cx * cx + cy * cy + cz * cz + ex * ex + ey * ey + ez * ez
-        along = np.float32(3.0) * (a * a + b * b + c * c + e * e) * inverse * inverse
-        value = inverse * (one + half * (along - whole) * inverse * inverse)
+        square = _dot(dx, dy, dz, dx, dy, dz)
+        inverse = rsqrt(square + tiny)
+        a, b = _dot(ax, ay, az, dx, dy, dz), _dot(bx, by, bz, dx, dy, dz)
+        c, e = _dot(cx, cy, cz, dx, dy, dz), _dot(ex, ey, ez, dx, dy, dz)
+        whole = own + _dot(cx, cy, cz, cx, cy, cz) + _dot(ex, ey, ez, ex, ey, ez)
+        second = inverse * inverse
+        along = three * muladd(a, a, _dot(b, c, e, b, c, e)) * second
+        value = muladd(half * inverse * (along - whole), second, inverse)
         far = reach + others[9, j]
-        out[j] = value if square > far * far else -one
+        out[j] = value if square > far * far else np.float32(-1.0)
 
 
-@fast
+@compiled
 def _flat(points, extent):
     """Coordinates of the four points and extent of each cluster, a column each, shape (13, l)."""
     out = np.empty((13, points.shape[0]), np.float32)
@@ -141,7 +147,7 @@ def _flat(points, extent):
     return out
 
 
-@fast
+@compiled
 def _near_means(flat, i, others, out, room):
     """Replace what is negative in a line by :func:`mean_inverse` of cluster i and those others."""
     count = 0
@@ -162,14 +168,14 @@ def _near_means(flat, i, others, out, room):
             for k in range(count):
                 dx, dy = x - room[3 * q, k], y - room[3 * q + 1, k]
                 dz = z - room[3 * q + 2, k]
-                square = dx * dx + dy * dy + dz * dz
-                fourth = square * square + room[12, k]
+                square = _dot(dx, dy, dz, dx, dy, dz)
+                fourth = muladd(square, square, room[12, k])
                 room[13, k] += rsqrt(fourth * rsqrt(fourth))
     for k in range(count):
         out[int(room[14, k])] = room[13, k] * np.float32(1.0 / 16.0)
 
 
-@fast
+@compiled
 def mean_inverse(first, second, extent):
     """Mean of a bounded 1/r [1/m] over four points of each of two clusters, shapes (4, 3)."""
     bound = np.float32((SOFT * extent) ** 4 + 1e-24)
@@ -185,7 +191,7 @@ def mean_inverse(first, second, extent):
     return total / np.float32(16.0)
 
 
-@fast
+@compiled
 def _near_mean(first, second, extent, other, same):
     """Mean of 1/r [1/m] between two rectangles of one surface, given by their four points."""
     if same:
@@ -209,7 +215,7 @@ def _near_mean(first, second, extent, other, same):
     )
 
 
-@fast
+@compiled
 def _arm(corners, which):
     """Half the distance [m] between two of the four points."""
     total = 0.0
@@ -218,7 +224,7 @@ def _arm(corners, which):
     return 0.5 * math.sqrt(total)
 
 
-@fast
+@compiled
 def _mean_potential(outer, inner):
     """Mean over the points of one rectangle of the potential of unit charge on the other [1/m]."""
     root = math.sqrt(3.0)
@@ -238,7 +244,7 @@ def _mean_potential(outer, inner):
     return total / (16.0 * a * b)
 
 
-@fast
+@compiled
 def _corner(x, y, z):
     """Antiderivative of 1/r over a rectangle (Wilton et al. 1984), z > 0."""
     r = math.sqrt(x * x + y * y + z * z)
@@ -246,7 +252,7 @@ def _corner(x, y, z):
             - z * math.atan(x * y / (z * r)))  # fmt: skip
 
 
-@fast
+@compiled
 def _self_mean(first, second):
     """Mean of 1/r [1/m] within a rectangle of two given standard deviations [m]."""
     a, b = math.sqrt(12.0) * first + 1e-9, math.sqrt(12.0) * second + 1e-9

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.surface.vector_kernels import fast
+from capsense._jit import compiled
 
 BODY = np.dtype(
     [
@@ -75,14 +75,14 @@ class Green(NamedTuple):
     """Thickness of what covers the electrodes of a flat design [m]; infinite for other designs."""
 
 
-@fast
+@compiled
 def smooth(x):
     """Smoothstep: 0 up to 0, 1 from 1 on."""
     x = min(1.0, max(0.0, x))
     return x * x * (3.0 - 2.0 * x)
 
 
-@fast
+@compiled
 def beyond(points, green):
     """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face."""
     out, depth = 0.0, 1.0
@@ -98,13 +98,13 @@ def beyond(points, green):
     return smooth(max(math.sqrt(out), deep) / SHORE)
 
 
-@fast
+@compiled
 def least_gap(extent, cover):
     """Least gap [m] between a cluster and a flat design, see :data:`_GAP`."""
     return max(_GAP[3], min(_GAP[1], max(_GAP[0], extent * extent / _GAP[2])) - cover)
 
 
-@fast
+@compiled
 def lift(points, gap, box):
     """Keep points (k, 3) off a flat design: a distance d < 2 gap becomes gap + d² / (4 gap).
 
@@ -134,7 +134,7 @@ def lift(points, gap, box):
             points[q, i] = edge + ratio * (points[q, i] - edge)
 
 
-@fast
+@compiled
 def distances(points, green):
     """Distance [m] of each leaf's centre from the design's box, shape (l,)."""
     out = np.empty(points.shape[0])
@@ -148,7 +148,7 @@ def distances(points, green):
     return out
 
 
-@fast
+@compiled
 def near_share(distance, blend):
     """One below the first distance of a blend, zero above the second, smooth in between."""
     return smooth((blend[1] - distance) / (blend[1] - blend[0]))

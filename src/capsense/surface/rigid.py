@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from capsense._frozen import Frozen
+from capsense._jit import compiled
 from capsense.errors import SolveError
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
 from capsense.surface.panels import SurfacePanels
 from capsense.surface.place_kernels import BODY
-from capsense.surface.vector_kernels import cholesky, fast
+from capsense.surface.vector_kernels import cholesky
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -157,11 +157,11 @@ def _equilibrium(free: Array) -> Array:
     return charge
 
 
-@fast
+@compiled
 def _conjugate_gradients(matrix: Array, x: Array) -> bool:
     """Solve ``matrix @ x = 1``, its diagonal for a preconditioner; False without convergence.
 
-    Compiled, so that bits do not depend on where arrays lie, as those of a BLAS do.
+    Compiled, so that bits do not depend on where arrays lie, as those of a BLAS may.
     """
     n = x.shape[0]
     residual, way, product = np.ones(n), np.empty(n), np.empty(n)
@@ -177,13 +177,13 @@ def _conjugate_gradients(matrix: Array, x: Array) -> bool:
         share = energy / before if step > 0 else 0.0
         for i in range(n):
             way[i] = residual[i] / matrix[i, i] + (share * way[i] if step > 0 else 0.0)
+        product[:] = 0.0
+        for j in range(n):  # the matrix is symmetric: row by row many sums go on at once
+            for i in range(n):
+                product[i] += matrix[j, i] * way[j]
         curvature = 0.0
         for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += matrix[i, j] * way[j]
-            product[i] = total
-            curvature += way[i] * total
+            curvature += way[i] * product[i]
         length = energy / curvature
         for i in range(n):
             x[i] += length * way[i]
@@ -205,14 +205,29 @@ def _made_definite(free: Array) -> Array:
             f"the surface of {len(free)} panels meets itself, so that no charge can be told; "
             "remove doubled faces"
         )
-    charge = solve_triangular(factor, np.ones(len(free)), lower=True, check_finite=False)
-    return solve_triangular(factor, charge, lower=True, trans=1, check_finite=False)
+    charge = np.ones(len(free))
+    _substitute(factor, charge)
+    return charge
 
 
-@fast
+@compiled
 def _factored(matrix: Array) -> bool:
     """Cholesky on one core: several threads of LAPACK hinder each other on busy machines."""
     return cholesky(matrix)
+
+
+@compiled
+def _substitute(factor: Array, x: Array) -> None:
+    """Solve ``factor @ factor.T @ x_new = x`` in place; compiled for the same reason as above."""
+    n = x.shape[0]
+    for i in range(n):
+        for j in range(i):
+            x[i] -= factor[i, j] * x[j]
+        x[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        x[i] /= factor[i, i]
+        for j in range(i):
+            x[j] -= factor[i, j] * x[i]
 
 
 def build_tree(panels: SurfacePanels, charge: Array) -> Tree:

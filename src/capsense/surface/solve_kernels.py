@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._jit import compiled
 from capsense._simd import at, madd, put_span, span
 from capsense.surface.vector_kernels import (
     WIDTH,
     cholesky,
-    fast,
     integers,
     multiply_part,
     singles,
@@ -58,7 +58,7 @@ class System(NamedTuple):
     """Energies of all functions by themselves [1/m], shape (f,)."""
 
 
-@fast
+@compiled
 def functions_of(bodies, cut):
     """List the charge functions of a cut, those to be solved for first."""
     count = bodies.shape[0]
@@ -86,12 +86,12 @@ def functions_of(bodies, cut):
     return Functions(cluster[:f], number[:f], body[:f], solved)
 
 
-@fast
+@compiled
 def _function(body, node):
     return integers(body.function)[node]
 
 
-@fast
+@compiled
 def _differences(cut, functions, values, out):
     """Integrals with the first functions, (f, m), of what has these means on clusters, (k, m)."""
     for f in range(out.shape[0]):
@@ -105,7 +105,7 @@ def _differences(cut, functions, values, out):
                 out[f, i] = x[i] - y[i]
 
 
-@fast
+@compiled
 def _climb(cut, values):
     """Fill the means (k, m) of all clusters of a cut from those of its leaves."""
     for a in range(cut.node.shape[0] - 1, -1, -1):
@@ -118,7 +118,7 @@ def _climb(cut, values):
                 row[i] = p * x[i] + q * y[i]
 
 
-@fast
+@compiled
 def assembled(bodies, cut, functions, rows, pairs, lead):
     """Set up the system of a cut from the rows (l, w) and pairs (l, l) of its leaves."""
     total, solved = functions.cluster.shape[0], functions.solved
@@ -160,7 +160,7 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
     return System(phi, matrix, rest, own)
 
 
-@fast
+@compiled
 def _integrals(cut, functions, rows, pairs):
     """Integrate rows (l, w) with all functions, and pairs (l, l) with all and those solved for."""
     clusters, leaves, solved = cut.node.shape[0], cut.leaves.shape[0], functions.solved
@@ -188,7 +188,7 @@ def _integrals(cut, functions, rows, pairs):
     return wide, outer
 
 
-@fast
+@compiled
 def _products(psi, solved):
     """Products of all rows of ψ with the first ``solved`` ones, up to the row's own."""
     total, modes = psi.shape
@@ -204,7 +204,7 @@ def _products(psi, solved):
     return out
 
 
-@fast
+@compiled
 def _depth(rows):
     """Up to which column rows have anything; the last modes are zero far from the sensor."""
     depth = rows.shape[1]
@@ -216,7 +216,7 @@ def _depth(rows):
     return 0
 
 
-@fast
+@compiled
 def _add_matter(bodies, functions, matrix, rest, own):
     """Add what ties bodies to ground, and the inside of dielectrics."""
     solved = functions.solved
@@ -248,7 +248,7 @@ def _add_matter(bodies, functions, matrix, rest, own):
         own[f] += factor * float(inside[functions.number[f] * (body.n + 1)])
 
 
-@fast
+@compiled
 def reduced(cut, functions, system, adjoint):
     """ΔC, the part of it that was estimated, the charges of all functions, a shift of the diagonal.
 
@@ -312,7 +312,7 @@ def reduced(cut, functions, system, adjoint):
     return delta, left, x, shift
 
 
-@fast
+@compiled
 def _factorise(matrix, root, own, factor):
     """Cholesky factor of √t A √t with A's own diagonal.
 
@@ -334,7 +334,7 @@ def _factorise(matrix, root, own, factor):
     return -1.0
 
 
-@fast
+@compiled
 def _add_products(left, right, out):
     """``out += left.T @ right``, shapes (n, m), (n, m) and (m, m); m a multiple of 8."""
     n, m = left.shape
@@ -346,7 +346,7 @@ def _add_products(left, right, out):
             put_span(out, i * m + c, total)
 
 
-@fast
+@compiled
 def _add_adjoint(matrix, rest, root, lack, factor, charge, x):
     """Add to the charges x of the functions solved for what the estimate asks of them.
 
@@ -369,7 +369,7 @@ def _add_adjoint(matrix, rest, root, lack, factor, charge, x):
             x[f, i] += charge[f, i] - root[f] * back[f, i]
 
 
-@fast
+@compiled
 def leaf_charges(cut, functions, x, leaves):
     """Charges on the leaves (l, m) of charges of the functions (f, m)."""
     clusters, m = cut.node.shape[0], x.shape[1]

@@ -13,6 +13,7 @@ import scipy.linalg
 from numba import njit
 from numpy.typing import NDArray
 
+from capsense._jit import compiled
 from capsense.surface.choose_kernels import Cut, chosen
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import leaf_pairs
@@ -27,7 +28,6 @@ from capsense.surface.solve_kernels import (
     leaf_charges,
     reduced,
 )
-from capsense.surface.vector_kernels import fast
 
 
 class Solution(NamedTuple):
@@ -74,7 +74,7 @@ def prepared(
     return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
 
 
-@fast
+@compiled
 def solve(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
 ) -> Solution:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from capsense._jit import compiled
+
 _COLUMNS = 128
 """Columns of a matrix that are taken at a time."""
 _TIE = 1e-6
@@ -140,7 +142,7 @@ def moments(kids, panel, charge, center, spread):
                 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def to_functions(values, kids, panel, charge, function, out):
     """Integrate columns of panel values with every charge function, some columns at a time.
 

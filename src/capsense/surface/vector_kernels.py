@@ -8,45 +8,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from capsense._simd import at, madd, put_span, span, splat
+from capsense._jit import compiled
+from capsense._simd import at, lane_sum, madd, muladd, put_span, rsqrt, span, splat, vmadd
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""
-
-_FAST = frozenset({"contract", "nsz", "reassoc", "arcp"})
-fast = njit(cache=True, nogil=True, error_model="numpy", fastmath=set(_FAST))
-"""Compiled with sums in any order; NaN and infinity keep their meaning."""
-
-
-@intrinsic
-def rsqrt(typing: Any, value: Any) -> Any:
-    """``1 / sqrt(value)`` in single precision, to 3e-7, for a normal number above zero.
-
-    The bits of a float are nearly its logarithm, which gives a first guess; three of Newton's
-    steps follow. Unlike a division and a root this takes a few cycles for many numbers at once.
-    """
-    if value != types.float32:
-        return None
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        integer, single = ir.IntType(32), ir.FloatType()
-        flags = ("contract", "nsz", "reassoc")
-        bits = builder.bitcast(args[0], integer)
-        half = builder.lshr(bits, ir.Constant(integer, 1))
-        y = builder.bitcast(builder.sub(ir.Constant(integer, 0x5F375A86), half), single)
-        x = builder.fmul(args[0], ir.Constant(single, -0.5), flags=flags)
-        for _ in range(3):
-            square = builder.fmul(y, y, flags=flags)
-            step = builder.fadd(builder.fmul(x, square, flags=flags), ir.Constant(single, 1.5),
-                                flags=flags)  # fmt: skip
-            y = builder.fmul(y, step, flags=flags)
-        return y
-
-    return types.float32(types.float32), code
 
 
 def _pointer(kind: Any) -> Any:
@@ -65,7 +34,7 @@ def _pointer(kind: Any) -> Any:
 singles, doubles, integers = _pointer(types.float32), _pointer(types.float64), _pointer(types.int64)
 
 
-@fast
+@compiled
 def source_potentials(points, sources, floor, least, out):
     """Mean over four points of the potential of every unit source and its image in the floor.
 
@@ -87,15 +56,16 @@ def source_potentials(points, sources, floor, least, out):
                 dy = y - sources[1, s]
                 dz = z - sources[2, s]
                 ez = z + sources[2, s] - two
-                across = dx * dx + dy * dy
-                value = quarter * (rsqrt(max(across + dz * dz, bound)) - rsqrt(across + ez * ez))
+                across = muladd(dx, dx, dy * dy)
+                value = rsqrt(max(muladd(dz, dz, across), bound)) - rsqrt(muladd(ez, ez, across))
+                value *= quarter
                 if q == 0:
                     out[i, s] = value
                 else:
                     out[i, s] += value
 
 
-@fast
+@compiled
 def point_potentials(points, sources, floor, least, out):
     """The same at single points, shape (k, 3)."""
     two, bound = np.float32(2.0) * floor, least * least
@@ -106,17 +76,17 @@ def point_potentials(points, sources, floor, least, out):
             dy = y - sources[1, s]
             dz = z - sources[2, s]
             ez = z + sources[2, s] - two
-            across = dx * dx + dy * dy
-            out[i, s] = rsqrt(max(across + dz * dz, bound)) - rsqrt(across + ez * ez)
+            across = muladd(dx, dx, dy * dy)
+            out[i, s] = rsqrt(max(muladd(dz, dz, across), bound)) - rsqrt(muladd(ez, ez, across))
 
 
-@fast
+@compiled
 def multiply(left, table, out):
     """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 32."""
     multiply_part(left, table, left.shape[1], table.shape[1], out)
 
 
-@fast
+@compiled
 def multiply_part(left, table, depth, width, out):
     """The same, of the first ``depth`` rows of the table and the first ``width`` columns only.
 
@@ -167,7 +137,7 @@ def _put(out, place, a, b, c, d):
     put_span(out, place + 24, d)
 
 
-@fast
+@compiled
 def multiply_lanes(left, table, out):
     """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 8, k of 4."""
     k, s, w = left.shape[0], left.shape[1], table.shape[1]
@@ -187,7 +157,7 @@ def multiply_lanes(left, table, out):
             put_span(out, o + 3 * w, d)
 
 
-@fast
+@compiled
 def cholesky(matrix):
     """Replace the lower half of a symmetric matrix (n, n) by its Cholesky factor.
 
@@ -195,16 +165,25 @@ def cholesky(matrix):
         Whether the matrix is positive definite.
     """
     n = matrix.shape[0]
+    zero = splat(matrix[0, 0] * 0.0)
     for i in range(n):
         for j in range(0, i + 1, 4):
             if j + 4 <= i:
-                s0 = s1 = s2 = s3 = 0.0
-                for k in range(j):
-                    x = matrix[i, k]
-                    s0 += x * matrix[j, k]
-                    s1 += x * matrix[j + 1, k]
-                    s2 += x * matrix[j + 2, k]
-                    s3 += x * matrix[j + 3, k]
+                a = b = c = d = zero
+                o, p = i * n, j * n
+                whole = j - j % 8
+                for k in range(0, whole, 8):
+                    v = span(matrix, o + k)
+                    a, b = vmadd(v, span(matrix, p + k), a), vmadd(v, span(matrix, p + n + k), b)
+                    c = vmadd(v, span(matrix, p + 2 * n + k), c)
+                    d = vmadd(v, span(matrix, p + 3 * n + k), d)
+                s0, s1, s2, s3 = lane_sum(a), lane_sum(b), lane_sum(c), lane_sum(d)
+                for k in range(whole, j):
+                    x = at(matrix, o + k)
+                    s0 = muladd(x, at(matrix, p + k), s0)
+                    s1 = muladd(x, at(matrix, p + n + k), s1)
+                    s2 = muladd(x, at(matrix, p + 2 * n + k), s2)
+                    s3 = muladd(x, at(matrix, p + 3 * n + k), s3)
                 l0 = (matrix[i, j] - s0) / matrix[j, j]
                 l1 = (matrix[i, j + 1] - s1 - l0 * matrix[j + 1, j]) / matrix[j + 1, j + 1]
                 l2 = (matrix[i, j + 2] - s2 - l0 * matrix[j + 2, j]
@@ -213,12 +192,12 @@ def cholesky(matrix):
                       - l2 * matrix[j + 3, j + 2]) / matrix[j + 3, j + 3]  # fmt: skip
                 matrix[i, j], matrix[i, j + 1], matrix[i, j + 2], matrix[i, j + 3] = l0, l1, l2, l3
             else:
-                for c in range(j, min(j + 4, i + 1)):
-                    total = matrix[i, c]
-                    for k in range(c):
-                        total -= matrix[i, k] * matrix[c, k]
-                    if c < i:
-                        matrix[i, c] = total / matrix[c, c]
+                for e in range(j, min(j + 4, i + 1)):
+                    total = matrix[i, e]
+                    for k in range(e):
+                        total = muladd(-at(matrix, i * n + k), at(matrix, e * n + k), total)
+                    if e < i:
+                        matrix[i, e] = total / matrix[e, e]
                     elif not total > 0.0:
                         return False
                     else:
@@ -226,7 +205,7 @@ def cholesky(matrix):
     return True
 
 
-@fast
+@compiled
 def substitute(factor, sides):
     """Replace right-hand sides (n, m) by the solution; ``factor`` is from :func:`cholesky`.
 
