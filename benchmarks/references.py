@@ -221,7 +221,7 @@ class Solution:
         self._floor = float(design.domain.lower[2])
         n = len(self.owner)
         matrix = kernels.system_matrix(
-            np.zeros(n, dtype=bool), np.zeros(n), self._floor, *self.panels.kernel_args
+            np.zeros(n, dtype=bool), np.zeros(n), self._floor, self.panels.polygons
         )
         unit = np.zeros((n, len(names)))
         driven = self.owner >= 0
@@ -233,7 +233,7 @@ class Solution:
         """Potentials [V] at points [m], shape (n, 3) -> (n, terminals)."""
         return np.concatenate(
             [
-                kernels.potential_matrix(part, self._floor, *self.panels.kernel_args) @ self.scaled
+                kernels.potential_matrix(part, self._floor, self.panels.polygons) @ self.scaled
                 for part in np.array_split(points, 1 + len(points) // 2000)
             ]
         )

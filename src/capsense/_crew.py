@@ -2,17 +2,50 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from capsense.errors import CapSenseError, SceneError
 
+Array = NDArray[np.float64]
+
 Key = TypeVar("Key", bound=Hashable)
 Result = TypeVar("Result")
+
+
+_PARTS = 8
+"""Parts that rows are filled in, for each thread: no thread then waits long for another."""
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def filled(kernel: Callable[..., None], out: Array, *args: Any) -> Array:
+    """Fill the rows of ``out`` by ``kernel(start, stop, *args, out)``, on all processors.
+
+    Threads of Python that end with the call, not Numba's own: after those have run, a process that
+    is forked off ends when it runs some too.
+    """
+    threads = processors()
+    bounds = np.linspace(0, len(out), min(len(out), _PARTS * threads) + 1).astype(int).tolist()
+    with ThreadPoolExecutor(threads, thread_name_prefix="capsense") as pool:
+        futures = [
+            pool.submit(kernel, start, stop, *args, out)
+            for start, stop in itertools.pairwise(bounds)
+        ]
+        for future in futures:
+            future.result()
+    return out
 
 
 class OneAtATime:
@@ -46,7 +79,7 @@ class Crew:
 
     def __init__(self, threads: int | None = None) -> None:
         if threads is None:
-            threads = len(os.sched_getaffinity(0))
+            threads = processors()
         if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
             raise SceneError(f"threads is {threads!r}; give a whole number from 1")
         self.threads = threads

@@ -47,3 +47,5 @@ more than half of the time of a scan. Room that a kernel needs is therefore hand
 """
 inlined = _jit(_nrt=False, inline="always")
 """The same, for what is written into the kernel that calls it."""
+pasted = njit(inline="always")
+"""What is written into the kernel that calls it, and may allocate."""

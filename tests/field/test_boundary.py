@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 
 import numpy as np
 import pytest
@@ -224,3 +225,12 @@ def test_point_sources_obey_reciprocity():
     phi = solution.potential(sources, solution.densities(np.eye(6)))
     expected = -4 * math.pi * EPS0 * phi.T
     np.testing.assert_allclose(drawn, expected, rtol=0.02, atol=2e-3 * np.abs(expected).max())
+
+
+def test_a_forked_process_solves_after_its_parent_did():
+    """Regression: after threads of OpenMP have run, they end a process that is forked off."""
+    design = patches(rectangle((0, 0), (0.03, 0.03)), size=0.2, backplane=0.01)
+    here = capacitance(design, 2.0)
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        there = pool.apply_async(capacitance, (design, 2.0)).get(120)
+    np.testing.assert_array_equal(here, there)

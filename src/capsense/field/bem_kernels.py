@@ -9,9 +9,15 @@ distributions on polygonal and polyhedral domains*, IEEE Trans. Antennas Propag.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numpy.typing import NDArray
+
+from capsense._crew import filled
+from capsense._jit import compiled, kernel
+
+Array = NDArray[np.float64]
 
 _TINY = 1e-30
 _OUTER = 1.6
@@ -20,7 +26,26 @@ _NEAR = 2.0
 """Panels nearer than this many of their own diameters are integrated in closed form."""
 
 
-@njit(cache=True)
+class Polygons(NamedTuple):
+    """Panels as the kernels take them."""
+
+    edges: Array
+    """Ends of all edges [m], shape (k, 2, 3)."""
+    first: NDArray[np.int64]
+    """Where each panel's edges begin, shape (n + 1,)."""
+    normals: Array
+    """Shape (n, 3)."""
+    centers: Array
+    """[m], shape (n, 3)."""
+    diameters: Array
+    """[m], shape (n,)."""
+    quad: Array
+    """Points of a quadrature [m], shape (n, q, 3)."""
+    weights: Array
+    """Their weights [m²], zero for those not used, shape (n, q)."""
+
+
+@kernel
 def polygon_potential(edges, normal, x, y, z):
     """Return ∫ dS' / |r − r'| [m] over a polygon given by its edges (k, 2, 3)."""
     nx, ny, nz = normal[0], normal[1], normal[2]
@@ -53,7 +78,7 @@ def polygon_potential(edges, normal, x, y, z):
     return total
 
 
-@njit(cache=True)
+@kernel
 def polygon_gradient(edges, normal, x, y, z, out):
     """Write ∇ ∫ dS' / |r − r'| (dimensionless) into ``out`` (3,).
 
@@ -95,31 +120,38 @@ def polygon_gradient(edges, normal, x, y, z, out):
     out[0], out[1], out[2] = gx, gy, gz
 
 
-@njit(cache=True)
-def _panel_potential(j, edges, first, normals, centers, diameters, quad, weights, x, y, z):
-    dx, dy, dz = x - centers[j, 0], y - centers[j, 1], z - centers[j, 2]
-    if dx * dx + dy * dy + dz * dz < (_NEAR * diameters[j]) ** 2:
-        return polygon_potential(edges[first[j] : first[j + 1]], normals[j], x, y, z)
+@kernel
+def _panel_potential(p, j, x, y, z):
+    """Potential of unit charge density on panel j, times 4π eps0 [m]."""
+    dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], z - p.centers[j, 2]
+    if dx * dx + dy * dy + dz * dz < (_NEAR * p.diameters[j]) ** 2:
+        return polygon_potential(p.edges[p.first[j] : p.first[j + 1]], p.normals[j], x, y, z)
     total = 0.0
-    for q in range(quad.shape[1]):
-        w = weights[j, q]
+    for q in range(p.quad.shape[1]):
+        w = p.weights[j, q]
         if w != 0.0:
-            ex, ey, ez = x - quad[j, q, 0], y - quad[j, q, 1], z - quad[j, q, 2]
+            ex, ey, ez = x - p.quad[j, q, 0], y - p.quad[j, q, 1], z - p.quad[j, q, 2]
             total += w / math.sqrt(ex * ex + ey * ey + ez * ez)
     return total
 
 
-@njit(cache=True)
-def _panel_gradient(j, edges, first, normals, centers, diameters, quad, weights, x, y, z, out):
-    dx, dy, dz = x - centers[j, 0], y - centers[j, 1], z - centers[j, 2]
-    if dx * dx + dy * dy + dz * dz < (_NEAR * diameters[j]) ** 2:
-        polygon_gradient(edges[first[j] : first[j + 1]], normals[j], x, y, z, out)
+@kernel
+def _imaged_potential(p, j, floor, x, y, z):
+    """The same with the image charge that the grounded plane z = ``floor`` is met by."""
+    return _panel_potential(p, j, x, y, z) - _panel_potential(p, j, x, y, 2.0 * floor - z)
+
+
+@kernel
+def _panel_gradient(p, j, x, y, z, out):
+    dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], z - p.centers[j, 2]
+    if dx * dx + dy * dy + dz * dz < (_NEAR * p.diameters[j]) ** 2:
+        polygon_gradient(p.edges[p.first[j] : p.first[j + 1]], p.normals[j], x, y, z, out)
         return
     out[:] = 0.0
-    for q in range(quad.shape[1]):
-        w = weights[j, q]
+    for q in range(p.quad.shape[1]):
+        w = p.weights[j, q]
         if w != 0.0:
-            ex, ey, ez = x - quad[j, q, 0], y - quad[j, q, 1], z - quad[j, q, 2]
+            ex, ey, ez = x - p.quad[j, q, 0], y - p.quad[j, q, 1], z - p.quad[j, q, 2]
             r2 = ex * ex + ey * ey + ez * ez
             f = -w / (r2 * math.sqrt(r2))
             out[0] += f * ex
@@ -127,102 +159,62 @@ def _panel_gradient(j, edges, first, normals, centers, diameters, quad, weights,
             out[2] += f * ez
 
 
-@njit(cache=True)
-def _mean_normal_gradient(
-    i, j, floor, edges, first, normals, centers, diameters, quad, weights, grad
-):
+@kernel
+def _mean_normal_gradient(p, i, j, floor, grad):
     """Mean over panel i of n_i · ∇ of panel j's unit potential and its image's.
 
     Panels are met by quadrature when close, at the centroid otherwise; a panel's own
     contribution is the principal value, zero.
     """
-    nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+    nx, ny, nz = p.normals[i, 0], p.normals[i, 1], p.normals[i, 2]
+    x, y = p.centers[i, 0], p.centers[i, 1]
     total = 0.0
     for image in range(2):
         sign = 1.0 if image == 0 else -1.0
         if image == 0 and i == j:
             continue
-        zc = centers[i, 2] if image == 0 else 2.0 * floor - centers[i, 2]
-        dx, dy, dz = (
-            centers[i, 0] - centers[j, 0],
-            centers[i, 1] - centers[j, 1],
-            zc - centers[j, 2],
-        )
-        reach = _OUTER * (diameters[j] + diameters[i])
+        zc = p.centers[i, 2] if image == 0 else 2.0 * floor - p.centers[i, 2]
+        dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], zc - p.centers[j, 2]
+        reach = _OUTER * (p.diameters[j] + p.diameters[i])
         if dx * dx + dy * dy + dz * dz < reach * reach:
-            if (
-                image == 0
-                and abs(nx * dx + ny * dy + nz * dz) < 1e-12
-                and (
-                    abs(nx * normals[j, 0] + ny * normals[j, 1] + nz * normals[j, 2]) > 1.0 - 1e-12
-                )
-            ):
+            along = nx * p.normals[j, 0] + ny * p.normals[j, 1] + nz * p.normals[j, 2]
+            apart = abs(nx * dx + ny * dy + nz * dz)
+            if image == 0 and apart < 1e-12 and abs(along) > 1.0 - 1e-12:
                 continue
             value, area = 0.0, 0.0
-            for q in range(quad.shape[1]):
-                w = weights[i, q]
+            for q in range(p.quad.shape[1]):
+                w = p.weights[i, q]
                 if w != 0.0:
-                    z = quad[i, q, 2] if image == 0 else 2.0 * floor - quad[i, q, 2]
-                    _panel_gradient(
-                        j,
-                        edges,
-                        first,
-                        normals,
-                        centers,
-                        diameters,
-                        quad,
-                        weights,
-                        quad[i, q, 0],
-                        quad[i, q, 1],
-                        z,
-                        grad,
-                    )
+                    z = p.quad[i, q, 2] if image == 0 else 2.0 * floor - p.quad[i, q, 2]
+                    _panel_gradient(p, j, p.quad[i, q, 0], p.quad[i, q, 1], z, grad)
                     value += w * (grad[0] * nx + grad[1] * ny + sign * grad[2] * nz)
                     area += w
             total += sign * value / area
         else:
-            _panel_gradient(
-                j,
-                edges,
-                first,
-                normals,
-                centers,
-                diameters,
-                quad,
-                weights,
-                centers[i, 0],
-                centers[i, 1],
-                zc,
-                grad,
-            )
+            _panel_gradient(p, j, x, y, zc, grad)
             total += sign * (grad[0] * nx + grad[1] * ny + sign * grad[2] * nz)
     return total
 
 
-@njit(cache=True, parallel=True)
-def potential_matrix(points, floor, edges, first, normals, centers, diameters, quad, weights):
+def potential_matrix(points: Array, floor: float, panels: Polygons) -> Array:
     """Return G [m], shape (points, panels): potential times 4π eps0 of unit charge densities.
 
     The grounded plane z = ``floor`` is met by image charges.
     """
-    n, m = points.shape[0], centers.shape[0]
-    out = np.empty((n, m))
-    for i in prange(n):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        zi = 2.0 * floor - z
-        for j in range(m):
-            out[i, j] = _panel_potential(
-                j, edges, first, normals, centers, diameters, quad, weights, x, y, z
-            ) - _panel_potential(
-                j, edges, first, normals, centers, diameters, quad, weights, x, y, zi
-            )
-    return out
+    out = np.empty((len(points), len(panels.centers)))
+    return filled(_fill_potentials, out, np.ascontiguousarray(points), floor, panels)
 
 
-@njit(cache=True, parallel=True)
+@kernel
+def _fill_potentials(start, stop, points, floor, p, out):
+    for i in range(start, stop):
+        for j in range(out.shape[1]):
+            out[i, j] = _imaged_potential(p, j, floor, points[i, 0], points[i, 1], points[i, 2])
+
+
 def system_matrix(
-    is_interface, contrast, floor, edges, first, normals, centers, diameters, quad, weights
-):
+    is_interface: NDArray[np.bool_], contrast: Array, floor: float, panels: Polygons
+) -> Array:
     """Return the boundary-element matrix, shape (n, n), rows scaled by 4π eps0.
 
     Conductor rows average the potential over the panel (Galerkin, outer integral by quadrature).
@@ -230,117 +222,79 @@ def system_matrix(
     ``2π σ + contrast · 4π eps0 E_n = 0`` with contrast = (e1 − e2) / (e1 + e2), where the normal
     points from medium 2 into medium 1 and E_n is the principal value.
     """
-    n = centers.shape[0]
-    out = np.empty((n, n))
-    for i in prange(n):
-        grad = np.empty(3)
+    out = np.empty((len(panels.centers),) * 2)
+    return filled(_fill_system, out, is_interface, contrast, floor, panels)
+
+
+@compiled
+def _fill_system(start, stop, is_interface, contrast, floor, p, out):
+    grad = np.empty(3)
+    for i in range(start, stop):
+        for j in range(out.shape[1]):
+            if is_interface[i]:
+                out[i, j] = -contrast[i] * _mean_normal_gradient(p, i, j, floor, grad)
+            else:
+                out[i, j] = _mean_potential(p, i, j, floor)
         if is_interface[i]:
-            for j in range(n):
-                out[i, j] = -contrast[i] * _mean_normal_gradient(
-                    i, j, floor, edges, first, normals, centers, diameters, quad, weights, grad
-                )
             out[i, i] += 2.0 * math.pi
-        else:
-            area = weights[i].sum()
-            for j in range(n):
-                dx = centers[i, 0] - centers[j, 0]
-                dy = centers[i, 1] - centers[j, 1]
-                dz = centers[i, 2] - centers[j, 2]
-                reach = _OUTER * (diameters[j] + diameters[i])
-                near = dx * dx + dy * dy + dz * dz < reach * reach
-                value = 0.0
-                if near or (
-                    diameters[i] > centers[i, 2] - floor and dx * dx + dy * dy < reach * reach
-                ):
-                    for q in range(quad.shape[1]):
-                        w = weights[i, q]
-                        if w != 0.0:
-                            x, y, z = quad[i, q, 0], quad[i, q, 1], quad[i, q, 2]
-                            value += (w / area) * (
-                                _panel_potential(
-                                    j,
-                                    edges,
-                                    first,
-                                    normals,
-                                    centers,
-                                    diameters,
-                                    quad,
-                                    weights,
-                                    x,
-                                    y,
-                                    z,
-                                )
-                                - _panel_potential(
-                                    j,
-                                    edges,
-                                    first,
-                                    normals,
-                                    centers,
-                                    diameters,
-                                    quad,
-                                    weights,
-                                    x,
-                                    y,
-                                    2.0 * floor - z,
-                                )
-                            )
-                else:
-                    x, y, z = centers[i, 0], centers[i, 1], centers[i, 2]
-                    value = _panel_potential(
-                        j, edges, first, normals, centers, diameters, quad, weights, x, y, z
-                    ) - _panel_potential(
-                        j,
-                        edges,
-                        first,
-                        normals,
-                        centers,
-                        diameters,
-                        quad,
-                        weights,
-                        x,
-                        y,
-                        2.0 * floor - z,
-                    )
-                out[i, j] = value
-    return out
 
 
-@njit(cache=True, parallel=True)
-def normal_gradient_matrix(rows, floor, edges, first, normals, centers, diameters, quad, weights):
+@kernel
+def _mean_potential(p, i, j, floor):
+    """Mean over panel i of panel j's unit potential and its image's [m]."""
+    x, y, z = p.centers[i, 0], p.centers[i, 1], p.centers[i, 2]
+    dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], z - p.centers[j, 2]
+    reach = _OUTER * (p.diameters[j] + p.diameters[i])
+    across = dx * dx + dy * dy
+    near = across + dz * dz < reach * reach
+    if not near and not (p.diameters[i] > z - floor and across < reach * reach):
+        return _imaged_potential(p, j, floor, x, y, z)
+    area = p.weights[i].sum()
+    value = 0.0
+    for q in range(p.quad.shape[1]):
+        w = p.weights[i, q]
+        if w != 0.0:
+            x, y, z = p.quad[i, q, 0], p.quad[i, q, 1], p.quad[i, q, 2]
+            value += (w / area) * _imaged_potential(p, j, floor, x, y, z)
+    return value
+
+
+def normal_gradient_matrix(rows: NDArray[np.int64], floor: float, panels: Polygons) -> Array:
     """Return n · ∇ of each panel's unit potential, averaged over the panels ``rows``."""
-    n, m = rows.shape[0], centers.shape[0]
-    out = np.empty((n, m))
-    for k in prange(n):
-        grad = np.empty(3)
-        for j in range(m):
-            out[k, j] = _mean_normal_gradient(
-                rows[k], j, floor, edges, first, normals, centers, diameters, quad, weights, grad
-            )
-    return out
+    out = np.empty((len(rows), len(panels.centers)))
+    return filled(_fill_normal_gradients, out, rows, floor, panels)
 
 
-@njit(cache=True, parallel=True)
-def flux_matrix(points, rows, floor, edges, first, normals, centers, diameters, quad, weights):
+@compiled
+def _fill_normal_gradients(start, stop, rows, floor, p, out):
+    grad = np.empty(3)
+    for k in range(start, stop):
+        for j in range(out.shape[1]):
+            out[k, j] = _mean_normal_gradient(p, rows[k], j, floor, grad)
+
+
+def flux_matrix(points: Array, rows: NDArray[np.int64], floor: float, panels: Polygons) -> Array:
     """Return n · ∇ of 1 / |x − point| integrated over x on panels ``rows``, shape (points, rows).
 
     The grounded plane z = ``floor`` is met by an image of each point.
     """
-    n, m = points.shape[0], rows.shape[0]
-    out = np.empty((n, m))
-    for i in prange(n):
+    out = np.empty((len(points), len(rows)))
+    return filled(_fill_fluxes, out, np.ascontiguousarray(points), rows, floor, panels)
+
+
+@compiled
+def _fill_fluxes(start, stop, points, rows, floor, p, out):
+    grad = np.empty(3)
+    for i in range(start, stop):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        grad = np.empty(3)
-        for k in range(m):
+        for k in range(out.shape[1]):
             j, total = rows[k], 0.0
             for image in range(2):
                 sign = 1.0 if image == 0 else -1.0
-                zs = z if image == 0 else 2.0 * floor - z
-                _panel_gradient(
-                    j, edges, first, normals, centers, diameters, quad, weights, x, y, zs, grad
-                )
+                _panel_gradient(p, j, x, y, z if image == 0 else 2.0 * floor - z, grad)
                 # the gradient with respect to the point is minus that with respect to the panel
                 total -= sign * (
-                    grad[0] * normals[j, 0] + grad[1] * normals[j, 1] + grad[2] * normals[j, 2]
-                )
+                    grad[0] * p.normals[j, 0] + grad[1] * p.normals[j, 1]
+                    + grad[2] * p.normals[j, 2]
+                )  # fmt: skip
             out[i, k] = total
-    return out

@@ -275,7 +275,7 @@ class BoundarySolution:
             self.model.eps_front + self.model.eps_back
         )
         matrix = kernels.system_matrix(
-            owner == INTERFACE, self._contrast, self.model.floor, *panels.kernel_args
+            owner == INTERFACE, self._contrast, self.model.floor, panels.polygons
         )
         progress("boundary elements: factorising")
         self._lu = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=True)
@@ -298,11 +298,11 @@ class BoundarySolution:
         """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
         panels, floor = self.model.panels, self.model.floor
         points = np.ascontiguousarray(sources)
-        rhs = -kernels.potential_matrix(points, floor, *panels.kernel_args).T
+        rhs = -kernels.potential_matrix(points, floor, panels.polygons).T
         rows = np.flatnonzero(self.model.owner == INTERFACE)
         if len(rows):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
-            flux = kernels.flux_matrix(points, rows, floor, *panels.kernel_args)
+            flux = kernels.flux_matrix(points, rows, floor, panels.polygons)
             rhs[rows] = self._contrast[rows, None] * flux.T
         return rhs / panels.areas[:, None]
 
@@ -314,7 +314,7 @@ class BoundarySolution:
         free = mean[:, None] * densities
         rows = np.flatnonzero((model.owner >= 0) & (np.abs(jump) > 1e-12))
         if len(rows):
-            grad = kernels.normal_gradient_matrix(rows, model.floor, *panels.kernel_args)
+            grad = kernels.normal_gradient_matrix(rows, model.floor, panels.polygons)
             # eps0 E_n = -grad . n sigma / (4 pi)
             free[rows] -= jump[rows, None] * (grad @ densities) / (4 * math.pi)
         charge = free * panels.areas[:, None]
@@ -329,8 +329,6 @@ class BoundarySolution:
         scaled = densities / (4 * math.pi * EPS0)
         for start in range(0, len(points), chunk):
             block = np.ascontiguousarray(points[start : start + chunk])
-            matrix = kernels.potential_matrix(
-                block, self.model.floor, *self.model.panels.kernel_args
-            )
+            matrix = kernels.potential_matrix(block, self.model.floor, self.model.panels.polygons)
             out[start : start + chunk] = matrix @ scaled
         return out

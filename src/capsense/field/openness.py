@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from capsense._crew import filled
+from capsense._jit import kernel
 from capsense.design.model import Design
 
 Array = NDArray[np.float64]
@@ -31,19 +32,24 @@ def openness(design: Design, points: Array) -> Array:
     side = np.sqrt(1 - z * z)
     rays = np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
     floor = float(design.domain.lower[2])
-    return _views(np.ascontiguousarray(points), rays, triangles, floor)
+    out = np.empty(len(points))
+    return filled(_fill_views, out, np.ascontiguousarray(points), rays, triangles, floor)
 
 
 def free_path(design: Design, points: Array, rays: Array) -> Array:
     """Distance to the first conductor along unit rays [m], (n, 3), (n, 3) -> (n,); may be inf."""
     triangles = np.concatenate([body.surface.triangles for body in design.sheets])
-    return _paths(np.ascontiguousarray(points), np.ascontiguousarray(rays), triangles)
-
-
-@njit(cache=True, parallel=True)
-def _views(points: Array, rays: Array, triangles: Array, floor: float) -> Array:
     out = np.empty(len(points))
-    for i in prange(len(points)):
+    return filled(
+        _fill_paths, out, np.ascontiguousarray(points), np.ascontiguousarray(rays), triangles
+    )
+
+
+@kernel
+def _fill_views(
+    start: int, stop: int, points: Array, rays: Array, triangles: Array, floor: float, out: Array
+) -> None:
+    for i in range(start, stop):
         total = 0.0
         for r in range(len(rays)):
             if _path(points[i], rays[r], triangles, False) == math.inf:
@@ -52,18 +58,17 @@ def _views(points: Array, rays: Array, triangles: Array, floor: float) -> Array:
                     view = min(1.0, (floor - points[i, 2]) / rays[r, 2] / _FLOOR_REACH)
                 total += max(view, 0.0)
         out[i] = total / len(rays)
-    return out
 
 
-@njit(cache=True, parallel=True)
-def _paths(points: Array, rays: Array, triangles: Array) -> Array:
-    out = np.empty(len(points))
-    for i in prange(len(points)):
+@kernel
+def _fill_paths(
+    start: int, stop: int, points: Array, rays: Array, triangles: Array, out: Array
+) -> None:
+    for i in range(start, stop):
         out[i] = _path(points[i], rays[i], triangles, True)
-    return out
 
 
-@njit(cache=True)
+@kernel
 def _path(point: Array, ray: Array, triangles: Array, nearest: bool) -> float:
     """Distance to the nearest, or just any, triangle that a ray meets (Möller, Trumbore 1997)."""
     found = math.inf

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
 from capsense.design.geometry import Facet
+from capsense.field.bem_kernels import Polygons
 
 Array = NDArray[np.float64]
 
@@ -66,12 +67,9 @@ class Panels:
         return self.weights.sum(axis=1)
 
     @property
-    def kernel_args(self) -> tuple[NDArray, ...]:
-        """The arrays in the order the compiled kernels take them."""
-        return (
-            self.edges, self.first, self.normals, self.centers,
-            self.diameters, self.quad, self.weights,
-        )  # fmt: skip
+    def polygons(self) -> Polygons:
+        """The arrays as the compiled kernels take them."""
+        return Polygons(*(getattr(self, name) for name in Polygons._fields))
 
 
 def concatenate(parts: list[Panels]) -> Panels:

@@ -6,10 +6,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, pasted
 from capsense.surface.place_kernels import (
     FAR_LEAST,
     NEAR_FACE,
@@ -59,7 +58,7 @@ class Cut(NamedTuple):
     """The leaves in this list, shape (l,)."""
 
 
-@njit(inline="always")
+@pasted
 def chosen(bodies, green, threshold, width):
     """Return the cut of a scene: see :func:`score` and :func:`choose`."""
     first = np.zeros(bodies.shape[0] + 1, np.int64)

@@ -7,9 +7,8 @@ potential at a cluster, a torque that about the origin of the sensor frame.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from capsense._jit import compiled
+from capsense._jit import compiled, pasted
 from capsense._simd import LANES, at, madd, put_span, rsqrt, span, splat, vadd, vmadd
 from capsense.surface.pair_kernels import SOFT, cluster_moments
 
@@ -134,12 +133,12 @@ def pair_line(shapes, i, others, weight, out, row):
         )  # fmt: skip
 
 
-@njit(inline="always")
+@pasted
 def _dot(x, y, z, u, v, w, addend):
     return vmadd(x, u, vmadd(y, v, vmadd(z, w, addend)))
 
 
-@njit(inline="always")
+@pasted
 def _cross(x, y, u, v):
     """``x v - y u``."""
     zero = splat(np.float32(0.0))

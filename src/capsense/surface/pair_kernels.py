@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from capsense._jit import compiled
+from capsense._jit import compiled, pasted
 from capsense._simd import muladd, rsqrt
 
 FAR = 0.75
@@ -106,7 +105,7 @@ def cluster_moments(points, extent):
     return out
 
 
-@njit(inline="always")
+@pasted
 def _dot(x, y, z, u, v, w):
     return muladd(x, u, muladd(y, v, z * w))
 

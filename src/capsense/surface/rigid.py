@@ -269,5 +269,6 @@ def split(features: Array, charge: Array) -> Clusters:
 
 
 def _of_functions(tree: Tree, block: Array) -> Array32:
-    """Change a symmetric block of panels to one of charge functions."""
-    return tree.to_functions(tree.to_functions(block).T).astype(np.float32)
+    """Change a symmetric block of panels to one of charge functions, symmetric to the last bit."""
+    lower = np.tril(tree.to_functions(tree.to_functions(block).T).astype(np.float32))
+    return lower + np.tril(lower, -1).T

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numba import njit
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, pasted
 from capsense.surface.choose_kernels import Cut, chosen
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import leaf_pairs
@@ -51,7 +50,7 @@ class Solution(NamedTuple):
     """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
 
 
-@njit(inline="always")
+@pasted
 def prepared(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float
 ) -> tuple[Cut, Leaves, Functions, System]:

@@ -9,6 +9,7 @@ import hashlib
 import logging
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,15 @@ from numpy.typing import NDArray
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir
 from capsense.field.store import read_arrays, write_arrays
-from capsense.scene import Shape, TriMesh
+from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
+from capsense.scene.shape import ShapeKind
 from capsense.surface.panels import panels_of, polygon_panels
 from capsense.surface.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.surface.standing import standing
 
 Array = NDArray[np.float64]
 
-VERSION = 4
+VERSION = 5
 """Of stored shapes: to be raised when the same mesh would get other panels or functions."""
 
 _log = logging.getLogger(__name__)
@@ -36,6 +38,8 @@ _FILES = 1_000_000_000
 """The same of files [bytes], the oldest first."""
 _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
+_LEAST = 1e-9
+"""The least of their lengths, over the largest."""
 _TRIANGLES = 1.6
 """So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
 _EACH = 0.2
@@ -44,7 +48,7 @@ _MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
 _LOCK = threading.Lock()
-_SHAPES: OrderedDict[tuple[object, ...], RigidShape] = OrderedDict()
+_SHAPES: OrderedDict[Hashable, RigidShape] = OrderedDict()
 
 
 def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
@@ -60,34 +64,48 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
     held = shape.__dict__.get("_rigid")
     if held is not None and held[0] == count:
         return held[1], held[2]
-    size, key = _key(shape, count)
+    size, key, make = _recipe(shape, count)
     with _LOCK:
         found = _SHAPES.get(key)
         if found is not None:
             _SHAPES.move_to_end(key)
     if found is None:
-        if isinstance(shape, TriMesh):
-            found = _mesh_shape(shape, count, str(key[0]))
-        else:
-            found = rigid_shape(panels_of(shape, count).scaled(1.0 / size), apart=True)
+        made = make()
         with _LOCK:
-            found = _SHAPES.setdefault(key, found)
+            found = _SHAPES.setdefault(key, made)
             while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
                 _SHAPES.popitem(last=False)
     shape.__dict__["_rigid"] = (count, found, size)
     return found, size
 
 
-def _key(shape: Shape, count: int) -> tuple[float, tuple[object, ...]]:
-    """A shape's size [m], and what tells its form from others."""
+def _recipe(shape: Shape, count: int) -> tuple[float, Hashable, Callable[[], RigidShape]]:
+    """A shape's size [m], what tells its form from others, and how to make it of size 1."""
     if isinstance(shape, TriMesh):
         digest = hashlib.sha256(repr((VERSION, count, shape.vertices.shape)).encode())
         for values in (shape.vertices, shape.faces):
             digest.update(np.ascontiguousarray(values).tobytes())
-        return 1.0, (digest.hexdigest()[:32],)
+        name = digest.hexdigest()[:32]
+        return 1.0, name, lambda: _mesh_shape(shape, count, name)
     size = float(shape.params.max())
-    form = tuple(round(x, _DIGITS) for x in (shape.params / size).tolist())
-    return size, (int(shape.kind), form, count)
+    first, second, third = (max(round(x, _DIGITS), _LEAST) for x in (shape.params / size).tolist())
+    # made from the rounded form, so that bits do not hang on which of its sizes was met first
+    whole: Shape
+    match shape.kind:
+        case ShapeKind.BOX:
+            whole = Box((2 * first, 2 * second, 2 * third))
+        case ShapeKind.SPHERE:
+            whole = Sphere(first)
+        case ShapeKind.CAPSULE:
+            whole = Capsule(first, 2 * second)
+        case ShapeKind.CYLINDER:
+            whole = Cylinder(first, 2 * second)
+        case ShapeKind.ELLIPSOID:
+            whole = Ellipsoid((first, second, third))
+        case _:
+            whole = shape  # has no panels, and is refused as that
+    key = (int(shape.kind), first, second, third, count)
+    return size, key, lambda: rigid_shape(panels_of(whole, count), apart=True)
 
 
 # -- meshes ---------------------------------------------------------------------------------------
@@ -96,7 +114,7 @@ def _key(shape: Shape, count: int) -> tuple[float, tuple[object, ...]]:
 def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
     file = default_cache_dir() / "shapes" / f"{key}.npz"
     try:
-        return _read(file, key)
+        return _unpacked(*read_arrays(file, kind="shape", key=key))
     except FileNotFoundError:
         pass
     except FieldError as error:
@@ -104,13 +122,14 @@ def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
     wanted = count * min(_MOST, max(_TRIANGLES, _EACH * shape.parts))
     own = standing(shape.vertices, shape.faces)
     made = _turned(rigid_shape(panels_of(own.corners, round(wanted))), own.axes, own.middle)
+    arrays, meta = _packed(made, key)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        _write(made, file, key)
+        write_arrays(file, arrays, meta)
         _make_room(file.parent)
     except OSError as error:
         _log.info("a shape cannot be kept in %s: %s", file.parent, error)
-    return made
+    return _unpacked(arrays, meta)  # as processes that read the file have it, to the last bit
 
 
 def _turned(shape: RigidShape, axes: Array, middle: Array) -> RigidShape:
@@ -129,28 +148,21 @@ def _charges(shape: RigidShape) -> Array:
     return charge
 
 
-def _write(shape: RigidShape, file: Path, key: str) -> None:
+def _packed(shape: RigidShape, key: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """What a file holds of a shape of triangles."""
     panels, tree = shape.panels, shape.tree
     arrays: dict[str, NDArray[Any]] = {
-        "corners": panels.corners[:, :3],  # of triangles
+        "corners": panels.corners[:, :3],
         "parts": panels.parts.astype(np.int32), "kids": tree.kids.astype(np.int32),
         "function": tree.function.astype(np.int32), "panel": tree.panel.astype(np.int32),
         "charge": _charges(shape), "energy": shape.energy[np.tril_indices(len(panels))],
     }  # fmt: skip
-    meta = {
+    return arrays, {
         "kind": "shape", "key": key, "closed": panels.closed, "capacitance": shape.capacitance,
     }  # fmt: skip
-    write_arrays(file, arrays, meta)
 
 
-def _read(file: Path, key: str) -> RigidShape:
-    """Read a shape.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        FieldError: It is damaged, or something else.
-    """
-    arrays, meta = read_arrays(file, kind="shape", key=key)
+def _unpacked(arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> RigidShape:
     corners = arrays["corners"][:, [0, 1, 2, 2]]
     panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
     clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from capsense._jit import compiled
 
@@ -16,7 +15,7 @@ _SHARP = 0.3
 """Share of the spread of normals that a jump between two of them must have to be an edge."""
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def split(features, charges, spatial, order, first, last, kids):
     """Split a surface into a binary tree of clusters, breadth first.
 
@@ -61,7 +60,7 @@ def split(features, charges, spatial, order, first, last, kids):
         k += 1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _sort(values, members):
     """Heap sort by value, equal ones by number."""
     n = values.shape[0]
@@ -87,7 +86,7 @@ def _sort(values, members):
             root = child
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _cut(values, members, charges, of_normals, spatial, last):
     """How many of the sorted members the first part gets; of equal cuts, the first or the last."""
     n = values.shape[0]
@@ -117,7 +116,7 @@ def _cut(values, members, charges, of_normals, spatial, last):
     return cut
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def moments(kids, panel, charge, center, spread):
     """Charge, centre of charge and second central moments of all clusters, from their parts.
 
@@ -174,7 +173,7 @@ def to_functions(values, kids, panel, charge, function, out):
             out[0, start + c] = means[0, c]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def prune(kids, panel, wanted, new_kids, new_panel, function, room):
     """Leave out panels: clusters without any go, those with one part left become that part.
 

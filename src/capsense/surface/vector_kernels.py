@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
-from capsense._jit import compiled
+from capsense._jit import compiled, pasted
 from capsense._simd import at, lane_sum, madd, muladd, put_span, rsqrt, span, splat, vmadd
 
 WIDTH = 32
@@ -129,7 +129,7 @@ def multiply_part(left, table, depth, width, out):
             _put(out, i * w + j, a0, a1, a2, a3)
 
 
-@njit(inline="always")
+@pasted
 def _put(out, place, a, b, c, d):
     put_span(out, place, a)
     put_span(out, place + 8, b)
