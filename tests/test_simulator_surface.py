@@ -144,7 +144,7 @@ CONTACT = {
 def test_contact_is_finite_and_monotone(simulators, design, name):
     """Measured: from 3 mm to 0.5 mm into the face, large entries grow by small steps.
 
-    Where functions come or go within 0.1 mm of the face, they may fall by some per cent.
+    Where functions come or go within 0.3 mm of the face, they may fall by some per cent.
     """
     shape, half, (x, y), turn = CONTACT[name]
     gaps = np.concatenate([np.arange(3e-3, 1.2e-3, -1e-4), np.arange(1.2e-3, -5.1e-4, -2.5e-5)])
@@ -156,7 +156,7 @@ def test_contact_is_finite_and_monotone(simulators, design, name):
     ])  # fmt: skip
     read = read[:, read[-1] > 0.1 * read[-1].max()]
     change = np.diff(np.log(read), axis=0)
-    assert change[gaps[1:] > 1.5e-4].min() > -1e-3
+    assert change[gaps[1:] > 2.6e-4].min() > -1e-3
     assert change.min() > -0.05
     assert change.max() < 0.16
     assert read[-1].max() < 50e-12

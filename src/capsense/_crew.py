@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 
 _PARTS = 8
-"""Parts that rows are filled in, for each thread: no thread then waits long for another."""
+"""Parts of a piece of work, for each thread: no thread then waits long for another."""
 
 
 def processors() -> int:
@@ -30,21 +30,27 @@ def processors() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def filled(kernel: Callable[..., None], out: Array, *args: Any) -> Array:
-    """Fill the rows of ``out`` by ``kernel(start, stop, *args, out)``, on all processors.
+def in_parts(kernel: Callable[..., None], count: int, *args: Any) -> None:
+    """Call ``kernel(start, stop, *args)`` for parts of 0 to ``count``, on all processors.
 
     Threads of Python that end with the call, not Numba's own: after those have run, a process that
     is forked off ends when it runs some too.
     """
     threads = processors()
-    bounds = np.linspace(0, len(out), min(len(out), _PARTS * threads) + 1).astype(int).tolist()
+    bounds = np.linspace(0, count, min(count, _PARTS * threads) + 1).astype(int).tolist()
     with ThreadPoolExecutor(threads, thread_name_prefix="capsense") as pool:
-        futures = [
-            pool.submit(kernel, start, stop, *args, out)
-            for start, stop in itertools.pairwise(bounds)
-        ]
-        for future in futures:
-            future.result()
+        parts = [pool.submit(kernel, a, b, *args) for a, b in itertools.pairwise(bounds)]
+        try:
+            for part in parts:
+                part.result()
+        finally:
+            for part in parts:  # after an interrupt, those that have not begun
+                part.cancel()
+
+
+def filled(kernel: Callable[..., None], out: Array, *args: Any) -> Array:
+    """Fill the rows of ``out`` by ``kernel(start, stop, *args, out)``, as :func:`in_parts`."""
+    in_parts(kernel, len(out), *args, out)
     return out
 
 

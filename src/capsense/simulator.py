@@ -8,19 +8,20 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Literal, Protocol, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._crew import Crew, OneAtATime, some_failed
 from capsense.design import load_design
-from capsense.design.model import Design, Role
+from capsense.design.model import Design
 from capsense.errors import BatchError, FieldError, ReadOutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.field.change import Change
+from capsense.field.terminals import Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
@@ -128,20 +129,10 @@ class Simulator:
         self._solver, rest = self._make_solver()
         self._one = OneAtATime()
         self._idle: deque[Simulator] = deque()  # sensors for the threads of batches
-        n = len(self.design.electrodes)
-        floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
         self._names = self.design.electrode_names
-        self._electrodes = np.arange(n)
-        self._floating = np.array([names.index(f) for f in floating], dtype=np.int64)
-        self._shields = np.array(
-            [k for k in range(n, len(names)) if names[k] not in floating], dtype=np.int64
-        )
-        self._rest = rest
-        self._empty = self._without_floating(rest)
-        self._screened = np.maximum(-rest, 0.0)  # coarse meshes may have them the other way
-        """At most so much changes [F]: terminals screened from each other do not couple."""
-        np.fill_diagonal(self._screened, np.inf)
-        self.baseline: Array = self._empty[:n, :n].copy()
+        self._terminals = Terminals(self.design, rest)
+        n = self._terminals.electrodes
+        self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
         self.baseline.setflags(write=False)
         self.readout: ReadOut | None = None
@@ -191,7 +182,7 @@ class Simulator:
     @property
     def empty(self) -> Reading:
         """The reading of an empty scene, which no chip has seen."""
-        return self._reading(np.zeros_like(self._empty), StepStats(0.0, 0.0))
+        return self._reading(np.zeros_like(self._terminals.empty), StepStats(0.0, 0.0))
 
     def use_readout(self, readout: ReadOut | str | Path | None, *, start: float = 0.0) -> None:
         """Read through a chip from now on.
@@ -244,25 +235,23 @@ class Simulator:
 
     def _of(self, found: Change, start: float) -> Reading:
         """The reading that a solver's result makes, of a step that began at ``start`` [s]."""
-        change = np.minimum(found.matrix, self._screened)
+        terminals = self._terminals
+        change: NDArray[Any] = terminals.screened(found.matrix)
         error = max(found.error, float((found.matrix - change).max()))
         if found.loss is not None:
             change = change - 1j * found.loss
-        whole = self._rest + change
-        if len(self._floating):
-            change = self._without_floating(whole) - self._empty
+        slope = None if found.jacobian is None else terminals.slope(change, found.jacobian)
+        change = terminals.change(change)
         stats = StepStats(error, perf_counter() - start, found.unknowns, found.iterations)
-        slope = None if found.jacobian is None else self._slope(whole, found.jacobian)
         reading = self._reading(change.real, stats, slope)
         if found.loss is None:
             return reading
-        n = len(self._electrodes)
+        n = terminals.electrodes
         return replace(reading, conductance=-2 * np.pi * self.frequency * change.imag[:n, :n])
 
     def _reading(self, change: Array, stats: StepStats, slope: Array | None = None) -> Reading:
         """A reading by the change of the matrix of electrodes and shields [F]."""
-        n = len(self._electrodes)
-        total = self._empty + change
+        n, total = self._terminals.electrodes, self._terminals.empty + change
         delta = change[:n, :n]
         return Reading(
             self.baseline + delta,
@@ -272,17 +261,6 @@ class Simulator:
             total[:n, n:].sum(axis=1),
             jacobian=slope,
         )
-
-    def _slope(self, whole: Array, slope: Array) -> Array:
-        """Jacobian of the electrodes' matrix, the design's floating conductors eliminated."""
-        n = len(self._electrodes)
-        if len(self._floating):
-            own = whole[np.ix_(self._floating, self._floating)]
-            follow = np.eye(len(whole))[:, self._electrodes]
-            cross = whole[np.ix_(self._floating, self._electrodes)]
-            follow[self._floating] = -np.linalg.solve(own, cross)
-            return np.einsum("ai,bacm,cj->bijm", follow, slope, follow)
-        return slope[:, :n, :n]
 
     def step_batch(
         self, scenes: Sequence[Scene | DepthFrame], *, threads: int | None = None
@@ -384,16 +362,6 @@ class Simulator:
             "boundary panels": self.background.n_panels,
             "point charges": len(green.near_sources), "modes": green.n_modes,
         }  # fmt: skip
-
-    def _without_floating(self, matrix: Array) -> Array:
-        """Eliminate the design's floating conductors; electrodes and shields remain."""
-        keep = np.concatenate([self._electrodes, self._shields])
-        inner = matrix[np.ix_(keep, keep)]
-        if not len(self._floating):
-            return inner
-        cross = matrix[np.ix_(keep, self._floating)]
-        own = matrix[np.ix_(self._floating, self._floating)]
-        return inner - cross @ np.linalg.solve(own, cross.T)
 
 
 def make_readout(readout: ReadOut | str | Path | None, simulator: Simulator) -> ReadOut | None:

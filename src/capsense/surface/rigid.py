@@ -33,6 +33,8 @@ INSIDE = 2.5
 for a ball in an even field, and 2 for the face of a half-space."""
 _NORMALS = 0.6
 """How far apart two opposite normals count, as a share of the shape's extent, in splitting."""
+_GRAIN = 1e-9
+"""Coordinates closer than this part of the extent are the same: cuts do not hang on rounding."""
 _EXTRA = 0.0, 1e-3, 1e-2, 0.1
 """What is added to the panels' own energies, relative, where some nearly coincide."""
 _LEFT, _MOST_STEPS = 1e-8, 1000
@@ -261,8 +263,8 @@ def split(features: Array, charge: Array) -> Clusters:
     n = len(features)
     order, first, last = np.empty(n, np.int64), *np.empty((2, 2 * n - 1), np.int64)
     kids = np.empty((2 * n - 1, 2), np.int64)
-    extent = float(np.ptp(features[:, :3], axis=0).max())
-    tree_kernels.split(features, charge, 1e-9 * extent, order, first, last, kids)
+    grain = _GRAIN * float(np.ptp(features[:, :3], axis=0).max())
+    tree_kernels.split(np.round(features / grain), charge, order, first, last, kids)
     single = kids[:, 0] < 0
     panel = np.where(single, order[first], -1)
     return Clusters(kids, np.where(single, -1, np.cumsum(~single)), panel)

@@ -31,7 +31,7 @@ from capsense.surface.window import windowed
 Array = NDArray[np.float64]
 
 
-_DOUBTFUL = 0.03
+DOUBTFUL = 0.03
 """Readings are in doubt where the matrix's diagonal was raised by more than this part of it."""
 _OF_MANY = 0.4
 """Panels of one part of a large mesh, over those of a body."""
@@ -205,7 +205,7 @@ class SurfaceSolver:
         The error is an estimate of that of the largest entry [F]; where bodies lie within each
         other or within the sensor so that the matrix had to be changed, it is all of that entry.
         """
-        doubt = solution.delta if solution.shift > _DOUBTFUL else solution.left
+        doubt = solution.delta if solution.shift > DOUBTFUL else solution.left
         return UNIT * solution.delta, UNIT * float(np.abs(np.diag(doubt).real).max())
 
     def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
@@ -243,7 +243,7 @@ class SurfaceSolver:
             rotation, middle = packed.rotation[k], self._middle - packed.position[k]
             parts = self._parts(view, place, middle @ rotation)
             for part, at in parts:
-                found.append(self._shape(part, _OF_MANY if len(parts) > 1 else 1.0))
+                found.append(self.functions_of(part, _OF_MANY if len(parts) > 1 else 1.0))
                 places.append(place)
                 offsets.append(rotation @ at)
         chosen, shapes = view.met[places], [shape for shape, _ in found]
@@ -278,7 +278,9 @@ class SurfaceSolver:
                 near.append((part, np.zeros(3)))
         return near
 
-    def _shape(self, shape: Shape, share: float) -> tuple[RigidShape | ChangingBody, float]:
+    def functions_of(
+        self, shape: Shape, share: float = 1.0
+    ) -> tuple[RigidShape | ChangingBody, float]:
         """Charge functions of a body from a share of the usual panels, and its size."""
         if isinstance(shape, Layers):
             return ChangingBody(*layer_pieces(shape)), 1.0

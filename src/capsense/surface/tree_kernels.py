@@ -16,16 +16,16 @@ _SHARP = 0.3
 
 
 @compiled
-def split(features, charges, spatial, order, first, last, kids):
+def split(features, charges, order, first, last, kids):
     """Split a surface into a binary tree of clusters, breadth first.
 
     A cluster is split across the feature that varies most: in the middle of its extent along a
     coordinate, at the largest jump of a normal. Panels that do not differ are halved.
 
     Args:
-        features: Centres [m] and scaled normals of the panels, shape (n, 6).
+        features: Centres and scaled normals of the panels in whole numbers of some grain, shape
+            (n, 6).
         charges: Equilibrium charges of the panels, shape (n,).
-        spatial: Differences below this [m] count as none.
         order: Filled with the panels, those of a cluster side by side, shape (n,).
         first: Filled with the first place in ``order`` of each cluster, shape (2 n - 1,).
         last: Filled with the place behind the last one, shape (2 n - 1,).
@@ -52,7 +52,7 @@ def split(features, charges, spatial, order, first, last, kids):
             for i in range(a, b):
                 values[i] = features[order[i], axis]
             _sort(values[a:b], order[a:b])
-            cut = _cut(values[a:b], order[a:b], charges, axis >= 3, spatial, k % 2 == 1)
+            cut = _cut(values[a:b], order[a:b], charges, axis >= 3, k % 2 == 1)
             kids[k, 0], kids[k, 1] = made, made + 1
             first[made], last[made] = a, a + cut
             first[made + 1], last[made + 1] = a + cut, b
@@ -87,7 +87,7 @@ def _sort(values, members):
 
 
 @compiled
-def _cut(values, members, charges, of_normals, spatial, last):
+def _cut(values, members, charges, of_normals, last):
     """How many of the sorted members the first part gets; of equal cuts, the first or the last."""
     n = values.shape[0]
     spread = values[n - 1] - values[0]
@@ -105,7 +105,7 @@ def _cut(values, members, charges, of_normals, spatial, last):
     tie = _TIE * (total if of_normals else spread)
     for i in range(n - 1):
         half += charges[members[i]]
-        if values[i + 1] - values[i] > spatial:
+        if values[i + 1] > values[i]:
             off = (
                 abs(2.0 * half - total)
                 if of_normals

@@ -1,0 +1,123 @@
+"""The step of many environments, compiled: each solved as :mod:`capsense.surface.step` does it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense._jit import compiled
+from capsense.surface.gradient_kernels import jacobian
+from capsense.surface.step import solve
+
+
+class Bodies(NamedTuple):
+    """What stands in every environment; e environments, b places for bodies."""
+
+    shapes: NDArray[Any]
+    """Shapes, of size 1, as records of ``place_kernels.BODY``, shape (u,)."""
+    radius: NDArray[Any]
+    """Radius of a ball about each shape's origin that holds it [m], shape (u,)."""
+    choice: NDArray[Any]
+    """Shape in each place, -1 where nothing is, shape (e, b)."""
+    scale: NDArray[Any]
+    """How many times as large it is, shape (e, b)."""
+    softness: NDArray[Any]
+    """1 / (eps - 1), 0 for conductors, shape (e, b)."""
+    tie: NDArray[Any]
+    """Energy that ties it to ground [1/m], shape (e, b)."""
+    neutral: NDArray[Any]
+    """Whether it has no net charge, shape (e, b)."""
+
+
+class Poses(NamedTuple):
+    """Where everything is: position [m] and quaternion (x, y, z, w) in the world's frame."""
+
+    bodies: NDArray[Any]
+    """Shape (e, b, 7)."""
+    sensors: NDArray[Any]
+    """Shape (e, s, 7)."""
+
+
+class Found(NamedTuple):
+    """What was found; e environments, s sensors; 4π eps0 = 1."""
+
+    delta: NDArray[Any]
+    """Change of the Maxwell matrix of m terminals [m], NaN where there is no solution,
+    shape (e, s, m, m)."""
+    error: NDArray[Any]
+    """Estimate of the error of the largest entry [m], shape (e, s)."""
+    slope: NDArray[Any]
+    """Change with the poses of the bodies in the sensor's frame, see ``gradient_kernels.jacobian``,
+    shape (e, s, b, m, m, 6); no environments where it is not asked for."""
+
+
+@compiled
+def step_rows(start, stop, bodies, poses, green, threshold, width, doubtful, found):
+    """Solve environments ``start`` to ``stop``."""
+    sensors, places = poses.sensors.shape[1], bodies.choice.shape[1]
+    m = green.terminals
+    seen, place = np.empty(places, bodies.shapes.dtype), np.empty(places, np.int64)
+    turn, own = np.empty((3, 3)), np.empty((3, 3))
+    for e in range(start, stop):
+        for s in range(sensors):
+            _matrix(poses.sensors[e, s], turn)
+            count = 0
+            for b in range(places):
+                if bodies.choice[e, b] >= 0:
+                    _matrix(poses.bodies[e, b], own)
+                    record = seen[count : count + 1]
+                    if _placed(bodies, e, b, poses, s, turn, own, green.room, record):
+                        seen[count].group = count
+                        place[count] = b
+                        count += 1
+            if count == 0:
+                continue
+            out = solve(seen[:count], green, threshold, width, found.slope.shape[0] > 0)
+            doubt = out.delta if out.shift > doubtful else out.left
+            for i in range(m):
+                found.error[e, s] = max(found.error[e, s], abs(doubt[i, i]))
+                for j in range(m):
+                    found.delta[e, s, i, j] = out.delta[i, j] if out.size > 0 else np.nan
+            if found.slope.shape[0] > 0 and out.size > 0:
+                slope = jacobian(out, seen[:count], green)
+                for c in range(count):
+                    found.slope[e, s, place[c]] = slope[c]
+
+
+@compiled
+def _matrix(pose, out):
+    """Rotation matrix of a pose."""
+    x, y, z, w = pose[3], pose[4], pose[5], pose[6]
+    out[0, 0], out[1, 1] = 1.0 - 2.0 * (y * y + z * z), 1.0 - 2.0 * (x * x + z * z)
+    out[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    out[0, 1], out[1, 0] = 2.0 * (x * y - z * w), 2.0 * (x * y + z * w)
+    out[0, 2], out[2, 0] = 2.0 * (x * z + y * w), 2.0 * (x * z - y * w)
+    out[1, 2], out[2, 1] = 2.0 * (y * z - x * w), 2.0 * (y * z + x * w)
+
+
+@compiled
+def _placed(bodies, e, b, poses, s, turn, own, room, record):
+    """Fill the record of a body in a sensor's frame; False where it is out of its sight."""
+    u, scale = bodies.choice[e, b], bodies.scale[e, b]
+    reach = scale * bodies.radius[u]
+    record[0] = bodies.shapes[u]
+    body = record[0]
+    for i in range(3):
+        at = 0.0
+        for k in range(3):
+            at += turn[k, i] * (poses.bodies[e, b, k] - poses.sensors[e, s, k])
+        if at + reach < room[0, i] or at - reach > room[1, i]:
+            return False
+        body.position[i] = at
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += turn[k, i] * own[k, j]
+            body.rotation[i, j] = total
+    body.scale, body.tie = scale, bodies.tie[e, b]
+    body.neutral, body.softness = bodies.neutral[e, b], bodies.softness[e, b]
+    if body.softness == 0.0:
+        body.impedance = 0
+    return True
