@@ -311,7 +311,7 @@ def test_a_killed_builder_frees_the_lock(tmp_path: Path, reference: str) -> None
 def test_ctrl_c_ends_a_build_at_once(tmp_path: Path) -> None:
     log = tmp_path / "log"
     folder = tmp_path / "cache"
-    builder = _start(folder, log, 0.3)
+    builder = _start(folder, log, 1.0)
     _wait_for(log, FIT)
     start = time.monotonic()
     builder.send_signal(signal.SIGINT)

@@ -29,12 +29,14 @@ class Terminals:
         self.rest = rest
         self.empty: Array = self._without_floating(rest)
         """Maxwell matrix of the driven terminals in the empty domain [F], shape (k, k)."""
-        self._screened = np.maximum(-rest, 0.0)  # coarse meshes may have them the other way
-        np.fill_diagonal(self._screened, np.inf)
+        self.bound: Array = np.maximum(-rest, 0.0)  # coarse meshes may have them the other way
+        """Most that each entry changes by [F], shape (t, t): terminals that are screened from each
+        other do not couple."""
+        np.fill_diagonal(self.bound, np.inf)
 
     def screened(self, change: Array) -> Array:
-        """Bound a change, shape (..., t, t): terminals screened from each other do not couple."""
-        return np.minimum(change, self._screened)
+        """Bound a change, shape (..., t, t)."""
+        return np.minimum(change, self.bound)
 
     def change(self, change: NDArray[Any]) -> NDArray[Any]:
         """Change of the driven terminals' matrix by that of all, (..., t, t) -> (..., k, k)."""

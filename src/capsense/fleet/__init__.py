@@ -1,5 +1,5 @@
 """Many environments at once: arrays of poses in, arrays of matrices out."""
 
-from capsense.fleet.fleet import Fleet, FleetReading
+from capsense.fleet.fleet import Fleet, FleetCheck, FleetReading
 
-__all__ = ["Fleet", "FleetReading"]
+__all__ = ["Fleet", "FleetCheck", "FleetReading"]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,16 +13,20 @@ from numpy.typing import ArrayLike, NDArray
 from capsense._crew import in_parts
 from capsense._patience import first_use
 from capsense.design import load_design
-from capsense.design.model import Design
-from capsense.errors import SceneError, SolveError
+from capsense.design.model import Design, Role
+from capsense.errors import DesignError, MissingDependencyError, SceneError, SolveError
 from capsense.field.cache import default_settings, load_or_build
 from capsense.field.terminals import Terminals
-from capsense.fleet.step_kernels import Bodies, Found, Poses, step_rows
-from capsense.scene.body import Body
+from capsense.fleet.step_kernels import Bodies, Found, Poses, Sensor, step_rows
+from capsense.scene import Body, Pose, Scene
+from capsense.simulator import Simulator
 from capsense.surface.matter import UNIT, matter_of
 from capsense.surface.place_kernels import BODY
 from capsense.surface.rigid import RigidShape
 from capsense.surface.solver import DOUBTFUL, PRESETS, SurfaceSolver
+
+if TYPE_CHECKING:
+    from capsense.fleet.warp_core import WarpCore
 
 Array = NDArray[np.float64]
 
@@ -30,28 +34,55 @@ _QUATERNION = 1e-3
 """Quaternions may be longer or shorter than 1 by so much; they are made 1 long."""
 
 
+_PANELS = 5
+"""Panels of a shape for each cluster that a body is cut into on Warp."""
+
+Preset = Literal["standard", "learning", "fine"]
+
+
 @dataclass(frozen=True, eq=False)
 class FleetReading:
-    """What the sensors of all environments see; e environments, s sensors, n electrodes."""
+    """What the sensors of all environments see; e environments, s sensors, n electrodes.
 
-    capacitance: Array
+    Arrays of NumPy on the CPU, else of Warp, in single precision, which PyTorch and JAX take by
+    DLPack; those are written anew by the next step.
+    """
+
+    capacitance: Any
     """Maxwell capacitance matrices [F], shape (e, s, n, n)."""
-    delta: Array
+    delta: Any
     """Their change by the bodies [F], shape (e, s, n, n)."""
-    error: Array
-    """Estimated error of the largest entry [F], shape (e, s)."""
+    error: Array | None = None
+    """Estimated error of the largest entry [F], shape (e, s); None on Warp."""
     jacobian: Array | None = None
     """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
     about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
+
+
+@dataclass(frozen=True)
+class FleetCheck:
+    """Errors of some environments against :class:`Simulator`, over each one's largest entry."""
+
+    environments: tuple[int, ...]
+    """Which environments."""
+    rms: float
+    """Root of the mean square over all entries."""
+    worst: float
+    """The largest."""
+    where: tuple[int, int]
+    """Environment and sensor that have it."""
 
 
 class Fleet:
     """Sensors of one design in many environments, with the same places for bodies in each.
 
     What stands in a place may differ from environment to environment, and change at a reset: see
-    :meth:`change`. Bodies out of a sensor's sight cost nothing. Readings are those of
-    :meth:`Simulator.step` of the same preset; but bodies that touch each other are not joined to
-    one conductor, and bodies longer than the diagonal of the sensor's box are not cut.
+    :meth:`change`. Bodies out of a sensor's sight cost nothing on the CPU.
+
+    On the CPU, readings are those of :meth:`Simulator.step` of the same preset; but bodies that
+    touch each other are not joined to one conductor, and bodies longer than the diagonal of the
+    sensor's box are not cut. On Warp every body is cut into as many clusters as ``budget`` says,
+    in single precision: the fewer, the faster and the less exact, see :meth:`check`.
 
     Args:
         design: A design, its name, or the path of its file.
@@ -59,13 +90,18 @@ class Fleet:
             used. Rigid shapes, of matter without losses.
         count: How many environments, e.
         sensors: How many sensors of the design each has, s.
-        preset: Accuracy, as of :class:`Simulator`.
+        device: ``"cpu"`` for the compiled core on all processors, or a device of Warp:
+            ``"cuda:0"``, or ``"warp:cpu"``, which is for tests.
+        preset: Accuracy on the CPU, as of :class:`Simulator`.
+        budget: Clusters of each body on Warp: 32, 64 or 128.
         frequency: Excitation frequency [Hz].
 
     Raises:
-        DesignError: The design is wrong.
+        DesignError: The design is wrong, or has floating conductors, on Warp.
         SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have;
             or a count is not a positive whole number.
+        ValueError: There is no such preset, budget or device.
+        MissingDependencyError: Warp is asked for and not installed.
     """
 
     def __init__(
@@ -75,36 +111,67 @@ class Fleet:
         count: int,
         *,
         sensors: int = 1,
-        preset: Literal["standard", "learning", "fine"] = "learning",
+        device: str = "cpu",
+        preset: Preset = "learning",
+        budget: int = 64,
         frequency: float = 250e3,
     ) -> None:
         for what, number in (("count", count), ("sensors", sensors)):
             if isinstance(number, bool) or not isinstance(number, int) or number < 1:
                 raise SceneError(f"{what} is {number!r}; give a whole number from 1")
-        if not bodies:
-            raise SceneError("a fleet needs at least one body; give bodies=[Body(…), …]")
-        if preset not in PRESETS:
-            raise ValueError(f"preset is {preset!r}; choose one of {', '.join(map(repr, PRESETS))}")
+        if isinstance(bodies, Body) or not bodies:
+            raise SceneError(f"bodies is {bodies!r}; give a list of at least one Body")
+        for what, chosen, known in (
+            ("preset", preset, tuple(PRESETS)), ("budget", budget, (32, 64, 128)),
+        ):  # fmt: skip
+            if chosen not in known:
+                raise ValueError(f"{what} is {chosen!r}; choose one of {known}")
         self.design = design if isinstance(design, Design) else load_design(design)
+        self.count, self.sensors, self.places = count, sensors, len(bodies)
+        """How many environments, sensors in each, and places for bodies."""
+        self.device = device
         field = load_or_build(self.design, default_settings(self.design))
+        chosen_preset = PRESETS[preset]
+        if device != "cpu":
+            chosen_preset = replace(chosen_preset, panels=_PANELS * budget)
         self._solver = SurfaceSolver(
-            field.green, self.design, frequency=frequency, preset=PRESETS[preset]
+            field.green, self.design, frequency=frequency, preset=chosen_preset
         )
         self._terminals = Terminals(self.design, field.capacitance)
         n = self._terminals.electrodes
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
-        self.count, self.sensors, self.places = count, sensors, len(bodies)
-        """How many environments, sensors in each, and places for bodies."""
-        self._kinds: dict[tuple[object, int], int] = {}
+        self._kinds: dict[tuple[int, bool], int] = {}
         self._held: list[RigidShape] = []  # records point to their arrays
         shape = count, self.places
         self._bodies = Bodies(
             np.zeros(0, BODY), np.zeros(0), np.full(shape, -1), np.ones(shape), np.zeros(shape),
             np.zeros(shape), np.zeros(shape, np.int64),
         )  # fmt: skip
+        self._given = np.full(shape, None, object)
+        self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
             self.change(place, body)
+
+    def _on_warp(self, budget: int) -> WarpCore:
+        try:
+            from capsense.fleet.warp_core import WarpCore, known_device
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"device {self.device!r} needs Warp; install it with: pip install 'capsense[warp]'"
+            ) from error
+        device = known_device(self.device)
+        floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
+        if floating:
+            raise DesignError(
+                f"design {self.design.name!r} has floating conductors, {', '.join(floating)}, "
+                'which fleets know on device "cpu" only'
+            )
+        n = self._terminals.electrodes
+        return WarpCore(
+            self._solver.green, self.baseline, self._terminals.bound[:n, :n],
+            (self.count, self.places, self.sensors), budget, device,
+        )  # fmt: skip
 
     @property
     def electrode_names(self) -> tuple[str, ...]:
@@ -148,6 +215,9 @@ class Fleet:
         values = [known[id(body)] for body in each]
         for column, part in zip(table[2:], zip(*values, strict=True), strict=True):
             column[rows, place] = part
+        self._given[rows, place] = each
+        if self._warp is not None:
+            self._warp.take(table, self._held)
 
     def _row(self, body: Body | None) -> tuple[int, float, float, float, int]:
         """Shape, scale, softness, tie and neutrality of a body."""
@@ -192,33 +262,52 @@ class Fleet:
     ) -> FleetReading:
         """Return the readings of all environments.
 
+        On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph.
+
         Args:
             poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
                 shape (e, b, 7).
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
-            jacobian: Whether to work out ``reading.jacobian`` as well.
+            jacobian: Whether to work out ``reading.jacobian`` as well, on the CPU only.
 
         Raises:
             SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long.
             SolveError: Some environments have no solution; the message names the first.
+            ValueError: A Jacobian is asked for on Warp.
         """
         e, s, b = self.count, self.sensors, self.places
-        where = Poses(
-            _checked("poses", poses, (e, b, 7)),
-            np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7)).copy()
-            if sensors is None else _checked("sensors", sensors, (e, s, 7)),
+        if sensors is None:
+            sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7))
+        if self._warp is None:
+            return self._step(
+                Poses(_checked("poses", poses, (e, b, 7)), _checked("sensors", sensors, (e, s, 7))),
+                jacobian,
+            )
+        if jacobian:
+            raise ValueError('a Jacobian is worked out on device "cpu" only')
+        self._warp.solve(
+            *(
+                values if hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
+                else _checked(what, values, shape)
+                for what, values, shape in (
+                    ("poses", poses, (e, b, 7)), ("sensors", sensors, (e, s, 7)),
+                )
+            )
         )  # fmt: skip
+        return FleetReading(self._warp.capacitance, self._warp.delta)
+
+    def _step(self, where: Poses, jacobian: bool) -> FleetReading:
+        """A step on the CPU."""
+        e, s, b = self.count, self.sensors, self.places
         solver = self._solver
         m = solver.green.terminals
         slope = np.zeros((e if jacobian else 0, s, b, m, m, 6))
         found = Found(np.zeros((e, s, m, m)), np.zeros((e, s)), slope)
-        preset = solver.preset
+        sensor = Sensor(solver.green, solver.preset.threshold, solver.preset.width, DOUBTFUL)
         with first_use():
-            in_parts(
-                step_rows, e, self._bodies, where, solver.green, preset.threshold,
-                preset.width, DOUBTFUL, found,
-            )  # fmt: skip
+            in_parts(step_rows, e, self._bodies, where, sensor, found)
         failed = np.flatnonzero(~np.isfinite(found.delta).all(axis=(1, 2, 3)))
         if len(failed):
             raise SolveError(
@@ -229,6 +318,51 @@ class Fleet:
         slopes = self._terminals.slope(change, UNIT * slope) if jacobian else None
         change = self._terminals.change(change)[..., :n, :n]
         return FleetReading(self.baseline + change, change, UNIT * found.error, slopes)
+
+    def check(
+        self,
+        poses: ArrayLike,
+        sensors: ArrayLike | None = None,
+        *,
+        samples: int = 16,
+        seed: int = 0,
+    ) -> FleetCheck:
+        """Compare some environments with ``Simulator(preset="standard")``.
+
+        Args:
+            poses, sensors: As :meth:`step` takes them, on the host.
+            samples: How many environments, drawn at random.
+            seed: Of the draw.
+
+        Raises:
+            SceneError: As by :meth:`step`.
+            SolveError: As by :meth:`step`.
+        """
+        e, s, b = self.count, self.sensors, self.places
+        where = _checked("poses", poses, (e, b, 7))
+        at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
+        found = np.asarray(
+            self.step(where, at).delta
+            if self._warp is None else self.step(where, at).delta.numpy()
+        )  # fmt: skip
+        drawn = np.random.default_rng(seed).permutation(e)[:samples]
+        simulator = Simulator(self.design, frequency=self._solver.frequency)
+        errors = np.empty((len(drawn), s, *self.baseline.shape))
+        for row, k in enumerate(drawn.tolist()):
+            for j in range(s):
+                frame = Pose() if at is None else Pose(at[k, j, :3], at[k, j, 3:])
+                scene = Scene(
+                    body.moved(frame.inverse() @ Pose(pose[:3], pose[3:]))
+                    for body, pose in zip(self._given[k], where[k], strict=True)
+                    if body is not None
+                )
+                truth = simulator.step(scene).delta
+                errors[row, j] = (found[k, j] - truth) / max(np.abs(truth).max(), 1e-18)
+        row, j = np.unravel_index(np.abs(errors).max(axis=(2, 3)).argmax(), errors.shape[:2])
+        return FleetCheck(
+            tuple(drawn.tolist()), float(np.sqrt((errors**2).mean())), float(np.abs(errors).max()),
+            (int(drawn[row]), int(j)),
+        )  # fmt: skip
 
 
 def _checked(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

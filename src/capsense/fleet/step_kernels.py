@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled
 from capsense.surface.gradient_kernels import jacobian
+from capsense.surface.place_kernels import Green
 from capsense.surface.step import solve
 
 
@@ -29,6 +30,18 @@ class Bodies(NamedTuple):
     """Energy that ties it to ground [1/m], shape (e, b)."""
     neutral: NDArray[Any]
     """Whether it has no net charge, shape (e, b)."""
+
+
+class Sensor(NamedTuple):
+    """The sensor of a fleet, and how finely scenes are resolved."""
+
+    green: Green
+    """Green's function of the design, of m terminals."""
+    threshold: float
+    width: float
+    """As :func:`capsense.surface.step.solve` takes them."""
+    doubtful: float
+    """Results are in doubt where the diagonal was raised by more than this part of it."""
 
 
 class Poses(NamedTuple):
@@ -54,9 +67,10 @@ class Found(NamedTuple):
 
 
 @compiled
-def step_rows(start, stop, bodies, poses, green, threshold, width, doubtful, found):
+def step_rows(start, stop, bodies, poses, sensor, found):
     """Solve environments ``start`` to ``stop``."""
     sensors, places = poses.sensors.shape[1], bodies.choice.shape[1]
+    green, slopes = sensor.green, found.slope.shape[0] > 0
     m = green.terminals
     seen, place = np.empty(places, bodies.shapes.dtype), np.empty(places, np.int64)
     turn, own = np.empty((3, 3)), np.empty((3, 3))
@@ -74,13 +88,13 @@ def step_rows(start, stop, bodies, poses, green, threshold, width, doubtful, fou
                         count += 1
             if count == 0:
                 continue
-            out = solve(seen[:count], green, threshold, width, found.slope.shape[0] > 0)
-            doubt = out.delta if out.shift > doubtful else out.left
+            out = solve(seen[:count], green, sensor.threshold, sensor.width, slopes)
+            doubt = out.delta if out.shift > sensor.doubtful else out.left
             for i in range(m):
                 found.error[e, s] = max(found.error[e, s], abs(doubt[i, i]))
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.size > 0 else np.nan
-            if found.slope.shape[0] > 0 and out.size > 0:
+            if slopes and out.size > 0:
                 slope = jacobian(out, seen[:count], green)
                 for c in range(count):
                     found.slope[e, s, place[c]] = slope[c]

@@ -13,7 +13,7 @@ FAR = 0.75
 """Clusters farther apart than so many of their joint extents are met by their moments."""
 _CLOSE = 0.6
 """Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
-_BARRIER = 1e6
+BARRIER = 1e6
 """Energy of charge that is out of reach [1/m]."""
 _LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
@@ -66,7 +66,7 @@ def leaf_pairs(leaves, floor):
                 out[i, j] += leaves.within[i] * line[j]
         for j in range(i):
             out[j, i] = out[i, j]
-        out[i, i] += _BARRIER * leaves.beyond[i] ** 3
+        out[i, i] += BARRIER * leaves.beyond[i] ** 3
     _add_lifted(leaves, out)
     return out
 

@@ -38,10 +38,10 @@ SHORE = 5e-3
 """Bodies fade out over this distance beyond the room, and behind the face of a flat design [m]."""
 NEAR_FACE = 2e-3
 """Clusters farther from the design [m] keep their gap to it."""
-_DEEP, _STEEP = 3e-3, 4.0
+DEEP, STEEP = 3e-3, 4.0
 """What is deeper behind the face of a flat design [m] comes to be screened by it; depth from the
 sides counts so many times."""
-_GAP = 1.5e-4, 7e-4, 0.18, 2e-5
+GAP = 1.5e-4, 7e-4, 0.18, 2e-5
 """Least gap to a flat design [m]: the square of a cluster's extent over the third, at least the
 first, at most the second; less by the thickness of a cover, but not less than the fourth."""
 
@@ -91,17 +91,17 @@ def beyond(points, green):
         off = max(green.room[0, i] - c, c - green.room[1, i], 0.0)
         out += off * off
         if i < 2:
-            depth = min(depth, _STEEP * (c - green.box[0, i]), _STEEP * (green.box[1, i] - c))
+            depth = min(depth, STEEP * (c - green.box[0, i]), STEEP * (green.box[1, i] - c))
         else:
             depth = min(depth, green.box[1, 2] - c)
-    deep = depth - _DEEP if green.cover < 1.0 else 0.0
+    deep = depth - DEEP if green.cover < 1.0 else 0.0
     return smooth(max(math.sqrt(out), deep) / SHORE)
 
 
 @compiled
 def least_gap(extent, cover):
-    """Least gap [m] between a cluster and a flat design, see :data:`_GAP`."""
-    return max(_GAP[3], min(_GAP[1], max(_GAP[0], extent * extent / _GAP[2])) - cover)
+    """Least gap [m] between a cluster and a flat design, see :data:`GAP`."""
+    return max(GAP[3], min(GAP[1], max(GAP[0], extent * extent / GAP[2])) - cover)
 
 
 @compiled
