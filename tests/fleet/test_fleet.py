@@ -1,0 +1,147 @@
+"""Fleets on the compiled core, against simulators."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import capsense as cs
+from capsense.errors import SceneError
+from capsense.fleet import Fleet
+
+GLASS = cs.Material("glass like", 5.0)
+BODIES = [
+    cs.Body(cs.Capsule(0.01, 0.05), material="human", grounding=100e-12),
+    cs.Body(cs.Box((0.05, 0.03, 0.02)), material=GLASS),
+    cs.Body(cs.Sphere(0.02), material="steel", grounding="floating"),
+]
+COUNT = 12
+
+
+def poses(rng, *shape, low=(-0.1, -0.06, 0.04), high=(0.1, 0.06, 0.12)):
+    turn = rng.normal(size=(*shape, 4))
+    turn /= np.linalg.norm(turn, axis=-1, keepdims=True)
+    return np.concatenate([rng.uniform(low, high, (*shape, 3)), turn], axis=-1)
+
+
+def frames(rng, *shape):
+    """Sensors near the world's origin that look about along its z."""
+    turn = np.concatenate([0.1 * rng.normal(size=(*shape, 3)), np.ones((*shape, 1))], axis=-1)
+    turn /= np.linalg.norm(turn, axis=-1, keepdims=True)
+    return np.concatenate([rng.uniform(-0.01, 0.01, (*shape, 3)), turn], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    return Fleet("six_patch", BODIES, COUNT, sensors=2)
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return cs.Simulator("six_patch", preset="learning")
+
+
+def scene(bodies, where, frame):
+    seen = cs.Pose(frame[:3], frame[3:]).inverse()
+    return cs.Scene(
+        b.moved(seen @ cs.Pose(p[:3], p[3:])) for b, p in zip(bodies, where, strict=True) if b
+    )
+
+
+def test_readings_are_those_of_simulators(fleet, simulator):
+    """Differential: conductors, dielectrics, floating bodies; two sensors that stand anywhere."""
+    rng = np.random.default_rng(1)
+    where, sensors = poses(rng, COUNT, 3), frames(rng, COUNT, 2)
+    reading = fleet.step(where, sensors)
+    assert reading.delta.shape == (COUNT, 2, 6, 6)
+    for e in range(COUNT):
+        for s in range(2):
+            truth = simulator.step(scene(BODIES, where[e], sensors[e, s]))
+            scale = np.abs(truth.delta).max() + 1e-18
+            assert np.abs(reading.delta[e, s] - truth.delta).max() < 1e-5 * scale
+            assert np.abs(reading.capacitance[e, s] - truth.capacitance).max() < 1e-5 * scale
+            assert reading.error[e, s] == pytest.approx(truth.stats.error_estimate, rel=1e-3)
+
+
+def test_jacobians_are_those_of_simulators(fleet, simulator):
+    """Differential."""
+    where = poses(np.random.default_rng(2), COUNT, 3)
+    found = fleet.step(where, jacobian=True).jacobian
+    assert found.shape == (COUNT, 2, 3, 6, 6, 6)
+    for e in range(4):
+        frame = np.array([0.0] * 6 + [1.0])
+        truth = simulator.step(scene(BODIES, where[e], frame), jacobian=True).jacobian
+        for s in range(2):
+            np.testing.assert_allclose(found[e, s], truth, rtol=0, atol=1e-5 * np.abs(truth).max())
+
+
+def test_what_stands_in_a_place_changes(simulator):
+    """Differential: sizes, materials and absence differ between environments."""
+    fleet = Fleet("six_patch", BODIES[:2], COUNT)
+    rng = np.random.default_rng(3)
+    rows = [1, 4, 5, 9]
+    others = [
+        cs.Body(cs.Sphere(0.03), material="human"), None,
+        cs.Body(cs.Capsule(0.02, 0.1), material=GLASS),
+        cs.Body(cs.Capsule(0.005, 0.025), material="human"),
+    ]  # fmt: skip
+    fleet.change(0, others, rows)
+    where = poses(rng, COUNT, 2)
+    found = fleet.step(where).delta[:, 0]
+    given = {k: [BODIES[0], BODIES[1]] for k in range(COUNT)}
+    given.update({row: [body, BODIES[1]] for row, body in zip(rows, others, strict=True)})
+    for e in range(COUNT):
+        frame = np.array([0.0] * 6 + [1.0])
+        truth = simulator.step(scene(given[e], where[e], frame)).delta
+        assert np.abs(found[e] - truth).max() < 1e-6 * np.abs(truth).max()
+
+
+def test_bodies_out_of_sight_change_nothing(fleet):
+    """Invariant: exactly nothing, and finite."""
+    where = poses(np.random.default_rng(4), COUNT, 3)
+    where[..., 2] += 50.0
+    reading = fleet.step(where)
+    assert not reading.delta.any()
+    np.testing.assert_array_equal(reading.capacitance[3, 1], fleet.baseline)
+
+
+def test_environments_do_not_depend_on_each_other(fleet):
+    """Invariant: to the last bit, in any order."""
+    where = poses(np.random.default_rng(5), COUNT, 3)
+    turned = fleet.step(where[::-1]).delta[::-1]
+    np.testing.assert_array_equal(fleet.step(where).delta, turned)
+
+
+def test_a_fleet_checks_itself(fleet):
+    """Measured: at the learning preset some per cent of the largest entry."""
+    found = fleet.check(poses(np.random.default_rng(6), COUNT, 3), samples=5)
+    assert len(set(found.environments)) == 5
+    assert 0 < found.rms < found.worst < 0.2
+    assert found.where[0] in found.environments
+
+
+def test_refused(fleet):
+    """Errors name the thing, the value and the fix."""
+    where = poses(np.random.default_rng(7), COUNT, 3)
+    with pytest.raises(SceneError, match=r"poses has shape \(12, 2, 7\); give \(12, 3, 7\)"):
+        fleet.step(where[:, :2])
+    bad = where.copy()
+    bad[3, 1, 2] = np.nan
+    with pytest.raises(SceneError, match=r"poses\[3, 1, 2\] is nan"):
+        fleet.step(bad)
+    bad = where.copy()
+    bad[3, 1, 3:] *= 2
+    with pytest.raises(SceneError, match=r"quaternion of poses\[3, 1\] is 2 long"):
+        fleet.step(bad)
+    with pytest.raises(SceneError, match="places 0 to 2"):
+        fleet.change(3, BODIES[0])
+    with pytest.raises(SceneError, match="numbers from 0 to 11"):
+        fleet.change(0, BODIES[0], [12])
+    with pytest.raises(SceneError, match="2 bodies are given for 3 environments"):
+        fleet.change(0, BODIES[:2], [1, 2, 3])
+    with pytest.raises(SceneError, match=r"has losses at 250000 Hz.*lossless"):
+        fleet.change(0, cs.Body(cs.Sphere(0.01), material="skin"))
+    with pytest.raises(SceneError, match="count is 0"):
+        Fleet("six_patch", BODIES, 0)
+    with pytest.raises(ValueError, match="preset is 'fast'"):
+        Fleet("six_patch", BODIES, 1, preset="fast")
