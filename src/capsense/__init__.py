@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         SkinError,
         SolveError,
     )
+    from capsense.fleet.fleet import Fleet, FleetReading
     from capsense.reading import Reading
     from capsense.readout.config import load_readout
     from capsense.readout.counts import Counts
@@ -74,6 +75,8 @@ __all__ = [
     "DesignError",
     "Ellipsoid",
     "FieldError",
+    "Fleet",
+    "FleetReading",
     "Layers",
     "Material",
     "MeshError",
@@ -159,6 +162,7 @@ _HOMES = {
     "capsense.scene.scene": ("Scene",),
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Simulator",),
+    "capsense.fleet.fleet": ("Fleet", "FleetReading"),
     "capsense.skin": ("Skin",),
 }
 _SUBMODULES = {

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -118,6 +121,18 @@ def test_a_fleet_checks_itself(fleet):
     assert len(set(found.environments)) == 5
     assert 0 < found.rms < found.worst < 0.2
     assert found.where[0] in found.environments
+
+
+def test_page():
+    """The page's snippets run one after another, and the arm is felt."""
+    text = (Path(__file__).parents[2] / "docs/fleets.md").read_text(encoding="utf-8")
+    scope = {}
+    for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+        exec(code, scope)
+    near = scope["reading"].delta[:, 0, 0, 0]
+    assert (np.diff(near) < 0).all()
+    assert near[0] > 5e-14
+    assert scope["found"].worst < 0.1
 
 
 def test_refused(fleet):

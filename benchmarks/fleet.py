@@ -1,0 +1,118 @@
+"""Fleets: solves a second, and errors against boundary elements beside them.
+
+    python benchmarks/fleet.py                        # the compiled core, on all processors
+    python benchmarks/fleet.py --device cuda:0 --counts 1024 4096 16384 65536
+    python benchmarks/fleet.py --device warp:cpu --counts 64
+
+A solve is one sensor in one environment: ``six_patch_bare`` before one finger (radius 8 mm, length
+60 mm, ends included 76 mm) whose lowest point is 15 to 100 mm in front, in any direction, a new
+pose in every environment and at every step. Errors are of the diagonal of ΔC (over the reference,
+or over 1 % of the scene's largest entry where that is more) in the scenes of
+``tests/data/reference_map.json`` that hold one primitive from 15 mm on, and in all scenes of
+primitives. Times are of steps with the poses on the device; a host array costs its copy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from machine import describe_machine
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
+
+from reference_scenes import DESIGN, ReferenceScene, diagonal_errors, reference_scenes
+
+import capsense as cs
+
+Array = NDArray[np.float64]
+PRIMITIVES = cs.Box, cs.Sphere, cs.Capsule, cs.Cylinder, cs.Ellipsoid
+FINGER = cs.Body(cs.Capsule(0.008, 0.06), material="human", name="finger")
+STEPS = 9
+
+
+def fingers(count: int, rng: np.random.Generator) -> Array:
+    """Poses of the finger, shape (count, 1, 7)."""
+    turn = rng.normal(size=(count, 4))
+    turn /= np.linalg.norm(turn, axis=1)[:, None]
+    low = 0.008 + 0.03 * np.abs(1 - 2 * (turn[:, :2] ** 2).sum(axis=1))  # under the middle
+    place = rng.uniform([-0.08, -0.05, 0.015], [0.08, 0.05, 0.1], (count, 3))
+    place[:, 2] += low
+    return np.concatenate([place, turn], axis=1)[:, None]
+
+
+def errors(options: dict[str, Any], scenes: list[ReferenceScene]) -> tuple[Array, Array]:
+    """Errors of single bodies from 15 mm on, and of all scenes [%]."""
+    most = max(len(s.scene) for s in scenes)
+    fleet = cs.Fleet(DESIGN, [FINGER] * most, len(scenes), **options)
+    poses = np.zeros((len(scenes), most, 7))
+    poses[..., 6] = 1.0
+    for place in range(most):
+        fleet.change(place, [s.scene[place] if place < len(s.scene) else None for s in scenes])
+        for e, s in enumerate(scenes):
+            if place < len(s.scene):
+                pose = s.scene[place].pose
+                poses[e, place] = [*pose.position, *pose.quaternion]
+    delta = fleet.step(poses).delta
+    delta = (delta if isinstance(delta, np.ndarray) else delta.numpy())[:, 0].astype(float)
+    found = np.array(
+        [100 * diagonal_errors(d, s.delta) for d, s in zip(delta, scenes, strict=True)]
+    )
+    single = [len(s.scene) == 1 and s.gap > 0.0149 for s in scenes]
+    return found[single].ravel(), found.ravel()
+
+
+def rate(options: dict[str, Any], count: int) -> float:
+    """Median of solves a second."""
+    fleet = cs.Fleet(DESIGN, [FINGER], count, **options)
+    rng = np.random.default_rng(count)
+    poses: list[Any] = [fingers(count, rng) for _ in range(STEPS)]
+    wait = lambda: None  # noqa: E731
+    if options["device"] != "cpu":
+        import warp as wp
+
+        device = wp.get_device(options["device"].removeprefix("warp:"))
+        poses = [wp.array(p.astype(np.float32), dtype=wp.float32, device=device) for p in poses]
+        wait = lambda: wp.synchronize_device(device)  # noqa: E731
+    times = []
+    for pose in poses:
+        wait()
+        start = perf_counter()
+        fleet.step(pose)
+        wait()
+        times.append(perf_counter() - start)
+    return count / float(np.median(times[1:]))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--device", default="cpu", help="cpu, warp:cpu or cuda:0 (default: cpu)")
+    parser.add_argument("--counts", type=int, nargs="+", default=[256, 1024, 4096])
+    options = parser.parse_args()
+    print(describe_machine(("capsense", "numpy", "numba", "warp-lang")))
+    scenes = [
+        s for s in reference_scenes() if all(isinstance(b.shape, PRIMITIVES) for b in s.scene)
+    ]
+    name, values = ("preset", ["learning", "standard"])
+    if options.device != "cpu":
+        name, values = ("budget", [32, 64, 128])
+    print(f"{name:10} {'environments':>12} {'solves/s':>10}   rms, worst error [%]: one body", end="")
+    print(" from 15 mm on, all scenes")
+    for value in values:
+        chosen = {"device": options.device, name: value}
+        single, every = errors(chosen, scenes)
+        told = ", ".join(
+            f"{np.sqrt((e**2).mean()):.2f} {np.abs(e).max():.2f}" for e in (single, every)
+        )
+        for count in options.counts:
+            print(f"{value!s:10} {count:12} {rate(chosen, count):10,.0f}   {told}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
