@@ -14,10 +14,19 @@ from capsense._crew import in_parts
 from capsense._patience import first_use
 from capsense.design import load_design
 from capsense.design.model import Design, Role
-from capsense.errors import DesignError, MissingDependencyError, SceneError, SolveError
+from capsense.errors import (
+    DesignError,
+    MissingDependencyError,
+    ReadOutError,
+    SceneError,
+    SolveError,
+)
 from capsense.field.cache import default_settings, load_or_build
 from capsense.field.terminals import Terminals
 from capsense.fleet.step_kernels import Bodies, Found, Poses, Sensor, step_rows
+from capsense.readout.counts import Held
+from capsense.readout.read_out import ReadOut
+from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
 from capsense.surface.matter import UNIT, matter_of
@@ -54,6 +63,11 @@ class FleetReading:
     """Their change by the bodies [F], shape (e, s, n, n)."""
     error: Array | None = None
     """Estimated error of the largest entry [F], shape (e, s); None on Warp."""
+    shield_coupling: Array | None = None
+    """Charge on each electrode per volt on all shields together [F], shape (e, s, n); None on
+    Warp."""
+    held: Held | None = None
+    """What the chips' registers hold, where there is a read-out, each of shape (e, s, channels)."""
     jacobian: Array | None = None
     """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
     about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
@@ -149,6 +163,7 @@ class Fleet:
             np.zeros(shape), np.zeros(shape, np.int64),
         )  # fmt: skip
         self._given = np.full(shape, None, object)
+        self._chips: SideBySide | None = None
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
             self.change(place, body)
@@ -257,26 +272,72 @@ class Fleet:
             )
         return found
 
+    def use_readout(self, readout: ReadOut | str | None, *, seed: int = 0) -> None:
+        """Read every sensor through a chip of its own from now on.
+
+        All are switched on together, at 0 s; noise differs from chip to chip.
+
+        Args:
+            readout: A read-out for this design's electrodes, the name of a chip, or None.
+            seed: Of all random numbers.
+
+        Raises:
+            ReadOutError: There is no such chip, or the read-out is of other electrodes; or the
+                design has shields, and the fleet is on Warp, where these are not looked at.
+        """
+        self._chips = None
+        if readout is None:
+            return
+        if isinstance(readout, str):
+            readout = ReadOut.preset(readout, self.electrode_names)
+        if readout.bank.electrodes != self.electrode_names:
+            raise ReadOutError(
+                f"the read-out is of electrodes {readout.bank.electrodes}, the fleet of "
+                f"{self.electrode_names}"
+            )
+        if self._warp is not None and self._terminals.driven > len(self.electrode_names):
+            raise ReadOutError('a design with shields is read through chips on device "cpu" only')
+        self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
+
     def step(
-        self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
+        self,
+        poses: ArrayLike,
+        sensors: ArrayLike | None = None,
+        *,
+        time: float | None = None,
+        jacobian: bool = False,
     ) -> FleetReading:
         """Return the readings of all environments.
 
         On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
-        not looked at; nothing waits for the device, so that a step can go into a CUDA graph.
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph. Chips
+        are on the host: with a read-out, matrices are copied there.
 
         Args:
             poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
                 shape (e, b, 7).
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
+            time: Time of the scenes [s], not before that of the last step; a read-out needs it.
             jacobian: Whether to work out ``reading.jacobian`` as well, on the CPU only.
 
         Raises:
             SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long.
             SolveError: Some environments have no solution; the message names the first.
+            ReadOutError: A read-out is given no time, or time went back.
             ValueError: A Jacobian is asked for on Warp.
         """
+        if self._chips is None:
+            return self._solved(poses, sensors, jacobian)
+        if time is None:
+            raise ReadOutError("a read-out needs the time; write step(poses, time=…), in seconds")
+        reading = self._solved(poses, sensors, jacobian)
+        matrix = reading.capacitance
+        host = matrix if isinstance(matrix, np.ndarray) else matrix.numpy()
+        return replace(reading, held=self._chips.sample(time, host, reading.shield_coupling))
+
+    def _solved(self, poses: ArrayLike, sensors: ArrayLike | None, jacobian: bool) -> FleetReading:
+        """A step without chips."""
         e, s, b = self.count, self.sensors, self.places
         if sensors is None:
             sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7))
@@ -316,8 +377,12 @@ class Fleet:
             )
         n, change = self._terminals.electrodes, self._terminals.screened(UNIT * found.delta)
         slopes = self._terminals.slope(change, UNIT * slope) if jacobian else None
-        change = self._terminals.change(change)[..., :n, :n]
-        return FleetReading(self.baseline + change, change, UNIT * found.error, slopes)
+        change = self._terminals.change(change)
+        shields = (self._terminals.empty + change)[..., :n, n:].sum(axis=-1)
+        change = change[..., :n, :n]
+        return FleetReading(
+            self.baseline + change, change, UNIT * found.error, shields, jacobian=slopes
+        )
 
     def check(
         self,
@@ -342,8 +407,8 @@ class Fleet:
         where = _checked("poses", poses, (e, b, 7))
         at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
         found = np.asarray(
-            self.step(where, at).delta
-            if self._warp is None else self.step(where, at).delta.numpy()
+            self._solved(where, at, False).delta
+            if self._warp is None else self._solved(where, at, False).delta.numpy()
         )  # fmt: skip
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
         simulator = Simulator(self.design, frequency=self._solver.frequency)
