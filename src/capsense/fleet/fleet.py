@@ -160,7 +160,7 @@ class Fleet:
         shape = count, self.places
         self._bodies = Bodies(
             np.zeros(0, BODY), np.zeros(0), np.full(shape, -1), np.ones(shape), np.zeros(shape),
-            np.zeros(shape), np.zeros(shape, np.int64),
+            np.zeros(shape), np.zeros(shape, np.int64), np.zeros((sensors, len(bodies)), np.bool_),
         )  # fmt: skip
         self._given = np.full(shape, None, object)
         self._chips: SideBySide | None = None
@@ -228,11 +228,31 @@ class Fleet:
         known = {id(body): self._row(body) for body in each}
         table = self._bodies
         values = [known[id(body)] for body in each]
-        for column, part in zip(table[2:], zip(*values, strict=True), strict=True):
+        for column, part in zip(table[2:-1], zip(*values, strict=True), strict=True):
             column[rows, place] = part
         self._given[rows, place] = each
         if self._warp is not None:
             self._warp.take(table, self._held)
+
+    def hide(self, sensor: int, places: Sequence[int]) -> None:
+        """Leave places out of what a sensor sees, such as the link that carries it.
+
+        Args:
+            sensor: Number of the sensor.
+            places: Numbers of the places; the sensor sees all others.
+
+        Raises:
+            SceneError: There is no such sensor or place.
+        """
+        for what, known, given in (
+            ("sensors", self.sensors, [sensor]), ("places", self.places, places),
+        ):  # fmt: skip
+            for number in given:
+                if number not in range(known):
+                    raise SceneError(f"hide: {number!r} is none of the {what} 0 to {known - 1}")
+        self._bodies.hidden[sensor] = np.isin(np.arange(self.places), places)
+        if self._warp is not None:
+            self._warp.take(self._bodies, self._held)
 
     def _row(self, body: Body | None) -> tuple[int, float, float, float, int]:
         """Shape, scale, softness, tie and neutrality of a body."""
@@ -416,10 +436,11 @@ class Fleet:
         for row, k in enumerate(drawn.tolist()):
             for j in range(s):
                 frame = Pose() if at is None else Pose(at[k, j, :3], at[k, j, 3:])
+                hidden = self._bodies.hidden[j]
                 scene = Scene(
                     body.moved(frame.inverse() @ Pose(pose[:3], pose[3:]))
-                    for body, pose in zip(self._given[k], where[k], strict=True)
-                    if body is not None
+                    for body, pose, out in zip(self._given[k], where[k], hidden, strict=True)
+                    if body is not None and not out
                 )
                 truth = simulator.step(scene).delta
                 errors[row, j] = (found[k, j] - truth) / max(np.abs(truth).max(), 1e-18)

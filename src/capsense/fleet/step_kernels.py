@@ -30,6 +30,8 @@ class Bodies(NamedTuple):
     """Energy that ties it to ground [1/m], shape (e, b)."""
     neutral: NDArray[Any]
     """Whether it has no net charge, shape (e, b)."""
+    hidden: NDArray[Any]
+    """Whether a sensor does not see a place, shape (s, b)."""
 
 
 class Sensor(NamedTuple):
@@ -79,7 +81,7 @@ def step_rows(start, stop, bodies, poses, sensor, found):
             _matrix(poses.sensors[e, s], turn)
             count = 0
             for b in range(places):
-                if bodies.choice[e, b] >= 0:
+                if bodies.choice[e, b] >= 0 and not bodies.hidden[s, b]:
                     _matrix(poses.bodies[e, b], own)
                     record = seen[count : count + 1]
                     if _placed(bodies, e, b, poses, s, turn, own, green.room, record):

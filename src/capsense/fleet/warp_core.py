@@ -60,7 +60,7 @@ class WarpCore:
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
         """Take over what stands where."""
         places = kernels.Places()
-        for name in ("choice", "neutral"):
+        for name in ("choice", "neutral", "hidden"):
             setattr(places, name, self._array(getattr(bodies, name), wp.int32))
         for name in ("scale", "softness", "tie"):
             setattr(places, name, self._array(getattr(bodies, name), wp.float32))

@@ -54,13 +54,14 @@ class Shapes:
 
 @wp.struct
 class Places:
-    """What stands in the places of all environments, each (e, b)."""
+    """What stands in the places of all environments, (e, b)."""
 
     choice: wp.array2d(dtype=wp.int32)
     scale: wp.array2d(dtype=wp.float32)
     softness: wp.array2d(dtype=wp.float32)
     tie: wp.array2d(dtype=wp.float32)
     neutral: wp.array2d(dtype=wp.int32)
+    hidden: wp.array2d(dtype=wp.int32)  # whether a sensor does not see a place, (s, b)
 
 
 @wp.struct
@@ -143,7 +144,7 @@ def choose(
     for j in range(clusters):
         cut.node[o + j, v] = -1
         cut.number[o + j, v] = -1
-    if u < 0:
+    if u < 0 or places.hidden[s, b] != 0:
         return
     at = wp.transform_multiply(wp.transform_inverse(sensors[e, s]), bodies[e, b])
     cut.pose[b, v] = at

@@ -1,0 +1,128 @@
+"""Sensors in all worlds of MuJoCo Warp: ``CapacitiveSensors(model, data, sites=["wrist"])``."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from capsense.adapters.mujoco_depth import find_site
+from capsense.adapters.mujoco_model import ModelReader
+from capsense.adapters.parallel import (
+    Options,
+    ParallelSensors,
+    Part,
+    as_numbers,
+    warn_left_out,
+)
+from capsense.adapters.parallel_kernels import from_matrices
+from capsense.adapters.rules import Rules
+from capsense.design.model import Design
+from capsense.fleet import FleetReading
+from capsense.scene import Body, Material, Pose, Shape
+from capsense.scene.body import Grounding
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+class CapacitiveSensors(ParallelSensors):
+    """Sensors on sites of a model, in all worlds of MuJoCo Warp.
+
+    Geoms are seen as they are in the model when the sensors are made, the same in all worlds;
+    change :attr:`fleet` where worlds differ. Planes, terrains and flexes are not seen.
+
+    Args:
+        model: The MuJoCo model that was put on the device.
+        data: ``mujoco_warp.Data`` of some worlds.
+        sites: Names of the sites.
+        design: A design, its name, or the path of its file, for all sites.
+        materials: Name pattern → material, as for :func:`capsense.mujoco.attach`, like all that
+            follow up to ``groups``.
+        grounding: Name pattern → grounding.
+        default_material: Material of everything else.
+        default_grounding: Grounding of everything else.
+        exclude: Name patterns of geoms that no sensor sees.
+        exclude_own: Leave out the geoms of the body that carries a sensor, for that sensor.
+        hull: Name patterns of mesh geoms that are taken as their convex hulls.
+        groups: See only geoms of these groups; default all.
+        options: Further keywords of :class:`~capsense.adapters.parallel.Options`: ``device``,
+            ``preset``, ``budget``.
+
+    Raises:
+        SceneError: There is no such site, a pattern fits nothing, or nothing can be seen.
+        DesignError: The design is wrong.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: Any,
+        sites: Sequence[str],
+        design: Design | str | Path = "six_patch",
+        *,
+        materials: Mapping[str, Material | str] | None = None,
+        grounding: Mapping[str, Grounding] | None = None,
+        default_material: Material | str = "steel",
+        default_grounding: Grounding = "grounded",
+        exclude: Sequence[str] = (),
+        exclude_own: bool = True,
+        hull: Sequence[str] = (),
+        groups: Collection[int] | None = None,
+        **options: Any,
+    ) -> None:
+        rules = Rules(
+            materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
+        )
+        reader = ModelReader(model, rules)
+        geoms: list[int] = []
+        parts: list[Part] = []
+        flat: list[str] = []
+        for geom in range(model.ngeom):
+            if groups is not None and int(model.geom_group[geom]) not in groups:
+                continue
+            solid = reader.solid(geom)
+            if solid is None:
+                continue
+            if not isinstance(solid.shape, Shape):
+                flat.append(solid.label)
+                continue
+            body = Body(solid.shape, Pose(), solid.material, solid.tie.grounding)
+            geoms.append(geom)
+            own = int(model.geom_bodyid[geom])
+            parts.append(Part((solid.label,), own if own > 0 else -1, body))
+        warn_left_out(flat, "a fleet sees no planes and terrains")
+        numbers = [find_site(model, site) for site in sites]
+        carriers = [
+            (name, int(model.site_bodyid[k])) for name, k in zip(sites, numbers, strict=True)
+        ]
+        device = data.geom_xpos.device
+        super().__init__(
+            parts, carriers, data.geom_xpos.shape[0],
+            Options(design, Rules(), exclude_own, **options), device,
+        )  # fmt: skip
+        self._geoms = as_numbers(geoms, device)
+        self._numbers = as_numbers(numbers, device)
+
+    def read(self, data: Any, *, time: float | None = None) -> FleetReading:
+        """Return the readings of all worlds, shape (worlds, sites, …).
+
+        Args:
+            data: ``mujoco_warp.Data`` after ``forward`` or ``step``.
+            time: As of :meth:`Fleet.step`, where a read-out is used.
+
+        Raises:
+            ReadOutError: As by :meth:`Fleet.step`.
+            SolveError: As by :meth:`Fleet.step`.
+        """
+        for position, matrix, number, out in (
+            (data.geom_xpos, data.geom_xmat, self._geoms, self._poses),
+            (data.site_xpos, data.site_xmat, self._numbers, self._frames),
+        ):
+            wp.launch(
+                from_matrices, dim=out.shape, inputs=[position, matrix, number, out],
+                device=out.device,
+            )  # fmt: skip
+        return self._read(time)

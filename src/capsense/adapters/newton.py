@@ -1,0 +1,213 @@
+"""Sensors in all worlds of Newton: ``SensorCapacitance(model, sites="skin_*").update(state)``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from capsense.adapters.meshes import solid_mesh
+from capsense.adapters.parallel import (
+    Options,
+    ParallelSensors,
+    Part,
+    as_numbers,
+    matching,
+    warn_left_out,
+)
+from capsense.adapters.parallel_kernels import compose
+from capsense.adapters.rules import Rules
+from capsense.design.model import Design
+from capsense.errors import SceneError
+from capsense.scene import (
+    Body,
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    Material,
+    Pose,
+    Shape,
+    Sphere,
+)
+from capsense.scene.body import Grounding
+
+
+class SensorCapacitance(ParallelSensors):
+    """Capacitive proximity sensors on sites of a Newton model, in all of its worlds.
+
+    Worlds must hold the same shapes in the same order, as ``ModelBuilder.replicate`` makes them;
+    sizes may differ. Shapes outside of all worlds are seen by all. Planes, height fields, cones and
+    Gaussians are not seen. Sizes and materials are those of the model when the sensor is made;
+    change :attr:`fleet` for others.
+
+    Args:
+        model: The model, after ``ModelBuilder.finalize``.
+        sites: Label patterns of the sites; those of the first world decide.
+        design: A design, its name, or the path of its file, for all sites.
+        materials: Label pattern → material; the first that fits decides.
+        grounding: Label pattern → grounding; the first that fits decides.
+        default_material: Material of everything else.
+        default_grounding: Grounding of everything else.
+        exclude: Label patterns of shapes that no sensor sees.
+        exclude_own: Leave out the shapes of the body that carries a sensor, for that sensor.
+        hull: Label patterns of meshes that are taken as their convex hulls.
+        options: Further keywords of :class:`~capsense.adapters.parallel.Options`: ``device``,
+            ``preset``, ``budget``.
+
+    Raises:
+        SceneError: There is no such site, a pattern fits nothing, nothing can be seen, or worlds
+            differ in their shapes.
+        DesignError: The design is wrong.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        sites: str | Sequence[str],
+        design: Design | str | Path = "six_patch",
+        *,
+        materials: Mapping[str, Material | str] | None = None,
+        grounding: Mapping[str, Grounding] | None = None,
+        default_material: Material | str = "steel",
+        default_grounding: Grounding = "grounded",
+        exclude: Sequence[str] = (),
+        exclude_own: bool = True,
+        hull: Sequence[str] = (),
+        **options: Any,
+    ) -> None:
+        from newton import ShapeFlags
+
+        rules = Rules(
+            materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
+        )
+        table = _by_world(model)
+        site = (model.shape_flags.numpy()[table[0]] & int(ShapeFlags.SITE)) != 0
+        labels = [model.shape_label[k] for k in table[0].tolist()]
+        reader = _Reader(model, rules)
+        parts: list[Part] = []
+        columns: list[int] = []
+        left: list[str] = []
+        carrier = model.shape_body.numpy()
+        for column in np.flatnonzero(~site).tolist():
+            if not reader.known(table[0, column]):
+                left.append(labels[column])
+                continue
+            bodies = [reader.body(k, labels[column]) for k in table[:, column].tolist()]
+            parts.append(Part((labels[column],), int(carrier[table[0, column]]), bodies))
+            columns.append(column)
+        warn_left_out(left, "a fleet sees no planes, height fields, cones and Gaussians")
+        known = np.flatnonzero(site)
+        names = [labels[k] for k in known]
+        chosen = known[matching(names, sites, "site")]
+        carriers = [(labels[k], int(carrier[table[0, k]])) for k in chosen.tolist()]
+        device = model.shape_transform.device
+        super().__init__(
+            parts, carriers, len(table), Options(design, rules, exclude_own, **options), device
+        )
+        local = model.shape_transform.numpy()
+        seen = np.array([columns[k] for k in self.chosen])
+        self._fixed = [
+            (
+                as_numbers(carrier[table[:, which]], device),
+                wp.array(local[table[:, which]], dtype=wp.transform, device=device),
+                out,
+            )
+            for which, out in ((seen, self._poses), (chosen, self._frames))
+        ]
+        self.capacitance: Any = None
+        self.delta: Any = None
+        """Maxwell matrices of the last update and their change by the bodies [F], shape (worlds,
+        sites, n, n)."""
+
+    def update(self, state: Any, *, time: float | None = None) -> None:
+        """Read all worlds.
+
+        Args:
+            state: The state, whose ``body_q`` is up to date.
+            time: As of :meth:`Fleet.step`, where a read-out is used.
+
+        Raises:
+            ReadOutError: As by :meth:`Fleet.step`.
+            SolveError: As by :meth:`Fleet.step`.
+        """
+        bodies = state.body_q
+        for number, local, out in self._fixed:
+            # bodies of all worlds stand in one row, which every world is shown
+            rows = wp.array(
+                ptr=bodies.ptr, dtype=wp.transform, shape=(out.shape[0], bodies.shape[0]),
+                strides=(0, bodies.strides[0]), device=out.device,
+            )  # fmt: skip
+            wp.launch(compose, dim=out.shape, inputs=[rows, number, local, out], device=out.device)
+        self.reading = self._read(time)
+        self.capacitance, self.delta = self.reading.capacitance, self.reading.delta
+
+
+def _by_world(model: Any) -> NDArray[np.int64]:
+    """Shapes of every world, those outside of all worlds last, shape (worlds, shapes)."""
+    world = model.shape_world.numpy()
+    count = max(int(model.world_count), 1)
+    shared = np.flatnonzero(world < 0)
+    rows = [np.flatnonzero(world == w) for w in range(count)]
+    kinds = model.shape_type.numpy()
+    for w, row in enumerate(rows):
+        if len(row) != len(rows[0]) or (kinds[row] != kinds[rows[0]]).any():
+            raise SceneError(
+                f"world {w} of the model has other shapes than world 0; a sensor needs the same "
+                "shapes in the same order in all worlds, as ModelBuilder.replicate makes them"
+            )
+    return np.array([np.concatenate([row, shared]) for row in rows], dtype=np.int64)
+
+
+class _Reader:
+    """Makes bodies of a model's shapes; alike ones are one body."""
+
+    def __init__(self, model: Any, rules: Rules) -> None:
+        from newton import GeoType
+
+        self._kinds = GeoType
+        self._type, self._scale = model.shape_type.numpy(), model.shape_scale.numpy()
+        self._source = model.shape_source
+        self._rules = rules
+        self._made: dict[Any, Body] = {}
+
+    def known(self, shape: int) -> bool:
+        kinds = self._kinds
+        return int(self._type[shape]) in {
+            int(k) for k in (
+                kinds.SPHERE, kinds.CAPSULE, kinds.ELLIPSOID, kinds.CYLINDER, kinds.BOX,
+                kinds.MESH, kinds.CONVEX_MESH,
+            )
+        }  # fmt: skip
+
+    def body(self, shape: int, label: str) -> Body:
+        kind, size = int(self._type[shape]), tuple(self._scale[shape].tolist())
+        key = (label, kind, size, id(self._source[shape]))
+        if key not in self._made:
+            names = (label,)
+            self._made[key] = Body(
+                self._shape(shape, kind, size, label), Pose(),
+                self._rules.material_of(names, None), self._rules.tie_of(names, None).grounding,
+            )  # fmt: skip
+        return self._made[key]
+
+    def _shape(self, shape: int, kind: int, size: tuple[float, ...], label: str) -> Shape:
+        kinds, (a, b, c) = self._kinds, size
+        if kind == int(kinds.SPHERE):
+            return Sphere(a)
+        if kind == int(kinds.CAPSULE):
+            return Capsule(a, 2 * b) if b > 0 else Sphere(a)
+        if kind == int(kinds.CYLINDER):
+            return Cylinder(a, 2 * b)
+        if kind == int(kinds.ELLIPSOID):
+            return Ellipsoid((a, b, c))
+        if kind == int(kinds.BOX):
+            return Box((2 * a, 2 * b, 2 * c))
+        mesh = self._source[shape]
+        vertices = np.asarray(mesh.vertices, float) * np.array(size)
+        faces = np.asarray(mesh.indices).reshape(-1, 3)
+        return solid_mesh(vertices, faces, label, hull=self._rules.takes_hull((label,)))

@@ -1,0 +1,137 @@
+"""Fleets on simulators whose worlds step together in arrays of NVIDIA Warp."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from capsense.adapters.rules import Names, Rules
+from capsense.design.model import Design
+from capsense.errors import SceneError
+from capsense.fleet import Fleet, FleetReading
+from capsense.scene import Body
+
+_SHOWN = 6
+"""Names that are listed in a message."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a sensor in many worlds is, and how it is solved."""
+
+    design: Design | str | Path = "six_patch"
+    """As :class:`~capsense.fleet.Fleet` takes it."""
+    rules: Rules = field(default_factory=Rules)
+    """What is seen, and what it is made of."""
+    exclude_own: bool = True
+    """Leave out, for each sensor, the shapes of the body that carries it."""
+    device: str | None = None
+    """As of a fleet; by default that of the simulator's arrays."""
+    preset: str = "learning"
+    budget: int = 64
+    """Accuracy on the CPU and on Warp, as of a fleet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One shape of a world, in all worlds."""
+
+    names: Names
+    """The names it answers to."""
+    body: int
+    """The simulator's body that carries it, in the first world; -1 for the world itself."""
+    bodies: Body | Sequence[Body]
+    """What it is: one for all worlds, or one for each."""
+
+
+class ParallelSensors:
+    """Sensors on several sites of a robot, in all worlds of a simulator.
+
+    Args:
+        parts: Shapes of a world.
+        sites: Names of the sites, and the bodies that carry them.
+        worlds: How many worlds.
+        options: The sensors.
+        device: Warp's device of the simulator's arrays.
+
+    Raises:
+        SceneError: Nothing can be seen, or the rules leave everything out.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        sites: Sequence[tuple[str, int]],
+        worlds: int,
+        options: Options,
+        device: Any,
+    ) -> None:
+        options.rules.check([part.names for part in parts])
+        self.chosen = [k for k, part in enumerate(parts) if not options.rules.excludes(part.names)]
+        """Which of the parts are seen."""
+        if not self.chosen:
+            raise SceneError("there is nothing to see: all shapes are left out")
+        seen = [parts[k] for k in self.chosen]
+        first = [p.bodies if isinstance(p.bodies, Body) else p.bodies[0] for p in seen]
+        where = options.device or ("cpu" if device.is_cpu else str(device))
+        self.fleet = Fleet(
+            options.design, first, worlds, sensors=len(sites), device=where,
+            preset=options.preset, budget=options.budget,  # type: ignore[arg-type]
+        )  # fmt: skip
+        """The fleet: its places are the shapes, its sensors the sites."""
+        self.names = tuple(part.names[-1] for part in seen)
+        self.sites = tuple(name for name, _ in sites)
+        """Names of the shapes that are seen, and of the sites, in order."""
+        for place, part in enumerate(seen):
+            if not isinstance(part.bodies, Body):
+                self.fleet.change(place, part.bodies)
+        if options.exclude_own:
+            for sensor, (_, own) in enumerate(sites):
+                mine = [k for k, part in enumerate(seen) if part.body == own >= 0]
+                self.fleet.hide(sensor, mine)
+        self._poses = wp.zeros((worlds, len(seen)), dtype=wp.transform, device=device)
+        self._frames = wp.zeros((worlds, len(sites)), dtype=wp.transform, device=device)
+
+    def _read(self, time: float | None) -> FleetReading:
+        """The reading at the poses that stand in the two arrays."""
+        poses, frames = self._poses, self._frames
+        if self.fleet.device == "cpu":
+            poses, frames = poses.numpy(), frames.numpy()
+        return self.fleet.step(poses, frames, time=time)
+
+
+def warn_left_out(names: Sequence[str], why: str) -> None:
+    """Say once which shapes of a model are not seen."""
+    if names:
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        warnings.warn(
+            f"sensor: {', '.join(map(repr, names[:_SHOWN]))}{more} not seen: {why}", stacklevel=4
+        )
+
+
+def matching(known: Sequence[str], patterns: str | Sequence[str], what: str) -> list[int]:
+    """Numbers of the names that fit one of some patterns, in the order of the patterns.
+
+    Raises:
+        SceneError: A pattern fits nothing.
+    """
+    from fnmatch import fnmatchcase
+
+    out: dict[int, None] = {}
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        found = [k for k, name in enumerate(known) if fnmatchcase(name, pattern)]
+        if not found:
+            raise SceneError(f"no {what} fits {pattern!r}; there are {list(known)[:20]}")
+        out.update(dict.fromkeys(found))
+    return list(out)
+
+
+def as_numbers(values: Any, device: Any) -> Any:
+    """Whole numbers as an array of Warp."""
+    return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)

@@ -1,0 +1,137 @@
+"""Sensors in all worlds of MuJoCo Warp and Newton, against simulators of one world."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import capsense as cs
+from capsense.errors import SceneError
+
+wp = pytest.importorskip("warp")
+WORLDS = 3
+MODEL = """<mujoco><worldbody>
+ <geom name="floor" type="plane" size="2 2 .1"/>
+ <geom name="table" type="box" size=".1 .1 .01" pos="0 0 .75"/>
+ <body name="arm" pos="0 0 .6"><freejoint/><geom name="arm" type="capsule" size=".02 .06"/></body>
+ <body name="robot" pos="0 0 .5"><joint type="hinge" axis="0 0 1"/>
+  <geom name="link" type="sphere" size=".03" pos="0 0 -.05"/>
+  <site name="skin_a"/><site name="skin_b" pos="0.05 0 0" euler="0 10 0"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def mujoco_worlds():
+    """A model, data of three worlds in which the arm lies elsewhere, and their states."""
+    mujoco = pytest.importorskip("mujoco")
+    mjw = pytest.importorskip("mujoco_warp")
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
+    states = np.tile(data.qpos, (WORLDS, 1))
+    states[:, :3] = rng.uniform([-0.05, -0.05, 0.57], [0.05, 0.05, 0.62], (WORLDS, 3))
+    turn = rng.normal(size=(WORLDS, 4))
+    states[:, 3:7] = turn / np.linalg.norm(turn, axis=1)[:, None]
+    states[:, 7] = [0.0, 0.5, 1.0]
+    mujoco.mj_forward(model, data)
+    there = mjw.put_data(model, data, nworld=WORLDS)
+    wp.copy(there.qpos, wp.array(states.astype(np.float32), dtype=wp.float32, device="cpu"))
+    mjw.kinematics(mjw.put_model(model), there)
+    return model, there, states
+
+
+@pytest.mark.parametrize(("device", "bound"), [(None, 1e-5), ("warp:cpu", 0.05)])
+def test_mujoco_warp(mujoco_worlds, device, bound):
+    """Differential: against a sensor attached to each world; on Warp within 5 % of the largest."""
+    import mujoco
+
+    from capsense.adapters.mujoco_warp import CapacitiveSensors
+
+    model, there, states = mujoco_worlds
+    with pytest.warns(UserWarning, match="'world/floor' not seen: a fleet sees no planes"):
+        sensors = CapacitiveSensors(
+            model, there, ["skin_a", "skin_b"], materials={"arm": "human"}, device=device
+        )
+    found = sensors.read(there).delta
+    found = found if device is None else found.numpy()
+    assert found.shape == (WORLDS, 2, 6, 6)
+    for w in range(WORLDS):
+        data = mujoco.MjData(model)
+        data.qpos[:] = states[w]
+        mujoco.mj_forward(model, data)
+        for s, site in enumerate(sensors.sites):
+            sensor = cs.mujoco.attach(
+                model, data, site, cs.Simulator("six_patch", preset="learning"),
+                materials={"arm": "human"}, exclude=["floor"],
+            )  # fmt: skip
+            truth = sensor.read().delta
+            assert np.abs(found[w, s] - truth).max() < bound * np.abs(truth).max()
+    assert np.ptp(found[:, 0, 0, 0]) > 0
+
+
+def test_mujoco_warp_refuses(mujoco_worlds):
+    """Errors name the thing."""
+    from capsense.adapters.mujoco_warp import CapacitiveSensors
+
+    model, there, _ = mujoco_worlds
+    with pytest.raises(SceneError, match="skin_x"):
+        CapacitiveSensors(model, there, ["skin_x"])
+    with pytest.raises(SceneError, match="nothing to see"):
+        CapacitiveSensors(model, there, ["skin_a"], exclude=["arm", "table", "floor", "link"])
+
+
+def newton_model(newton):
+    """Three worlds of a robot's link with two sites and an arm; a table outside of them."""
+    world = newton.ModelBuilder()
+    robot = world.add_body(xform=wp.transform((0.0, 0.0, 0.5), wp.quat_identity()), label="robot")
+    world.add_shape_sphere(
+        robot, xform=wp.transform((0.0, 0.0, -0.05), wp.quat_identity()), radius=0.03, label="link"
+    )
+    world.add_site(robot, label="skin_a")
+    tilt = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.17)
+    world.add_site(robot, xform=wp.transform((0.05, 0.0, 0.0), tilt), label="skin_b")
+    arm = world.add_body(xform=wp.transform((0.0, 0.0, 0.6), wp.quat_identity()), label="arm")
+    world.add_shape_capsule(arm, radius=0.02, half_height=0.06, label="forearm")
+    builder = newton.ModelBuilder()
+    builder.replicate(world, WORLDS)
+    builder.add_shape_box(
+        -1, xform=wp.transform((0.0, 0.0, 0.75), wp.quat_identity()), hx=0.1, hy=0.1, hz=0.01,
+        label="table",
+    )  # fmt: skip
+    builder.add_ground_plane()
+    return builder.finalize(device="cpu")
+
+
+@pytest.mark.parametrize(("device", "bound"), [(None, 1e-5), ("warp:cpu", 0.05)])
+def test_newton(device, bound):
+    """Differential: against scenes made by hand."""
+    newton = pytest.importorskip("newton")
+    from capsense.adapters.newton import SensorCapacitance
+
+    model = newton_model(newton)
+    state = model.state()
+    bodies = state.body_q.numpy()
+    rng = np.random.default_rng(2)
+    bodies[1::2, :3] = rng.uniform([-0.05, -0.05, 0.57], [0.05, 0.05, 0.62], (WORLDS, 3))
+    turn = rng.normal(size=(WORLDS, 4))
+    bodies[1::2, 3:] = turn / np.linalg.norm(turn, axis=1)[:, None]
+    wp.copy(state.body_q, wp.array(bodies, dtype=wp.transform, device="cpu"))
+    with pytest.warns(UserWarning, match="not seen"):
+        sensor = SensorCapacitance(model, "*skin_*", materials={"*forearm": "human"}, device=device)
+    sensor.update(state)
+    found = sensor.delta if device is None else sensor.delta.numpy()
+    assert found.shape == (WORLDS, 2, 6, 6)
+    simulator = cs.Simulator("six_patch", preset="learning")
+    arm, table = cs.Capsule(0.02, 0.12), cs.Box((0.2, 0.2, 0.02))
+    frames = [cs.Pose((0, 0, 0.5)), cs.Pose.from_euler((0.05, 0, 0.5), (0, 0.17, 0))]
+    for w in range(WORLDS):
+        pose = bodies[2 * w + 1].astype(float)
+        for s, frame in enumerate(frames):
+            seen = frame.inverse()
+            truth = simulator.step(cs.Scene([
+                cs.Body(arm, seen @ cs.Pose(pose[:3], pose[3:]), "human"),
+                cs.Body(table, seen @ cs.Pose((0, 0, 0.75))),
+            ])).delta  # fmt: skip
+            assert np.abs(found[w, s] - truth).max() < bound * np.abs(truth).max()
+    with pytest.raises(SceneError, match="no site fits 'nose'"):
+        SensorCapacitance(model, "nose")
