@@ -348,16 +348,18 @@ class Fleet:
             ValueError: A Jacobian is asked for on Warp.
         """
         if self._chips is None:
-            return self._solved(poses, sensors, jacobian)
+            return self.solved(poses, sensors, jacobian=jacobian)
         if time is None:
             raise ReadOutError("a read-out needs the time; write step(poses, time=…), in seconds")
-        reading = self._solved(poses, sensors, jacobian)
+        reading = self.solved(poses, sensors, jacobian=jacobian)
         matrix = reading.capacitance
         host = matrix if isinstance(matrix, np.ndarray) else matrix.numpy()
         return replace(reading, held=self._chips.sample(time, host, reading.shield_coupling))
 
-    def _solved(self, poses: ArrayLike, sensors: ArrayLike | None, jacobian: bool) -> FleetReading:
-        """A step without chips."""
+    def solved(
+        self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
+    ) -> FleetReading:
+        """The same as :meth:`step`, without chips and their time."""
         e, s, b = self.count, self.sensors, self.places
         if sensors is None:
             sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7))
@@ -427,8 +429,8 @@ class Fleet:
         where = _checked("poses", poses, (e, b, 7))
         at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
         found = np.asarray(
-            self._solved(where, at, False).delta
-            if self._warp is None else self._solved(where, at, False).delta.numpy()
+            self.solved(where, at).delta
+            if self._warp is None else self.solved(where, at).delta.numpy()
         )  # fmt: skip
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
         simulator = Simulator(self.design, frequency=self._solver.frequency)
