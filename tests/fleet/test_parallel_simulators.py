@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -135,3 +138,20 @@ def test_newton(device, bound):
             assert np.abs(found[w, s] - truth).max() < bound * np.abs(truth).max()
     with pytest.raises(SceneError, match="no site fits 'nose'"):
         SensorCapacitance(model, "nose")
+
+
+@pytest.mark.parametrize("name", ["mujoco_warp", "newton"])
+def test_examples(name):
+    """The arm falls past: finite, varying, highest when it is level with the pad."""
+    pytest.importorskip(name)
+    path = Path(__file__).parents[2] / "examples" / f"fleet_{name}.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    found = module.main(4)
+    assert found.shape == (10, 4, 1, 6, 6)
+    assert np.isfinite(found).all()
+    near = found[:, 0, 0].trace(axis1=1, axis2=2)
+    assert near.argmax() in (5, 6)  # 0.2 m below after 0.2 s
+    assert near.max() > 20 * near[0]
+    assert (np.diff(found[6, :, 0, 0, 0]) < 0).all()
