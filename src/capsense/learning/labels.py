@@ -21,7 +21,7 @@ _STEP = 1e-5
 """Differences of distances are taken over twice this [m]."""
 _ROUNDS = 100
 """Projections between a body and the electrodes, at most."""
-_STILL = 1e-8
+_STILL = 1e-9
 """Nearest points that move by less than this [m] are found."""
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from capsense._crew import processors
 from capsense.errors import MissingDependencyError, ScenarioError, SimulatorError, SolveError
+from capsense.learning.settle import settled, settling
 from capsense.learning.spec import Spec
 from capsense.readout.read_out import ReadOut
 from capsense.recording.tables import replacing
@@ -26,8 +27,9 @@ COLUMNS = {
     "scene": "number of the scene",
     "capacitance": "Maxwell capacitance matrix, row by row, M × M, F",
     "delta": "its change from the empty scene, row by row, M × M, F",
+    "self_delta": "change of the self capacitances, the design's shields driven along, M, F",
     "code": "what the converter of each channel holds, K, codes",
-    "code_capacitance": "what its user makes of it, K, F",
+    "code_delta": "what its user makes of it, change from the empty scene, K, F",
     "distance": "from the nearest electrode to the nearest body, m",
     "closest_point": "the point of that body's surface nearest to the electrodes, x, y, z, m",
     "normal": "unit normal of its surface there, out of the body, x, y, z",
@@ -91,9 +93,7 @@ def make_spec_readout(spec: Spec, simulator: Simulator) -> ReadOut | None:
     return make_readout(choice, simulator)
 
 
-def _row(
-    spec: Spec, number: int, simulator: Simulator, readout: ReadOut | None
-) -> dict[str, Any]:
+def _row(spec: Spec, number: int, simulator: Simulator, readout: ReadOut | None) -> dict[str, Any]:
     scene, near, rng = spec.scene(number)
     try:
         reading = simulator.step(scene)
@@ -103,14 +103,14 @@ def _row(
         "scene": number,
         "capacitance": reading.capacitance.ravel(),
         "delta": reading.delta.ravel(),
+        "self_delta": reading.self_capacitance - simulator.empty.self_capacitance,
         "bodies": len(scene),
     }
     if readout is not None:
-        plan = readout.schedule
         readout.reset(seed=int(rng.integers(2**63)))
-        readout.sample(0.0, reading)
-        held = readout.sample(2 * plan.period + plan.lag, reading).held()
-        row |= {"code": held.code, "code_capacitance": held.capacitance}
+        empty = settled(readout, simulator.empty, 0.0)
+        held = settled(readout, reading, settling(readout))
+        row |= {"code": held.code, "code_delta": held.capacitance - empty.capacitance}
     if near is not None:
         row |= {
             "distance": near.distance, "closest_point": near.point, "normal": near.normal,
@@ -129,7 +129,8 @@ def _table(spec: Spec, rows: list[dict[str, Any]], readout: ReadOut | None, elec
     matrix = pa.list_(number, electrodes**2)
     kinds = {
         "scene": pa.int64(), "capacitance": matrix, "delta": matrix,
-        "code": pa.list_(pa.int64(), channels), "code_capacitance": pa.list_(number, channels),
+        "self_delta": pa.list_(number, electrodes),
+        "code": pa.list_(pa.int64(), channels), "code_delta": pa.list_(number, channels),
         "distance": number, "closest_point": three, "normal": three, "axis": three,
         "body": pa.string(), "material": pa.string(), "eps_r": number, "sigma": number,
         "bodies": pa.int64(),

@@ -185,8 +185,8 @@ def _texts(value: Any) -> Iterator[str]:
 def _draw(value: Any, rng: Generator, table: Table) -> Any:
     """A value with everything random in it decided.
 
-    ``{ from = a, to = b }`` is uniform, with ``log = true`` uniform in its logarithm;
-    ``{ any = [...] }`` is one of several; ``quaternion = "uniform"`` is any orientation.
+    ``{ from = a, to = b }`` is a number, ``{ any = [...] }`` one of several, and
+    ``quaternion = "uniform"`` any orientation.
     """
     if isinstance(value, list):
         return [_draw(v, rng, table) for v in value]
@@ -198,19 +198,26 @@ def _draw(value: Any, rng: Generator, table: Table) -> Any:
             raise table.error(f"{dict(value)} must be {{ any = [one, another, …] }}")
         return _draw(options[rng.integers(len(options))], rng, table)
     if "from" in value or "to" in value:
-        span = Table(value, table.source, f"{table.item}: {{ from, to }}")
-        span.only(("from", "to", "log"))
-        log = span.boolean("log", False)
-        low = span.number("from", np.finfo(float).tiny if log else -1e12, 1e12)
-        high = span.number("to", low, 1e12)
-        if log:
-            return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-        return float(rng.uniform(low, high))
+        return _number(Table(value, table.source, f"{table.item}: {{ from, to }}"), rng)
     out = {k: _draw(v, rng, table) for k, v in value.items()}
     if out.get("quaternion") == "uniform":
         four = rng.standard_normal(4)
         out["quaternion"] = (four / np.linalg.norm(four)).tolist()
     return out
+
+
+def _number(span: Table, rng: Generator) -> float:
+    """A number between two; with ``log`` uniform in its logarithm, with ``steps`` one of so many.
+
+    Steps suit sizes: a body of proportions that were met before costs a tenth of a new one.
+    """
+    span.only(("from", "to", "log", "steps"))
+    log = span.boolean("log", False)
+    low = span.number("from", 1e-300 if log else -1e12, 1e12)
+    high = span.number("to", low, 1e12)
+    steps = span.integer("steps", 2, 10**6, 0)
+    share = rng.integers(steps) / (steps - 1) if steps else rng.random()
+    return float(low * (high / low) ** share if log else low + (high - low) * share)
 
 
 def _limb(table: Table) -> list[Body]:
