@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,6 @@ import capsense as cs
 gymnasium = pytest.importorskip("gymnasium")
 pytest.importorskip("mujoco")
 
-import scripted  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from capsense.learning.envs import IDS  # noqa: E402
@@ -28,6 +29,9 @@ from capsense.learning.envs.wrapper import (  # noqa: E402
     write_model,
 )
 
+scripted = SimpleNamespace(
+    **runpy.run_path(str(Path(__file__).parents[2] / "examples" / "policies.py"))
+)
 FOLLOW, DRESS, STOP = IDS
 TIP = cs.Pose((0.0, 0.0, 0.03))
 """A sensor on the fingertip of Gymnasium's Reacher, looking up."""
@@ -75,20 +79,20 @@ def test_scripted_follower_earns_more() -> None:
     env = gymnasium.make(FOLLOW)
     still = np.zeros(5, np.float32)
     for seed in range(2):
-        felt, _ = scripted.play(env, scripted.follow, seed, 150)
-        idle, _ = scripted.play(env, lambda _: still, seed, 150)
-        wild, _ = scripted.play(env, scripted.at_random(env, seed), seed, 150)
+        felt, *_ = scripted.play(env, scripted.follow, seed, 150)
+        idle, *_ = scripted.play(env, lambda _: still, seed, 150)
+        wild, *_ = scripted.play(env, scripted.at_random(env, seed), seed, 150)
         assert felt > 1.2 * idle
         assert felt > 1.5 * wild
 
 
 def test_scripted_dresser_arrives() -> None:
     env = gymnasium.make(DRESS)
-    total, facts = scripted.play(env, scripted.dress, 0, 400)
+    total, facts, _ = scripted.play(env, scripted.dress, 0, 400)
     assert facts["success"]
     assert facts["error"] < 0.03
     assert 15.0 < total <= 25.0
-    wild, _ = scripted.play(env, scripted.at_random(env, 0), 0, 100)
+    wild, *_ = scripted.play(env, scripted.at_random(env, 0), 0, 100)
     assert wild < 0
 
 
@@ -96,10 +100,10 @@ def test_skin_that_is_heeded_keeps_off() -> None:
     """The arm that ignores its skin hits the person; the one that heeds it arrives."""
     env = gymnasium.make(STOP)
     ahead = np.array([-1.0, 0.0, 0.0], np.float32)
-    blind, facts = scripted.play(env, lambda _: ahead, 2, 300)
+    blind, facts, _ = scripted.play(env, lambda _: ahead, 2, 300)
     assert facts["force"] > 50.0
     assert not facts["success"]
-    felt, facts = scripted.play(env, scripted.stop, 2, 300)
+    felt, facts, _ = scripted.play(env, scripted.stop, 2, 300)
     assert facts["success"]
     assert felt > 2 * blind
 
@@ -168,7 +172,7 @@ def test_bad_action() -> None:
 def test_vectorised() -> None:
     envs = gymnasium.make_vec(FOLLOW, num_envs=2, vectorization_mode="sync")
     observation, _ = envs.reset(seed=[1, 2])
-    single = gymnasium.make(FOLLOW)
+    single = gymnasium.make(f"capsense.learning.envs:{FOLLOW}")
     np.testing.assert_array_equal(observation[1], single.reset(seed=2)[0])
     assert envs.step(envs.action_space.sample())[0].shape == (2, *single.observation_space.shape)
 
@@ -204,7 +208,7 @@ def test_wrapper_refuses_what_has_no_model() -> None:
 
 
 def test_missing_gymnasium_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.setitem(sys.modules, "gymnasium.envs.registration", None)
     monkeypatch.delitem(sys.modules, "capsense.learning.envs")
     with pytest.raises(cs.MissingDependencyError, match=r"capsense\[gym\]"):
         import capsense.learning.envs  # noqa: F401

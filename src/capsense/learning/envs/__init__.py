@@ -1,6 +1,6 @@
 """Environments for Gymnasium, in MuJoCo; importing this module registers them.
 
-With the package installed, ``gymnasium.make("capsense/LimbFollow-v0")`` finds them by itself.
+``gymnasium.make("capsense.learning.envs:capsense/LimbFollow-v0")`` imports it by itself.
 """
 
 from __future__ import annotations
@@ -8,12 +8,11 @@ from __future__ import annotations
 from capsense.errors import MissingDependencyError
 
 try:
-    import gymnasium
     import mujoco  # noqa: F401
-    from gymnasium.envs.registration import register as _register
-except ImportError as error:
+    from gymnasium.envs.registration import register
+except ImportError:
     raise MissingDependencyError(
-        f"environments need {error.name}; pip install 'capsense[gym]'"
+        "environments need Gymnasium and MuJoCo; pip install 'capsense[gym]'"
     ) from None
 
 IDS = {
@@ -23,12 +22,5 @@ IDS = {
 }
 """Name → its class, and the steps of an episode at most."""
 
-
-def register() -> None:
-    """Tell Gymnasium of the environments that it does not know yet."""
-    for name, (where, steps) in IDS.items():
-        if name not in gymnasium.envs.registration.registry:
-            _register(name, f"capsense.learning.envs.{where}", max_episode_steps=steps)
-
-
-register()
+for _name, (_where, _steps) in IDS.items():
+    register(_name, f"capsense.learning.envs.{_where}", max_episode_steps=_steps)

@@ -51,7 +51,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         DesignError: The design is wrong.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, as in Gymnasium
     model_file: ClassVar[str]
     """The MJCF file beside this module; its body ``limb`` is moved by the task."""
     sites: ClassVar[tuple[str, ...]]

@@ -81,18 +81,17 @@ class Dressing(CapacitiveEnv):
     def judge(self, action: Array, force: float) -> tuple[float, bool, dict[str, Any]]:
         place, axes = self.site_frame("pad")
         wrist, elbow, shoulder = self._joints
-        lengths = np.linalg.norm(elbow - wrist), np.linalg.norm(shoulder - elbow)
+        lengths = [math.dist(elbow, wrist), math.dist(shoulder, elbow)]
         fore, upper = (elbow - wrist) / lengths[0], (shoulder - elbow) / lengths[1]
         gone = float((place - elbow) @ upper)
         if gone > 0:
-            share, ends, along, middle = gone / lengths[1], (1, 2), upper, elbow
-            done = lengths[0] + min(gone, lengths[1])
+            done, along, middle = lengths[0] + min(gone, lengths[1]), upper, elbow
         else:
             done = min(max(0.0, float((place - wrist) @ fore)), lengths[0])
-            share, ends, along, middle = done / lengths[0], (0, 1), fore, wrist
-        radius = float(np.interp(share, (0, 1), [self._radii[k] for k in ends]))
+            along, middle = fore, wrist
+        radius = float(np.interp(done, [0.0, lengths[0], sum(lengths)], self._radii))
         error, angle = across(place, axes, middle, along, radius)
-        progress = float(done / sum(lengths))
+        progress = done / sum(lengths)
         success = progress > 0.9
         ahead = max(0.0, progress - self._best) if self.data.time > 0 else 0.0
         self._best = max(self._best, progress)

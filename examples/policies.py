@@ -1,12 +1,21 @@
-"""Policies for the environments that follow the sensors by hand-set gains, and random ones."""
+"""Gymnasium: policies that follow the sensors by hand-set gains, against idle and random ones.
+
+Run it: ``python examples/policies.py [EPISODES]``. It prints the mean sum of the rewards of an
+episode for each policy, and how many steps a second the environment makes. Needs
+``pip install "capsense[gym]"``.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from time import perf_counter
 from typing import Any
 
 import gymnasium
 import numpy as np
+
+import capsense.learning.envs
 
 Policy = Callable[[np.ndarray], np.ndarray]
 LEVEL = 1.1
@@ -56,19 +65,48 @@ def stop(observation: np.ndarray) -> np.ndarray:
     return np.array([-speed, 0.0, 0.0], np.float32)
 
 
-def play(env: gymnasium.Env[Any, Any], policy: Policy, seed: int, steps: int) -> tuple[float, Any]:
-    """Sum of the rewards of an episode, and the last facts."""
+def play(
+    env: gymnasium.Env[Any, Any], policy: Policy, seed: int, most: int = 1000
+) -> tuple[float, dict[str, Any], int]:
+    """Sum of the rewards of an episode, the last facts, and how many steps it took."""
     observation, facts = env.reset(seed=seed)
-    total = 0.0
-    for _ in range(steps):
+    total, step = 0.0, 0
+    for _ in range(most):
         observation, reward, over, cut, facts = env.step(policy(observation))
-        total += float(reward)
+        total, step = total + float(reward), step + 1
         if over or cut:
             break
-    return total, facts
+    return total, facts, step
 
 
 def at_random(env: gymnasium.Env[Any, Any], seed: int) -> Policy:
     """Actions drawn from the space."""
     env.action_space.seed(seed)
     return lambda _: env.action_space.sample()
+
+
+SCRIPTED = {
+    "capsense/LimbFollow-v0": follow,
+    "capsense/Dressing-v0": dress,
+    "capsense/ApproachStop-v0": stop,
+}
+
+
+def main(episodes: int = 5) -> None:
+    """Print the table."""
+    print("environment                scripted     idle   random   steps a second")
+    for name in capsense.learning.envs.IDS:
+        env = gymnasium.make(name)
+        idle = np.zeros(env.action_space.shape, np.float32)
+        policies = (SCRIPTED[name], lambda _, idle=idle: idle, at_random(env, 0))
+        start, steps, sums = perf_counter(), 0, []
+        for policy in policies:
+            found = [play(env, policy, seed) for seed in range(episodes)]
+            sums.append(np.mean([total for total, _, _ in found]))
+            steps += sum(count for _, _, count in found)
+        rate = steps / (perf_counter() - start)
+        print(f"{name:26}" + "".join(f"{s:9.1f}" for s in sums) + f"{rate:12.0f}", flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
