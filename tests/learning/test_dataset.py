@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import multiprocessing
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import pytest
 import capsense as cs
 from capsense.cli.main import main
 from capsense.learning.labels import Outline
-from capsense.learning.shards import missing, run, shard_path
+from capsense.learning.shards import COLUMNS, missing, run, shard_path
 from capsense.learning.spec import Spec, load_spec
 
 pa = pytest.importorskip("pyarrow")
@@ -186,6 +188,20 @@ def test_a_shard_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
     assert not list((tmp_path / "out" / "data").iterdir())
 
 
+def test_killed_processes_are_told_of(tmp_path: Path) -> None:
+    """What they had completed is kept, and the same call makes the rest."""
+    spec = spec_of(tmp_path, SPEC.replace("shard_size = 3", "shard_size = 1"))
+
+    def kill(_: int) -> None:
+        for child in multiprocessing.active_children():
+            child.kill()
+
+    with pytest.raises(ChildProcessError, match="run it again"):
+        run(spec, tmp_path / "out", workers=2, each=kill)
+    assert 0 < len(left := missing(spec, tmp_path / "out")) < 11
+    assert run(spec, tmp_path / "out", workers=1) == len(left)
+
+
 def test_another_data_set_is_refused(tmp_path: Path) -> None:
     spec = spec_of(tmp_path)
     run(spec, tmp_path / "out", part=(0, 4), workers=1)
@@ -296,3 +312,15 @@ def test_example_holds() -> None:
     spec = load_spec(Path(__file__).parents[2] / "examples" / "forearms.toml")
     assert spec.shards == 20
     assert spec.scene(9999)[1] is not None
+
+
+def test_the_page_s_file_holds(tmp_path: Path) -> None:
+    """What the page shows is a data set, and its table of columns is that of the files."""
+    page = (Path(__file__).parents[2] / "docs" / "learning.md").read_text(encoding="utf-8")
+    text = page.partition("```toml\n")[2].partition("```")[0]
+    assert spec_of(tmp_path, text).shards == 100
+    table = page.partition("### Columns")[2].partition("Lists have")[0]
+    named = re.findall(
+        r"`(\w+)`", "\n".join(row.split("|")[1] for row in table.splitlines() if row)
+    )
+    assert named == list(COLUMNS)

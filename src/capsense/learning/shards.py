@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -14,7 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from capsense._crew import processors
-from capsense.errors import MissingDependencyError, ScenarioError, SimulatorError, SolveError
+from capsense.errors import (
+    MissingDependencyError,
+    ScenarioError,
+    SceneError,
+    SimulatorError,
+    SolveError,
+)
 from capsense.learning.settle import settled, settling
 from capsense.learning.spec import Spec
 from capsense.readout.read_out import ReadOut
@@ -68,6 +73,7 @@ def make_shard(spec: Spec, folder: Path, shard: int) -> int:
 
     Raises:
         ScenarioError: A scene cannot be drawn.
+        SceneError: A scene is none that can be solved; the message names it.
         SolveError: A scene was not solved; the message names it.
     """
     import pyarrow.parquet as pq
@@ -97,8 +103,8 @@ def _row(spec: Spec, number: int, simulator: Simulator, readout: ReadOut | None)
     scene, near, rng = spec.scene(number)
     try:
         reading = simulator.step(scene)
-    except SolveError as error:
-        raise SolveError(f"scene {number}: {error}") from None
+    except (SceneError, SolveError) as error:
+        raise type(error)(f"scene {number}: {error}") from None
     row: dict[str, Any] = {
         "scene": number,
         "capacitance": reading.capacitance.ravel(),
@@ -168,7 +174,8 @@ def run(
 
     Raises:
         ScenarioError: The folder holds another data set, or a scene cannot be drawn.
-        SimulatorError: A worker process died, or the scheduler does not answer.
+        SimulatorError: The scheduler does not answer.
+        ChildProcessError: Worker processes were killed.
         SolveError: A scene was not solved.
         MissingDependencyError: pyarrow or Dask is not installed.
     """
@@ -210,10 +217,7 @@ def _made(
                 for future in as_completed([pool.submit(job, shard) for shard in todo]):
                     yield future.result()
             except BrokenProcessPool:
-                raise SimulatorError(
-                    "a worker process was killed, perhaps for want of memory; what is complete is "
-                    "kept: run it again, perhaps with fewer --workers"
-                ) from None
+                raise _killed("a worker process was") from None
             finally:
                 pool.shutdown(cancel_futures=True)
 
@@ -221,7 +225,7 @@ def _made(
 def _on_cluster(job: Callable[[int], int], todo: Iterable[int], scheduler: str) -> Iterator[int]:
     """The same on Dask's workers; the scheduler gives the shards of one that died to another."""
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
         from distributed import as_completed as completed
     except ImportError:
         raise MissingDependencyError(
@@ -234,8 +238,18 @@ def _on_cluster(job: Callable[[int], int], todo: Iterable[int], scheduler: str) 
             f"no Dask scheduler answers at {scheduler}: {error}; start one with dask scheduler"
         ) from None
     with client:
-        for future in completed(client.map(job, list(todo), pure=False)):
-            yield future.result()
+        try:
+            for future in completed(client.map(job, list(todo), pure=False)):
+                yield future.result()
+        except KilledWorker:
+            raise _killed("several of Dask's workers were") from None
+
+
+def _killed(who: str) -> ChildProcessError:
+    return ChildProcessError(
+        f"{who} killed, perhaps for want of memory; what is complete is kept: run it again, "
+        "perhaps with fewer workers"
+    )
 
 
 def _about(spec: Spec, folder: Path, shard: int) -> dict[str, Any] | None:
@@ -271,14 +285,17 @@ def _write_manifest(spec: Spec, folder: Path) -> None:
         ScenarioError: The one that is there is of another data set.
     """
     path = folder / MANIFEST
-    if path.exists() and json.loads(path.read_text())["identity"] != spec.identity:
+    told = json.loads(path.read_text()) if path.exists() else None
+    if told is not None and told["identity"] != spec.identity:
         raise _other(spec, path)
     paths = [shard_path(spec, folder, k) for k in range(spec.shards)]
-    complete = all(p.exists() for p in paths)
+    about = [_about(spec, folder, k) for k in range(spec.shards) if paths[k].exists()]
+    complete = None not in about and len(about) == spec.shards
+    if told is not None and not complete and not told["complete"]:
+        return  # so that it never takes the place of one that somebody else has just completed
     simulator = Simulator(spec.design, preset=spec.preset)
     readout = make_spec_readout(spec, simulator)
-    about = [_about(spec, folder, k) or {} for k in range(spec.shards)] if complete else []
-    made_by = {json.dumps(a["versions"], sort_keys=True) for a in about if a}
+    made_by = {json.dumps(a["versions"], sort_keys=True) for a in about if a is not None}
     data = {
         "name": spec.name, "complete": complete, "identity": spec.identity,
         "design": spec.design.name, "electrodes": simulator.electrode_names,
@@ -294,5 +311,3 @@ def _write_manifest(spec: Spec, folder: Path) -> None:
     }  # fmt: skip
     with replacing(path) as part, part.open("w", encoding="utf-8") as file:
         json.dump(data, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())

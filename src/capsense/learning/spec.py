@@ -209,7 +209,7 @@ def _draw(value: Any, rng: Generator, table: Table) -> Any:
 def _number(span: Table, rng: Generator) -> float:
     """A number between two; with ``log`` uniform in its logarithm, with ``steps`` one of so many.
 
-    Steps suit sizes: a body of proportions that were met before costs a tenth of a new one.
+    Steps suit sizes: a body of new proportions takes the solver many times as long as others.
     """
     span.only(("from", "to", "log", "steps"))
     log = span.boolean("log", False)

@@ -154,12 +154,12 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.start()
+        self._move_limb(self.limb_pose(0.0))
         mujoco.mj_forward(self.model, self.data)
-        ground = self.drawn.grounding
         skin = adapter.attach_skin(
             self.model, self.data, self.sites, self.simulator, threads=1,
             materials={"limb*": "human", "cushion": Material("cushion", self.drawn.permittivity)},
-            grounding={"limb*": ground},
+            grounding={"limb*": self.drawn.grounding},
         )  # fmt: skip
         names = self.simulator.electrode_names
         self.signals = Signals(
