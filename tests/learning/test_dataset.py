@@ -309,7 +309,7 @@ def test_shards_that_are_not(text: str) -> None:
 
 
 def test_example_holds() -> None:
-    spec = load_spec(Path(__file__).parents[2] / "examples" / "forearms.toml")
+    spec = load_spec(Path(__file__).parents[2] / "examples" / "datasets" / "forearms.toml")
     assert spec.shards == 20
     assert spec.scene(9999)[1] is not None
 

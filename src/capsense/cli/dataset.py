@@ -19,7 +19,7 @@ on any machine. A shard appears once it is complete, and what is complete is not
 an interruption, run the same command.
 """
 EXAMPLES = """\
-  capsense dataset examples/forearms.toml -o forearms/
+  capsense dataset examples/datasets/forearms.toml -o forearms/
   capsense dataset spec.toml -o /shared/set --shard $SLURM_ARRAY_TASK_ID/1000
   capsense dataset spec.toml -o /shared/set --scheduler tcp://10.0.0.1:8786
 """
