@@ -212,3 +212,15 @@ def test_missing_gymnasium_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "capsense.learning.envs")
     with pytest.raises(cs.MissingDependencyError, match=r"capsense\[gym\]"):
         import capsense.learning.envs  # noqa: F401
+
+
+def test_pressing_costs() -> None:
+    """A pad driven into the arm: force, readings within bounds, less reward than touch alone."""
+    env = gymnasium.make(FOLLOW).unwrapped
+    env.reset(seed=0)
+    for _ in range(30):
+        observation, reward, _, _, facts = env.step(np.array([0, 0, -1, 0, 0]))
+    assert facts["force"] > 5.0
+    assert reward < 1 - 0.01 - 0.02 * facts["force"]
+    assert env.observation_space.contains(observation)
+    assert observation[:6].max() == 100.0  # beyond what the numbers tell

@@ -20,7 +20,7 @@ an interruption, run the same command.
 """
 EXAMPLES = """\
   capsense dataset examples/datasets/forearms.toml -o forearms/
-  capsense dataset spec.toml -o /shared/set --shard $SLURM_ARRAY_TASK_ID/1000
+  capsense dataset spec.toml -o /shared/set --shard 17/1000
   capsense dataset spec.toml -o /shared/set --scheduler tcp://10.0.0.1:8786
 """
 

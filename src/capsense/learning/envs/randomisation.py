@@ -11,6 +11,7 @@ from numpy.random import Generator
 from capsense.errors import SceneError
 from capsense.humans import Build
 from capsense.readout.calibration import LinearSensor
+from capsense.readout.presets import chip_of
 from capsense.readout.read_out import ReadOut
 
 Range = tuple[float, float]
@@ -43,15 +44,16 @@ class Drawn:
         return Build(sex, percentile=self.percentile, girth=self.girth)  # type: ignore[arg-type]
 
     def readout(self, chip: str, electrodes: tuple[str, ...], rng: Generator) -> ReadOut:
-        """The read-out of one sensor, each of its channels with a gain of its own.
+        """The read-out of one sensor, at the chip's highest rate, with a gain of its own.
 
         Raises:
             ReadOutError: There is no such chip.
         """
-        off = rng.uniform(-1.0, 1.0)
-        stage = LinearSensor(np.array(1 + off * self.gain), np.array(0.0), np.array(0.0), 0.0)
+        rate = max(r.per_second for r in chip_of(chip).rates)
+        gain = 1.0 + self.gain * rng.uniform(-1.0, 1.0)
+        stage = LinearSensor(np.array(gain), np.array(0.0), np.array(0.0), 0.0)
         return ReadOut.preset(
-            chip, electrodes, rate=_fastest(chip), latency=self.latency, white=self.noise,
+            chip, electrodes, rate=rate, latency=self.latency, white=self.noise,
             walk=self.drift, stages=(stage,),
         )  # fmt: skip
 
@@ -112,14 +114,3 @@ class Randomisation:
     def _at(self, name: str, share: float) -> float:
         low, high = getattr(self, name)
         return float(low * (high / low) ** share if name in _LOG else low + share * (high - low))
-
-
-def _fastest(chip: str) -> float:
-    """Most conversions a second of a chip.
-
-    Raises:
-        ReadOutError: There is no such chip.
-    """
-    from capsense.readout.presets import chip_of
-
-    return max(rate.per_second for rate in chip_of(chip).rates)
