@@ -8,7 +8,9 @@ import multiprocessing
 import os
 import re
 import signal
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -306,6 +308,26 @@ def test_shards_that_are_not(text: str) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["dataset", "spec.toml", "-o", "out", f"--shard={text}"])
     assert stopped.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "options"),
+    [("pyarrow.parquet", "dataset", {}), ("distributed", "cluster", {"scheduler": "tcp://x:1"})],
+)
+def test_what_is_not_installed_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, extra: str, options: Any
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(cs.MissingDependencyError, match=rf"capsense\[{extra}\]"):
+        run(spec_of(tmp_path), tmp_path / "out", **options)
+
+
+def test_no_scheduler_there(tmp_path: Path) -> None:
+    dask = pytest.importorskip("dask")
+    with dask.config.set({"distributed.comm.timeouts.connect": "0.3s"}):
+        spec = spec_of(tmp_path)
+        with pytest.raises(cs.SimulatorError, match="no Dask scheduler answers"):
+            run(spec, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 
 
 def test_example_holds() -> None:
