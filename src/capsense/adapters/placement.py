@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.model import Design, Electrode
+from capsense.design.model import Conductor, Design, Electrode
 from capsense.scene import Body, Layers, Scene, TriMesh
 from capsense.scene.mesh_shape import Triangles
 from capsense.simulator import Simulator
@@ -25,7 +25,7 @@ _POINTS = 100
 
 def placement(scene: Scene, simulator: Simulator) -> list[str]:
     """What is wrong with the bodies of a scene, given in the sensor frame."""
-    points = {e.name: _points_on(e) for e in simulator.design.electrodes}
+    points = {e.name: points_on(e) for e in simulator.design.electrodes}
     found = []
     for body in scene:
         found += _contacts(body, points)
@@ -59,7 +59,7 @@ def _contacts(body: Body, electrodes: dict[str, Array]) -> list[str]:
         return []
     inside, touching, depth = [], [], 0.0
     for name, points in electrodes.items():
-        off = _distance(body, points)
+        off = distances(body, points)
         if off.min() < -_TOUCH:
             inside.append(name)
             depth = max(depth, -float(off.min()))
@@ -102,7 +102,7 @@ def _coarse(body: Body, panels: int) -> list[str]:
     ]
 
 
-def _distance(body: Body, points: Array) -> Array:
+def distances(body: Body, points: Array) -> Array:
     """Distances of points to a body [m], negative inside; of an open mesh, by its winding."""
     local, shape = body.pose.inverse().apply(points), body.shape
     if not isinstance(shape, Triangles) or shape.closed:
@@ -130,8 +130,8 @@ def _wound(shape: Triangles, points: Array) -> NDArray[np.bool_]:
     return out
 
 
-def _points_on(electrode: Electrode) -> Array:
-    """Corners of an electrode's triangles, and points spread evenly over it [m], shape (n, 3)."""
+def points_on(electrode: Electrode | Conductor) -> Array:
+    """Corners of a sheet's triangles, and points spread evenly over it [m], shape (n, 3)."""
     corners = electrode.surface.triangles
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1)

@@ -18,6 +18,7 @@ COMMANDS = (
     "capsense.cli.export",
     "capsense.cli.design",
     "capsense.cli.readout",
+    "capsense.cli.dataset",
     "capsense.cli.bench",
     "capsense.cli.reproduce",
     "capsense.cli.serve",

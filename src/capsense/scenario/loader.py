@@ -65,7 +65,7 @@ def parse_scenario(
     _refuse_former(top)
     top.only(TOP_KEYS)
     name = top.string("name")
-    design = _read_design(top, where)
+    design = read_design(top, where)
     sample_rate = top.number("sample_rate", 1e-3, 1e6, unit="Hz")
     excitation = Excitation(top.choice("excitation", list(Excitation), Excitation.MATRIX.value))
     pairs = _read_pairs(top, excitation, design)
@@ -98,7 +98,13 @@ def _refuse_former(top: Table) -> None:
         raise top.error('method = "perturbation" is gone; write "surface", or remove the line')
 
 
-def _read_design(top: Table, folder: Path) -> Design:
+def read_design(top: Table, folder: Path) -> Design:
+    """The design that ``design`` names: packaged, or a file relative to ``folder``.
+
+    Raises:
+        ScenarioError: There is no such design.
+        DesignError: Something is wrong in its file.
+    """
     value = top.string("design")
     is_path = value.endswith(".toml") or bool(set("/\\") & set(value))
     path = folder / value

@@ -1,0 +1,26 @@
+"""Environments for Gymnasium, in MuJoCo; importing this module registers them.
+
+``gymnasium.make("capsense.learning.envs:capsense/LimbFollow-v0")`` imports it by itself.
+"""
+
+from __future__ import annotations
+
+from capsense.errors import MissingDependencyError
+
+try:
+    import mujoco  # noqa: F401
+    from gymnasium.envs.registration import register
+except ImportError:
+    raise MissingDependencyError(
+        "environments need Gymnasium and MuJoCo; pip install 'capsense[gym]'"
+    ) from None
+
+IDS = {
+    "capsense/LimbFollow-v0": ("follow:LimbFollow", 250),
+    "capsense/Dressing-v0": ("dressing:Dressing", 400),
+    "capsense/ApproachStop-v0": ("approach:ApproachStop", 300),
+}
+"""Name → its class, and the steps of an episode at most."""
+
+for _name, (_where, _steps) in IDS.items():
+    register(_name, f"capsense.learning.envs.{_where}", max_episode_steps=_steps)

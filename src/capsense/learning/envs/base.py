@@ -1,0 +1,220 @@
+"""What the environments share: a model, a limb of random size, sensors, one step."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from capsense.adapters import mujoco as adapter
+from capsense.design import load_design
+from capsense.errors import SceneError
+from capsense.humans import arm
+from capsense.learning.envs.randomisation import Randomisation
+from capsense.learning.envs.signals import LIMIT, Signals
+from capsense.scene import Material, Pose
+from capsense.simulator import PresetName, Simulator
+
+Array = NDArray[np.float64]
+Observation = NDArray[np.float32]
+
+CONTROL = 0.04
+"""Time from one action to the next [s]."""
+_AWAY = Pose((0.0, 0.0, 50.0))
+"""Where the limb is while the chips are tared."""
+SQUEEZE = 0.02
+"""What one newton of contact force costs at every step."""
+
+
+class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
+    """Capacitive sensors on a moving body, and a person's arm.
+
+    Actions are velocities of the model's actuators, each from -1 to 1 of its :attr:`speeds`.
+    Observations are those of :class:`~capsense.learning.envs.signals.Signals`, then positions [m
+    or rad] and velocities [m/s or rad/s] of the joints that the actuators move, then what a task
+    adds. The same seed gives the same episode, to the last bit.
+
+    Args:
+        randomisation: What episodes draw from.
+        chip: Name of the chip behind every sensor.
+        preset: How finely the solver resolves surfaces.
+        design: Sensor design, instead of the task's own.
+
+    Raises:
+        ReadOutError: There is no such chip.
+        DesignError: The design is wrong.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, as in Gymnasium
+    model_file: ClassVar[str]
+    """The MJCF file beside this module; its body ``limb`` is moved by the task."""
+    sites: ClassVar[tuple[str, ...]]
+    """Sites of the sensors."""
+    own_design: ClassVar[str]
+    """The sensors' design."""
+    speeds: ClassVar[tuple[float, ...]]
+    """Of the actuators, in their order [m/s or rad/s]."""
+    parts: ClassVar[tuple[str, ...]]
+    """Segments of the arm that are there."""
+    extra: ClassVar[int] = 0
+    """How many numbers :meth:`also` adds to observations."""
+
+    def __init__(
+        self,
+        randomisation: Randomisation | None = None,
+        chip: str = "fdc1004",
+        preset: PresetName = "learning",
+        design: str | Path | None = None,
+    ) -> None:
+        self.randomisation = randomisation or Randomisation()
+        self._chip = chip
+        self.simulator = Simulator(load_design(design or self.own_design), preset=preset)
+        self.drawn = self.randomisation.held().draw(np.random.default_rng(0))
+        """What holds for this episode."""
+        self._build(np.random.default_rng(0))
+        self.action_space = Box(-1.0, 1.0, (len(self.speeds),), np.float32)
+        rest = np.full(2 * len(self.speeds) + self.extra, LIMIT, np.float32)
+        most = np.concatenate([self.signals.limits, rest])
+        self.observation_space = Box(-most, most, dtype=np.float32)
+
+    # -- what a task says ------------------------------------------------------------------------
+
+    @abstractmethod
+    def begin(self) -> dict[str, float]:
+        """Draw the task's own random numbers; return joint angles of the limb [rad]."""
+
+    @abstractmethod
+    def limb_pose(self, time: float) -> Pose:
+        """Where the limb's frame is at a time [s]."""
+
+    @abstractmethod
+    def judge(self, action: Array, force: float) -> tuple[float, bool, dict[str, Any]]:
+        """Reward of the step that was made, whether the episode ends by it, and facts about it."""
+
+    def also(self) -> Array:
+        """Further numbers for observations, shape (extra,)."""
+        return np.empty(0)
+
+    # -- Gymnasium -------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode with a new person, place and chip; ``options`` are not used."""
+        super().reset(seed=seed)
+        rng = self.np_random
+        self.drawn = self.randomisation.draw(rng)
+        self._build(rng)
+        self._move_limb(_AWAY)
+        mujoco.mj_forward(self.model, self.data)
+        tare = self.signals.skin.read()
+        self._move_limb(self.limb_pose(0.0))
+        mujoco.mj_forward(self.model, self.data)
+        self.signals.reset(0.0, int(rng.integers(2**31)), tare)
+        return self._observe(), self.judge(np.zeros(len(self.speeds)), 0.0)[2]
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move at the velocities that an action tells, for 0.04 s.
+
+        Raises:
+            SceneError: The action has another shape, or is not finite.
+        """
+        asked = np.asarray(action, dtype=float)
+        if asked.shape != (len(self.speeds),) or not np.isfinite(asked).all():
+            raise SceneError(f"action is {action!r}; give {len(self.speeds)} finite numbers")
+        asked = np.clip(asked, -1.0, 1.0)
+        self.data.ctrl[:] = asked * self.speeds
+        steps, force = round(CONTROL / self.model.opt.timestep), 0.0
+        for _ in range(steps):
+            self._move_limb(self.limb_pose(self.data.time))
+            mujoco.mj_step(self.model, self.data)
+            force = max(force, self._force())
+        mujoco.mj_forward(self.model, self.data)
+        reward, over, facts = self.judge(asked, force)
+        observation = self._observe()
+        return observation, reward - SQUEEZE * force, over, False, {**facts, "force": force}
+
+    # -- the world -------------------------------------------------------------------------------
+
+    def _build(self, rng: np.random.Generator) -> None:
+        """Make the model anew, with a limb of the size that was drawn, and attach the sensors."""
+        self._rng = rng
+        self.limb = arm(self.drawn.build)
+        spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name(self.model_file)))
+        angles = self.begin()
+        self._add_limb(spec, angles)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.start()
+        self._move_limb(self.limb_pose(0.0))
+        mujoco.mj_forward(self.model, self.data)
+        skin = adapter.attach_skin(
+            self.model, self.data, self.sites, self.simulator, threads=1,
+            materials={"limb*": "human", "cushion": Material("cushion", self.drawn.permittivity)},
+            grounding={"limb*": self.drawn.grounding},
+        )  # fmt: skip
+        names = self.simulator.electrode_names
+        self.signals = Signals(
+            skin, {site: self.drawn.readout(self._chip, names, rng) for site in self.sites}
+        )
+
+    def start(self) -> None:
+        """Set the state in which an episode begins."""
+
+    def _add_limb(self, spec: mujoco.MjSpec, angles: dict[str, float]) -> None:
+        where, body = self.limb.forward(angles), spec.body("limb")
+        for segment in self.limb.segments:
+            if segment.name not in self.parts:
+                continue
+            for name, part in self.limb.named_parts(segment):
+                pose = where[segment.name] @ part.pose
+                x, y, z, w = pose.quaternion
+                body.add_geom(
+                    name=f"limb_{name}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, pos=pose.position,
+                    quat=(w, x, y, z), size=(part.radius, 0.5 * part.shape.length, 0.0),
+                    contype=1, conaffinity=1,
+                )  # fmt: skip
+
+    def _move_limb(self, pose: Pose) -> None:
+        x, y, z, w = pose.quaternion
+        self.data.mocap_pos[0] = pose.position
+        self.data.mocap_quat[0] = (w, x, y, z)
+
+    def _force(self) -> float:
+        """Sum of the normal forces of all contacts [N]."""
+        total, one = 0.0, np.zeros(6)
+        for k in range(self.data.ncon):
+            mujoco.mj_contactForce(self.model, self.data, k, one)
+            total += abs(float(one[0]))
+        return total
+
+    def _observe(self) -> Observation:
+        joints = self.model.actuator_trnid[:, 0]
+        own = [self.data.qpos[self.model.jnt_qposadr[joints]],
+               self.data.qvel[self.model.jnt_dofadr[joints]], self.also()]  # fmt: skip
+        rest = np.clip(np.concatenate(own), -LIMIT, LIMIT).astype(np.float32)
+        return np.concatenate([self.signals.read(self.data.time), rest])
+
+    # -- help for tasks --------------------------------------------------------------------------
+
+    def site_frame(self, site: str) -> tuple[Array, Array]:
+        """Position [m] and rotation matrix of a site in the world."""
+        here = self.data.site(site)
+        return here.xpos.copy(), here.xmat.reshape(3, 3).copy()
+
+    def astray(self, turned: bool = False) -> Array:
+        """A random shift [m], or turn [rad], of the size that was drawn, shape (3,)."""
+        way = self._rng.standard_normal(3)
+        return (self.drawn.turn if turned else self.drawn.shift) * way / np.linalg.norm(way)
+
+    def between(self, low: float, high: float) -> float:
+        """A random number of the task's own."""
+        return float(self._rng.uniform(low, high))
