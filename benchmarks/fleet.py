@@ -101,8 +101,8 @@ def main() -> int:
     name, values = ("preset", ["learning", "standard"])
     if options.device != "cpu":
         name, values = ("budget", [32, 64, 128])
-    print(f"{name:10} {'environments':>12} {'solves/s':>10}   rms, worst error [%]: one body", end="")
-    print(" from 15 mm on, all scenes")
+    told = "rms, worst error [%]: one body from 15 mm on, all scenes"
+    print(f"{name:10} {'environments':>12} {'solves/s':>10}   {told}")
     for value in values:
         chosen = {"device": options.device, name: value}
         single, every = errors(chosen, scenes)
