@@ -44,6 +44,17 @@ def bare(axes: Axes) -> None:
     axes.tick_params(labelsize=8, colors=INK, length=3, color=FAINT)
 
 
+def dress(axes: Axes, x: str = "", y: str = "", title: str = "") -> None:
+    """Name the axes and what they show, each where it is given; the rest as :func:`bare`."""
+    if x:
+        axes.set_xlabel(x, **LABELS)
+    if y:
+        axes.set_ylabel(y, **LABELS)
+    if title:
+        axes.set_title(title, **TITLES)
+    bare(axes)
+
+
 def unit_of(largest: float) -> tuple[float, str]:
     """A factor and a unit in which ``largest`` [F] is a handy number."""
     for factor, unit in ((1e12, "pF"), (1e15, "fF")):

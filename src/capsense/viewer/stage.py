@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._style import QUIET, signal_colours
 from capsense.design import Design
 from capsense.design.draw import ROLE_COLOURS
 from capsense.design.geometry import Surface
@@ -19,10 +20,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
-QUIET: Colour = (214, 219, 222)
-"""An electrode without a signal."""
-LOUD: Colour = (213, 94, 0)
-"""An electrode with the largest signal so far."""
 LAYER: Colour = (206, 212, 178)
 CONDUCTIVE: Colour = (120, 134, 150)
 DIELECTRIC: Colour = (150, 190, 205)
@@ -69,9 +66,7 @@ class Stage:
 
     def show_signals(self, strength: Array) -> None:
         """Colour the electrodes by their signals, 0 to 1, shape (M,)."""
-        part = np.clip(strength, 0.0, 1.0)[:, None]
-        mixed = np.array(QUIET) + part * (np.array(LOUD) - QUIET)
-        colours: list[Colour] = [(int(r), int(g), int(b)) for r, g, b in mixed]
+        colours: list[Colour] = [(int(r), int(g), int(b)) for r, g, b in signal_colours(strength)]
         for k, (handle, colour) in enumerate(zip(self._electrodes, colours, strict=True)):
             if not self._shown or self._shown[k] != colour:
                 handle.color = colour
