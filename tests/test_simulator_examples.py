@@ -36,7 +36,7 @@ def test_forearm(
     assert (tmp_path / "forearm.png").stat().st_size > 10_000
     from PIL import Image
 
-    with Image.open(tmp_path / "forearm.gif") as animation:
+    with Image.open(tmp_path / "forearm.webp") as animation:
         assert getattr(animation, "n_frames", 1) > 20
     table = (tmp_path / "forearm.csv").read_text(encoding="utf-8").splitlines()
     assert len(table) == 1 + len(record.time)
@@ -64,7 +64,7 @@ def test_skin_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "RATE", 10.0)
     record = module.main(tmp_path)
     assert record.signal[0].shape == (16,)
-    for name in ("skin_stops.png", "skin_stops.gif"):
+    for name in ("skin_stops.png", "skin_stops.webp"):
         assert 10_000 < (tmp_path / name).stat().st_size < 400_000
 
 
