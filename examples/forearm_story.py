@@ -20,6 +20,8 @@ SECONDS = 8.0
 """How long the story lasts [s]."""
 RATE = 50.0
 """Readings per second [Hz]."""
+FRAMES = 60
+"""Of the animation."""
 
 PERSON = arm(Build("female", percentile=50), "right")
 SHOULDER = cs.Pose((0.0, 0.0, 0.95))
@@ -142,8 +144,8 @@ def save(record: Record, folder: Path) -> None:
 # -- pictures ------------------------------------------------------------------------------------
 
 
-def draw(record: Record, folder: Path, title: str, frames: int = 60) -> None:
-    """Write ``forearm.png``, and ``forearm.webp`` of so many frames."""
+def draw(record: Record, folder: Path, title: str) -> None:
+    """Write ``forearm.png`` and ``forearm.webp``."""
     from matplotlib.figure import Figure
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -154,7 +156,7 @@ def draw(record: Record, folder: Path, title: str, frames: int = 60) -> None:
     bottom.plot(record.time, np.array(record.along) * 1e3, color=INK)
     dress(bottom, "time [s]", "along forearm [mm]")
     figure.savefig(folder / "forearm.png", dpi=130)
-    _animate(record, folder / "forearm.webp", frames)
+    _animate(record, folder / "forearm.webp", FRAMES)
 
 
 def _curves(axes: Any, record: Record, count: int) -> list[Any]:
@@ -165,14 +167,8 @@ def _curves(axes: Any, record: Record, count: int) -> list[Any]:
         for k, name in enumerate(record.names)
     ]  # fmt: skip
     axes.set(xlim=(0, record.time[-1]), ylim=(0, record.diagonal.max() * 1.08e15))
-    axes.legend(
-        ncols=6,
-        loc="lower left",
-        bbox_to_anchor=(-0.02, 1.0),
-        handlelength=1.0,
-        columnspacing=0.8,
-        **LEGEND,
-    )
+    place = {"loc": "lower left", "bbox_to_anchor": (-0.02, 1.0), "ncols": 6}
+    axes.legend(**place, **LEGEND, handlelength=1.0, columnspacing=0.8)
     dress(axes, "", "change of capacitance [fF]")
     return lines
 
@@ -183,7 +179,7 @@ SCALE = 0.1
 
 
 def _electrodes() -> list[Any]:
-    """The electrodes as meshes in the sensor frame; once more on the back of the pad, to be seen."""
+    """The electrodes as meshes in the sensor frame, and once more on the back of the pad."""
     out = []
     for electrode in cs.load_design("six_patch").electrodes:
         corners = electrode.surface.triangles.reshape(-1, 3)

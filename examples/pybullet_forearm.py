@@ -1,8 +1,8 @@
 """PyBullet: a KUKA iiwa carries six electrodes along a person's moving forearm.
 
-Run it: ``python examples/pybullet_forearm.py [FOLDER]``. It needs no display and no OpenGL. A table,
-a plot and an animation go to the folder (``out`` by default). The robot and its meshes come with
-PyBullet.
+Run it: ``python examples/pybullet_forearm.py [FOLDER]``. It needs no display and no OpenGL. A
+table, a plot and an animation go to the folder (``out`` by default). The robot and its meshes come
+with PyBullet.
 """
 
 from __future__ import annotations

@@ -31,6 +31,8 @@ from capsense._style import COLOURS, INK, LABELS, LEGEND, dress, signal_colours
 
 SECONDS = 9.0
 """How long the story lasts [s]."""
+FRAMES = 60
+"""Of the animation."""
 RATE = 50.0
 """Readings of the whole skin per second [Hz]."""
 SPEED = 0.45
@@ -205,7 +207,7 @@ def _animate(record: Record, file: Path) -> None:
     words = axis.text(16, 26, "", **LABELS)
     meshes: dict[tuple[float, float], object] = {}
     frames = []
-    for k in range(0, len(record.time), max(1, len(record.time) // 60)):
+    for k in np.linspace(0, len(record.time) - 1, FRAMES).astype(int):
         rings = record.signal[k].reshape(len(RING_NAMES), -1).max(axis=1) / STOP
         looks = LOOKS | dict(zip(RING_NAMES, signal_colours(rings) / 255, strict=True))
         parts = []
