@@ -104,11 +104,14 @@ class View:
         if self._plane is None:
             return
         plane, shot, driven = self._plane.plane, self._player.with_field, self._plane.driven
-        if (plane, shot, driven) == self._painted:
+        state = (plane, shot, driven, self._plane.charge)
+        if state == self._painted:
             return
-        self._painted = (plane, shot, driven)
+        self._painted = state
+        with_charge = self._plane.charge and shot is not None
+        self._stage.show_charges(shot.charges if shot and with_charge else None, driven)
         if plane is None:
-            self._stage.hide_plane()
+            self._stage.hide("/potential")
         elif shot is not None and shot.plane is plane and shot.potentials is not None:
             self._stage.show_plane(plane, shot.potentials[:, driven])
 
