@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
     from capsense.simulator import Simulator
     from capsense.skin import Skin
+    from capsense.viewer.show import show
 
     __version__: str
 
@@ -116,6 +117,7 @@ __all__ = [
     "rasterise",
     "record",
     "replay",
+    "show",
 ]
 
 _HOMES = {
@@ -159,6 +161,7 @@ _HOMES = {
     "capsense.scene.scene": ("Scene",),
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Simulator",),
+    "capsense.viewer.show": ("show",),
     "capsense.skin": ("Skin",),
 }
 _SUBMODULES = {

@@ -15,7 +15,7 @@ from capsense.errors import RecordingError
 from capsense.reading import Reading
 from capsense.recording.session import GONE
 from capsense.scenario import Channel, Scenario
-from capsense.scene import Scene
+from capsense.scene import Pose, Scene, Shape
 from capsense.simulator import Simulator
 from capsense.surface.solver import SurfaceSolver
 
@@ -55,6 +55,9 @@ class Shot:
     """Potentials at its points [V], shape (n, terminals)."""
     charges: Charges | None = None
     """On the bodies, where potentials were asked for."""
+    around: tuple[tuple[Shape, Pose], ...] = ()
+    """All solids of the robot's simulator in the sensor frame, where there is one; drawn in place
+    of the bodies."""
 
 
 class Source(Protocol):

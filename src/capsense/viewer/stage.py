@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from capsense._style import signal_colours
 from capsense.design import Design
 from capsense.design.draw import ROLE_COLOURS
 from capsense.design.geometry import Surface
-from capsense.scene import Body, Layers, Scene, ShapeKind
+from capsense.scene import Body, Layers, Pose, Scene, Shape, ShapeKind
 from capsense.viewer.plane import Plane
 from capsense.viewer.source import Charges
 
@@ -52,6 +53,7 @@ class Stage:
         self._scene = server.scene
         self._bodies: list[tuple[Any, ...]] = []
         self._spots: list[Array] = []
+        self._around: list[tuple[Shape, Any]] = []
         self._shades = np.full(len(design.electrodes), -1)
         self._plates: dict[tuple[int, int], Any] = {}
         self._surfaces = [e.surface for e in design.electrodes]
@@ -113,6 +115,25 @@ class Stage:
             for handle in handles:
                 handle.wxyz, handle.position = (w, x, y, z), body.pose.position
 
+    def show_around(self, solids: Sequence[tuple[Shape, Pose]]) -> None:
+        """Put a robot's solids where they stand; those of other shapes are made anew."""
+        if [id(shape) for shape, _ in solids] != [id(shape) for shape, _ in self._around]:
+            for _, handle in self._around:
+                handle.remove()
+            self._around = [
+                (shape, self._opaque(f"/robot/{k}", shape)) for k, (shape, _) in enumerate(solids)
+            ]
+        for (_, pose), (_, handle) in zip(solids, self._around, strict=True):
+            x, y, z, w = pose.quaternion
+            handle.wxyz, handle.position = (w, x, y, z), pose.position
+
+    def _opaque(self, name: str, shape: Shape) -> Any:
+        mesh = shape.to_trimesh()
+        return self._scene.add_mesh_simple(
+            name, mesh.vertices, mesh.faces, color=CONDUCTIVE, flat_shading=shape.kind in _FACETED,
+            side="double", cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
     def show_plane(self, plane: Plane, potential: Array) -> None:
         """Draw lines of the potential at a plane's points [V], shape (n,)."""
         pieces, colours = plane.contours(potential)
@@ -120,7 +141,7 @@ class Stage:
             self.hide("/potential")
             return
         self._scene.add_line_segments(
-            "/potential", pieces, colours, thickness=1.8, thickness_units="screen"
+            "/potential", pieces, colours, thickness=2.2, thickness_units="screen"
         )
 
     def show_charges(self, charges: Charges | None, terminal: int) -> None:

@@ -10,8 +10,10 @@ import threading
 import numpy as np
 
 from capsense.errors import MissingDependencyError, ServerError
+from capsense.scene import Scene
 from capsense.viewer.charts import heat_map, make_charts, strip
 from capsense.viewer.controls import PlaneControls, TimeControls, status
+from capsense.viewer.export import ExportControls
 from capsense.viewer.player import Playback
 from capsense.viewer.stage import Stage
 
@@ -53,6 +55,7 @@ class View:
         self._status = gui.add_html("")
         self._time = TimeControls(gui, player)
         self._plane = PlaneControls(gui, player) if source.green is not None else None
+        ExportControls(gui, player)
         panel = gui.add_panel()
         tab = panel.add_tab("signals")
         self._charts = make_charts(gui, tab, source.channels)
@@ -83,7 +86,8 @@ class View:
             self._drawn = state
             with self._server.atomic():
                 self._time.show(shot)
-                self._stage.show_bodies(shot.scene)
+                self._stage.show_bodies(Scene() if shot.around else shot.scene)
+                self._stage.show_around(shot.around)
                 window = strip(*player.history(shot.index))
                 for chart in self._charts:
                     chart.show(*window)
