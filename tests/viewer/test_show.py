@@ -80,7 +80,8 @@ class Watcher:
         self.shade += 10
         return np.full((rows, columns, 4), self.shade, np.uint8)
 
-    def send_file_download(self, name: str, content: bytes) -> None:
+    def send_file_download(self, name: str, content: bytes, *, save_immediately: bool) -> None:
+        assert save_immediately
         self.files[name] = content
 
 

@@ -42,7 +42,7 @@ def send_picture(client: Any) -> None:
 
     file = io.BytesIO()
     Image.fromarray(_seen(client)).save(file, "png")
-    client.send_file_download("capsense.png", file.getvalue())
+    client.send_file_download("capsense.png", file.getvalue(), save_immediately=True)
 
 
 def send_video(client: Any, player: Playback, wait: Callable[[float], None] = time.sleep) -> None:
@@ -58,7 +58,10 @@ def send_video(client: Any, player: Playback, wait: Callable[[float], None] = ti
                 break
             wait(0.01)
         wait(SETTLE)
-        frames.append(Image.fromarray(_seen(client)))
+        try:
+            frames.append(Image.fromarray(_seen(client)))
+        except RuntimeError:  # the client has left
+            return
     times, _ = player.history(last)
     long = float(times[-1] - times[0]) / max(len(frames) - 1, 1)
     file = io.BytesIO()
@@ -66,7 +69,7 @@ def send_video(client: Any, player: Playback, wait: Callable[[float], None] = ti
         file, "webp", save_all=True, append_images=frames[1:], quality=80, loop=0,
         duration=max(20, round(1e3 * long)),
     )  # fmt: skip
-    client.send_file_download("capsense.webp", file.getvalue())
+    client.send_file_download("capsense.webp", file.getvalue(), save_immediately=True)
 
 
 def _seen(client: Any) -> Any:

@@ -62,6 +62,7 @@ class View:
         with tab:
             self._matrix = gui.add_html("")
         panel.dock_left()
+        self._own = [k for k, c in enumerate(source.channels) if c.row == c.column]
         self._loudest = 1e-21
         self._drawn: tuple[object, ...] = ()
         self._painted: tuple[object, ...] = ()
@@ -88,11 +89,13 @@ class View:
                 self._time.show(shot)
                 self._stage.show_bodies(Scene() if shot.around else shot.scene)
                 self._stage.show_around(shot.around)
-                window = strip(*player.history(shot.index))
+                times, changes = player.history(shot.index)
+                window = strip(times, changes)
                 for chart in self._charts:
                     chart.show(*window)
                 own = np.abs(np.diag(shot.reading.delta))
-                self._loudest = max(self._loudest, float(own.max()))
+                before = np.abs(changes[:, self._own]).max(initial=0.0)
+                self._loudest = max(self._loudest, float(own.max()), float(before))
                 self._status.content = status(player, shot, self._loudest)
                 self._stage.show_signals(own / self._loudest)
                 self._matrix.content = heat_map(shot.reading.electrode_names, shot.reading.delta)
