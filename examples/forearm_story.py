@@ -5,17 +5,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from sticks import Rod, frame_of, save_animation, silhouettes
+import trimesh
+from shaded import Camera, Part, frame_of, picture, save_animation
 
 import capsense as cs
+from capsense._style import COLOURS, INK, LABELS, LEGEND, dress
+from capsense.design.draw import outline_patch, outlines
 from capsense.humans import Build, arm
 
 SECONDS = 8.0
 """How long the story lasts [s]."""
 RATE = 50.0
 """Readings per second [Hz]."""
+FRAMES = 60
+"""Of the animation."""
 
 PERSON = arm(Build("female", percentile=50), "right")
 SHOULDER = cs.Pose((0.0, 0.0, 0.95))
@@ -60,8 +66,9 @@ def person_angles(t: float) -> dict[str, float]:
     }
 
 
-View = tuple[cs.Pose, list[Rod]]
+View = tuple[cs.Pose, list[Part]]
 """Where the sensor is in the world, and what is drawn around it."""
+SKIN, SHIRT, METAL = (0.85, 0.64, 0.52), (0.30, 0.42, 0.58), (0.62, 0.64, 0.67)
 
 
 @dataclass
@@ -78,10 +85,10 @@ class Record:
     views: list[View] = field(default_factory=list)
     """What there is to be drawn."""
 
-    def add(self, t: float, reading: cs.Reading, pose: cs.Pose, capsules: list[Rod]) -> None:
+    def add(self, t: float, reading: cs.Reading, pose: cs.Pose, parts: list[Part]) -> None:
         """Keep one reading, and print every tenth as a line of the table.
 
-        ``capsules`` are the robot's and the person's, in the world, to be drawn.
+        ``parts`` are the robot's and the person's, in the world, to be drawn.
         """
         if not self.time:
             print("   t    x " + "".join(f"{n:>9}" for n in self.names) + "   change, fF")
@@ -91,7 +98,7 @@ class Record:
         self.time.append(t)
         self.delta.append(reading.delta)
         self.along.append(pose.position[0])
-        self.views.append((pose, capsules))
+        self.views.append((pose, parts))
 
     @property
     def diagonal(self) -> np.ndarray:
@@ -138,62 +145,102 @@ def save(record: Record, folder: Path) -> None:
 
 
 def draw(record: Record, folder: Path, title: str) -> None:
-    """Write ``forearm.png`` and ``forearm.gif``."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    """Write ``forearm.png`` and ``forearm.webp``."""
+    from matplotlib.figure import Figure
 
     folder.mkdir(parents=True, exist_ok=True)
-    figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(8, 5.5), height_ratios=(3, 1))
-    for k, name in enumerate(record.names):
-        top.plot(
-            record.time, record.diagonal[:, k] * 1e15, label=name,
-            color=f"C{k % 3}", linestyle="-" if k < 3 else "--",
-        )  # fmt: skip
-    top.set(ylabel="change of capacitance, fF", title=title)
-    top.legend(ncols=2)
-    bottom.plot(record.time, np.array(record.along) * 1e3, color="black")
-    bottom.set(xlabel="time, s", ylabel="sensor along\nforearm, mm")
-    for axis in (top, bottom):
-        axis.grid(alpha=0.3)
-    figure.tight_layout()
+    figure = Figure(figsize=(8, 5.5), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    _curves(top, record, len(record.time))
+    figure.suptitle(title, fontsize=10, fontweight="bold", color=INK)
+    bottom.plot(record.time, np.array(record.along) * 1e3, color=INK)
+    dress(bottom, "time [s]", "along forearm [mm]")
     figure.savefig(folder / "forearm.png", dpi=130)
-    plt.close(figure)
-    _animate(record, folder / "forearm.gif")
+    _animate(record, folder / "forearm.webp", FRAMES)
 
 
-COLOURS = {"robot": "#8090a0", "person": "#e0a080", "pad": "C1"}
-RIGHT = np.array((-0.94, -0.34, 0.0))
-UP = np.array((-0.10, 0.28, 0.95))
-"""Axes of the picture in the world: seen from the person's left, a little from above."""
+def _curves(axes: Any, record: Record, count: int) -> list[Any]:
+    """The first samples of all electrodes."""
+    lines = [
+        axes.plot(record.time[:count], record.diagonal[:count, k] * 1e15, color=COLOURS[k],
+                  lw=1.8, label=name)[0]
+        for k, name in enumerate(record.names)
+    ]  # fmt: skip
+    axes.set(xlim=(0, record.time[-1]), ylim=(0, record.diagonal.max() * 1.08e15))
+    place = {"loc": "lower left", "bbox_to_anchor": (-0.02, 1.0), "ncols": 6}
+    axes.legend(**place, **LEGEND, handlelength=1.0, columnspacing=0.8)
+    dress(axes, "", "change of capacitance [fF]")
+    return lines
 
 
-def _animate(record: Record, file: Path) -> None:
-    """Robot and person, and the electrodes as bars."""
-    from matplotlib import pyplot as plt
-    from matplotlib.collections import PolyCollection
+CAMERA = Camera((1.55, 0.78, 1.33), (0.15, -0.13, 0.745), math.radians(32.0), (430, 520))
+SCALE = 0.1
+"""Length of the bar that is drawn as a scale [m]."""
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 4), dpi=70, width_ratios=(3, 2))
-    left.set(xlim=(-0.66, 0.20), ylim=(0.28, 1.04), aspect="equal")
+
+def _electrodes() -> list[Any]:
+    """The electrodes as meshes in the sensor frame, and once more on the back of the pad."""
+    out = []
+    for electrode in cs.load_design("six_patch").electrodes:
+        corners = electrode.surface.triangles.reshape(-1, 3)
+        back = corners - (0.0, 0.0, PAD_SIZE[2] + 0.0025)
+        both = np.concatenate([corners, back])
+        out.append(trimesh.Trimesh(both, np.arange(len(both)).reshape(-1, 3), process=False))
+    return out
+
+
+def _plan(figure: Any) -> list[Any]:
+    """The electrodes as seen from the front, with their names, in a corner of the picture."""
+    axes = figure.add_axes((0.012, 0.03, 0.15, 0.22))
+    patches = []
+    for electrode in cs.load_design("six_patch").electrodes:
+        (outline,) = outlines(electrode.surface)
+        patches.append(axes.add_patch(outline_patch(outline, ec="white", lw=0.8)))
+        x, y, _ = 1e3 * electrode.surface.bounds.mean(axis=0)
+        axes.text(x, y, electrode.name, ha="center", va="center", fontsize=7, color="white")
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    return patches
+
+
+def _animate(record: Record, file: Path, count: int) -> None:
+    """Robot, person and pad; electrodes light up in the colours of their curves."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import to_rgb
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.2, 4.3), dpi=100)
+    FigureCanvasAgg(figure)
+    left, right = figure.add_axes((0, 0, 5.2 / 9.2, 1)), figure.add_axes((0.635, 0.13, 0.35, 0.78))
     left.set_axis_off()
-    left.set_title("0.0 s")
-    shapes = PolyCollection([], edgecolor="0.25", linewidth=0.5)
-    left.add_collection(shapes)
-    bars = right.bar(record.names, np.zeros(len(record.names)), color="C1")
-    right.set(ylim=(0, record.diagonal.max() * 1.1e15), ylabel="change of capacitance, fF")
-    figure.tight_layout()
+    image = left.imshow(np.zeros((*CAMERA.size, 3), np.uint8))
+    distance = float(np.linalg.norm(np.subtract(CAMERA.target, CAMERA.eye)))
+    long = SCALE * CAMERA.focal / distance
+    left.plot([500 - long, 500], [408, 408], color=INK, lw=2)
+    left.text(500 - long / 2, 402, f"{1e3 * SCALE:.0f} mm", ha="center", **LABELS)
+    clock = left.text(20, 28, "", **LABELS)
+    plan = _plan(figure)
+    lines = _curves(right, record, 0)
+    right.set_xlabel("time [s]", **LABELS)
+    dots = right.scatter([0.0] * len(lines), [0.0] * len(lines), c=COLOURS[: len(lines)], s=22)
+    housing = trimesh.creation.box(PAD_SIZE)
+    below = cs.Pose((0.0, 0.0, PAD_BOX.position[2] - PAD.position[2]))
+    plates, strongest = _electrodes(), record.diagonal.max(axis=0)
     frames = []
-    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    box = 0.5 * corners * PAD_SIZE - (0.0, 0.0, 0.5 * PAD_SIZE[2])
-    for k in range(0, len(record.time), max(1, len(record.time) // 50)):
-        pose, capsules = record.views[k]
-        polygons = silhouettes(capsules, RIGHT, UP, [(pose.apply(box), "pad")])
-        shapes.set_verts([p for p, _ in polygons])
-        shapes.set_facecolor([COLOURS[what] for _, what in polygons])
-        for bar, value in zip(bars, record.diagonal[k], strict=True):
-            bar.set_height(value * 1e15)
-        left.set_title(f"{record.time[k]:.1f} s")
+    for k in np.linspace(0, len(record.time) - 1, count).astype(int):
+        pose, parts = record.views[k]
+        lit = np.sqrt(np.clip(record.diagonal[k] / strongest, 0.0, 1.0))[:, None]
+        colours = 0.30 + lit * (np.array([to_rgb(c) for c in COLOURS[: len(lit)]]) - 0.30)
+        pad = (housing, pose @ below, (0.16, 0.17, 0.19))
+        glowing = [(plate, pose, c) for plate, c in zip(plates, colours, strict=True)]
+        image.set_data(picture([*parts, pad], CAMERA, glowing))
+        for patch, colour in zip(plan, colours, strict=True):
+            patch.set_facecolor(colour)
+        clock.set_text(f"{record.time[k]:.1f} s")
+        for line, values in zip(lines, 1e15 * record.diagonal[: k + 1].T, strict=True):
+            line.set_data(record.time[: k + 1], values)
+        now = np.full(len(lit), record.time[k])
+        dots.set_offsets(np.column_stack([now, 1e15 * record.diagonal[k]]))
         frames.append(frame_of(figure))
-    save_animation(frames, file, 120)
-    plt.close(figure)
+    save_animation(frames, file, round(1e3 * record.time[-1] / count))

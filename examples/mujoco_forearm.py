@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from forearm_story import (
+    METAL,
     PAD,
     PAD_BOX,
     PAD_SIZE,
@@ -24,6 +25,7 @@ from forearm_story import (
     ROBOT_BASE,
     SECONDS,
     SHOULDER,
+    SKIN,
     Record,
     check,
     draw,
@@ -31,7 +33,7 @@ from forearm_story import (
     save,
     sensor_target,
 )
-from sticks import Rod
+from shaded import Part, capsule
 
 import capsense as cs
 from capsense.humans.export import mjcf_body
@@ -141,24 +143,28 @@ def step_towards(
     return data.qpos[joints] + jacobian.T @ np.linalg.solve(gain, error)
 
 
-def capsules(model: mujoco.MjModel, data: mujoco.MjData) -> list[Rod]:
-    """All capsules of the world, to be drawn."""
-    out = []
-    for k in np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)):
-        arm = data.geom_xmat[k].reshape(3, 3)[:, 2] * model.geom_size[k, 1]
-        whose = "person" if model.geom(k).name.startswith(PERSON.name) else "robot"
-        ends = data.geom_xpos[k] - arm, data.geom_xpos[k] + arm
-        out.append((*ends, float(model.geom_size[k, 0]), whose))
+def parts(model: mujoco.MjModel, data: mujoco.MjData, meshes: dict[int, Any]) -> list[Part]:
+    """All capsules of the world, to be drawn; ``meshes`` keeps theirs."""
+    out: list[Part] = []
+    for k in np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)).tolist():
+        if k not in meshes:
+            meshes[k] = capsule(float(model.geom_size[k, 0]), 2 * float(model.geom_size[k, 1]))
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, data.geom_xmat[k])
+        w, x, y, z = quaternion.tolist()
+        person = model.geom(k).name.startswith(PERSON.name)
+        out.append((meshes[k], cs.Pose(tuple(data.geom_xpos[k]), (x, y, z, w)),
+                    SKIN if person else METAL))  # fmt: skip
     return out
 
 
 def main(folder: Path, depth: bool = False) -> Record:
     """Run the story, check it, and draw it."""
     ride = Ride(depth)
-    record = Record(ride.sensor.electrode_names)
+    record, meshes = Record(ride.sensor.electrode_names), dict[int, Any]()
     while not ride.over:
         reading = ride.sensor.read()
-        record.add(ride.data.time, reading, ride.sensor.pose, capsules(ride.model, ride.data))
+        record.add(ride.data.time, reading, ride.sensor.pose, parts(ride.model, ride.data, meshes))
         ride.go_on(RATE)
     save(record, folder)
     seen = ", seen by a depth camera" if depth else ""

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from shaded import Camera, capsule, frame_of, picture, save_animation
 from skin_robot import (
     GROUNDING,
     JOINTS,
@@ -24,12 +25,14 @@ from skin_robot import (
     SITES,
     model_text,
 )
-from sticks import Rod, frame_of, save_animation, silhouettes
 
 import capsense as cs
+from capsense._style import COLOURS, INK, LABELS, LEGEND, dress, signal_colours
 
 SECONDS = 9.0
 """How long the story lasts [s]."""
+FRAMES = 60
+"""Of the animation."""
 RATE = 50.0
 """Readings of the whole skin per second [Hz]."""
 SPEED = 0.45
@@ -54,6 +57,10 @@ def person_angles(t: float) -> dict[str, float]:
     up = 0.5 - 0.5 * math.cos(math.pi * up)
     sway = math.radians(3.0) * math.sin(2 * math.pi * t / 1.5)
     return {"shoulder_flexion": math.radians(75.0) * up, "elbow_flexion": math.radians(8.0) + sway}
+
+
+Rod = tuple[np.ndarray, np.ndarray, float, str]
+"""A capsule to be drawn: its two ends [m] in the world, its radius [m], what it is."""
 
 
 @dataclass
@@ -154,78 +161,76 @@ def _keep(record: Record, model: mujoco.MjModel, data: mujoco.MjData, signal: np
     record.views.append(rods)
 
 
-COLOURS = {"robot": "#8090a0", "person": "#e0a080"}
-RIGHT = np.array((-0.676, 0.737, 0.0))
-UP = np.array((-0.427, -0.392, 0.814))
-"""Axes of the picture in the world: seen from in front of the person, from above."""
+LOOKS = {"robot": (0.55, 0.58, 0.62), "person": (0.85, 0.64, 0.52)}
+CAMERA = Camera((1.75, 1.45, 1.85), (0.26, -0.15, 1.13), math.radians(27.0), (440, 500))
 
 
 def draw(felt: Record, blind: Record, folder: Path) -> None:
-    """Write ``skin_stops.png`` and ``skin_stops.gif``."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    """Write ``skin_stops.png`` and ``skin_stops.webp``."""
+    from matplotlib.figure import Figure
 
     folder.mkdir(parents=True, exist_ok=True)
-    figure, (top, middle, bottom) = plt.subplots(
-        3, 1, sharex=True, figsize=(8, 7), height_ratios=(3, 2, 2)
-    )
+    figure = Figure(figsize=(8, 7), layout="constrained")
+    top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
     signal = np.array(felt.signal) * 1e15
-    for k in np.argsort(-signal.max(axis=0))[:6]:
-        top.plot(felt.time, signal[:, k], label=SITES[k])
+    for n, k in enumerate(np.argsort(-signal.max(axis=0))[:6]):
+        top.plot(felt.time, signal[:, k], color=COLOURS[n], label=SITES[k])
     for level, text in ((SLOW, "slows down"), (STOP, "stands")):
-        top.axhline(level * 1e15, color="0.4", linestyle=":", linewidth=1)
-        top.text(felt.time[-1], level * 1e15, text, ha="right", va="bottom", color="0.4")
-    top.set(ylabel="largest change\nof a sensor, fF", title="A robot arm stops before a person")
-    top.legend(ncols=2, title="sensor")
+        top.axhline(level * 1e15, color=INK, linestyle=":", linewidth=1)
+        top.text(felt.time[-1], level * 1e15, text, ha="right", va="bottom", **LABELS)
+    dress(top, "", "largest change\nof a sensor [fF]", "A robot arm stops before a person")
+    top.legend(ncols=2, title="sensor", **LEGEND)
     for record, text, style in ((felt, "with its skin", "-"), (blind, "without", "--")):
-        colour = "C0" if record is felt else "C3"
+        colour = COLOURS[0] if record is felt else COLOURS[3]
         middle.plot(record.time, np.degrees(record.turn), style, color=colour, label=text)
         bottom.plot(record.time, np.array(record.gap) * 1e3, style, color=colour, label=text)
-    middle.set(ylabel="angle of\nthe arm, °")
-    bottom.axhspan(min(blind.gap) * 1e3 - 10, 0, color="C3", alpha=0.12, linewidth=0)
-    bottom.text(0.1, min(blind.gap) * 1e3, "touches", color="C3", va="bottom")
-    bottom.set(xlabel="time, s", ylabel="distance to\nthe person, mm", ylim=(-80, 300))
-    middle.legend()
-    for axis in (top, middle, bottom):
-        axis.grid(alpha=0.3)
-    figure.tight_layout()
+    dress(middle, "", "angle of\nthe arm [°]")
+    bottom.axhspan(min(blind.gap) * 1e3 - 10, 0, color=COLOURS[3], alpha=0.12, linewidth=0)
+    bottom.text(0.1, min(blind.gap) * 1e3, "touches", color=COLOURS[3], va="bottom")
+    bottom.set_ylim(-80, 300)
+    dress(bottom, "time [s]", "distance to\nthe person [mm]")
+    middle.legend(**LEGEND)
     figure.savefig(folder / "skin_stops.png", dpi=100)
-    plt.close(figure)
-    _animate(felt, folder / "skin_stops.gif")
+    _animate(felt, folder / "skin_stops.webp")
 
 
 def _animate(record: Record, file: Path) -> None:
     """Robot and person; a ring's colour tells the largest change that it feels."""
-    import matplotlib
-    from matplotlib import pyplot as plt
-    from matplotlib.collections import PolyCollection
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    figure, axis = plt.subplots(figsize=(5, 4.4), dpi=70)
-    axis.set(xlim=(-0.95, 0.32), ylim=(0.36, 1.56), aspect="equal")
+    figure = Figure(figsize=(CAMERA.size[1] / 100, CAMERA.size[0] / 100), dpi=100)
+    FigureCanvasAgg(figure)
+    axis = figure.add_axes((0, 0, 1, 1))
     axis.set_axis_off()
-    shapes = PolyCollection([], edgecolor="0.25", linewidth=0.5)
-    axis.add_collection(shapes)
-    axis.set_title("0.0 s")
-    figure.tight_layout()
-    colours = matplotlib.colormaps["YlOrRd"]
+    image = axis.imshow(np.zeros((*CAMERA.size, 3), np.uint8))
+    words = axis.text(16, 26, "", **LABELS)
+    meshes: dict[tuple[float, float], object] = {}
     frames = []
-    for k in range(0, len(record.time), max(1, len(record.time) // 60)):
+    for k in np.linspace(0, len(record.time) - 1, FRAMES).astype(int):
         rings = record.signal[k].reshape(len(RING_NAMES), -1).max(axis=1) / STOP
-        known = COLOURS | {
-            name: colours(min(1.0, v)) for name, v in zip(RING_NAMES, rings, strict=True)
-        }
-        polygons = silhouettes(record.views[k], RIGHT, UP)
-        shapes.set_verts([p for p, _ in polygons])
-        shapes.set_facecolor([known[what] for _, what in polygons])
-        axis.set_title(
-            f"{record.time[k]:.1f} s, {record.gap[k] * 1e3:.0f} mm, "
-            f"{record.signal[k].max() * 1e15:.1f} fF"
+        looks = LOOKS | dict(zip(RING_NAMES, signal_colours(rings) / 255, strict=True))
+        parts = []
+        for a, b, radius, what in record.views[k]:
+            size = radius, round(float(np.linalg.norm(b - a)), 6)
+            mesh = meshes.setdefault(size, capsule(*size))
+            parts.append((mesh, _along(a, b), looks[what]))
+        image.set_data(picture(parts, CAMERA))
+        words.set_text(
+            f"{record.time[k]:.1f} s    distance {record.gap[k] * 1e3:.0f} mm    "
+            f"largest change {record.signal[k].max() * 1e15:.1f} fF"
         )
         frames.append(frame_of(figure))
-    save_animation(frames, file, 130)
-    plt.close(figure)
+    save_animation(frames, file, 150)
+
+
+def _along(a: np.ndarray, b: np.ndarray) -> cs.Pose:
+    """The pose of a capsule along z whose ends are to be at two points."""
+    x, y, z = (b - a) / max(float(np.linalg.norm(b - a)), 1e-12)
+    quaternion = (-y, x, 0.0, 1.0 + z) if z > -0.999 else (1.0, 0.0, 0.0, 0.0)
+    if not (x or y or z):
+        quaternion = (0.0, 0.0, 0.0, 1.0)
+    return cs.Pose(tuple((a + b) / 2), quaternion)
 
 
 def main(folder: Path) -> Record:

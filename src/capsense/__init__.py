@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
     from capsense.simulator import Simulator
     from capsense.skin import Skin
+    from capsense.viewer.show import show
 
     __version__: str
 
@@ -119,6 +120,7 @@ __all__ = [
     "rasterise",
     "record",
     "replay",
+    "show",
 ]
 
 _HOMES = {
@@ -163,6 +165,7 @@ _HOMES = {
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Simulator",),
     "capsense.fleet.fleet": ("Fleet", "FleetReading"),
+    "capsense.viewer.show": ("show",),
     "capsense.skin": ("Skin",),
 }
 _SUBMODULES = {

@@ -304,3 +304,33 @@ def test_the_check_list_runs(server: StandIn, capsys: pytest.CaptureFixture[str]
     assert "WRONG  the glass block is in its place" in capsys.readouterr().out
     assert set(server.things) == before
     assert not server.collections
+
+
+def test_what_draws_nothing_is_told(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """A build without OpenGL answers all calls, and its images stay empty."""
+    put(server, "block")
+    sensor = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    sim.startSimulation()
+    sensor.read()
+    server.headless = True
+    with pytest.raises(cs.SimulatorError, match=r"draws nothing .*without OpenGL"):
+        sensor.read()
+
+
+def test_a_collection_that_is_gone_is_made_anew(
+    server: StandIn, sim: Any, tiny_simulator: cs.Simulator
+) -> None:
+    """It goes with the script of the connection; what is left out stays left out."""
+    put(server, "block")
+    screen = put(server, "screen", cs.Box((0.08, 0.08, 0.001)), cs.Pose((0, 0, 0.01)))
+    sensor = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator, exclude=["screen"])
+    sim.startSimulation()
+    before = sensor.read().delta
+    server.collections.clear()
+    assert sensor.read().delta == pytest.approx(before)
+    (hidden,) = server.collections.values()
+    assert hidden == {screen}
+    server.collections.clear()
+    sensor.remove()

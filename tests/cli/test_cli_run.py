@@ -103,6 +103,17 @@ def test_excitations(scenario: Path, tmp_path: Path, excitation: str, columns: l
 
 
 @pytest.mark.usefixtures("fake")
+@pytest.mark.parametrize(("excitation", "told"), [("matrix", 1), ("self", 0), ("mutual", 0)])
+def test_signs_in_the_table_are_told(
+    scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], excitation: str, told: int
+) -> None:
+    """Entries of the Maxwell matrix are not taken for mutual capacitances."""
+    scenario.write_text(ball_scenario(excitation), encoding="utf-8")
+    assert main(["run", str(scenario), "-o", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.count("Maxwell matrix; the mutual capacitance") == told
+
+
+@pytest.mark.usefixtures("fake")
 def test_rate_quiet_and_repeat(
     scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -76,6 +76,8 @@ class StandIn:
         self.time = 0.0
         self.starts_late = 0
         """Steps that pass until a start takes effect."""
+        self.headless = False
+        """Whether it draws nothing, as builds without OpenGL."""
         self.stepping = False
         self.mirrored = False
         """Whether images come with the top row first, as they should not."""
@@ -287,6 +289,8 @@ class StandIn:
         return handle
 
     def destroyCollection(self, collection: int) -> None:
+        if collection not in self.collections:
+            raise RefusedError("Collection does not exist.")
         del self.collections[collection]
 
     def addItemToCollection(self, collection: int, what: int, handle: int, options: int) -> None:
@@ -329,9 +333,13 @@ class StandIn:
         if which != CONSTANTS["shapeintparam_static"]:
             self._thing(handle).parameters[_NAMES[which].partition("param_")[2]] = value
 
-    def handleVisionSensor(self, handle: int) -> int:
-        self._draw(self._thing(handle), self.pose(handle))
-        return 0
+    def handleVisionSensor(self, handle: int) -> tuple[int, list[float], list[float]]:
+        eye = self._thing(handle)
+        seen = int(eye.parameters["entity_to_render"])
+        if self.headless or (seen >= 0 and seen not in self.collections):
+            return 0, [], []  # two packets at least, even if empty
+        self._draw(eye, self.pose(handle))
+        return 0, [0.0] * 15, []
 
     def getVisionSensorDepth(self, handle: int, options: int) -> tuple[bytes, list[int]]:
         assert options == 1  # metres

@@ -25,6 +25,7 @@ from capsense.recording.parts import (
     read_shape,
     shape_fields,
 )
+from capsense.recording.session import describe
 from capsense.recording.steps import StepMessages
 from capsense.scene import RestSurface, SurfaceMesh
 
@@ -94,10 +95,10 @@ def test_surfaces() -> None:
         read_rest(shape_message(kind="rest", vertices=vertices.ravel()))
 
 
-def test_steps_of_a_deforming_surface() -> None:
+def test_steps_of_a_deforming_surface(sim: cs.Simulator) -> None:
     """Of a surface that moves, only the vertices come again; a reader puts all together."""
-    design = tiny_design()
-    writer = StepMessages(MESSAGES, "sensor", design)
+    session = describe(sim, "sensor", "", readout=None, empty=sim.empty)
+    writer = StepMessages(MESSAGES, session)
     foil = cs.DeformableSurface(np.eye(3), [[0, 1, 2]], material="steel", name="foil")
     bodies, kinds = [], []
     shapes: dict[int, Any] = {}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ import recorded_scenes
 from mcap.reader import make_reader
 
 import capsense as cs
+from capsense.recording.export import export
 
 decoder = pytest.importorskip("mcap_ros2.decoder", reason="needs mcap-ros2-support")
 
@@ -26,8 +29,10 @@ TYPES = {
     "/sensor/depth/camera_info": "sensor_msgs/msg/CameraInfo",
     "/sensor/depth/image": "sensor_msgs/msg/Image",
     "/sensor/depth/permittivity": "sensor_msgs/msg/Image",
+    "/sensor/electrodes": "visualization_msgs/msg/MarkerArray",
     "/sensor/markers": "visualization_msgs/msg/MarkerArray",
     "/sensor/shapes": "capsense_msgs/msg/Shape",
+    "/sensor/signals": "capsense_msgs/msg/Signals",
     "/sensor/step": "capsense_msgs/msg/Step",
     "/tf": "tf2_msgs/msg/TFMessage",
 }
@@ -63,7 +68,6 @@ def test_what_rosbag2_wants(recorded: Recorded) -> None:
     assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
     for channel in summary.channels.values():
         assert channel.message_encoding == "cdr"
-        assert channel.metadata["offered_qos_profiles"] == ""
         assert re.fullmatch("RIHS01_[0-9a-f]{64}", channel.metadata["topic_type_hash"])
     assert attachments == ["design.json", "session.json"]
     assert metadata["capsense"]["design"] == "six_patch"
@@ -89,10 +93,15 @@ def test_opens_as_a_bag(recorded: Recorded) -> None:
     path, readings = recorded
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
         assert {c.topic: c.msgtype for c in bag.connections} == TYPES
+        qos = {c.topic: c.ext.offered_qos_profiles for c in bag.connections}
         only = [c for c in bag.connections if c.topic == "/sensor/delta"]
         found = [bag.deserialize(raw, c.msgtype) for c, _, raw in bag.messages(only)]
     for message, reading in zip(found, readings, strict=True):
         assert message.data.tobytes() == reading.delta.tobytes()
+    assert {topic: profiles[0].durability.name for topic, profiles in qos.items() if profiles} == {
+        f"/sensor/{name}": "TRANSIENT_LOCAL"
+        for name in ("bodies", "electrodes", "markers", "shapes")
+    }
 
 
 def test_matrices(recorded: Recorded, decoded: dict[str, list[tuple[int, Any]]]) -> None:
@@ -180,19 +189,13 @@ def test_permittivity_images(sim: cs.Simulator, tmp_path: Path) -> None:
 
 
 def test_markers(decoded: dict[str, list[tuple[int, Any]]]) -> None:
-    """Drawn anew when the bodies change; electrodes in place, bodies in their own frames."""
+    """Bodies are drawn anew when they change, in their own frames."""
     messages = [m for _, m in decoded["/sensor/markers"]]
     assert 1 < len(messages) < 8
     first = messages[0].markers
     assert (first[0].action, first[0].type) == (3, 1)
-    electrodes = [m for m in first if m.ns == "electrodes"]
-    design = cs.load_design("six_patch")
-    assert len(electrodes) == 6
-    for marker, electrode in zip(electrodes, design.electrodes, strict=True):
-        points = np.array([[p.x, p.y, p.z] for p in marker.points])
-        np.testing.assert_array_equal(points, electrode.surface.triangles.reshape(-1, 3))
-    kinds = {m.ns: [] for m in first[7:]}
-    for m in first[7:]:
+    kinds = {m.ns: [] for m in first[1:]}
+    for m in first[1:]:
         assert m.header.frame_id == m.ns
         assert m.frame_locked
         kinds[m.ns].append((m.type, round(m.scale.x, 9), round(m.scale.z, 9)))
@@ -204,6 +207,68 @@ def test_markers(decoded: dict[str, list[tuple[int, Any]]]) -> None:
         "sensor/body4": [(2, 0.04, 0.03)],
         "sensor/wedge": [(11, 1.0, 1.0)],
     }
+
+
+def test_electrodes_light_up(recorded: Recorded, decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    """In place; the larger the change of their capacitance, the less green in their colour."""
+    design, stamps = cs.load_design("six_patch"), [t for t, _ in decoded["/sensor/step"]]
+    for log_time, message in decoded["/sensor/electrodes"]:
+        change = np.abs(np.diagonal(recorded[1][stamps.index(log_time)].delta))
+        assert [m.ns for m in message.markers] == list(design.electrode_names)
+        for marker, electrode in zip(message.markers, design.electrodes, strict=True):
+            points = np.array([[p.x, p.y, p.z] for p in marker.points])
+            np.testing.assert_array_equal(points, electrode.surface.triangles.reshape(-1, 3))
+        green = np.array([m.color.g for m in message.markers])[np.argsort(change)]
+        assert (np.diff(green) <= 0).all()
+        assert green[-1] < green[0] < 219 / 255
+
+
+def test_signals(recorded: Recorded, decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    """Stamped, named, in femtofarads."""
+    names = recorded[1][0].electrode_names
+    for (log_time, message), reading in zip(decoded["/sensor/signals"], recorded[1], strict=True):
+        assert at(message.header.stamp) == log_time
+        found = {c.name: (c.capacitance, c.change) for c in message.channels}
+        assert len(found) == 21
+        for i, j in ((0, 0), (0, 3), (4, 5)):
+            expected = 1e15 * reading.capacitance[i, j], 1e15 * reading.delta[i, j]
+            assert found[f"C_{names[i]}_{names[j]}"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_package_of_the_messages() -> None:
+    """A ROS 2 package: every message is there, and every package that they name."""
+    from capsense import recording
+    from capsense.recording.messages import OWN
+
+    folder = Path(recording.__file__).parent / "capsense_msgs"
+    texts = {path.stem: path.read_text() for path in folder.glob("msg/*.msg")}
+    assert sorted(texts) == sorted(OWN)
+    used = set(re.findall(r"^(\w+)/", "\n".join(texts.values()), re.MULTILINE))
+    package = ElementTree.parse(folder / "package.xml").getroot()
+    build = (folder / "CMakeLists.txt").read_text()
+    assert package.findtext("name") == "capsense_msgs"
+    assert {e.text for e in package.findall("depend")} == used
+    for name in used:
+        assert f"find_package({name} REQUIRED)" in build
+        assert name in build[build.index("DEPENDENCIES") :]
+
+
+def test_layout(recorded: Recorded, tmp_path: Path) -> None:
+    """Every panel is placed once, and shows topics and channels that are in the file."""
+    assert export(cs.open_recording(recorded[0]), tmp_path / "layout.json") == 1
+    layout = json.loads((tmp_path / "layout.json").read_text())
+    panels = layout["configById"]
+    placed = re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(layout["layout"]))
+    assert sorted(placed) == sorted(panels) == ["3D!sensor", "Plot!own", "Plot!pairs"]
+    assert set(panels["3D!sensor"]["topics"]) <= set(TYPES)
+    paths = [p["value"] for k in ("own", "pairs") for p in panels[f"Plot!{k}"]["paths"]]
+    names = recorded[1][0].electrode_names
+    known = {f"C_{a}_{b}" for a in names for b in names}
+    for path in paths:
+        topic, name = re.fullmatch(r'(.*)\.channels\[:\]{name=="(\w+)"}\.change', path).groups()
+        assert TYPES[topic] == "capsense_msgs/msg/Signals"
+        assert name in known
+    assert len(set(paths)) == len(paths) == 6 + 8
 
 
 def test_attached_sensor(simulators: Callable[..., cs.Simulator], tmp_path: Path) -> None:

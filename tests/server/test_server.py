@@ -358,3 +358,25 @@ def test_wrong_options(options: dict, words: str) -> None:
             Limits(**limit)
     assert Options(("patch",), host="0.0.0.0", token=TOKEN).token == TOKEN
     assert Options(("patch",), host="::1").host == "::1"
+
+
+def test_the_client_comes_back() -> None:
+    """A server that goes and comes finds its client there again, the sensor opened as it was."""
+    depth = np.full((8, 8), 0.05, np.float32)
+    first = RunningServer().__enter__()
+    with first.client(timeout=5.0) as client:
+        sensor = client.open(sensor=3, material="steel")
+        before = sensor.step(depth)
+        first.stop()
+        with pytest.raises(ProtocolError) as lost:
+            sensor.step(depth)
+        assert lost.value.code == "closed" or "closed the connection" in str(lost.value)
+        with RunningServer(port=first.port):
+            again = sensor.step(depth)
+        assert (again.sensor, again.sequence) == (3, 2)
+        np.testing.assert_allclose(again.delta, before.delta, rtol=1e-9)
+        client.timeout = 0.5
+        with pytest.raises(ProtocolError):
+            sensor.step(depth)
+        with pytest.raises(OSError):  # noqa: PT011, whatever the system says
+            sensor.step(depth)

@@ -22,6 +22,8 @@ public static class Driver
             case "stay": Stay(url); break;
             case "component": Component(url, last == "reversed"); break;
             case "sample": Sample(url); break;
+            case "settings": Settings(url); break;
+            case "silent": Silent(url); break;
             default: return 2;
         }
         return 0;
@@ -187,6 +189,56 @@ public static class Driver
             "received", received);
         sensor.Tell("OnDisable");
         Print("state", sensor.State.ToString());
+    }
+
+    /// <summary>No address, then one; a field that changes; frames while an answer is waited for.</summary>
+    private static void Settings(string url)
+    {
+        World.Depth = (x, y) => 0;
+        var sensor = new GameObject("sensor").AddComponent<CapacitiveSensor>();
+        sensor.url = "";
+        sensor.Tell("OnEnable");
+        sensor.Tell("LateUpdate");
+        Print("errors", UnityEngine.Debug.Errors.ToArray(), "cameras", World.Components.OfType<Camera>().Count());
+        sensor.url = url;
+        Wait(sensor, () => sensor.Reading != null);
+        var camera = World.Components.OfType<Camera>().Single();
+        Wait(sensor, () => camera.Rendered > 5);
+        int rendered = camera.Rendered, frames = (int)sensor.Reading.Sequence;
+        Print("rendered", rendered, "sequence", frames, "self", sensor.Reading.Delta[0, 0]);
+        sensor.resolution = 32;
+        var first = sensor.Remote;
+        Wait(sensor, () => sensor.Remote != first && sensor.Remote.Electrodes != null);
+        Print("cameras", World.Components.OfType<Camera>().Count(),
+            "textures", UnityEngine.Object.Destroyed.OfType<RenderTexture>().Count());
+        var clock = Stopwatch.StartNew();
+        sensor.Tell("OnDisable");
+        sensor.Tell("OnDisable");
+        Print("state", sensor.State.ToString(), "quick", clock.Elapsed.TotalSeconds < 0.5);
+    }
+
+    private static void Wait(CapacitiveSensor sensor, Func<bool> done)
+    {
+        var limit = Stopwatch.StartNew();
+        while (!done() && limit.Elapsed.TotalSeconds < 15)
+        {
+            UnityEngine.Time.time += 0.02f;
+            sensor.Tell("LateUpdate");
+            Thread.Sleep(1);
+        }
+        if (!done()) throw new TimeoutException();
+    }
+
+    /// <summary>A server that takes frames and never answers is given up.</summary>
+    private static void Silent(string url)
+    {
+        using (var client = new CapSenseClient(url) { AnswerTimeout = TimeSpan.FromSeconds(0.5) })
+        {
+            RemoteSensor sensor = client.Add(new SensorOptions());
+            client.Start();
+            try { sensor.StepAsync(Dome(0)).Wait(); }
+            catch (AggregateException error) { Print("code", ((CapSenseException)error.InnerException).Code); }
+        }
     }
 
     /// <summary>The sample, a few frames long; what its bars say, and the readings.</summary>

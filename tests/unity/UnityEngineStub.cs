@@ -10,7 +10,7 @@ namespace Unity.Collections
     {
         private readonly T[] items;
         public NativeArray(T[] items) { this.items = items; }
-        public T this[int k] { get { return items[k]; } }
+        public void CopyTo(T[] target) { items.CopyTo(target, 0); }
     }
 }
 
@@ -29,7 +29,8 @@ namespace UnityEngine
     {
         public HideFlags hideFlags;
         public string name;
-        public static void Destroy(Object thing) { }
+        public static readonly List<Object> Destroyed = new List<Object>();
+        public static void Destroy(Object thing) { Destroyed.Add(thing); }
         public static void DestroyImmediate(Object thing) { }
     }
 
@@ -111,6 +112,23 @@ namespace UnityEngine
     public enum PrimitiveType { Capsule, Cube }
     public enum CameraClearFlags { Skybox, SolidColor }
     public enum FilterMode { Point, Bilinear }
+    public static class Debug
+    {
+        public static readonly List<string> Errors = new List<string>();
+        public static void LogError(object message, Object context) { Errors.Add((string)message); }
+    }
+
+    public class Shader : Object
+    {
+        public static Shader Find(string name) { return new Shader { name = name }; }
+    }
+
+    public class Material : Object
+    {
+        public readonly Shader Shader;
+        public Material(Shader shader) { Shader = shader; }
+    }
+
     public enum RenderTextureFormat { ARGB32, Depth, RFloat }
     public enum RenderTextureReadWrite { Default, Linear }
     public enum TextureFormat { RFloat, RGBA32 }
@@ -166,8 +184,9 @@ namespace UnityEngine
 
     public static class Graphics
     {
-        public static void Blit(Texture from, RenderTexture to)
+        public static void Blit(Texture from, RenderTexture to, Material material)
         {
+            if (material.Shader.name != "Hidden/CapSense/CopyDepth") throw new InvalidOperationException();
             ((RenderTexture)from).depthBuffer.Depth.CopyTo(to.colorBuffer.Depth, 0);
         }
     }
@@ -179,18 +198,15 @@ namespace UnityEngine
         public LayerMask cullingMask;
         public CameraClearFlags clearFlags;
         public Color backgroundColor;
-        private RenderBuffer color, depth;
-
-        public void SetTargetBuffers(RenderBuffer color, RenderBuffer depth)
-        {
-            this.color = color;
-            this.depth = depth;
-        }
+        public RenderTexture targetTexture;
+        public int Rendered;
 
         public void Render()
         {
             if (!orthographic || enabled || allowMSAA || allowHDR || nearClipPlane != 0)
                 throw new InvalidOperationException("this camera does not measure depths");
+            Rendered++;
+            RenderBuffer color = targetTexture.colorBuffer, depth = targetTexture.depthBuffer;
             int n = (int)Math.Sqrt(depth.Depth.Length);
             for (int row = 0; row < n; row++)
                 for (int column = 0; column < n; column++)

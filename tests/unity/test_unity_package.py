@@ -182,6 +182,44 @@ def test_component(program: Path, served: RunningServer, depth_buffer: str) -> N
 
 
 @needs_mono
+def test_settings_of_the_component(program: Path, served: RunningServer) -> None:
+    """No address is an error told once; a field that changes is taken over; all is cleaned up.
+
+    While an answer is waited for nothing is rendered; what touches the sensor is felt.
+    """
+    wrong, seen, again, last = run(program, "settings", served.url)
+    (error,) = wrong["errors"]
+    assert "is no address of a server" in error
+    assert wrong["cameras"] == 0
+    assert 0 <= seen["rendered"] - seen["sequence"] - 1 <= 1
+    assert seen["self"] > 1e-12
+    assert again == {"cameras": 2, "textures": 2}
+    assert last == {"state": "Stopped", "quick": True}
+
+
+@needs_mono
+def test_silent_server(program: Path) -> None:
+    """One that takes frames and never answers is given up."""
+    from websockets.sync.server import serve
+
+    def handle(connection: Any) -> None:
+        connection.recv()
+        connection.send(json.dumps({"type": "welcome"}))
+        sensor = json.loads(connection.recv())["sensor"]
+        opened = {"type": "opened", "sensor": sensor, "baseline": [[1.0]], "channels": [],
+                  "electrodes": ["E1"]}  # fmt: skip
+        connection.send(json.dumps(opened))
+        for _ in connection:
+            pass
+
+    with serve(handle, "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        assert run(program, "silent", url) == [{"code": "closed"}]
+        server.shutdown()
+
+
+@needs_mono
 def test_sample(program: Path, served: RunningServer) -> None:
     """A bar for each electrode, as high as its signal."""
     (line,) = run(program, "sample", served.url)
@@ -241,9 +279,21 @@ def test_package_is_whole() -> None:
     manifest = json.loads((PACKAGE / "package.json").read_text())
     assert re.fullmatch(r"[a-z]+(\.[a-z]+)+", manifest["name"])
     assert manifest["version"] == cs.__version__
+    assert f"## [{manifest['version']}]" in (PACKAGE / "CHANGELOG.md").read_text()
     for sample in manifest["samples"]:
-        assert list((PACKAGE / sample["path"]).glob("*.cs"))
-    assets = [p for p in PACKAGE.rglob("*") if p.suffix != ".meta" and "~" not in str(p)]
+        (scene,) = (PACKAGE / sample["path"]).glob("*.unity")
+        (script,) = (PACKAGE / sample["path"]).glob("*.cs")
+        identity = script.with_name(script.name + ".meta").read_text().split("guid: ")[1].strip()
+        assert f"guid: {identity}" in scene.read_text()
+    shaders = {
+        re.findall(r'^Shader "(.+)"', p.read_text(), re.MULTILINE)[0]
+        for p in PACKAGE.rglob("*.shader")
+    }
+    used = re.findall(r'Shader.Find\("(.+)"\)', (PACKAGE / "Runtime/DepthCamera.cs").read_text())
+    assert set(used) <= shaders
+    sample_files = [p for p in PACKAGE.rglob("*") if "Samples~/Hand/" in p.as_posix()]
+    assets = [p for p in PACKAGE.rglob("*") if "~" not in str(p)] + sample_files
+    assets = [p for p in assets if p.suffix != ".meta"]
     identities = set()
     for asset in assets:
         meta = asset.with_name(asset.name + ".meta")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.viewer.plane import NEAR, OCTAVES, Plane, is_flat, paint, palette, region
+from capsense.viewer.plane import NEAR, OCTAVES, Plane, is_flat, levels, palette, region
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +93,27 @@ def test_potentials_on_a_plane(simulator: cs.Simulator) -> None:
     assert np.abs(found[inside]).max() < 0.05 * empty[inside].max()
 
 
-def test_paint() -> None:
-    """One colour for each halving; nothing below the last, nor below zero."""
-    potential = np.array([1.0, 0.51, 0.49, 2.0**-OCTAVES * 1.01, 2.0**-OCTAVES * 0.99, -0.1])
-    shown, colours = paint(potential)
-    np.testing.assert_array_equal(shown, [True, True, True, True, False, False])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_contours(simulator: cs.Simulator, axis: int) -> None:
+    """Lines of a linear potential are straight, on the plane, where it has their value."""
+    bounds = region(simulator.design)
+    plane = Plane(simulator.background.green, bounds, axis, 0.02)
+    across = next(k for k in range(3) if k != axis)
+    low, high = bounds[across]
+    pieces, colours = plane.contours((plane.points[:, across] - low) / (high - low))
+    assert pieces.shape == colours.shape
+    np.testing.assert_allclose(pieces[..., axis], 0.02)
+    value = (pieces[..., across] - low) / (high - low)
+    nearest = np.abs(value[..., None] - levels()).argmin(axis=-1)
+    np.testing.assert_allclose(value, levels()[nearest], rtol=1e-6)
+    np.testing.assert_array_equal(colours, palette()[nearest])
+
+
+def test_colours_of_lines() -> None:
+    """Two from each halving to the next, darker and darker."""
+    np.testing.assert_allclose(levels()[2:] / levels()[:-2], 2.0)
+    assert levels()[0] == 2.0**-OCTAVES
+    assert levels()[-1] < 1.0
     c = palette()
-    np.testing.assert_array_equal(colours, c[[-1, -1, -2, 0]])
-    assert len(np.unique(c, axis=0)) == OCTAVES
-    brightness = c.astype(float).sum(axis=1)
-    assert (np.diff(brightness) < 0).all()
+    assert len(np.unique(c, axis=0)) == len(levels())
+    assert (np.diff(c.astype(float).sum(axis=1)) < 0).all()

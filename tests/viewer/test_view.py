@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from collections.abc import Iterator
 from typing import Any
@@ -15,10 +16,12 @@ from recorded_scenes import SLAB, bodies, frame_at, scene_at
 from view_sources import Queued, until
 
 import capsense as cs
+from capsense._style import LOUD, QUIET
 from capsense.errors import ProtocolError, ServerError
 from capsense.viewer.follower import Follower
 from capsense.viewer.plane import Plane, region
-from capsense.viewer.stage import LOUD, QUIET, Stage
+from capsense.viewer.source import charges_of
+from capsense.viewer.stage import SHADES, Stage
 from capsense.viewer.view import View, check_address
 
 
@@ -41,6 +44,7 @@ def test_designs(server: Any, name: str) -> None:
     server.scene.reset()
     design = cs.load_design(name)
     Stage(server, design)
+    assert len(nodes(server, "/axes/")) == 3
     for under, parts in (
         ("/electrodes/", design.electrodes), ("/conductors/", design.conductors),
         ("/layers/", design.layers), ("/labels/", design.electrodes),
@@ -105,30 +109,66 @@ def test_deforming_surfaces(server: Any) -> None:
 
 
 def test_signals(server: Any) -> None:
-    """From quiet to loud, and no further."""
+    """From quiet to loud, and no further; light does not change the colours."""
     server.scene.reset()
     stage = Stage(server, cs.load_design("patch"))
     stage.show_signals(np.array([0.0, 0.5, 1.0, 7.0]))
-    colours = [server.scene._handle_from_node_name[f"/electrodes/{k}"].color for k in range(4)]
-    assert tuple(colours[0]) == QUIET
-    assert tuple(colours[2]) == tuple(colours[3]) == LOUD
-    np.testing.assert_allclose(colours[1], (np.array(QUIET) + LOUD) / 2, atol=1)
+    shown = {
+        n: h.glb_data for n, h in server.scene._handle_from_node_name.items()
+        if n.startswith("/electrodes/") and h.visible
+    }  # fmt: skip
+    assert sorted(shown) == [f"/electrodes/{k}-{s}" for k, s in enumerate((0, 16, SHADES, SHADES))]
+    stage.show_signals(np.zeros(4))
+    assert not server.scene._handle_from_node_name[f"/electrodes/2-{SHADES}"].visible
+    for data, colour in ((shown["/electrodes/0-0"], QUIET), (shown["/electrodes/2-31"], LOUD)):
+        length = int.from_bytes(data[12:16], "little")
+        (material,) = json.loads(data[20 : 20 + length])["materials"]
+        assert material["extensions"] == {"KHR_materials_unlit": {}}
+        linear = np.array(material["pbrMetallicRoughness"]["baseColorFactor"][:3])
+        srgb = np.where(linear < 0.0031, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        np.testing.assert_allclose(255 * srgb, colour, atol=3)
 
 
 def test_plane(server: Any) -> None:
-    """Points where the potential is worth showing; none once it is hidden."""
+    """Lines of equal potential on the plane; none once they are hidden."""
     server.scene.reset()
     simulator = cs.Simulator("six_patch")
     stage = Stage(server, simulator.design)
     plane = Plane(simulator.background.green, region(simulator.design), 1, 0.0)
     simulator.step(cs.Scene())
     stage.show_plane(plane, simulator.potentials(plane.points)[:, 1])
-    cloud = server.scene._handle_from_node_name["/potential"]
-    assert 1000 < len(cloud.points) < len(plane.drawn)
-    assert np.abs(cloud.points[:, 1].astype(float)).max() == 0
-    stage.hide_plane()
+    lines = server.scene._handle_from_node_name["/potential"]
+    assert len(lines.points) > 1000
+    assert np.abs(lines.points[..., 1].astype(float)).max() == 0
+    stage.hide("/potential")
     assert "/potential" not in server.scene._handle_from_node_name
-    stage.hide_plane()
+    stage.hide("/potential")
+
+
+def test_charges(server: Any) -> None:
+    """On the surface of the ball, the densest nearest to the electrode; none without a body."""
+    server.scene.reset()
+    simulator = cs.Simulator("six_patch")
+    stage = Stage(server, simulator.design)
+    x, y, _ = simulator.design.electrodes[1].surface.bounds.mean(axis=0)
+    ball = cs.Body(cs.Sphere(0.02), cs.Pose((x, y, 0.04)), "steel", name="ball")
+    scene = cs.Scene([ball])
+    simulator.step(scene)
+    charges = charges_of(simulator)
+    assert charges is not None
+    stage.show_bodies(scene)
+    stage.show_charges(charges, 1)
+    cloud = server.scene._handle_from_node_name["/charge"]
+    points = cloud.points.astype(float)
+    radius = np.linalg.norm(points - ball.pose.position, axis=1)
+    np.testing.assert_allclose(radius, 0.02, atol=1.5e-3)  # a mesh stands for the sphere
+    darkest = points[np.argmin(cloud.colors.astype(int).sum(axis=1))]
+    assert darkest[2] < 0.025
+    assert nodes(server, "/names/") == ["/names/0"]
+    simulator.step(cs.Scene())
+    assert charges_of(simulator) is None
+    stage.show_charges(None, 1)
+    assert "/charge" not in server.scene._handle_from_node_name
 
 
 def test_live_controls() -> None:

@@ -1,5 +1,6 @@
 using System;
 using System.Collections.Generic;
+using System.Linq;
 using System.Net.WebSockets;
 using System.Text;
 using System.Threading;
@@ -41,11 +42,13 @@ namespace CapSense
         private Task work;
 
         /// <param name="url">Such as ws://127.0.0.1:8765.</param>
+        /// <exception cref="ArgumentException">It is no such address.</exception>
         /// <param name="token">What the server was told to ask for.</param>
         /// <param name="protocol">Version that is announced; for tests.</param>
         public CapSenseClient(string url, string token = "", int protocol = Wire.Protocol)
         {
-            uri = new Uri(url);
+            if (!Uri.TryCreate(url, UriKind.Absolute, out uri) || (uri.Scheme != "ws" && uri.Scheme != "wss"))
+                throw new ArgumentException("'" + url + "' is no address of a server, such as ws://127.0.0.1:8765");
             this.token = token ?? "";
             this.protocol = protocol;
         }
@@ -61,8 +64,8 @@ namespace CapSense
         /// <summary>First and longest pause before the next attempt to connect.</summary>
         public TimeSpan Pause = TimeSpan.FromSeconds(0.25), LongestPause = TimeSpan.FromSeconds(5);
 
-        /// <summary>Longest wait for the server's welcome.</summary>
-        public TimeSpan Timeout = TimeSpan.FromSeconds(5);
+        /// <summary>Longest wait for the server's welcome, and for the answer to a frame.</summary>
+        public TimeSpan Timeout = TimeSpan.FromSeconds(5), AnswerTimeout = TimeSpan.FromSeconds(10);
 
         /// <summary>Want a sensor; it is opened as soon as there is a connection.</summary>
         public RemoteSensor Add(SensorOptions options)
@@ -85,14 +88,16 @@ namespace CapSense
                 if (work == null) work = Task.Run(StayConnected);
         }
 
-        /// <summary>Close the connection and stop.</summary>
+        /// <summary>Close the connection and stop; does not wait for the server.</summary>
         public void Dispose()
         {
-            stop.Cancel();
+            lock (gate)
+            {
+                stop.Cancel();
+                State = ClientState.Stopped;
+            }
             ClientWebSocket current = socket;
             if (current != null) current.Abort();
-            if (work != null) work.Wait(TimeSpan.FromSeconds(2));
-            State = ClientState.Stopped;
         }
 
         private async Task StayConnected()
@@ -108,7 +113,8 @@ namespace CapSense
                         Enter(ClientState.Connecting, uri.ToString());
                         await Greet().ConfigureAwait(false);
                         pause = Pause;
-                        await Receive().ConfigureAwait(false);
+                        using (new Timer(_ => Watch(), null, 1000, 1000))
+                            await Receive().ConfigureAwait(false);
                     }
                 }
                 catch (CapSenseException error)
@@ -159,11 +165,20 @@ namespace CapSense
             RemoteSensor[] known;
             lock (gate)
             {
+                if (stop.IsCancellationRequested) return;
                 State = ClientState.Connected;  // whatever is added from now on opens itself
                 known = All();
             }
             foreach (RemoteSensor sensor in known) SendText(sensor.Options.ToMessage(sensor.Number));
             Say("connected");
+        }
+
+        /// <summary>Give a connection up that does not answer.</summary>
+        private void Watch()
+        {
+            if (!All().Any(sensor => sensor.Overdue(AnswerTimeout))) return;
+            ClientWebSocket current = socket;
+            if (current != null) current.Abort();
         }
 
         private async Task Receive()
@@ -275,7 +290,11 @@ namespace CapSense
 
         private void Enter(ClientState state, string why)
         {
-            State = state;
+            lock (gate)
+            {
+                if (stop.IsCancellationRequested) return;
+                State = state;
+            }
             Say(state.ToString().ToLowerInvariant() + ": " + why);
         }
 

@@ -38,6 +38,8 @@ namespace CapSense
         private RemoteSensor remote;
         private DepthCamera view;
         private float next;
+        private bool refused;
+        private Settings made;
 
         /// <summary>The newest reading; null before the first.</summary>
         public Reading Reading { get; private set; }
@@ -53,8 +55,17 @@ namespace CapSense
 
         private void OnEnable()
         {
-            view = new DepthCamera(transform, resolution, size, range, seen, permittivityCodes);
-            client = new CapSenseClient(url, token);
+            made = Wanted;
+            try
+            {
+                client = new CapSenseClient(url, token);
+            }
+            catch (System.ArgumentException error)
+            {
+                client = null;
+                Debug.LogError("CapSense: " + error.Message, this);
+                return;
+            }
             remote = client.Add(new SensorOptions
             {
                 Design = design,
@@ -64,26 +75,67 @@ namespace CapSense
                 Columns = "-x",
                 Material = material,
             });
+            view = new DepthCamera(transform, resolution, size, range, seen, permittivityCodes);
             client.Start();
         }
 
         private void OnDisable()
         {
+            if (client == null) return;
             client.Dispose();
             view.Dispose();
+            client = null;
         }
 
         private void LateUpdate()
         {
+            if (!made.Equals(Wanted))
+            {
+                OnDisable();
+                OnEnable();
+            }
+            if (client == null) return;
             Reading found;
             if (remote.TryTake(out found))
             {
                 Reading = found;
                 if (Received != null) Received(found);
             }
-            if (client.State != ClientState.Connected || Time.time < next) return;
+            if (!refused && client.State == ClientState.Refused)
+                Debug.LogError("CapSense: " + client.LastError.Message, this);
+            refused = client.State == ClientState.Refused;
+            // while an answer is waited for nothing is rendered
+            if (!remote.Idle || Time.time < next) return;
             next = rate > 0 ? Mathf.Max(next + 1 / rate, Time.time) : 0;
             remote.Submit(view.Take(Time.timeAsDouble));
+        }
+
+        private Settings Wanted
+        {
+            get
+            {
+                return new Settings
+                {
+                    Url = url, Token = token, Design = design, Material = material,
+                    Codes = permittivityCodes, Resolution = resolution, Size = size, Range = range, Seen = seen,
+                };
+            }
+        }
+
+        /// <summary>What needs a new connection, or a new camera, when it changes.</summary>
+        private struct Settings : System.IEquatable<Settings>
+        {
+            internal string Url, Token, Design, Material;
+            internal bool Codes;
+            internal int Resolution, Seen;
+            internal float Size, Range;
+
+            public bool Equals(Settings other)
+            {
+                return Url == other.Url && Token == other.Token && Design == other.Design
+                    && Material == other.Material && Codes == other.Codes && Resolution == other.Resolution
+                    && Seen == other.Seen && Size.Equals(other.Size) && Range.Equals(other.Range);
+            }
         }
     }
 }

@@ -5,14 +5,23 @@ using UnityEngine;
 namespace CapSense
 {
     /// <summary>An orthographic camera whose depth and red channel are read back.</summary>
+    /// <remarks>
+    /// It renders into target textures, as every render pipeline can. The depth texture is copied to a
+    /// float texture by a shader of the package. With codes it renders a second time, for colours.
+    /// </remarks>
     public sealed class DepthCamera : IDisposable
     {
+        /// <summary>Depth of what touches the sensor [m]; 0 would be air.</summary>
+        public const float Contact = 1e-6f;
+
         private readonly Camera camera;
-        private readonly bool codes;
         private readonly int resolution;
         private readonly float range;
         private readonly RenderTexture color, depth, copy;
         private readonly Texture2D depthPixels, colorPixels;
+        private readonly Material copier;
+        private readonly DepthFrame frame;
+        private readonly byte[] rgba;
 
         /// <param name="parent">The camera stands at its origin and looks along its forward axis.</param>
         /// <param name="resolution">Pixels along either side.</param>
@@ -23,9 +32,10 @@ namespace CapSense
         public DepthCamera(
             Transform parent, int resolution, float size, float range, LayerMask seen, bool codes)
         {
-            this.codes = codes;
             this.resolution = resolution;
             this.range = range;
+            int pixels = resolution * resolution;
+            frame = new DepthFrame(resolution, resolution, new float[pixels], codes ? new byte[pixels] : null);
             var holder = new GameObject("CapSense camera") { hideFlags = HideFlags.HideAndDontSave };
             holder.transform.SetParent(parent, false);
             Vector3 scale = parent.lossyScale;  // sizes are metres, whatever the parent's scale
@@ -42,44 +52,57 @@ namespace CapSense
             camera.backgroundColor = Color.clear;
             camera.allowMSAA = false;  // codes and depths must not be blended
             camera.allowHDR = false;
-            color = Target(0, RenderTextureFormat.ARGB32);
+            copier = new Material(Shader.Find("Hidden/CapSense/CopyDepth"));
             depth = Target(32, RenderTextureFormat.Depth);
             copy = Target(0, RenderTextureFormat.RFloat);
             depthPixels = new Texture2D(resolution, resolution, TextureFormat.RFloat, false, true);
+            if (!codes) return;
+            color = Target(32, RenderTextureFormat.ARGB32);
             colorPixels = new Texture2D(resolution, resolution, TextureFormat.RGBA32, false, true);
-            camera.SetTargetBuffers(color.colorBuffer, depth.depthBuffer);
+            rgba = new byte[4 * pixels];
         }
 
         /// <summary>Take an image; its first row is the lowest.</summary>
+        /// <returns>The same object every time; it is filled anew.</returns>
         public DepthFrame Take(double time)
         {
+            camera.targetTexture = depth;
             camera.Render();
-            Graphics.Blit(depth, copy);
-            NativeArray<float> raw = Read<float>(copy, depthPixels);
-            var metres = new float[resolution * resolution];
+            Graphics.Blit(depth, copy, copier);
+            Read<float>(copy, depthPixels).CopyTo(frame.Depth);
             bool reversed = SystemInfo.usesReversedZBuffer;
-            for (int k = 0; k < metres.Length; k++)
+            for (int k = 0; k < frame.Depth.Length; k++)
             {
-                float share = reversed ? 1 - raw[k] : raw[k];  // linear, since it is orthographic
-                metres[k] = share < 1 ? Math.Max(share * range, float.Epsilon) : 0;
+                // linear, since it is orthographic
+                float share = reversed ? 1 - frame.Depth[k] : frame.Depth[k];
+                frame.Depth[k] = share < 1 ? Math.Max(share * range, Contact) : 0;
             }
-            return new DepthFrame(resolution, resolution, metres, codes ? Red() : null, time);
+            if (frame.Codes != null) TakeCodes();
+            frame.Time = time;
+            return frame;
         }
 
         public void Dispose()
         {
-            foreach (RenderTexture texture in new[] { color, depth, copy }) texture.Release();
+            camera.targetTexture = null;
+            foreach (RenderTexture texture in new[] { color, depth, copy })
+            {
+                if (texture == null) continue;
+                texture.Release();
+                Destroy(texture);
+            }
             Destroy(depthPixels);
-            Destroy(colorPixels);
+            if (colorPixels != null) Destroy(colorPixels);
+            Destroy(copier);
             Destroy(camera.gameObject);
         }
 
-        private byte[] Red()
+        private void TakeCodes()
         {
-            NativeArray<byte> raw = Read<byte>(color, colorPixels);
-            var red = new byte[resolution * resolution];
-            for (int k = 0; k < red.Length; k++) red[k] = raw[4 * k];
-            return red;
+            camera.targetTexture = color;
+            camera.Render();
+            Read<byte>(color, colorPixels).CopyTo(rgba);
+            for (int k = 0; k < frame.Codes.Length; k++) frame.Codes[k] = rgba[4 * k];
         }
 
         private RenderTexture Target(int depthBits, RenderTextureFormat format)
@@ -89,6 +112,7 @@ namespace CapSense
             {
                 filterMode = FilterMode.Point,
                 antiAliasing = 1,
+                hideFlags = HideFlags.HideAndDontSave,
             };
             target.Create();
             return target;

@@ -89,6 +89,12 @@ namespace CapSense
         /// <summary>What was last wrong with a frame of this sensor, or with opening it.</summary>
         public CapSenseException LastError { get; private set; }
 
+        /// <summary>Whether a frame that is submitted now is sent at once.</summary>
+        public bool Idle
+        {
+            get { lock (gate) return open && underway == null && waiting == null; }
+        }
+
         /// <summary>Send a frame as soon as the one before is answered; the newest wins.</summary>
         public void Submit(DepthFrame frame)
         {
@@ -138,12 +144,19 @@ namespace CapSense
                 order = underway = waiting;
                 waiting = null;
                 order.Sequence = sequence++;
+                order.Sent = DateTime.UtcNow;
             }
             // One frame is underway at a time, so the buffer is free.
             int size = Wire.SizeOf(order.Frame);
             if (buffer.Length < size) buffer = new byte[size];
             Wire.Pack(buffer, Number, order.Sequence, order.Frame);
             client.Send(new ArraySegment<byte>(buffer, 0, size));
+        }
+
+        /// <summary>Whether an answer has been waited for longer than this.</summary>
+        internal bool Overdue(TimeSpan limit)
+        {
+            lock (gate) return underway != null && DateTime.UtcNow - underway.Sent > limit;
         }
 
         internal void Opened(Dictionary<string, object> message)
@@ -226,6 +239,7 @@ namespace CapSense
             internal readonly DepthFrame Frame;
             internal readonly TaskCompletionSource<Reading> Answer;
             internal long Sequence;
+            internal DateTime Sent;
 
             internal Order(DepthFrame frame, TaskCompletionSource<Reading> answer)
             {

@@ -16,7 +16,7 @@ namespace CapSense
         public readonly byte[] Codes;
 
         /// <summary>Time of the image [s].</summary>
-        public readonly double Time;
+        public double Time;
 
         /// <exception cref="ArgumentException">An array has another size than the image.</exception>
         public DepthFrame(int rows, int columns, float[] depth, byte[] codes = null, double time = 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,7 +90,7 @@ class CoppeliaSensor(DepthSensor):
 
         Raises:
             SceneError: The simulation is not running, or the vision sensor was changed.
-            SimulatorError: CoppeliaSim does not answer.
+            SimulatorError: CoppeliaSim does not answer, or draws nothing.
         """
         remote, handle = self._remote, self.eye.handle
         if remote.is_stopped():
@@ -97,7 +98,16 @@ class CoppeliaSensor(DepthSensor):
                 "the simulation is not running; call sim.startSimulation() and sim.step(), or "
                 "step in capsense.coppeliasim.running(sim)"
             )
-        remote.call("handleVisionSensor", handle)
+        if self._paint is None:
+            remote.call("handleVisionSensor", handle)
+        elif not _draws(remote, handle):
+            self._paint.collect(handle)  # CoppeliaSim drops collections of scripts that end
+            if not _draws(remote, handle):
+                raise SimulatorError(
+                    f"CoppeliaSim draws nothing for vision sensor {self.eye.path!r}; builds and "
+                    "machines without OpenGL do not, nor does it while vision sensors are "
+                    "disabled: start the usual build, on a machine without a display under xvfb-run"
+                )
         depth = self._image("getVisionSensorDepth", np.dtype("<f4"), 1, 1)
         seen: Any = self._material
         if seen is None:
@@ -105,14 +115,14 @@ class CoppeliaSensor(DepthSensor):
         return DepthFrame(depth, seen, self.eye.camera, grounding=self._grounding, back=self._back)
 
     def refresh(self) -> None:
-        """Colour the world's shapes again, after some were added.
+        """Colour the world's shapes again, and collect anew which are seen, after some were added.
 
         Raises:
             SceneError: A name pattern fits nothing.
             SimulatorError: CoppeliaSim does not answer.
         """
         if self._paint is not None:
-            self._paint.refresh()
+            self._paint.collect(self.eye.handle)
 
     def remove(self) -> None:
         """Take the vision sensor that was made for this one out of the scene again.
@@ -158,23 +168,21 @@ class Paint:
 
     def __init__(self, remote: Remote, rules: Rules, own: int | None) -> None:
         self._remote, self._rules = remote, rules
-        shapes = self._shapes()  # refuses wrong patterns before the scene is changed
-        self.collection = int(remote.call("createCollection", 0))
+        self._own = own
+        self.collection = self._paint(self._shapes())
         """Handle of the collection of what is seen."""
-        every = remote.constant("handle_all")
-        remote.call("addItemToCollection", self.collection, every, -1, 0)
-        self._hidden: set[int] = set()
-        if own is not None:
-            self._hide(own)
-        self._colour(shapes)
 
-    def refresh(self) -> None:
-        """Colour the shapes that there are now.
+    def collect(self, eye: int) -> None:
+        """Colour the shapes that there are now, and show them to a vision sensor.
 
         Raises:
             SceneError: A name pattern fits nothing.
         """
-        self._colour(self._shapes())
+        shapes = self._shapes()  # refuses wrong patterns before the scene is changed
+        with suppress(SimulatorError):  # it may be gone already
+            self._remote.call("destroyCollection", self.collection)
+        self.collection = self._paint(shapes)
+        show(self._remote, eye, self.collection)
 
     def _shapes(self) -> dict[int, tuple[tuple[str, str], float]]:
         """Names and code, from 0 to 1, of every shape in the scene.
@@ -194,17 +202,18 @@ class Paint:
             out[handle] = names, int(code) / CONDUCTOR_CODE
         return out
 
-    def _colour(self, shapes: dict[int, tuple[tuple[str, str], float]]) -> None:
-        component = self._remote.constant("colorcomponent_auxiliary")
+    def _paint(self, shapes: dict[int, tuple[tuple[str, str], float]]) -> int:
+        """Colour shapes; returns a new collection of those that are seen."""
+        remote = self._remote
+        component = remote.constant("colorcomponent_auxiliary")
+        single, every = remote.constant("handle_single"), remote.constant("handle_all")
+        collection = int(remote.call("createCollection", 0))
+        remote.call("addItemToCollection", collection, every, -1, 0)
         for handle, (names, red) in shapes.items():
-            if self._rules.excludes(names) and handle not in self._hidden:
-                self._hide(handle)
-            self._remote.call("setShapeColor", handle, None, component, [red, 0.0, 0.0])
-
-    def _hide(self, handle: int) -> None:
-        self._hidden.add(handle)
-        single = self._remote.constant("handle_single")
-        self._remote.call("addItemToCollection", self.collection, single, handle, _REMOVED)
+            if handle == self._own or self._rules.excludes(names):
+                remote.call("addItemToCollection", collection, single, handle, _REMOVED)
+            remote.call("setShapeColor", handle, None, component, [red, 0.0, 0.0])
+        return collection
 
 
 def find_eye(remote: Remote, handle: int) -> Eye | None:
@@ -248,9 +257,26 @@ def make_eye(
     remote.call("setObjectAlias", eye, _ALIAS)
     remote.call("setObjectParent", eye, handle, False)
     remote.call("setObjectPose", eye, [*pose.position, *pose.quaternion], handle)
-    for name, value in (("render_mode", _AUXILIARY_CHANNELS), ("entity_to_render", seen)):
-        remote.call("setObjectInt32Param", eye, remote.constant(f"visionintparam_{name}"), value)
+    mode = remote.constant("visionintparam_render_mode")
+    remote.call("setObjectInt32Param", eye, mode, _AUXILIARY_CHANNELS)
+    show(remote, eye, seen)
     return _read_eye(remote, eye)
+
+
+def show(remote: Remote, eye: int, collection: int) -> None:
+    """Let a vision sensor see what is in a collection."""
+    entity = remote.constant("visionintparam_entity_to_render")
+    remote.call("setObjectInt32Param", eye, entity, collection)
+
+
+def _draws(remote: Remote, eye: int) -> bool:
+    """Let a vision sensor look; whether anything was drawn, be it the background alone.
+
+    A vision sensor that drew returns figures of its image, fifteen numbers; one that could not,
+    for want of OpenGL or of its collection, returns none.
+    """
+    found = remote.call("handleVisionSensor", eye)
+    return not isinstance(found, list | tuple) or len(found) < 2 or len(found[1]) > 0
 
 
 def carrier(remote: Remote, handle: int) -> int | None:
@@ -264,7 +290,8 @@ def carrier(remote: Remote, handle: int) -> int | None:
 def _remove_eye(remote: Remote, eye: int) -> None:
     """Remove a vision sensor made here, and the collection of what it sees."""
     entity = remote.constant("visionintparam_entity_to_render")
-    remote.call("destroyCollection", remote.call("getObjectInt32Param", eye, entity))
+    with suppress(SimulatorError):  # CoppeliaSim drops collections of scripts that end
+        remote.call("destroyCollection", remote.call("getObjectInt32Param", eye, entity))
     remote.call("removeObjects", [eye])
 
 

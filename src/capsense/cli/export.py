@@ -13,11 +13,13 @@ Turn a recording into another file. The ending chooses the format:
   .npz             the arrays of readings.npz, the episode, and the counts of a read-out;
                    capsense readout takes it
   .mcap            the recording again; one whose recorder was killed gets its index
+  .json            a layout in which Foxglove shows the recording
 """
 EXAMPLES = """\
   capsense export hand.mcap -o hand.parquet
   capsense export hand.mcap -o counts.csv --counts
   capsense export killed.mcap -o whole.mcap
+  capsense export hand.mcap -o layout.json
 """
 
 
@@ -46,6 +48,6 @@ def execute(args: argparse.Namespace) -> int:
     if not recording.complete:
         say(f"warning: {args.recording} was not closed; what was written until then is exported")
     count = export(recording, args.output, counts=args.counts)
-    what = "messages" if args.output.suffix.lower() == ".mcap" else "rows"
+    what = {".mcap": "messages", ".json": "layout"}.get(args.output.suffix.lower(), "rows")
     print(f"{count} {what} in {args.output}")
     return OK

@@ -10,9 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
-from capsense.cli.plot_views import FAINT, INK, LABELS, TIME_COLOURS, bare, draw_views
+from capsense._style import (
+    COLOURS,
+    DASHES,
+    FAINT,
+    INK,
+    LABELS,
+    TIME_COLOURS,
+    bare,
+    style_of,
+    unit_of,
+)
+from capsense.cli.plot_views import draw_views
 from capsense.cli.recorder import Recorder
-from capsense.design.draw import COLOURS
 from capsense.scenario import Channel, Excitation
 
 if TYPE_CHECKING:
@@ -20,7 +30,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
 PLAIN_ELECTRODE = "#c08a3e"
 MAX_LINES = 8
 """So many lines of a family are coloured; the rest, the weakest, stay grey."""
@@ -112,11 +121,6 @@ def _families(recorder: Recorder) -> list[_Family]:
     return out
 
 
-def style_of(number: int) -> tuple[str, Any]:
-    """Colour and dashes of signal ``number``."""
-    return COLOURS[number % len(COLOURS)], DASHES[(number // len(COLOURS)) % len(DASHES)]
-
-
 def _pair_styles(channels: list[Channel]) -> list[tuple[str, Any]]:
     """Colours for the strongest pairs, dashed in turns so that neighbours differ twice."""
     return [
@@ -138,7 +142,7 @@ def _strongest(recorder: Recorder) -> int:
 
 def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: Axes) -> None:
     changes = family.values - family.levels
-    factor, unit = _unit(float(np.abs(changes).max(initial=0.0)))
+    factor, unit = unit_of(float(np.abs(changes).max(initial=0.0)))
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.where(family.levels != 0, family.values / family.levels, np.nan)
     marker = "o" if len(times) < 3 else ""
@@ -188,14 +192,6 @@ def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: A
     lower.set_xlabel("time [s]", **LABELS)
     if len(times) > 1:
         _time_strip(lower, times)
-
-
-def _unit(largest: float) -> tuple[float, str]:
-    """A factor and a unit in which ``largest`` [F] is a handy number."""
-    for factor, unit in ((1e12, "pF"), (1e15, "fF")):
-        if largest * factor >= 1.0:
-            return factor, unit
-    return 1e18, "aF"
 
 
 def _time_strip(axes: Axes, times: Array) -> None:

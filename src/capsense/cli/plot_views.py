@@ -11,6 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from capsense._style import FAINT, INK, LABELS, LEGEND, TIME_COLOURS, TITLES, bare
 from capsense.cli.recorder import Recorder
 from capsense.design import Design
 from capsense.design.draw import LAYER_COLOUR, ROLE_COLOURS, outline_patch, outlines
@@ -20,11 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Array = NDArray[np.float64]
-
-INK, FAINT = "#2b2b2b", "#b9bdc1"
-TIME_COLOURS = "cividis"
-"""The colour map of time: even in lightness, and the same to any colour vision."""
-LABELS: dict[str, Any] = {"fontsize": 9, "color": INK}
 
 
 def draw_views(recorder: Recorder, peak: int, colours: list[str], above: Axes, side: Axes) -> None:
@@ -63,24 +59,13 @@ def draw_views(recorder: Recorder, peak: int, colours: list[str], above: Axes, s
         axes.grid(visible=False)
         axes.set_xlabel(f"{'xyz'[a]} [mm]", **LABELS)
         axes.set_ylabel(f"{'xyz'[b]} [mm]", **LABELS)
-        axes.set_title(title, fontsize=10, fontweight="bold", color=INK, loc="left")
+        axes.set_title(title, **TITLES)
     if recorder.scenario.bodies and len(recorder.times) > 1:
         handles = [Line2D([], [], ls="-", color=INK, lw=0.9, label="body at the largest change")]
         if peak:
             style: dict[str, Any] = {"marker": "o", "ls": "--", "color": INK, "mfc": "white"}
             handles.insert(0, Line2D([], [], lw=0.9, label="start", **style))
-        above.figure.legend(
-            handles=handles, loc="outside lower right", ncols=2, fontsize=8, frameon=False
-        )
-
-
-def bare(axes: Axes) -> None:
-    """Take everything off the axes that shows no data."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.grid(color="#e6e8ea", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8, colors=INK, length=3, color=FAINT)
+        above.figure.legend(handles=handles, loc="outside lower right", ncols=2, **LEGEND)
 
 
 def _window(recorder: Recorder, peak: int) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from capsense.cli.plot_views import FAINT, INK, LABELS, bare
+from capsense._style import COLOURS, FAINT, INK, LABELS, LEGEND, TITLES, bare
 from capsense.errors import ReadOutError
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from capsense.readout.recording import Recording
 
 Array = NDArray[np.float64]
-SELF_COLOUR, MUTUAL_COLOUR, OUTSIDE = "#0072B2", "#009E73", "#D55E00"
+SELF_COLOUR, MUTUAL_COLOUR, OUTSIDE = COLOURS[0], COLOURS[2], COLOURS[3]
 LINEAR_BELOW = 1.0
 """Changes below this are drawn on a linear scale, those above on a logarithmic one [fF]."""
 
@@ -82,8 +82,8 @@ def _draw_truth(axes: Axes, time: Array, shown: dict[str, tuple[Array, str]]) ->
     for label, (change, colour) in shown.items():
         what = "fall, mutual" if colour == MUTUAL_COLOUR else "rise, self"
         axes.plot(time, change, color=colour, lw=1.6, label=f"{label} ({what})")
-    axes.legend(fontsize=8, frameon=False, loc="lower center")
-    axes.set_title("true capacitance", fontsize=10, fontweight="bold", color=INK, loc="left")
+    axes.legend(loc="lower center", **LEGEND)
+    axes.set_title("true capacitance", **TITLES)
 
 
 def _draw_chip(
@@ -103,6 +103,6 @@ def _draw_chip(
         axes.plot(one.time[~inside], change[~inside], color=OUTSIDE, ms=3, mew=0, **style)
         axes.annotate("out of range", (0.98, 0.05), xycoords="axes fraction", ha="right",
                       fontsize=8, color=OUTSIDE)  # fmt: skip
-    axes.set_title(readout.name, fontsize=10, fontweight="bold", color=INK, loc="left")
+    axes.set_title(readout.name, **TITLES)
     rate = 1 / readout.schedule.period
     axes.set_title(f"{rate:.3g} samples/s", fontsize=8, color=INK, loc="right")

@@ -207,6 +207,8 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     blocks = [facts(lines)]
     channels = summary["channels"]
     if step is not None:
+        if summary["excitation"] == "matrix":
+            blocks.append("Maxwell matrix; the mutual capacitance of a pair is minus its entry")
         header = ("channel", "empty [pF]", "least [pF]", "largest [pF]", "least %", "largest %")
         blocks.append(table(header, [_channel_row(c) for c in channels[:_MAX_ROWS]]))
         if len(channels) > _MAX_ROWS:

@@ -10,6 +10,7 @@ import shapely.geometry
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
+from capsense._style import INK, LEGEND, dress
 from capsense.design.geometry import Surface, ring_vertices
 from capsense.design.model import Design, Role
 
@@ -19,12 +20,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#7A5C00", "#333333")
-"""After Okabe and Ito: told apart with any colour vision; yellow darkened for white paper."""
 ELECTRODES = ("#d9822b", "#eab676")  # neighbours in matrix order differ
 ROLE_COLOURS = {Role.GROUND: "#8fa3ad", Role.SHIELD: "#7fb59a", Role.FLOATING: "#b59ac4"}
 LAYER_COLOUR = "#eef0e4"
-INK = "#2b2b2b"
 
 
 def draw_design(design: Design, ax: Axes | None = None) -> Axes:
@@ -139,11 +137,8 @@ def _top_view(design: Design, ax: Axes) -> None:
     ax.set_xlim(points[:, 0].min() - margin, points[:, 0].max() + margin)
     ax.set_ylim(points[:, 1].min() - margin, points[:, 1].max() + margin)
     ax.set_aspect("equal")
-    ax.set(xlabel="x [mm]", ylabel="y [mm]", title=design.name)
-    ax.tick_params(labelsize=8)
-    ax.grid(color="#d8d8d8", lw=0.4)
-    ax.set_axisbelow(True)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, fontsize=8, frameon=False)
+    dress(ax, "x [mm]", "y [mm]", design.name)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, **LEGEND)
 
 
 def _label_place(surface: Surface, parts: list[Polygon]) -> tuple[float, float, float]:
@@ -172,10 +167,7 @@ def _profile(design: Design, ax: Axes) -> None:
         _edge_on(ax, electrode.surface, lambda z: z * 1e3, ELECTRODES[number % 2], 2.0, 2.0)
     ax.set_aspect("equal")
     ax.set_xlim(ax.figure.axes[0].get_xlim())
-    ax.tick_params(labelsize=8)
-    ax.set(xlabel="x [mm]", ylabel="z [mm]")
-    ax.set_title("side view", fontsize=9)
-    ax.spines[["top", "right"]].set_visible(False)
+    dress(ax, "x [mm]", "z [mm]", "side view")
 
 
 def _side_view(design: Design, ax: Axes) -> None:
@@ -224,10 +216,7 @@ def _side_view(design: Design, ax: Axes) -> None:
     ax.set_xlim(top_axes.get_xlim())
     ax.set_ylim(-0.35, len(levels) - 0.4)
     ax.set_yticks(np.arange(len(levels)), [f"{v:.4g}" for v in levels], fontsize=8)
-    ax.tick_params(labelsize=8)
-    ax.set(xlabel="x [mm]", ylabel="z [mm]")
-    ax.set_title("side view, heights not to scale", fontsize=9)
-    ax.spines[["top", "right"]].set_visible(False)
+    dress(ax, "x [mm]", "z [mm]", "side view, heights not to scale")
 
 
 def _edge_on(

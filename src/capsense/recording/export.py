@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from capsense.errors import MissingDependencyError, RecordingError
 from capsense.readout.counts import Counts, join
+from capsense.recording.foxglove import layout
 from capsense.recording.reader import Recording, Step
 from capsense.recording.session import Session
 from capsense.recording.tables import (
@@ -25,7 +26,7 @@ from capsense.recording.tables import (
 
 Array = NDArray[np.float64]
 
-ENDINGS = (".csv", ".npz", ".parquet", ".mcap")
+ENDINGS = (".csv", ".npz", ".parquet", ".mcap", ".json")
 """What a recording is exported to, by the ending of the file."""
 _BATCH = 4096
 """Steps that go into a Parquet file at once."""
@@ -36,7 +37,7 @@ def export(recording: Recording, path: Path, *, counts: bool = False) -> int:
 
     ``.csv`` and ``.parquet`` have the columns of ``readings.csv`` and the episode; ``.npz`` has the
     arrays of ``readings.npz``, the episode, and the counts; ``.mcap`` is the recording again, made
-    whole if it was cut short.
+    whole if it was cut short; ``.json`` is a layout in which Foxglove shows it.
 
     Args:
         recording: What to export.
@@ -44,7 +45,7 @@ def export(recording: Recording, path: Path, *, counts: bool = False) -> int:
         counts: Write the read-out's conversions in place of the readings; ``.csv``, ``.parquet``.
 
     Returns:
-        Rows, samples or messages written.
+        Rows, samples, messages or layouts written.
 
     Raises:
         RecordingError: The ending is not known, the recording is damaged, or holds no steps or no
@@ -64,6 +65,7 @@ def export(recording: Recording, path: Path, *, counts: bool = False) -> int:
         ".parquet": _counts_parquet if counts else _parquet,
         ".npz": _npz,
         ".mcap": _mcap,
+        ".json": _layout,
     }
     with replacing(path) as part:
         return writers[ending](recording, part)
@@ -185,6 +187,15 @@ def _columns(counts: Counts) -> dict[str, NDArray[Any]]:
     if counts.baseline is not None and counts.touched is not None:
         out.update(baseline=counts.baseline, touched=counts.touched)
     return out
+
+
+def _layout(recording: Recording, path: Path) -> int:
+    session, levels = recording.session, _levels(recording.session)
+    peaks = np.zeros(len(levels))
+    for step in recording.steps():
+        peaks = np.maximum(peaks, np.abs(_values(session, step) - levels))
+    path.write_text(layout(session.name, session.channels, peaks) + "\n", encoding="utf-8")
+    return 1
 
 
 def _mcap(recording: Recording, path: Path) -> int:

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from capsense.errors import MissingDependencyError
-from capsense.recording.messages import PACKAGE, Messages
+from capsense.recording.messages import PACKAGE, Messages, lasting
 
 _BLOCK_MS = 1
 """How long a writer waits for a reader that does not keep up [ms]."""
@@ -86,12 +86,11 @@ class LiveTopics:
         from cyclonedds.topic import Topic
         from cyclonedds.util import duration
 
-        # Markers are sent when bodies change, so those who come later may ask for the last ones.
-        lasting = topic.endswith("/markers")
-        durability = Policy.Durability.TransientLocal if lasting else Policy.Durability.Volatile
+        kept = lasting(topic)
+        durability = Policy.Durability.TransientLocal if kept else Policy.Durability.Volatile
         qos = Qos(
             Policy.Reliability.Reliable(duration(milliseconds=_BLOCK_MS)),
-            Policy.History.KeepLast(1 if lasting else 10),
+            Policy.History.KeepLast(kept or 10),
             durability,
         )
         described = Topic(self._participant, f"rt{topic}", self._type(type_name), qos=qos)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from capsense.recording.disk import Disk
-from capsense.recording.messages import Messages
+from capsense.recording.messages import Messages, offered_qos
 
 FLUSH_EVERY = 0.5
 """Longest time that a message waits before it is written to the file [s]."""
@@ -126,9 +126,8 @@ class McapFile:
             self._schemas[type_name] = self._writer.register_schema(
                 type_name, "ros2msg", text.encode()
             )
-        # An empty profile is what rosbag2 takes for its defaults, in all its versions.
         notes = {
-            "offered_qos_profiles": "",
+            "offered_qos_profiles": offered_qos(topic),
             "topic_type_hash": self.messages.type_hash(type_name),
         }
         channel = self._writer.register_channel(topic, "cdr", self._schemas[type_name], notes)

@@ -1,7 +1,8 @@
 """ROS 2 messages: their definitions, and their CDR form.
 
-Standard messages come with ``rosbags``; those of ``capsense_msgs`` lie in ``msg/`` beside this
-module. Stored schemas hold the definition and those of all messages in it, as ROS 2 wants.
+Standard messages come with ``rosbags``; those of ``capsense_msgs`` lie in a ROS 2 package of that
+name beside this module. Stored schemas hold the definition and those of all messages in it, as
+ROS 2 wants.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from typing import Any
 from capsense.errors import MissingDependencyError, RecordingError
 
 PACKAGE = "capsense_msgs/msg"
-OWN = ("Shape", "Body", "Step", "Counts")
+OWN = ("Shape", "Body", "Step", "Counts", "Signal", "Signals")
 """Messages of ``capsense_msgs``."""
+_LASTING = {"markers": 1, "electrodes": 1, "shapes": 1000, "bodies": 1000}
 
 
 def require() -> None:
@@ -38,10 +40,39 @@ def _store() -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
+    folder = resources.files("capsense.recording") / PACKAGE
     for name in OWN:
-        text = (resources.files("capsense.recording") / "msg" / f"{name}.msg").read_text()
+        text = (folder / f"{name}.msg").read_text()
         store.register(get_types_from_msg(text, f"{PACKAGE}/{name}"))
     return store
+
+
+def lasting(topic: str) -> int:
+    """How many messages of a topic are kept for those who come later; 0 for none.
+
+    These topics are written when something changes, not at every step.
+    """
+    return _LASTING.get(topic.rpartition("/")[2], 0)
+
+
+def offered_qos(topic: str) -> str:
+    """Quality of service of a lasting topic, as rosbag2 writes it down.
+
+    Policies are numbers, which all versions of rosbag2 read. Other topics have none, which it takes
+    for its defaults.
+    """
+    if not lasting(topic):
+        return ""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
+    from rosbags.interfaces import QosTime as Time
+    from rosbags.rosbag2.metadata import dump_qos_v8
+
+    ever = Time(9223372036, 854775807)
+    profile = Qos(
+        QosHistory.KEEP_LAST, lasting(topic), QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL, ever, ever, QosLiveliness.AUTOMATIC, ever, False,
+    )  # fmt: skip
+    return dump_qos_v8([profile])
 
 
 class Messages:

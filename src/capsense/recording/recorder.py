@@ -83,17 +83,17 @@ class Recorder:
         empty = self._simulator.empty
         self._readout, config = make_readout(readout, self._simulator.electrode_names, empty)
         self.reset()
-        self._live = None if ros_domain is None else LiveTopics(ros_domain)
-        self._file = McapFile(self.path, overwrite=overwrite)
-        self._messages = StepMessages(self._file.messages, name, self._simulator.design)
-        self._steps = self._episode = self._base = 0
-        self._time, self._stamp = -math.inf, -1
         self.session = describe(
             self._simulator, name, scenario.name if scenario else "", readout=config,
             excitation=scenario.excitation if scenario else Excitation.MATRIX,
             pairs=scenario.pairs if scenario else (), empty=empty,
         )  # fmt: skip
         """What the file says once, at its start."""
+        self._live = None if ros_domain is None else LiveTopics(ros_domain)
+        self._file = McapFile(self.path, overwrite=overwrite)
+        self._messages = StepMessages(self._file.messages, self.session)
+        self._steps = self._episode = self._base = 0
+        self._time, self._stamp = -math.inf, -1
         try:
             self._begin(self.session)
         except OSError as error:

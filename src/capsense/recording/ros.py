@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
-from capsense.recording.messages import Messages
+from capsense.recording.messages import PACKAGE, Messages
 from capsense.scene import Box, Capsule, Cylinder, DepthFrame, Ellipsoid, Pose, Shape, Sphere
 from capsense.scene.body import Body
 
@@ -18,7 +18,6 @@ Colour = tuple[float, float, float, float]
 
 WORLD = "world"
 """Frame in which the sensor moves."""
-COPPER: Colour = (0.85, 0.53, 0.2, 1.0)
 METAL: Colour = (0.72, 0.74, 0.78, 1.0)
 PLASTIC: Colour = (0.35, 0.6, 0.9, 0.6)
 _CUBE, _SPHERE, _CYLINDER, _TRIANGLES, _DELETE_ALL = 1, 2, 3, 11, 3
@@ -120,16 +119,32 @@ class Composer:
         """The camera's frame."""
         return f"{self.name}/depth_camera"
 
-    def markers(self, stamp: int, design: Design, bodies: Sequence[tuple[str, Body]]) -> Any:
-        """Electrodes and bodies for drawing; each body moves with the frame it is given with."""
+    def electrodes(self, stamp: int, design: Design, colours: Array) -> Any:
+        """Electrodes for drawing, in colours from 0 to 1, shape (M, 3)."""
+        markers = [
+            self._marker(
+                stamp, self.name, electrode.name, k, _TRIANGLES, (*colour, 1.0),
+                points=electrode.surface.triangles.reshape(-1, 3),
+            )
+            for k, (electrode, colour) in enumerate(
+                zip(design.electrodes, colours.tolist(), strict=True)
+            )
+        ]  # fmt: skip
+        return self._make("visualization_msgs/msg/MarkerArray", markers=markers)
+
+    def signals(self, stamp: int, names: Sequence[str], values: Array, changes: Array) -> Any:
+        """Channels by their names, with their capacitances and changes [F]."""
+        channels = [
+            self._make(f"{PACKAGE}/Signal", name=name, capacitance=value, change=change)
+            for name, value, change in zip(
+                names, (1e15 * values).tolist(), (1e15 * changes).tolist(), strict=True
+            )
+        ]
+        return self._make(f"{PACKAGE}/Signals", header=self.header(stamp), channels=channels)
+
+    def markers(self, stamp: int, bodies: Sequence[tuple[str, Body]]) -> Any:
+        """Bodies for drawing; each moves with the frame it is given with."""
         out = [self._marker(stamp, self.name, "", 0, _CUBE, METAL, action=_DELETE_ALL)]
-        for k, electrode in enumerate(design.electrodes):
-            points = electrode.surface.triangles.reshape(-1, 3)
-            out.append(
-                self._marker(
-                    stamp, self.name, "electrodes", k, _TRIANGLES, COPPER, points=points
-                )
-            )  # fmt: skip
         for frame, body in bodies:
             colour = METAL if body.material.is_conductor() else PLASTIC
             out += [

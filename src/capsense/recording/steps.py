@@ -7,17 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from capsense.design.model import Design
+from capsense._style import signal_colours
 from capsense.reading import Reading
 from capsense.readout.counts import Counts
 from capsense.recording.messages import PACKAGE, Messages
 from capsense.recording.parts import CHANGING, body_fields, shape_fields
 from capsense.recording.ros import WORLD, Composer
-from capsense.recording.session import shield_coupling
+from capsense.recording.session import Session, shield_coupling
 from capsense.scene import Body, DepthFrame, Pose, RestSurface, Scene, Shape, SurfaceMesh
 
 Topics = list[tuple[str, Any]]
 """Messages in the order in which they are written, each with its topic."""
+SHADES = 32
+"""Colours of an electrode between no signal and the largest."""
+_SMALLEST, _DECADES = 1e-16, 4.0
+
+
+def strength(changes: Any) -> Any:
+    """How strongly electrodes light up, 0 to 1: the logarithm of 1 + change / 0.1 fF, 1 at 1 pF."""
+    return np.clip(np.log10(1.0 + np.abs(changes) / _SMALLEST) / _DECADES, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -37,13 +45,15 @@ class StepMessages:
 
     Args:
         messages: Where message types come from.
-        name: The sensor's frame, and the beginning of its topics.
-        design: The sensor.
+        session: Whose steps these are.
     """
 
-    def __init__(self, messages: Messages, name: str, design: Design) -> None:
-        self._make, self._name, self._design = messages.make, name, design
-        self._compose = Composer(messages, name)
+    def __init__(self, messages: Messages, session: Session) -> None:
+        self._make, self._name, self._design = messages.make, session.name, session.design
+        self._compose = Composer(messages, session.name)
+        self._channels, empty = session.channels, session.empty
+        self._levels = np.array([c.read(empty) for c in self._channels])
+        self._lit: list[float] = []
         self._shapes: dict[Shape | RestSurface, int] = {}
         self._bodies: dict[tuple[Any, ...], int] = {}
         self._ids = 0
@@ -82,13 +92,28 @@ class StepMessages:
         if drawn != self._drawn:
             self._drawn = drawn
             bodies = [(child, body) for child, _, body in solid]
-            self._add(out, "markers", self._compose.markers(stamp, self._design, bodies))
+            self._add(out, "markers", self._compose.markers(stamp, bodies))
         if reading.counts is not None and len(reading.counts):
             self._add(out, "counts", self._counts(stamp, reading.counts))
+        self._light_up(stamp, reading, out)
+        values = np.array([c.read(reading) for c in self._channels])
+        names = [c.column_name for c in self._channels]
+        signals = self._compose.signals(stamp, names, values, values - self._levels)
+        self._add(out, "signals", signals)
         self._add(out, "capacitance", self._compose.matrix(reading.capacitance))
         self._add(out, "delta", self._compose.matrix(reading.delta))
         self._add(out, "step", self._step(moment, scene, ids, reading))
         return out
+
+    def _light_up(self, stamp: int, reading: Reading, out: Topics) -> None:
+        """Colour the electrodes by the changes of their own capacitances, where that is seen."""
+        shades = np.rint(SHADES * strength(np.nan_to_num(np.diagonal(reading.delta))))
+        if shades.tolist() == self._lit:
+            return
+        self._lit = shades.tolist()
+        colours = signal_colours(shades / SHADES) / 255.0
+        electrodes = self._compose.electrodes(stamp, self._design, colours)
+        self._add(out, "electrodes", electrodes)
 
     def _add(self, out: Topics, topic: str, message: Any) -> None:
         out.append((f"/{self._name}/{topic}", message))

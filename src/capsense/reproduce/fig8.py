@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
+from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.bench import moving_bar, reference_bar, time_steps
 from capsense.field.background import BuildSettings
 from capsense.masked.planes import plan_axes
@@ -215,20 +216,18 @@ def _plot(points: list[Point]) -> Figure:
 
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     times, errors = figure.subplots(1, 2, sharex=True)
-    times.loglog(*paper_figure(), "s-", color="black", label="the paper, i7 3.4 GHz, 3 electrodes")
-    for method, colour, marker in (("masked", "tab:gray", "^"), ("surface", "tab:orange", "o")):
+    times.loglog(*paper_figure(), "s-", color=INK, label="the paper, i7 3.4 GHz, 3 electrodes")
+    for method, colour, marker in (("masked", COLOURS[1], "^"), ("surface", COLOURS[0], "o")):
         mine = [p for p in points if p.method == method]
         sizes = [p.tetrahedra or p.unknowns for p in mine]
         label = f"{_LABELS[mine[0].method]}, 6 electrodes"
         times.loglog(sizes, [p.median for p in mine], f"{marker}-", color=colour, label=label)
         worst = [100 * max(p.errors) for p in mine]
         errors.loglog(sizes, worst, f"{marker}-", color=colour)
-    times.set_ylabel("time of a step, median [ms]")
-    errors.set_ylabel("largest error of ΔC$_{ii}$,\ngaps 5 to 100 mm [%]")
-    for axes in (times, errors):
-        axes.set_xlabel("tetrahedra; for CapSense, charge functions")
-        axes.grid(which="major", color="0.9")
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    size = "tetrahedra; for CapSense, charge functions"
+    dress(times, size, "time of a step, median [ms]")
+    dress(errors, size, "largest error of ΔC$_{ii}$,\ngaps 5 to 100 mm [%]")
+    figure.legend(loc="outside lower center", ncols=3, **LEGEND)
     return figure
 
 

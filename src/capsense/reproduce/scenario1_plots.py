@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from capsense._style import COLOURS, FAINT, INK, LABELS, LEGEND, TITLES, bare
 from capsense.reproduce.scenario1_setup import Array, Curves, Setup
 
-MEASURED, PAPER, OURS, FAINT = "#2b2b2b", "#E69F00", "#0072B2", "#b9bdc1"
+MEASURED, PAPER, OURS = INK, COLOURS[1], COLOURS[0]
 
 
 def plot_panels(panels: Mapping[str, tuple[Array, Curves | None]]) -> Figure:
@@ -25,11 +26,11 @@ def plot_panels(panels: Mapping[str, tuple[Array, Curves | None]]) -> Figure:
         else:
             name += ", predicted"
         ax.plot(sample, ours, color=OURS, lw=1.6, label="CapSense")
-        ax.set_ylabel(f"C / C empty\n{name.replace('_', ', ')}")
+        ax.set_ylabel(f"C / C empty\n{name.replace('_', ', ')}", **LABELS)
         ax.set_xlim(0, len(ours) + 1)
-        _bare(ax)
-    axes[0].legend(frameon=False, fontsize=9, loc="lower left", ncols=3, bbox_to_anchor=(0, 1))
-    axes[-1].set_xlabel("sample")
+        bare(ax)
+    axes[0].legend(loc="lower left", ncols=3, bbox_to_anchor=(0, 1), **LEGEND)
+    axes[-1].set_xlabel("sample", **LABELS)
     return figure
 
 
@@ -54,11 +55,11 @@ def plot_trajectories(
         for row, board in enumerate(boards, start=1):
             ax = axes[row, column]
             ax.plot(*curves[board, way], color=OURS, lw=1.0)
-            _bare(ax)
+            bare(ax)
             if column == 0:
-                ax.set_ylabel(f"{board}: C / C empty")
-        axes[-1, column].set_xlabel("time [s]")
-    axes[0, -1].legend(frameon=False, fontsize=8, loc="upper left", handlelength=1.2)
+                ax.set_ylabel(f"{board}: C / C empty", **LABELS)
+        axes[-1, column].set_xlabel("time [s]", **LABELS)
+    axes[0, -1].legend(loc="upper left", handlelength=1.2, **LEGEND)
     return figure
 
 
@@ -80,14 +81,8 @@ def _draw_way(ax: Axes, setup: Setup, boards: list[str], way: str) -> None:
     x, z = points[0, 0], height[0]
     ax.plot([x - half, x + half], [z, z], color=FAINT, lw=3, solid_capstyle="butt")
     ax.plot([-32.5, 32.5], [0, 0], color=MEASURED, lw=3, solid_capstyle="butt")
-    ax.set_title(f"{way} [mm]", fontsize=10)
+    ax.set_title(f"{way} [mm]", **TITLES)
     ax.set_xlim(-265, 265)
     ax.set_ylim(-8, 220)
     ax.set_aspect("equal")
-    _bare(ax)
-
-
-def _bare(ax: Axes) -> None:
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.tick_params(labelsize=8)
-    ax.grid(color=FAINT, lw=0.3)
+    bare(ax)

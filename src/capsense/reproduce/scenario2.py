@@ -10,12 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
+from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.field.background import BuildSettings
 from capsense.mesh.settings import MeshSettings
 from capsense.reproduce.limb_rides import PARTICIPANTS, RIDES, SEED, Ride, course, rides
@@ -57,6 +58,12 @@ class Run:
 
 
 REFERENCE, DEPTH, PAPER = "reference", "depth", "paper"
+LINES: tuple[dict[str, Any], ...] = (
+    {"color": COLOURS[0], "lw": 2.4},
+    {"color": INK, "ls": DASHES[1], "lw": 1.0},
+    {"color": COLOURS[1], "lw": 1.4},
+)
+"""Of reference, depth camera and the paper's scheme: the first two nearly coincide."""
 AGAIN = "again"
 """The reference read by a second chip: what its noise leaves of a correlation."""
 RUNS: dict[str, Run] = {
@@ -272,20 +279,14 @@ def _ride_plot(codes: Mapping[str, Changes], ways: Mapping[str, list[Ride]]) -> 
     peaks = {(p, k): float(r.max()) for p, v in codes[REFERENCE].items() for k, r in enumerate(v)}
     person, number = sorted(peaks, key=lambda key: peaks[key])[len(peaks) // 2]
     time = ways[person][number].time
-    figure = Figure(figsize=(9, 5))
+    figure = Figure(figsize=(9, 5), layout="constrained")
     for k, axis in enumerate(figure.subplots(2, 3, sharex=True, sharey=True).ravel()):
-        for name, style in ((REFERENCE, "k-"), (DEPTH, "C0--"), (PAPER, "C1-")):
-            axis.plot(time, codes[name][person][number][:, k], style, label=RUNS[name].title)
-        axis.set_title(f"E{k + 1}", fontsize=10)
-        axis.grid(alpha=0.3)
-        if k >= 3:
-            axis.set_xlabel("time, s")
-        if k % 3 == 0:
-            axis.set_ylabel("tared codes")
+        for name, style in ((REFERENCE, LINES[0]), (DEPTH, LINES[1]), (PAPER, LINES[2])):
+            axis.plot(time, codes[name][person][number][:, k], **style, label=RUNS[name].title)
+        dress(axis, "time [s]" if k >= 3 else "", "" if k % 3 else "tared codes", f"E{k + 1}")
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=3, fontsize=8)
-    figure.suptitle(f"participant {person}, ride {number + 1}", fontsize=10)
-    figure.tight_layout(rect=(0, 0.04, 1, 1))
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, **LEGEND)
+    figure.suptitle(f"participant {person}, ride {number + 1}", fontsize=10, color=INK)
     return figure
 
 
@@ -293,21 +294,17 @@ def _scale_plot(codes: Mapping[str, Changes]) -> Figure:
     """Codes of both schemes against those of the reference, all samples."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.2, 4.6))
+    figure = Figure(figsize=(5.2, 4.6), layout="constrained")
     axis = figure.subplots()
     ours = np.concatenate([v.ravel() for v in codes[REFERENCE].values()])
-    for name, colour in ((PAPER, "C1"), (DEPTH, "C0")):
+    for name, colour in ((PAPER, COLOURS[1]), (DEPTH, COLOURS[0])):
         other = np.concatenate([v.ravel() for v in codes[name].values()])
         axis.plot(ours, other, ".", color=colour, ms=1.5, alpha=0.5, label=RUNS[name].title)
     ends = np.array([0.5, max(2.0, float(ours.max()))])
-    axis.plot(ends, ends, "k-", lw=0.8)
-    axis.set(
-        xscale="log", yscale="log", xlim=ends, ylim=(0.5, None),
-        xlabel="tared codes, accurate method on geometry", ylabel="tared codes",
-    )  # fmt: skip
-    axis.legend(fontsize=8, markerscale=6)
-    axis.grid(alpha=0.3)
-    figure.tight_layout()
+    axis.plot(ends, ends, color=INK, lw=0.8)
+    axis.set(xscale="log", yscale="log", xlim=ends, ylim=(0.5, None))
+    dress(axis, "tared codes, accurate method on geometry", "tared codes")
+    axis.legend(markerscale=6, **LEGEND)
     return figure
 
 

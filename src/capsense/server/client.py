@@ -26,8 +26,15 @@ from capsense.server.frames import (
 Array = NDArray[np.float64]
 
 
+FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
+"""Between attempts to connect anew [s]."""
+
+
 class Client:
     """A connection to a server; use it in a ``with`` block.
+
+    When it is lost, the call at hand fails with code ``closed``; the next one connects anew, within
+    ``timeout``, and opens the sensors again, under their numbers.
 
     Args:
         url: The server's address, such as ``ws://127.0.0.1:8765``.
@@ -46,8 +53,7 @@ class Client:
         name: str = "python",
     ) -> None:  # fmt: skip
         try:
-            from websockets.exceptions import WebSocketException
-            from websockets.sync.client import connect
+            import websockets.sync.client  # noqa: F401
         except ImportError as error:
             raise MissingDependencyError(
                 'the client needs websockets; install it with: pip install "capsense[serve]"'
@@ -56,19 +62,52 @@ class Client:
         self.timeout = timeout
         self.sensors: dict[int, RemoteSensor] = {}
         """Open sensors, by number."""
+        self._url, self._token, self._name = url, token, name
+        self._lost = False
+        self._connect()
+
+    def _connect(self) -> None:
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
+
         try:
             self._connection = connect(
-                url, compression=None, open_timeout=timeout, close_timeout=1.0, max_size=None
-            )
+                self._url, compression=None, open_timeout=self.timeout, close_timeout=1.0,
+                max_size=None,
+            )  # fmt: skip
         except WebSocketException as error:
-            raise ProtocolError(f"{url} is no server for this client: {error}", "closed") from None
+            what = f"{self._url} is no server for this client: {error}"
+            raise ProtocolError(what, "closed") from None
+        self._lost = False
         try:
-            self.welcome = self.ask("welcome", type="hello", protocol=PROTOCOL, token=token,
-                                    client=name)  # fmt: skip
+            self.welcome = self.ask("welcome", type="hello", protocol=PROTOCOL, token=self._token,
+                                    client=self._name)  # fmt: skip
             """The server's answer to the hello: its version, designs and limits."""
         except BaseException:
             self.close()
             raise
+
+    def _connect_again(self) -> None:
+        """Connect, and open all sensors anew; try again and again until the timeout.
+
+        Raises:
+            ProtocolError: The server refuses.
+            OSError: There is no server.
+        """
+        limit, pause = time.monotonic() + self.timeout, FIRST_PAUSE
+        while True:
+            try:
+                self._connect()
+                for number, sensor in list(self.sensors.items()):
+                    sensor.opened(self.ask("opened", type="open", sensor=number, **sensor.options))
+                return
+            except (OSError, ProtocolError) as error:
+                self._lost = True
+                final = isinstance(error, ProtocolError) and error.code not in ("closed", "timeout")
+                if final or time.monotonic() + pause > limit:
+                    raise
+            time.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE)
 
     def __enter__(self) -> Client:
         return self
@@ -94,13 +133,21 @@ class Client:
         if sensor is None:
             sensor = next(k for k in range(len(self.sensors) + 1) if k not in self.sensors)
         answer = self.ask("opened", type="open", sensor=sensor, **options)
-        self.sensors[sensor] = RemoteSensor(self, answer)
+        self.sensors[sensor] = RemoteSensor(self, answer, options)
         return self.sensors[sensor]
 
     def send(self, message: str | bytes) -> None:
-        """Send a message as it is; a closed connection shows at the next :meth:`receive`."""
+        """Send a message as it is; a closed connection shows at the next :meth:`receive`.
+
+        One that has shown already is made anew if there are sensors.
+
+        Raises:
+            ProtocolError, OSError: That failed.
+        """
         from websockets.exceptions import ConnectionClosed
 
+        if self._lost and self.sensors:
+            self._connect_again()
         with suppress(ConnectionClosed):  # what the server said before it closed is yet to be read
             self._connection.send(message)
 
@@ -143,6 +190,7 @@ class Client:
         except TimeoutError:
             raise ProtocolError(f"no answer within {self.timeout:g} s", "timeout") from None
         except ConnectionClosed as error:
+            self._lost = True
             raise _closed(error) from None
         if isinstance(message, str):
             return json.loads(message)
@@ -177,9 +225,19 @@ class Client:
 class RemoteSensor:
     """A sensor that a server simulates; made by :meth:`Client.open`."""
 
-    def __init__(self, client: Client, opened: Mapping[str, Any]) -> None:
-        self.client = client
+    def __init__(
+        self, client: Client, opened: Mapping[str, Any], options: Mapping[str, Any]
+    ) -> None:
+        self.client, self.options = client, dict(options)
         self.number: int = opened["sensor"]
+        self.sequence = 0
+        """Number of the next frame."""
+        self.kept: deque[ReadingMessage] = deque(maxlen=64)
+        """Readings that came while something else was waited for."""
+        self.opened(opened)
+
+    def opened(self, opened: Mapping[str, Any]) -> None:
+        """Take over what the server said when it opened the sensor."""
         self.design: str = opened["design"]
         self.electrode_names: tuple[str, ...] = tuple(opened["electrodes"])
         """In matrix order."""
@@ -189,10 +247,6 @@ class RemoteSensor:
         """Maxwell matrix of the empty scene [F], shape (M, M)."""
         self.domain: Array = np.array(opened["domain"])
         """Lower and upper corner of what the sensor sees [m], shape (2, 3)."""
-        self.sequence = 0
-        """Number of the next frame."""
-        self.kept: deque[ReadingMessage] = deque(maxlen=64)
-        """Readings that came while something else was waited for."""
 
     def step(
         self, depth: ArrayLike, eps_r: ArrayLike | None = None, time: float = 0.0

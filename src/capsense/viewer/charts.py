@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.draw import COLOURS
+from capsense._style import COLOURS
 from capsense.scenario import Channel
 
 if TYPE_CHECKING:

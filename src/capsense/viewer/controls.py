@@ -75,6 +75,7 @@ class PlaneControls:
         first = int(np.argmin(np.linalg.norm(self._centres - middle, axis=1).round(3)))
         with gui.add_folder("potential"):
             self._on = gui.add_checkbox("shown", True)
+            self._charge = gui.add_checkbox("charge on the bodies", True)
             self._driven = gui.add_dropdown("1 V at", self._names, initial_value=self._names[first])
             self._across = gui.add_dropdown("plane across", AXES, initial_value="y")
             self._at: list[Any] = [
@@ -95,6 +96,11 @@ class PlaneControls:
     def driven(self) -> int:
         """Number of the electrode at 1 V."""
         return self._names.index(self._driven.value)
+
+    @property
+    def charge(self) -> bool:
+        """Whether charges are wanted, too."""
+        return bool(self._charge.value and self._on.value)
 
     @property
     def plane(self) -> Plane | None:
@@ -136,7 +142,7 @@ def legend() -> str:
     return (
         '<div style="padding:0 0.8em 0.6em;font-size:12px"><table style="width:100%;'
         f'border-spacing:0;line-height:0.8"><tr>{cells}</tr></table><span style="float:right">1 V'
-        f"</span>{1e3 * 2.0**-OCTAVES:.0f} mV, doubling from colour to colour</div>"
+        f"</span>{1e3 * 2.0**-OCTAVES:.0f} mV, doubling from line to second next</div>"
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,17 +86,43 @@ class Plane:
             self._carry.append(np.stack([np.interp(fine[-1], coarse[-1], e) for e in unit], axis=1))
         self.points = self._grid(*coarse)
         """Where potentials are taken [m], shape (n, 3)."""
-        points = self._grid(*fine)
+        points, self._fine = self._grid(*fine), fine
         away = cKDTree(green.near_sources).query(points, distance_upper_bound=NEAR)[0]
-        self._drawn = ~(away < NEAR)
-        self.drawn = points[self._drawn]
+        self._drawn = ~(away < NEAR).reshape(len(fine[0]), len(fine[1]))
+        self.drawn = points[self._drawn.ravel()]
         """Where they are drawn [m], shape (m, 3)."""
 
     def carried(self, potential: Array) -> Array:
         """Potentials [V] where they are drawn, shape (m,), from those at ``points``, (n,)."""
+        return self._carried(potential)[self._drawn]
+
+    def contours(self, potential: Array) -> tuple[Array, NDArray[np.uint8]]:
+        """Lines of equal potential, two from each halving to the next.
+
+        Args:
+            potential: At ``points`` [V], shape (n,).
+
+        Returns:
+            Ends of straight pieces [m], shape (s, 2, 3), and the red, green and blue of these ends,
+            same shape.
+        """
+        from contourpy import LineType, contour_generator
+
+        values = np.ma.masked_array(self._carried(potential), ~self._drawn)
+        across, along = self._fine[::-1]
+        made: Any = contour_generator(across, along, values, line_type=LineType.Separate)
+        pieces, colours = [np.empty((0, 2, 2))], [np.empty((0, 2, 3), np.uint8)]
+        for level, colour in zip(levels(), palette(), strict=True):
+            for line in made.lines(level):
+                pieces.append(np.stack([line[:-1, ::-1], line[1:, ::-1]], axis=1))
+                colours.append(np.broadcast_to(colour, (len(line) - 1, 2, 3)))
+        return np.insert(np.concatenate(pieces), self.axis, self.at, axis=-1), np.concatenate(
+            colours
+        )
+
+    def _carried(self, potential: Array) -> Array:
         rows, columns = self._carry
-        grid = potential.reshape(rows.shape[1], columns.shape[1])
-        return (rows @ grid @ columns.T).ravel()[self._drawn]
+        return rows @ potential.reshape(rows.shape[1], columns.shape[1]) @ columns.T
 
     def _grid(self, u: Array, v: Array) -> Array:
         """Points of the plane, shape (len(u) · len(v), 3)."""
@@ -105,25 +131,14 @@ class Plane:
         return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def paint(potential: Array) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
-    """Colours of potentials: one colour for each halving.
-
-    Args:
-        potential: At points [V], shape (n,).
-
-    Returns:
-        Which points are shown, shape (n,), and the red, green and blue of these, shape (shown, 3).
-    """
-    floor = 2.0**-OCTAVES
-    band = np.floor(np.log2(np.maximum(potential, floor / 2) / floor)).astype(int)
-    band = np.minimum(band, OCTAVES - 1)
-    shown = band >= 0
-    return shown, palette()[band[shown]]
+def levels() -> Array:
+    """Potentials that have a line [V], from the lowest on, shape (2 · OCTAVES,)."""
+    return 2.0 ** (-OCTAVES + np.arange(2 * OCTAVES) / 2)
 
 
 @cache
 def palette() -> NDArray[np.uint8]:
-    """The colours, from the lowest potentials to the highest, shape (OCTAVES, 3)."""
+    """The colours, from the lowest potentials to the highest, shape (2 · OCTAVES, 3)."""
     from matplotlib import colormaps
 
-    return colormaps["YlGnBu"](np.linspace(0.12, 1.0, OCTAVES), bytes=True)[:, :3]
+    return colormaps["YlGnBu"](np.linspace(0.25, 1.0, 2 * OCTAVES), bytes=True)[:, :3]

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.constants import EPS0
 from capsense.design import Design
 from capsense.errors import RecordingError
 from capsense.reading import Reading
 from capsense.recording.session import GONE
 from capsense.scenario import Channel, Scenario
-from capsense.scene import Scene
+from capsense.scene import Pose, Scene, Shape
 from capsense.simulator import Simulator
+from capsense.surface.solver import SurfaceSolver
 
 if TYPE_CHECKING:
     from capsense.field.green import GreenFunction
@@ -23,6 +25,18 @@ if TYPE_CHECKING:
     from capsense.viewer.plane import Plane
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Charges:
+    """Charges that the terminals draw onto the bodies."""
+
+    points: Array
+    """Where they sit [m], shape (n, 3)."""
+    density: Array
+    """Size of the surface density for each terminal at 1 V [C/m²], shape (n, terminals)."""
+    pitch: float
+    """Usual distance of neighbours [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +53,11 @@ class Shot:
     """Where potentials were asked for."""
     potentials: Array | None = None
     """Potentials at its points [V], shape (n, terminals)."""
+    charges: Charges | None = None
+    """On the bodies, where potentials were asked for."""
+    around: tuple[tuple[Shape, Pose], ...] = ()
+    """All solids of the robot's simulator in the sensor frame, where there is one; drawn in place
+    of the bodies."""
 
 
 class Source(Protocol):
@@ -113,8 +132,10 @@ class ScenarioSource:
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
         reading = self._simulator.step(scene)
-        found = None if plane is None else self._simulator.potentials(plane.points)
-        return Shot(index, time, scene, reading, plane, found)
+        if plane is None:
+            return Shot(index, time, scene, reading)
+        found = self._simulator.potentials(plane.points)
+        return Shot(index, time, scene, reading, plane, found, charges_of(self._simulator))
 
     def close(self) -> None:
         """Nothing is held."""
@@ -150,11 +171,13 @@ class RecordingSource:
 
     def shot(self, index: int, plane: Plane | None = None) -> Shot:
         """See :class:`Seekable`."""
-        step, found = self._steps[index], None
-        if plane is not None:
-            self._simulator.step(step.scene)
-            found = self._simulator.potentials(plane.points)
-        return Shot(index, float(self.times[index]), step.scene, step.reading, plane, found)
+        step = self._steps[index]
+        shot = Shot(index, float(self.times[index]), step.scene, step.reading)
+        if plane is None:
+            return shot
+        self._simulator.step(step.scene)
+        found = self._simulator.potentials(plane.points)
+        return replace(shot, plane=plane, potentials=found, charges=charges_of(self._simulator))
 
     def close(self) -> None:
         """Nothing is held."""
@@ -163,3 +186,15 @@ class RecordingSource:
 def green_of(simulator: Simulator) -> GreenFunction | None:
     """Green's function of a simulator that gives potentials; None if it does not."""
     return simulator.background.green if simulator.method == "surface" else None
+
+
+def charges_of(simulator: Simulator) -> Charges | None:
+    """Charges of a simulator's last step; None where no body was near or it has none to show."""
+    solver = simulator._solver
+    if not isinstance(solver, SurfaceSolver) or solver._last is None:
+        return None
+    _, solution = solver._last
+    terminals = solver.green.terminals
+    area = np.maximum(solution.extent, 1e-9)[:, None] ** 2
+    density = 4 * np.pi * EPS0 * np.abs(solution.charge[:, :terminals]) / area
+    return Charges(solution.points.mean(axis=1), density, float(np.median(solution.extent)))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from capsense._style import signal_colours
 from capsense.design import Design
 from capsense.design.draw import ROLE_COLOURS
 from capsense.design.geometry import Surface
-from capsense.scene import Body, Layers, Scene, ShapeKind
-from capsense.viewer.plane import Plane, paint
+from capsense.scene import Body, Layers, Pose, Scene, Shape, ShapeKind
+from capsense.viewer.plane import Plane
+from capsense.viewer.source import Charges
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -19,10 +23,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
-QUIET: Colour = (214, 219, 222)
-"""An electrode without a signal."""
-LOUD: Colour = (213, 94, 0)
-"""An electrode with the largest signal so far."""
 LAYER: Colour = (206, 212, 178)
 CONDUCTIVE: Colour = (120, 134, 150)
 DIELECTRIC: Colour = (150, 190, 205)
@@ -30,6 +30,14 @@ SHRUNK = 3e-4
 """So much [m] is taken off the faces of layers, so that sheets on them are in front of them."""
 MAX_LABELS = 32
 """A design of more electrodes shows no names."""
+SHADES = 31
+"""Colours of an electrode beyond that of no signal."""
+AXES = 0.03
+"""Length of the axes that are drawn [m]."""
+CHARGE_DECADES = 3.0
+"""Charges down to ten to the minus this of the densest are shown."""
+SPOTS, DOT = 6000, 1.2e-3
+"""So many dots a body shows its charge with, and their radius [m]."""
 _FACETED = (ShapeKind.BOX, ShapeKind.CYLINDER, ShapeKind.MESH)
 
 
@@ -43,15 +51,17 @@ class Stage:
 
     def __init__(self, server: ViserServer, design: Design) -> None:
         self._scene = server.scene
-        self._bodies: list[tuple[Body, Any]] = []
-        self._shown: list[Colour] = []
+        self._bodies: list[tuple[Any, ...]] = []
+        self._spots: list[Array] = []
+        self._around: list[tuple[Shape, Any]] = []
+        self._shades = np.full(len(design.electrodes), -1)
+        self._plates: dict[tuple[int, int], Any] = {}
+        self._surfaces = [e.surface for e in design.electrodes]
         server.scene.configure_default_lights(cast_shadow=False)
         self._draw_domain(design)
         self._draw_stack(design)
-        self._electrodes = [
-            self._sheet(f"/electrodes/{k}", e.surface, QUIET)
-            for k, e in enumerate(design.electrodes)
-        ]
+        self.show_signals(np.zeros(len(design.electrodes)))
+        self._draw_scale(design)
         if len(design.electrodes) <= MAX_LABELS:
             for k, e in enumerate(design.electrodes):
                 self._scene.add_label(
@@ -69,44 +79,92 @@ class Stage:
 
     def show_signals(self, strength: Array) -> None:
         """Colour the electrodes by their signals, 0 to 1, shape (M,)."""
-        part = np.clip(strength, 0.0, 1.0)[:, None]
-        mixed = np.array(QUIET) + part * (np.array(LOUD) - QUIET)
-        colours: list[Colour] = [(int(r), int(g), int(b)) for r, g, b in mixed]
-        for k, (handle, colour) in enumerate(zip(self._electrodes, colours, strict=True)):
-            if not self._shown or self._shown[k] != colour:
-                handle.color = colour
-        self._shown = colours
+        shades = np.rint(SHADES * np.clip(strength, 0.0, 1.0)).astype(int)
+        for k in np.flatnonzero(shades != self._shades).tolist():
+            old = self._plates.get((k, int(self._shades[k])))
+            self._plate(k, int(shades[k])).visible = True
+            if old is not None:
+                old.visible = False
+        self._shades = shades
+
+    def _plate(self, number: int, shade: int) -> Any:
+        """An electrode in one of its colours, whatever the light; made once, then kept."""
+        if (number, shade) not in self._plates:
+            corners = self._surfaces[number].triangles.reshape(-1, 3)
+            colour = signal_colours([shade / SHADES])[0]
+            self._plates[number, shade] = self._scene.add_glb(
+                f"/electrodes/{number}-{shade}", unlit(corners, colour), cast_shadow=False,
+                receive_shadow=False,
+            )  # fmt: skip
+        return self._plates[number, shade]
 
     def show_bodies(self, scene: Scene) -> None:
         """Put the bodies where they stand; those of other shapes are made anew."""
         bodies = list(scene)
         same = len(bodies) == len(self._bodies) and all(
             new.shape is old.shape and new.material == old.material
-            for new, (old, _) in zip(bodies, self._bodies, strict=True)
+            for new, (old, *_) in zip(bodies, self._bodies, strict=True)
         )
         if not same:
-            for _, handle in self._bodies:
+            for handle in [h for _, *handles in self._bodies for h in handles]:
                 handle.remove()
-            self._bodies = [(b, self._solid(f"/bodies/{k}", b)) for k, b in enumerate(bodies)]
-        for body, (_, handle) in zip(bodies, self._bodies, strict=True):
+            self._bodies = [self._named(k, b) for k, b in enumerate(bodies)]
+            self._spots = [spots_of(b) for b in bodies]
+        for body, (_, *handles) in zip(bodies, self._bodies, strict=True):
             x, y, z, w = body.pose.quaternion
-            handle.wxyz, handle.position = (w, x, y, z), body.pose.position
+            for handle in handles:
+                handle.wxyz, handle.position = (w, x, y, z), body.pose.position
 
-    def show_plane(self, plane: Plane, potential: Array) -> None:
-        """Paint the potential at a plane's points [V], shape (n,).
+    def show_around(self, solids: Sequence[tuple[Shape, Pose]]) -> None:
+        """Put a robot's solids where they stand; those of other shapes are made anew."""
+        if [id(shape) for shape, _ in solids] != [id(shape) for shape, _ in self._around]:
+            for _, handle in self._around:
+                handle.remove()
+            self._around = [
+                (shape, self._opaque(f"/robot/{k}", shape)) for k, (shape, _) in enumerate(solids)
+            ]
+        for (_, pose), (_, handle) in zip(solids, self._around, strict=True):
+            x, y, z, w = pose.quaternion
+            handle.wxyz, handle.position = (w, x, y, z), pose.position
 
-        As points, which hide and are hidden as they should be: an image would be sorted as a whole
-        among the bodies that light passes through.
-        """
-        shown, colours = paint(plane.carried(potential))
-        self._scene.add_point_cloud(
-            "/potential", plane.drawn[shown], colours, point_size=0.6 * plane.pitch,
-            point_shape="square", point_shading="flat",
+    def _opaque(self, name: str, shape: Shape) -> Any:
+        mesh = shape.to_trimesh()
+        return self._scene.add_mesh_simple(
+            name, mesh.vertices, mesh.faces, color=CONDUCTIVE, flat_shading=shape.kind in _FACETED,
+            side="double", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
-    def hide_plane(self) -> None:
-        """Take the plane away."""
-        self._scene.remove_by_name("/potential")
+    def show_plane(self, plane: Plane, potential: Array) -> None:
+        """Draw lines of the potential at a plane's points [V], shape (n,)."""
+        pieces, colours = plane.contours(potential)
+        if not len(pieces):
+            self.hide("/potential")
+            return
+        self._scene.add_line_segments(
+            "/potential", pieces, colours, thickness=2.2, thickness_units="screen"
+        )
+
+    def show_charges(self, charges: Charges | None, terminal: int) -> None:
+        """Dots on the bodies, the darker the more charge a terminal at 1 V draws there."""
+        if charges is None:
+            self.hide("/charge")
+            return
+        spots = [b.pose.apply(s) for (b, *_), s in zip(self._bodies, self._spots, strict=True)]
+        points = np.concatenate([*spots, charges.points]) if spots else charges.points
+        far, near = cKDTree(charges.points).query(points, k=min(4, len(charges.points)))
+        weight = 1.0 / (far.reshape(len(points), -1) + 0.1 * charges.pitch) ** 2
+        found = charges.density[near.reshape(len(points), -1), terminal]
+        density = (weight * found).sum(axis=1) / weight.sum(axis=1)
+        share = 1.0 + np.log10(np.maximum(density / density.max(), 1e-9)) / CHARGE_DECADES
+        shown = (share > 0) & (weight.max(axis=1) > 1.0 / charges.pitch**2)
+        self._scene.add_point_cloud(
+            "/charge", points[shown], charge_colours(share[shown]), point_shading="flat",
+            point_shape="circle", point_size=DOT,
+        )  # fmt: skip
+
+    def hide(self, name: str) -> None:
+        """Take something away."""
+        self._scene.remove_by_name(name)
 
     def _draw_domain(self, design: Design) -> None:
         low, high = design.domain.lower, design.domain.upper
@@ -137,6 +195,36 @@ class Stage:
             flat_shading=True, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
+    def _named(self, number: int, body: Body) -> tuple[Any, ...]:
+        """A body, what is drawn of it, and its name, if it has one and there are not too many."""
+        solid = self._solid(f"/bodies/{number}", body)
+        if body.name is None or number >= MAX_LABELS:
+            return body, solid
+        return (
+            body,
+            solid,
+            self._scene.add_label(
+                f"/names/{number}", body.name, anchor="center-center", font_screen_scale=0.8
+            ),
+        )
+
+    def _draw_scale(self, design: Design) -> None:
+        """Axes of the sensor frame in its origin, and a grid of 10 mm beneath."""
+        self._scene.add_frame("/axes", axes_length=AXES, axes_radius=4e-4, origin_radius=8e-4)
+        for name, at in zip("xyz", AXES * np.eye(3), strict=True):
+            self._scene.add_label(f"/axes/{name}", name, position=1.1 * at, font_screen_scale=0.8)
+        low, high = design.domain.lower, design.domain.upper
+        middle, size = (low + high) / 2, high - low
+        self._scene.add_grid(
+            "/grid", float(size[0]), float(size[1]), cell_size=0.01, section_size=0.05,
+            cell_color=(228, 230, 233), section_color=(206, 209, 213),
+            cell_thickness=0.5, section_thickness=0.8, position=(middle[0], middle[1], low[2]),
+        )  # fmt: skip
+        self._scene.add_label(
+            "/grid_scale", "grid: 10 mm, 50 mm", position=(high[0], low[1], low[2]),
+            font_screen_scale=0.8,
+        )  # fmt: skip
+
     def _solid(self, name: str, body: Body) -> Any:
         colour = CONDUCTIVE if body.material.is_conductor() else DIELECTRIC
         if isinstance(body.shape, Layers):
@@ -159,3 +247,43 @@ class Stage:
             name, points, colour, point_size=0.2 * min(width, height), point_shape="circle",
             point_shading="flat",
         )  # fmt: skip
+
+
+def spots_of(body: Body) -> Array:
+    """Points spread over a body's surface, in its own frame [m]; none of images and soft bodies."""
+    if body.shape.kind in (ShapeKind.LAYERS, ShapeKind.SURFACE):
+        return np.empty((0, 3))
+    import trimesh
+
+    points, _ = trimesh.sample.sample_surface(body.shape.to_trimesh(), SPOTS, seed=0)
+    return np.asarray(points)
+
+
+def charge_colours(share: Array) -> NDArray[np.uint8]:
+    """Red, green and blue of charges, from none, 0, to the densest, 1, shape (n, 3)."""
+    from matplotlib import colormaps
+
+    return colormaps["RdPu"](0.15 + 0.85 * share, bytes=True)[:, :3]
+
+
+def unlit(corners: Array, colour: Array) -> bytes:
+    """Triangles as a glTF file, in a colour that light does not change.
+
+    Args:
+        corners: Three for each triangle [m], shape (3 n, 3).
+        colour: Red, green and blue, 0 to 255.
+    """
+    import trimesh
+
+    def tree(gltf: dict[str, Any]) -> None:
+        gltf["extensionsUsed"] = ["KHR_materials_unlit"]
+        for material in gltf["materials"]:
+            material["extensions"] = {"KHR_materials_unlit": {}}
+            material["doubleSided"] = True
+
+    # glTF holds factors of linear light
+    linear = np.where(colour <= 10.3, colour / 255 / 12.92, ((colour / 255 + 0.055) / 1.055) ** 2.4)
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[*linear, 1.0])
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    mesh.visual = trimesh.visual.TextureVisuals(material=material)
+    return bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), tree_postprocessor=tree))

@@ -10,8 +10,10 @@ import threading
 import numpy as np
 
 from capsense.errors import MissingDependencyError, ServerError
+from capsense.scene import Scene
 from capsense.viewer.charts import heat_map, make_charts, strip
 from capsense.viewer.controls import PlaneControls, TimeControls, status
+from capsense.viewer.export import ExportControls
 from capsense.viewer.player import Playback
 from capsense.viewer.stage import Stage
 
@@ -53,12 +55,14 @@ class View:
         self._status = gui.add_html("")
         self._time = TimeControls(gui, player)
         self._plane = PlaneControls(gui, player) if source.green is not None else None
+        ExportControls(gui, player)
         panel = gui.add_panel()
         tab = panel.add_tab("signals")
         self._charts = make_charts(gui, tab, source.channels)
         with tab:
             self._matrix = gui.add_html("")
         panel.dock_left()
+        self._own = [k for k, c in enumerate(source.channels) if c.row == c.column]
         self._loudest = 1e-21
         self._drawn: tuple[object, ...] = ()
         self._painted: tuple[object, ...] = ()
@@ -83,12 +87,15 @@ class View:
             self._drawn = state
             with self._server.atomic():
                 self._time.show(shot)
-                self._stage.show_bodies(shot.scene)
-                window = strip(*player.history(shot.index))
+                self._stage.show_bodies(Scene() if shot.around else shot.scene)
+                self._stage.show_around(shot.around)
+                times, changes = player.history(shot.index)
+                window = strip(times, changes)
                 for chart in self._charts:
                     chart.show(*window)
                 own = np.abs(np.diag(shot.reading.delta))
-                self._loudest = max(self._loudest, float(own.max()))
+                before = np.abs(changes[:, self._own]).max(initial=0.0)
+                self._loudest = max(self._loudest, float(own.max()), float(before))
                 self._status.content = status(player, shot, self._loudest)
                 self._stage.show_signals(own / self._loudest)
                 self._matrix.content = heat_map(shot.reading.electrode_names, shot.reading.delta)
@@ -104,11 +111,14 @@ class View:
         if self._plane is None:
             return
         plane, shot, driven = self._plane.plane, self._player.with_field, self._plane.driven
-        if (plane, shot, driven) == self._painted:
+        state = (plane, shot, driven, self._plane.charge)
+        if state == self._painted:
             return
-        self._painted = (plane, shot, driven)
+        self._painted = state
+        with_charge = self._plane.charge and shot is not None
+        self._stage.show_charges(shot.charges if shot and with_charge else None, driven)
         if plane is None:
-            self._stage.hide_plane()
+            self._stage.hide("/potential")
         elif shot is not None and shot.plane is plane and shot.potentials is not None:
             self._stage.show_plane(plane, shot.potentials[:, driven])
 

@@ -1,0 +1,104 @@
+"""Sensors on robots, shown with the robot; pictures and videos for the one who watches."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
+
+from view_sources import Counting, until
+
+import capsense as cs
+from capsense.viewer.export import SIZE, send_picture, send_video
+from capsense.viewer.player import Player
+
+ARM = """<mujoco><worldbody>
+<body name="arm" pos="0 0 .3"><joint type="slide" axis="1 0 0"/>
+<geom type="box" size=".06 .05 .005"/><site name="pad" pos="0 0 .006"/></body>
+<body name="limb" pos="0 0 .4"><geom type="capsule" size=".03 .1" euler="0 90 0"/></body>
+</worldbody></mujoco>"""
+
+
+def test_the_robot_in_mujoco() -> None:
+    """All geoms, the one that carries the sensor too, where they are as the sensor sees them."""
+    mujoco = pytest.importorskip("mujoco", reason="needs pip install 'capsense[mujoco]'")
+    model = mujoco.MjModel.from_xml_string(ARM)
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1.0
+    sensor = cs.mujoco.attach(model, data, "pad", materials={"limb": "human"})
+    with cs.show(sensor, port=0) as page:
+        assert page.url.startswith("http://127.0.0.1:")
+        for _ in range(10):
+            mujoco.mj_step(model, data)
+            reading = page.read()
+        assert reading.delta.diagonal().min() > 0
+        until(lambda: page._player.newest is not None and page._player.newest.index == 9)
+        shot = page._player.newest
+        assert shot is not None
+        assert shot.time == pytest.approx(data.time)
+        (carrier, at), (limb, there) = shot.around
+        assert isinstance(carrier, cs.Box)
+        np.testing.assert_allclose(at.position, (0, 0, -0.006), atol=1e-12)
+        assert isinstance(limb, cs.Capsule)
+        np.testing.assert_allclose(there.position, (-data.site_xpos[0, 0], 0, 0.094), atol=1e-9)
+        page._view.refresh()
+        drawn = page._view._stage._scene._handle_from_node_name
+        assert {"/robot/0", "/robot/1"} <= set(drawn)
+        assert not any(name.startswith("/bodies/") for name in drawn)
+
+
+def test_the_robot_in_pybullet() -> None:
+    p = pytest.importorskip("pybullet", reason="needs pip install 'capsense[pybullet]'")
+    client = p.connect(p.DIRECT)
+    pad = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.06, 0.045, 0.005])
+    robot = p.createMultiBody(0, pad)
+    ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.03)
+    p.createMultiBody(0, ball, basePosition=[0, 0, 0.09])
+    sensor = cs.pybullet.attach(client, robot, link=-1, pose_in_link=cs.Pose((0, 0, 0.006)))
+    with cs.show(sensor, port=0) as page:
+        page.read()
+        until(lambda: page._player.newest is not None)
+        shot = page._player.newest
+        assert shot is not None
+        assert [type(shape) for shape, _ in shot.around] == [cs.Box, cs.Sphere]
+    p.disconnect(client)
+
+
+class Watcher:
+    """A client of a page, whose picture is of one colour."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, bytes] = {}
+        self.shade = 0
+
+    def get_render(self, rows: int, columns: int, **_: Any) -> np.ndarray:
+        self.shade += 10
+        return np.full((rows, columns, 4), self.shade, np.uint8)
+
+    def send_file_download(self, name: str, content: bytes, *, save_immediately: bool) -> None:
+        assert save_immediately
+        self.files[name] = content
+
+
+def test_pictures_and_videos() -> None:
+    """A picture as it is; a video of all samples, as long as they last."""
+    player = Player(Counting(6, period=0.05))
+    watcher = Watcher()
+    try:
+        send_picture(watcher)
+        send_video(watcher, player)
+    finally:
+        player.stop()
+    with Image.open(io.BytesIO(watcher.files["capsense.png"])) as picture:
+        assert picture.size == SIZE[::-1]
+        assert picture.getpixel((5, 5)) == (10, 10, 10)
+    with Image.open(io.BytesIO(watcher.files["capsense.webp"])) as video:
+        assert video.n_frames == 6  # type: ignore[attr-defined]
+        video.seek(5)
+        video.load()
+        assert video.info["duration"] == 50
