@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
@@ -41,6 +42,22 @@ def test_what_it_did_not_foresee_is_passed_on(threads: int) -> None:
 
     with pytest.raises(ZeroDivisionError):
         Crew(threads).run({"a": broken, "b": broken})
+
+
+def test_after_a_bug_nothing_more_is_begun() -> None:
+    """The other thread ends what it is at, and takes nothing new."""
+    meet, done = threading.Barrier(2, timeout=20), []
+
+    def first() -> None:
+        meet.wait()
+        if threading.current_thread() is threading.main_thread():
+            raise ZeroDivisionError
+        time.sleep(0.5)
+
+    tasks = {k: first for k in range(2)} | {k: lambda k=k: done.append(k) for k in range(2, 40)}
+    with pytest.raises(ZeroDivisionError):
+        Crew(2).run(tasks)
+    assert not done
 
 
 def test_a_report_names_the_first_failure_and_lists_the_others() -> None:
