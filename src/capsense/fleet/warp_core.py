@@ -94,7 +94,7 @@ class WarpCore:
             (kernels.pairs, (n, n, views), [green, cut, k, self.matrix]),
             (kernels.to_functions, (places, width, views), [cut, k, self.rows]),
             (kernels.to_functions, (places, n, views), [cut, k, self.matrix]),
-            (kernels.to_functions_across, (places, n, views), [cut, k, self.matrix]),
+            (kernels.to_functions, (places, n, views), [cut, k, self.matrix.transpose((1, 0, 2))]),
             (
                 kernels.assemble, (n, n, views),
                 [*at, cut, count, k, green.lead, self.rows, self.matrix],

@@ -375,22 +375,6 @@ def to_functions(cut: Cut, clusters: int, values: wp.array3d(dtype=wp.float32)):
 
 
 @wp.kernel
-def to_functions_across(cut: Cut, clusters: int, values: wp.array3d(dtype=wp.float32)):
-    """The same of the second index."""
-    b, c, v = wp.tid()
-    o = b * clusters
-    for k in range(clusters - 1):
-        j = clusters - 1 - k
-        if cut.number[o + j, v] >= 0:
-            i = o + cut.split[o + j, v]
-            x = values[c, i, v]
-            y = values[c, o + j, v]
-            p = cut.part[o + j, v]
-            values[c, i, v] = p * x + (1.0 - p) * y
-            values[c, o + j, v] = x - y
-
-
-@wp.kernel
 def assemble(
     shapes: Shapes, places: Places, cut: Cut, sensors: int, clusters: int, lead: int,
     potentials: wp.array3d(dtype=wp.float32), matrix: wp.array3d(dtype=wp.float32),
