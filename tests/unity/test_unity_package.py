@@ -26,7 +26,7 @@ from capsense.simulator import Simulator
 
 HERE = Path(__file__).parent
 PACKAGE = HERE.parents[1] / "unity"
-TIMEOUT = 30
+TIMEOUT = 120
 """Longest time that a run may take [s]."""
 
 needs_mono = pytest.mark.skipif(

@@ -55,10 +55,12 @@ def test_the_robot_in_mujoco() -> None:
 def test_the_robot_in_pybullet() -> None:
     p = pytest.importorskip("pybullet", reason="needs pip install 'capsense[pybullet]'")
     client = p.connect(p.DIRECT)
-    pad = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.06, 0.045, 0.005])
-    robot = p.createMultiBody(0, pad)
-    ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.03)
-    p.createMultiBody(0, ball, basePosition=[0, 0, 0.09])
+    pad = p.createCollisionShape(
+        p.GEOM_BOX, halfExtents=[0.06, 0.045, 0.005], physicsClientId=client
+    )
+    robot = p.createMultiBody(0, pad, physicsClientId=client)
+    ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.03, physicsClientId=client)
+    p.createMultiBody(0, ball, basePosition=[0, 0, 0.09], physicsClientId=client)
     sensor = cs.pybullet.attach(client, robot, link=-1, pose_in_link=cs.Pose((0, 0, 0.006)))
     with cs.show(sensor, port=0) as page:
         page.read()

@@ -157,7 +157,7 @@ def test_the_potential_is_drawn(page: Any) -> None:
     """The picture holds a colour of the potential, until it is not wanted."""
     press(page, "|<")
     wait_for_sample(page, 0)
-    assert painted(page, lambda count: count > 20) > 20
+    assert painted(page, lambda count: count > 12) > 12
     page.get_by_role("checkbox").nth(-2).click()
     assert painted(page, lambda count: count < 10) < 10
 

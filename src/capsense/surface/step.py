@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, pasted
@@ -92,6 +91,35 @@ def solve(
     )
 
 
+@compiled
+def eliminate(matrix: NDArray[np.complex128], sides: NDArray[np.complex128]) -> None:
+    """Replace right-hand sides (n, m) by the solution for a symmetric complex matrix (n, n), lost.
+
+    Without pivots, which it needs none of: its real part is positive definite, as energies are, and
+    losses have one sign (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.4).
+    Compiled, as the bits of a BLAS depend on how many threads it has.
+    """
+    n, m = sides.shape
+    for k in range(n):
+        for i in range(k + 1, n):
+            share = matrix[i, k] / matrix[k, k]
+            for j in range(k + 1, n):
+                matrix[i, j] -= share * matrix[k, j]
+            for c in range(m):
+                sides[i, c] -= share * sides[k, c]
+    for k in range(n - 1, -1, -1):
+        for c in range(m):
+            sides[k, c] /= matrix[k, k]
+        for i in range(k):
+            for c in range(m):
+                sides[i, c] -= matrix[i, k] * sides[k, c]
+
+
+def _product(left: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
+    """``left @ right``, with the same bits however many threads a BLAS has."""
+    return np.einsum("ij,jk->ik", left, right)
+
+
 def solve_lossy(
     records: NDArray[np.void],
     ties: NDArray[np.complex128],
@@ -137,14 +165,16 @@ def solve_lossy(
     root = np.sqrt(fade[:n])
     faded = root[:, None] * matrix[:n] * root
     np.fill_diagonal(faded, np.diag(matrix[:n]))
-    solved = root[:, None] * scipy.linalg.solve(faded, root[:, None] * phi[:n, :m], assume_a="sym")
+    solved = (root[:, None] * phi[:n, :m]).astype(complex)
+    eliminate(faded, solved)
+    solved *= root[:, None]
     lack = GAIN * (1 - fade) * (1 - (1 - np.where(net, 1.0, cut.above[clusters])) ** 4) / diagonal
-    residual = phi[:, :m] - matrix @ solved
+    residual = phi[:, :m] - _product(matrix, solved)
     extra = lack[:, None] * residual
-    left = residual.T @ extra
+    left = _product(residual.T, extra)
     x = np.zeros((len(fade), m), complex)
     x[:n], x[n:] = solved, extra[n:]
-    delta = phi[:n, :m].T @ solved + left
+    delta = _product(phi[:n, :m].T, solved) + left
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     return Solution(
         0.5 * (delta + delta.T), np.ascontiguousarray(left.real), charge,
