@@ -1,3 +1,12 @@
+"""The solver of scenes with losses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capsense.surface.step import eliminate
+
+
 def test_elimination_without_pivots():
     """Differential: against LAPACK, for energies that are positive and losses of one sign."""
     rng = np.random.default_rng(9)

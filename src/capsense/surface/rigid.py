@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from capsense._frozen import Frozen
 from capsense._jit import compiled
@@ -125,7 +126,9 @@ class RigidShape(Frozen):
             z = np.float32(INSIDE) * self.energy
             z[0] = z[:, 0] = 0.0
             return z
-        return _of_functions(self.tree, impedance(self.panels, free_block(self.panels)))
+        with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
+            z = impedance(self.panels, free_block(self.panels))
+        return _of_functions(self.tree, z)
 
     @property
     def nbytes(self) -> int:
