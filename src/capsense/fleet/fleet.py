@@ -225,7 +225,8 @@ class Fleet:
         each = [bodies] * len(rows) if isinstance(bodies, Body) or bodies is None else list(bodies)
         if len(each) != len(rows):
             raise SceneError(f"{len(each)} bodies are given for {len(rows)} environments")
-        known = {id(body): self._row(body) for body in each}
+        alike = {id(body): body for body in each}
+        known = {key: self._row(body) for key, body in alike.items()}
         table = self._bodies
         values = [known[id(body)] for body in each]
         for column, part in zip(table[2:-1], zip(*values, strict=True), strict=True):
