@@ -1,7 +1,7 @@
 """The tutorials, run as they stand on their pages.
 
-A line such as ``EPISODES = 20  # the tests use 2`` is run with the smaller number. Pages without one
-must print what they show.
+A line such as ``EPISODES = 20  # the tests use 2`` is run with the smaller number. Pages without
+one must print what they show.
 """
 
 from __future__ import annotations

@@ -189,6 +189,16 @@ def test_dac_follows_only_if_it_may():
             assert after[1][1] == pytest.approx(14e-12, abs=1e-15)
 
 
+@pytest.mark.parametrize("first", [0.0, 9e-12])
+def test_each_channel_sets_its_dac_at_its_first_sample(first):
+    """Also where another channel was converted before, on code 0 or above it."""
+    conversion = Conversion(LINEAR, CapDac(3e-12, 32), 2)
+    conversion(np.array([0]), np.array([first]))
+    reported = conversion(np.array([1]), np.array([30e-12]))[1]
+    assert conversion.dac_codes.tolist() == [round(first / 3e-12), 10]
+    assert reported == pytest.approx([30e-12], abs=1e-15)
+
+
 def test_dac_follows_both_ways_to_its_ends():
     """Half a converter's range at a time: up, down, and no further than the DAC goes."""
     assert CapDac(3e-12, 12).nearest(np.array([-9e-12, 40e-12])).tolist() == [0, 11]
