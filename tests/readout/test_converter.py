@@ -194,9 +194,9 @@ def test_each_channel_sets_its_dac_at_its_first_sample(first):
     """Also where another channel was converted before, on code 0 or above it."""
     conversion = Conversion(LINEAR, CapDac(3e-12, 32), 2)
     conversion(np.array([0]), np.array([first]))
-    reported = conversion(np.array([1]), np.array([30e-12]))[1]
-    assert conversion.dac_codes.tolist() == [round(first / 3e-12), 10]
-    assert reported == pytest.approx([30e-12], abs=1e-15)
+    reported = conversion(np.array([1]), np.array([92e-12]))[1]
+    assert conversion.dac_codes.tolist() == [round(first / 3e-12), 31]
+    assert reported == pytest.approx([92e-12], abs=1e-15)
 
 
 def test_dac_follows_both_ways_to_its_ends():
