@@ -17,7 +17,7 @@ from capsense.mesh.settings import MeshSettings
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 9
+NUMERICS = 10
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 
