@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from capsense.design.loader import available_designs, load_design
     from capsense.design.model import Design
     from capsense.errors import (
+        AdapterError,
         BatchError,
         CapSenseError,
         DesignError,
@@ -25,12 +26,11 @@ if TYPE_CHECKING:
         MeshError,
         MissingDependencyError,
         ProtocolError,
-        ReadOutError,
+        ReadoutError,
         RecordingError,
         ScenarioError,
         SceneError,
         ServerError,
-        SimulatorError,
         SkinError,
         SolveError,
     )
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from capsense.reading import Reading
     from capsense.readout.config import load_readout
     from capsense.readout.counts import Counts
-    from capsense.readout.read_out import ReadOut
+    from capsense.readout.readout import Readout
     from capsense.recording.reader import open_recording
     from capsense.recording.recorder import Recorder, record
     from capsense.recording.replay import replay
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from capsense.scene.mesh_shape import TriMesh
     from capsense.scene.point_surface import point_surface
     from capsense.scene.pose import Pose
-    from capsense.scene.raster import rasterise
+    from capsense.scene.raster import render_depth
     from capsense.scene.scene import Scene
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
     from capsense.simulator import Simulator
@@ -63,6 +63,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MATERIALS",
+    "AdapterError",
     "BatchError",
     "Body",
     "Box",
@@ -86,9 +87,9 @@ __all__ = [
     "PerspectiveCamera",
     "Pose",
     "ProtocolError",
-    "ReadOut",
-    "ReadOutError",
     "Reading",
+    "Readout",
+    "ReadoutError",
     "Recorder",
     "RecordingError",
     "Scenario",
@@ -97,7 +98,6 @@ __all__ = [
     "SceneError",
     "ServerError",
     "Simulator",
-    "SimulatorError",
     "Skin",
     "SkinError",
     "SolveError",
@@ -117,8 +117,8 @@ __all__ = [
     "open_recording",
     "point_surface",
     "pybullet",
-    "rasterise",
     "record",
+    "render_depth",
     "replay",
     "show",
 ]
@@ -134,18 +134,18 @@ _HOMES = {
         "MeshError",
         "MissingDependencyError",
         "ProtocolError",
-        "ReadOutError",
+        "ReadoutError",
         "RecordingError",
         "ScenarioError",
         "SceneError",
         "ServerError",
-        "SimulatorError",
+        "AdapterError",
         "SkinError",
         "SolveError",
     ),
     "capsense.readout.config": ("load_readout",),
     "capsense.readout.counts": ("Counts",),
-    "capsense.readout.read_out": ("ReadOut",),
+    "capsense.readout.readout": ("Readout",),
     "capsense.reading": ("Reading",),
     "capsense.recording.reader": ("open_recording",),
     "capsense.recording.recorder": ("Recorder", "record"),
@@ -160,7 +160,7 @@ _HOMES = {
     "capsense.scene.mesh_shape": ("TriMesh",),
     "capsense.scene.point_surface": ("point_surface",),
     "capsense.scene.pose": ("Pose",),
-    "capsense.scene.raster": ("rasterise",),
+    "capsense.scene.raster": ("render_depth",),
     "capsense.scene.scene": ("Scene",),
     "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
     "capsense.simulator": ("Simulator",),

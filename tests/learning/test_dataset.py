@@ -326,7 +326,7 @@ def test_no_scheduler_there(tmp_path: Path) -> None:
     dask = pytest.importorskip("dask")
     with dask.config.set({"distributed.comm.timeouts.connect": "0.3s"}):
         spec = spec_of(tmp_path)
-        with pytest.raises(cs.SimulatorError, match="no Dask scheduler answers"):
+        with pytest.raises(cs.AdapterError, match="no Dask scheduler answers"):
             run(spec, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 
 
