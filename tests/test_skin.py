@@ -9,7 +9,7 @@ import pytest
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
-from capsense.errors import SceneError, SkinError
+from capsense.errors import FieldError, SceneError, SkinError
 from capsense.skin import make_simulators
 
 Array = np.ndarray
@@ -161,5 +161,5 @@ def test_refused(tiny: cs.Simulator) -> None:
 
 def test_a_field_of_another_design_is_refused(tiny: cs.Simulator) -> None:
     """A simulator does not take the field of other terminals."""
-    with pytest.raises(cs.FieldError, match="leave it out"):
+    with pytest.raises(FieldError, match="leave it out"):
         cs.Simulator("six_patch", background=tiny.background)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.errors import SceneError, SkinError
+from capsense.errors import ReadoutError, SceneError, SkinError
 
 MJCF = """
 <mujoco><option gravity="0 0 0"/>
@@ -240,13 +240,13 @@ def test_seeds_of_a_skin() -> None:
     single.reset(seed=1 + 2**32)
     arm.data.time = 0.1
     assert single.read().counts.code.tolist() == second["b"]
-    with pytest.raises(cs.ReadoutError, match="seed is -1"):
+    with pytest.raises(ReadoutError, match="seed is -1"):
         single.reset(seed=-1)
 
 
 def test_a_readout_is_not_shared(tiny_simulator: cs.Simulator) -> None:
     readout = cs.Readout.preset("fdc1004", tiny_simulator.electrode_names)
-    with pytest.raises(cs.ReadoutError, match="would be shared by all sensors"):
+    with pytest.raises(ReadoutError, match="would be shared by all sensors"):
         MujocoArm().skin(tiny_simulator, readout=readout)
 
 

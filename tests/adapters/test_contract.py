@@ -15,6 +15,7 @@ import pytest
 from adapter_worlds import Thing, Way, plain_reading
 
 import capsense as cs
+from capsense.errors import ReadoutError
 
 SensorIn = Callable[..., Any]
 
@@ -282,7 +283,7 @@ def test_a_readout_may_be_a_file(sensor_in: SensorIn, tmp_path: Path) -> None:
     for choice in (file, str(file)):
         sensor.use_readout(choice)
         assert sensor.readout.schedule.conversion == pytest.approx(2.5e-3, rel=1e-12)
-    with pytest.raises(cs.ReadoutError, match="readout is 3; give a chip's name, a file, or a"):
+    with pytest.raises(ReadoutError, match="readout is 3; give a chip's name, a file, or a"):
         sensor.use_readout(3)
 
 

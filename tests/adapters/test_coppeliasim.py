@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
+from capsense.errors import ReadoutError
 
 pytest.importorskip(
     "coppeliasim_zmqremoteapi_client", reason="CoppeliaSim's client is not installed"
@@ -221,7 +222,7 @@ def test_slips_are_refused_before_the_scene_is_changed(
     ):
         with pytest.raises(cs.SceneError, match=message):
             cs.coppeliasim.attach(sim, thing, tiny_simulator, **options)
-    with pytest.raises(cs.ReadoutError):
+    with pytest.raises(ReadoutError):
         cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator, readout="fdc1005")
     assert len(server.things) == 3
     assert not server.collections

@@ -106,7 +106,8 @@ class CoppeliaSensor(DepthSensor):
                 raise AdapterError(
                     f"CoppeliaSim draws nothing for vision sensor {self.vision_sensor.path!r}; "
                     "builds and machines without OpenGL do not, nor does it while vision sensors "
-                    "are disabled: start the usual build, on a machine without a display under xvfb-run"
+                    "are disabled: start the usual build, on a machine without a display under "
+                    "xvfb-run"
                 )
         depth = self._image("getVisionSensorDepth", np.dtype("<f4"), 1, 1)
         seen: Any = self._material
