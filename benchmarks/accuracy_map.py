@@ -2,7 +2,7 @@
 
     python benchmarks/accuracy_map.py                           # the default method and preset
     python benchmarks/accuracy_map.py --presets learning standard fine -o out/accuracy_time.png
-    python benchmarks/accuracy_map.py --method masked --worst 0
+    python benchmarks/accuracy_map.py --method fem_masked --worst 0
     python benchmarks/accuracy_map.py --settings refine=1.5
 
 Every method is run with every preset and all settings, a point each of a curve of error against

@@ -148,10 +148,10 @@ def times() -> None:
         mesh = trimesh.creation.icosphere(level, 0.1)
         vertices, f = mesh.vertices + np.array([0, 0, 0.2]), np.array(mesh.faces)
         for n in (64, 128):
-            raster = cs.rasterise(vertices, f, (0.21, 0.21), (n, n))
-            run = median(lambda v=vertices, f=f, n=n: cs.rasterise(v, f, (0.21, 0.21), (n, n)))
+            raster = cs.render_depth(vertices, f, (0.21, 0.21), (n, n))
+            run = median(lambda v=vertices, f=f, n=n: cs.render_depth(v, f, (0.21, 0.21), (n, n)))
             layers = median(raster.layers)
-            print(f"  {faces} triangles at {n} x {n}: rasterise {run:.3f}, layers {layers:.3f}")
+            print(f"  {faces} triangles at {n} x {n}: render_depth {run:.3f}, layers {layers:.3f}")
     sim = cs.Simulator("six_patch")
     capsule = cs.Capsule(0.045, 0.2)
     frames = {}

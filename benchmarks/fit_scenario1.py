@@ -19,14 +19,14 @@ from capsense.reproduce.metrics import cross_correlation, rmse
 from capsense.reproduce.scenario1_fit import (
     Fit,
     Grid,
-    Table,
+    ResponseTable,
     fit,
     fit_without,
     own_figures,
     predicted,
     tabulate,
 )
-from capsense.reproduce.scenario1_setup import Array, Setup, load_curves, load_setup
+from capsense.reproduce.scenario1_setup import Array, Scenario1Setup, load_curves, load_setup
 from capsense.reproduce.scenario1_signal import matrices, mutual, normalised
 from capsense.simulator import Simulator
 
@@ -40,48 +40,52 @@ def report(stage: str, fraction: float) -> None:
     print(f"  {stage}", file=sys.stderr)
 
 
-def simulators(setup: Setup) -> dict[str, Simulator]:
+def simulators(setup: Scenario1Setup) -> dict[str, Simulator]:
     """Of both boards."""
     return {
-        name: Simulator(setup.boards[name].sensor(setup.pour), frequency=setup.frequency)
+        name: Simulator(
+            setup.boards[name].sensor(setup.pour), excitation_frequency=setup.excitation_frequency
+        )
         for name in BOARDS
     }
 
 
-def tables_of(setup: Setup, grids: dict[str, Grid]) -> dict[str, Table]:
+def tables_of(setup: Scenario1Setup, grids: dict[str, Grid]) -> dict[str, ResponseTable]:
     """Tables of the set-up's pairs."""
     return {name: grid.table(setup.boards[name].pair) for name, grid in grids.items()}
 
 
-def recorded(setup: Setup) -> list[str]:
+def recorded(setup: Scenario1Setup) -> list[str]:
     """Names of the panels whose curves are given."""
     return [name for name, panel in setup.panels.items() if panel.file]
 
 
-def curve_of(setup: Setup, tables: dict[str, Table], panel: str) -> Array:
+def curve_of(setup: Scenario1Setup, tables: dict[str, ResponseTable], panel: str) -> Array:
     """A panel's curve by the table of its board."""
     return predicted(setup, panel, tables[setup.panels[panel].board])
 
 
-def likeness(setup: Setup, tables: dict[str, Table], panel: str) -> tuple[float, float]:
+def likeness(
+    setup: Scenario1Setup, tables: dict[str, ResponseTable], panel: str
+) -> tuple[float, float]:
     """Zero-mean correlation and rms error of a panel's curve by the table against hardware."""
     measured = load_curves(setup.panels[panel]).measured
     curve = curve_of(setup, tables, panel)
     return cross_correlation(curve, measured), rmse(curve, measured)
 
 
-def level_boards(setup: Setup) -> Setup:
+def level_boards(setup: Scenario1Setup) -> Scenario1Setup:
     """The same with both boards at one height, which is no longer fitted."""
     kept = {key: u for key, u in setup.uncertainty.items() if key != "patch.height"}
     return replace(setup.changed({"patch.height": 0.0}), uncertainty=kept)
 
 
-def held_out(setup: Setup, tables: dict[str, Table]) -> dict[str, Setup]:
+def held_out(setup: Scenario1Setup, tables: dict[str, ResponseTable]) -> dict[str, Scenario1Setup]:
     """For each recorded panel the set-up that is fitted with it held out."""
     return {name: fit_without(setup, tables, name) for name in recorded(setup)}
 
 
-def print_held_out(setup: Setup, tables: dict[str, Table]) -> None:
+def print_held_out(setup: Scenario1Setup, tables: dict[str, ResponseTable]) -> None:
     """How each panel is foretold by the others, and what becomes of the predicted one."""
     best = curve_of(setup, tables, PREDICTED)
     for title, begin in (("", setup), (", boards at one height", level_boards(setup))):
@@ -97,7 +101,7 @@ def print_held_out(setup: Setup, tables: dict[str, Table]) -> None:
                 print(f"  {key} = {other.value(key):.4g}    # ± {other.uncertainty[key]:.2g}")
 
 
-def print_pairs(setup: Setup, grids: dict[str, Grid], count: int | None = None) -> None:
+def print_pairs(setup: Scenario1Setup, grids: dict[str, Grid], count: int | None = None) -> None:
     """The fit of every choice of pairs, and the panel that it predicts, the best first."""
     best = curve_of(setup, tables_of(setup, grids), PREDICTED)
     found = []
@@ -124,7 +128,7 @@ def print_pairs(setup: Setup, grids: dict[str, Grid], count: int | None = None) 
         print(text)
 
 
-def print_prediction(result: Fit, tables: dict[str, Table]) -> None:
+def print_prediction(result: Fit, tables: dict[str, ResponseTable]) -> None:
     """How far the predicted panel moves with the fitted figures' uncertainties."""
     curve = curve_of(result.setup, tables, PREDICTED)
     moved = [curve_of(one, tables, PREDICTED) for one in result.drawn(DRAWS)]
@@ -137,7 +141,9 @@ def print_prediction(result: Fit, tables: dict[str, Table]) -> None:
     )
 
 
-def print_fit(setup: Setup, sims: dict[str, Simulator], tables: dict[str, Table]) -> Fit:
+def print_fit(
+    setup: Scenario1Setup, sims: dict[str, Simulator], tables: dict[str, ResponseTable]
+) -> Fit:
     """The figures, and each recorded panel's curve by the simulation itself."""
     result = fit(setup, tables, report=report)
     print(f"cost {result.cost:.6f}, correlation of successive residuals {result.memory:.3f}\n")

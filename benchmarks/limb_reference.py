@@ -17,7 +17,7 @@ from capsense.reproduce.limb_curves import (
     LIMB_LENGTH,
     MAIN,
     RANGES,
-    Setup,
+    LimbSetup,
     slopes,
 )
 
@@ -28,7 +28,12 @@ def main() -> None:
     """Print the slopes of four electrodes, by the reference and by two presets."""
     z = np.unique(np.concatenate([np.geomspace(a, b, 4) for a, b in RANGES]))
     turn = Rotation.from_quat(ACROSS)
-    for setup in (Setup(0.03), Setup(0.06), Setup(0.10), Setup(0.06, "ground plane")):
+    for setup in (
+        LimbSetup(0.03),
+        LimbSetup(0.06),
+        LimbSetup(0.10),
+        LimbSetup(0.06, "ground plane"),
+    ):
         sensor = Sensor(setup.design, 1.0)
         line = np.linspace(-setup.size / 2, setup.size / 2, 13)
         points = np.stack([*np.meshgrid(line, line), np.zeros((13, 13))], axis=-1).reshape(-1, 3)

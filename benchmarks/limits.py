@@ -100,7 +100,7 @@ def inside(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         out = []
         for gap in (0.001, 0.0, -0.001, -0.005):
             reading = sim.step(cs.Scene([low(shape, gap, AT, turn)]))
-            out.append(reading.stats.error_estimate / float(np.abs(reading.delta).max()))
+            out.append(reading.stats.solver_error / float(np.abs(reading.delta).max()))
         yield name, out
 
 

@@ -70,7 +70,7 @@ class PaperScheme:
 
 
 class PaperOnLattice:
-    """The same on the default mesh of CapSense's ``method="masked"``.
+    """The same on the default mesh of CapSense's ``method="fem_masked"``.
 
     The bar's staircase there changes only in some steps; a warm start makes the others cheap.
     """
@@ -83,7 +83,7 @@ class PaperOnLattice:
             "the paper's scheme, CapSense's planes", warm_start, PUBLISHED_TOLERANCE
         )
         sensor = lattice_sensor(design(), sim.background.terminals, sim.settings.mesh)
-        self._scenes = MaskedScenes(sensor, sim.frequency, warm_start=warm_start)
+        self._scenes = MaskedScenes(sensor, sim.excitation_frequency, warm_start=warm_start)
         planes = np.array([len(axis) for axis in plan_axes(design(), MeshSettings())])
         self.n_tets, self.unknowns = int(6 * (planes - 1).prod()), int(planes.prod())
 

@@ -1,4 +1,4 @@
-"""What a read-out and an image cost beside the field: ``python benchmarks/readout_cost.py``.
+"""What a readout and an image cost beside the field: ``python benchmarks/readout_cost.py``.
 
 Six electrodes, a simulator that steps at 100 Hz; images of 2240 voxels from 21 pairs. Times are of
 this machine, one process, as found.
@@ -13,7 +13,7 @@ import numpy as np
 
 from capsense.readout.chips import CHIPS
 from capsense.readout.imaging import back_projection, landweber, tikhonov
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 
 NAMES = tuple(f"E{k}" for k in range(6))
 STEPS, RATE = 3000, 100.0
@@ -54,7 +54,7 @@ def main() -> None:
     scenes = matrices(STEPS)
     times = np.arange(STEPS) / RATE
     for name in CHIPS:
-        readout = ReadOut.preset(name, NAMES, expected=2e-12)
+        readout = Readout.preset(name, NAMES, expected=2e-12)
         taken, total = np.empty(STEPS), 0
         for k in range(STEPS):
             start = time.perf_counter()

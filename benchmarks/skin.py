@@ -106,7 +106,7 @@ def far_away(world: World) -> None:
     """Print what sensors cost that see nothing."""
     poses = {f"s{k}": cs.Pose((0.0, 0.0, 10.0 + k)) for k in range(16)}
     one = cs.Simulator("arm_segment")
-    skin = cs.Skin({name: (one.sibling(), pose) for name, pose in poses.items()}, threads=1)
+    skin = cs.Skin({name: (one.copy(), pose) for name, pose in poses.items()}, threads=1)
     scene = cs.Scene([cs.Body(cs.Sphere(0.1), cs.Pose((k, 0.0, 0.0))) for k in range(30)])
     times = []
     for _ in range(100):
@@ -122,7 +122,7 @@ def memory() -> None:
     scene = cs.Scene([cs.Body(cs.Sphere(0.04), cs.Pose((0.0, 0.0, 0.06)))])
     first.step(scene)
     tracemalloc.start()
-    second = first.sibling()
+    second = first.copy()
     second.step(scene)
     taken = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()

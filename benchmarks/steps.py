@@ -7,7 +7,7 @@ The worlds are those of ``step_scenes.py``, in front of ``six_patch``. Times are
 medians and 95 % (``capsense.bench.Times``); "clock" is the median by the clock. "off" is the
 largest difference of ΔC at sample 0 from the bodies as plain shapes with the fine preset, over ΔC's
 largest entry: what presets differ by, and what depth images and meshes lack besides. The paper's
-scheme (``method="masked"``, its default mesh) takes turns with the presets at single bodies.
+scheme (``method="fem_masked"``, its default mesh) takes turns with the presets at single bodies.
 "target" is what the standard preset is meant to take.
 
 Batches are of 256 random bodies on two threads, by the clock. Set-up: the first reading of a shape
@@ -90,11 +90,11 @@ def time_world(sims: dict[str, cs.Simulator], world: World, steps: int) -> dict[
     """Times of each simulator. They take turns, so that whatever else the machine does meets all;
     the first steps of a turn, which fill the caches, do not count.
     """
-    times = {name: Times() for name in sims if name != "masked" or world.single}
+    times = {name: Times() for name in sims if name != "fem_masked" or world.single}
     unknowns: dict[str, list[int]] = {name: [] for name in times}
     for turn in range(TURNS):
         for name, taken in times.items():
-            count = MASKED_STEPS if name == "masked" else steps
+            count = MASKED_STEPS if name == "fem_masked" else steps
             for k in range(-WARM_UP, count // TURNS):
                 sample = turn * steps // TURNS + k
                 reading = taken.take(reader(sims[name], world, sample), keep=k >= 0)
@@ -183,7 +183,7 @@ def main() -> None:
     sims = {p: cs.Simulator(DESIGN, preset=p) for p in args.presets}
     fine = cs.Simulator(DESIGN, preset="fine")
     if not args.no_masked:
-        sims["masked"] = cs.Simulator(DESIGN, method="masked")
+        sims["fem_masked"] = cs.Simulator(DESIGN, method="fem_masked")
     print(f"{'':34s} {'':9s} {'median':>8s} {'95 %':>8s} {'target':>7s} {'clock':>8s} ms "
           f"{'unknowns':>5s} off, %")  # fmt: skip
     rows: dict[str, Any] = {}

@@ -51,8 +51,8 @@ def ride(
     model, data, sensor = way.model, way.data, way.sensor
     if back != "fill":
         sensor = cs.mujoco.attach(
-            model, data, "wrist_pad", "six_patch", world="depth", default_material="human",
-            default_grounding=100e-12, back=back,
+            model, data, "wrist_pad", "six_patch", perception="depth_camera",
+            default_material="human", default_grounding=100e-12, back=back,
         )  # fmt: skip
     no_sensors = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     times, found, unknowns = Times(), [], []
@@ -131,7 +131,7 @@ def seen_by_rays(body: cs.Body, pixels: int) -> cs.DepthFrame:
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    return cs.mujoco.attach(model, data, "pad", _sim(), world="depth").frame()
+    return cs.mujoco.attach(model, data, "pad", _sim(), perception="depth_camera").frame()
 
 
 def seen_by_renderer(body: cs.Body, pixels: int) -> cs.DepthFrame:
@@ -146,7 +146,9 @@ def seen_by_renderer(body: cs.Body, pixels: int) -> cs.DepthFrame:
     p.createMultiBody(
         0, -1, drawn, body.pose.position, body.pose.quaternion, physicsClientId=client
     )
-    frame = cs.pybullet.attach(client, pad, design=_sim(), world="depth", resolution=pixels).frame()
+    frame = cs.pybullet.attach(
+        client, pad, design=_sim(), perception="depth_camera", resolution=pixels
+    ).frame()
     p.disconnect(physicsClientId=client)
     return frame
 
@@ -204,7 +206,7 @@ def round_shapes() -> None:
         visual = p.createVisualShape(kind, radius=shape.radius, length=0.2, physicsClientId=client)
         p.createMultiBody(0, -1, visual, pose.position, pose.quaternion, physicsClientId=client)
         sensor = cs.pybullet.attach(
-            client, pad, design=_sim(), world="depth", resolution=n, size=size,
+            client, pad, design=_sim(), perception="depth_camera", resolution=n, size=size,
             back=2 * shape.radius,
         )  # fmt: skip
         frame = sensor.frame()

@@ -215,7 +215,7 @@ def _animate(record: Record, file: Path, count: int) -> None:
     left, right = figure.add_axes((0, 0, 5.2 / 9.2, 1)), figure.add_axes((0.635, 0.13, 0.35, 0.78))
     left.set_axis_off()
     image = left.imshow(np.zeros((*CAMERA.size, 3), np.uint8))
-    distance = float(np.linalg.norm(np.subtract(CAMERA.target, CAMERA.eye)))
+    distance = float(np.linalg.norm(np.subtract(CAMERA.target, CAMERA.position)))
     long = SCALE * CAMERA.focal / distance
     left.plot([500 - long, 500], [408, 408], color=INK, lw=2)
     left.text(500 - long / 2, 402, f"{1e3 * SCALE:.0f} mm", ha="center", **LABELS)

@@ -81,7 +81,7 @@ def attach(model: mujoco.MjModel, data: mujoco.MjData, depth: bool) -> Any:
     """Six electrodes on the pad: they feel the person, and the robot's own links."""
     if depth:
         return cs.mujoco.attach(
-            model, data, site="wrist_pad", design="six_patch", world="depth",
+            model, data, site="wrist_pad", design="six_patch", perception="depth_camera",
             default_material="human", default_grounding=100e-12,
         )  # fmt: skip
     return cs.mujoco.attach(

@@ -27,7 +27,7 @@ _SMOOTH: dict[int, tuple[Any, Any]] = {}
 class Camera:
     """Where a picture is taken from."""
 
-    eye: tuple[float, float, float]
+    position: tuple[float, float, float]
     target: tuple[float, float, float]
     field: float
     """Angle that the picture's height covers [rad]."""
@@ -37,7 +37,7 @@ class Camera:
     @property
     def axes(self) -> np.ndarray:
         """Right, down and forward in the world, as rows, shape (3, 3)."""
-        forward = np.subtract(self.target, self.eye)
+        forward = np.subtract(self.target, self.position)
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right = right / np.linalg.norm(right)
@@ -102,7 +102,7 @@ def picture(parts: Sequence[Part], camera: Camera, glowing: Sequence[Part] = ())
     near, owner = np.zeros((rows, columns)), np.full((rows, columns), -1)
     normal = np.zeros((rows, columns, 3))
     for k, (points, normals) in enumerate(triangles):
-        seen = (points - camera.eye) @ axes.T
+        seen = (points - camera.position) @ axes.T
         depth = np.maximum(seen[..., 2:], 1e-3)
         where = focal * seen[..., :2] / depth + (0.5 * columns - 0.5, 0.5 * rows - 0.5)
         _fill(np.concatenate([where, 1 / depth], axis=-1), normals, k, near, owner, normal)
@@ -111,8 +111,8 @@ def picture(parts: Sequence[Part], camera: Camera, glowing: Sequence[Part] = ())
     rays = rays @ axes / focal
     ground = (owner < 0) & (rays[..., 2] < -1e-3)
     depth = np.where(near > 0, 1 / np.maximum(near, 1e-9), 0.0)
-    depth[ground] = -camera.eye[2] / rays[ground, 2]
-    place = camera.eye + rays * depth[..., None]
+    depth[ground] = -camera.position[2] / rays[ground, 2]
+    place = camera.position + rays * depth[..., None]
     normal[ground] = (0.0, 0.0, 1.0)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
     normal *= -np.sign(np.sum(normal * rays, axis=-1, keepdims=True))

@@ -89,7 +89,7 @@ def results() -> dict[str, Any]:
     mesh = cs.Body(cs.TriMesh(ball.vertices, ball.faces), cs.Pose((0, 0, 0.03)), "glass")
     scene = cs.Scene([mesh, cs.Body(cs.Sphere(0.01), cs.Pose((0.03, 0, 0.03)))])
     reading = sim.step(scene, jacobian=True)
-    chip = cs.ReadOut.preset("fdc1004", sim.electrode_names)
+    chip = cs.Readout.preset("fdc1004", sim.electrode_names)
     camera = cs.OrthographicCamera(0.1)
     frame = cs.DepthFrame(np.full((8, 8), 0.02), 10.0, camera)
     sim.step(frame)

@@ -93,7 +93,7 @@ def table_file(folder: Path, kind: str) -> Format:
     assert main(["run", str(scenario), "-o", str(folder / "run"), "-q"]) == 0
     name = f"readings.{kind}"
     sound = (folder / "run" / name).read_bytes()
-    return Format(sound, name, tables.load_recording, errors.ReadOutError)
+    return Format(sound, name, tables.load_recording, errors.ReadoutError)
 
 
 READOUT = b"""
@@ -132,7 +132,7 @@ def text_file(_: Path, kind: str) -> Format:
             return Format(ball_scenario().encode(), "a.toml", cs.load_scenario, wrong)
         case "readout":
             return Format(
-                READOUT, "a.toml", lambda p: cs.load_readout(p, ("A", "B")), errors.ReadOutError
+                READOUT, "a.toml", lambda p: cs.load_readout(p, ("A", "B")), errors.ReadoutError
             )
         case "stl":
             sound = (DATA / "original_meshes/stripe_geom.stl").read_bytes()
@@ -213,7 +213,7 @@ def test_files_that_inflate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(errors.MeshError, match="inflates to more than 1,000 bytes"):
         load_mesh(tmp_path / form.name)
     table_file(tmp_path, "npz")
-    with pytest.raises(errors.ReadOutError, match="bytes of memory"):
+    with pytest.raises(errors.ReadoutError, match="bytes of memory"):
         tables.load_recording(tmp_path / "run")
     form = recording_file(tmp_path, "mcap")
     with pytest.raises(errors.RecordingError, match="bytes of memory"):

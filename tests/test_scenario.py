@@ -67,6 +67,8 @@ def test_base() -> None:
     assert scenario.times == pytest.approx(np.arange(31) / 10)
     assert [c.column_name for c in scenario.channels] == ["Cm_E1_E2", "Cm_E3_E1"]
     assert scenario.method == "surface"
+    assert parse_scenario({**BASE, "method": "fem_masked"}).method == "fem_masked"
+    assert parse_scenario({**BASE, "method": "masked"}).method == "fem_masked"  # its former name
     scene = scenario.scene_at(1.0)
     assert scene["bar"].pose.position == pytest.approx((0.0, 0.0, 0.05))
     assert scene["bar"].grounding == "grounded"

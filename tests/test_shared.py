@@ -17,7 +17,7 @@ import capsense as cs
 from capsense.adapters import skin as skin_module
 
 
-@pytest.fixture(params=["surface", "masked"])
+@pytest.fixture(params=["surface", "fem_masked"])
 def tiny(field_cache: Path, request: pytest.FixtureRequest) -> cs.Simulator:
     """A square and a disc in a 0.1 m box."""
     return cs.Simulator(
@@ -58,7 +58,7 @@ def test_threads_that_share_a_simulator(
 ) -> None:
     """No two are in the solver at once, and each reads what a thread alone reads."""
     scenes = balls(12)
-    expected = [tiny.sibling().step(scene).delta for scene in scenes]
+    expected = [tiny.copy().step(scene).delta for scene in scenes]
     for name in ("solve", "reset"):
         monkeypatch.setattr(tiny._solver, name, alone(getattr(tiny._solver, name)))
     readings = at_once(lambda k: (tiny.step(scenes[k]), tiny.reset() if k % 4 == 3 else None)[0])
@@ -67,17 +67,17 @@ def test_threads_that_share_a_simulator(
 
 
 def test_batches_at_once(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two batches of one sensor never use the same sibling together."""
+    """Two batches of one sensor never use the same copy together."""
     batches = [balls(4, 0.002 * k) for k in range(4)]
-    expected = [tiny.sibling().step_batch(batch, threads=1) for batch in batches]
-    make = cs.Simulator.sibling
+    expected = [tiny.copy().step_batch(batch, threads=1) for batch in batches]
+    make = cs.Simulator.copy
 
-    def sibling(self: cs.Simulator) -> cs.Simulator:
+    def copy(self: cs.Simulator) -> cs.Simulator:
         made = make(self)
         monkeypatch.setattr(made._solver, "solve", alone(made._solver.solve))
         return made
 
-    monkeypatch.setattr(cs.Simulator, "sibling", sibling)
+    monkeypatch.setattr(cs.Simulator, "copy", copy)
     found = at_once(lambda k: tiny.step_batch(batches[k], threads=2), 4)
     for readings, others in zip(found, expected, strict=True):
         for a, b in zip(readings, others, strict=True):

@@ -7,9 +7,9 @@ import pytest
 from numba import njit
 
 from capsense._simd import (
-    LANES,
+    SIMD_WIDTH,
     at,
-    lane_sum,
+    horizontal_sum,
     madd,
     muladd,
     put_span,
@@ -23,7 +23,7 @@ from capsense._simd import (
 
 @njit
 def _combine(x, y, scalar, two, out):
-    for k in range(0, x.size, LANES):
+    for k in range(0, x.size, SIMD_WIDTH):
         left, right = span(x, k), span(y, k)
         put_span(out, k, vmadd(left, right, vadd(madd(scalar, left, splat(two)), right)))
 
@@ -31,7 +31,7 @@ def _combine(x, y, scalar, two, out):
 @njit
 def _sums(x, out):
     for a in range(out.size):
-        out[a] = lane_sum(span(x, a * LANES))
+        out[a] = horizontal_sum(span(x, a * SIMD_WIDTH))
 
 
 @njit
@@ -55,15 +55,15 @@ def _turn_round(x, out):
 def _roots(x, one, eight):
     for k in range(x.size):
         one[k] = rsqrt(x[k])
-    for k in range(0, x.size, LANES):
+    for k in range(0, x.size, SIMD_WIDTH):
         put_span(eight, k, rsqrt(span(x, k)))
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_every_lane_and_row_is_treated_alike(kind):
-    """Differential: s x + 2 + x y + y, row by row and lane by lane."""
+    """Differential: s x + 2 + x y + y, row by row and element by element."""
     rng = np.random.default_rng(3)
-    x, y = rng.normal(size=(2, 37, LANES)).astype(kind)
+    x, y = rng.normal(size=(2, 37, SIMD_WIDTH)).astype(kind)
     out = np.full_like(x, np.nan)
     _combine(x, y, kind(-1.5), kind(2.0), out)
     np.testing.assert_allclose(out, x * y - 1.5 * x + 2.0 + y, rtol=0, atol=20 * np.finfo(kind).eps)
@@ -72,7 +72,7 @@ def test_every_lane_and_row_is_treated_alike(kind):
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_lanes_are_added_up(kind):
     """Differential."""
-    x = np.random.default_rng(4).normal(size=(11, LANES)).astype(kind)
+    x = np.random.default_rng(4).normal(size=(11, SIMD_WIDTH)).astype(kind)
     out = np.empty(11, kind)
     _sums(x, out)
     np.testing.assert_allclose(out, x.sum(axis=1), rtol=0, atol=20 * np.finfo(kind).eps)

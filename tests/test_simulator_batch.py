@@ -34,7 +34,7 @@ def frame() -> cs.DepthFrame:
 def test_each_reading_is_that_of_a_step_from_rest(tiny: cs.Simulator, threads: int | None) -> None:
     """Differential: to the last bit, whatever stands beside it; and again in a second batch."""
     views = [*scenes(), frame()]
-    alone = tiny.sibling()
+    alone = tiny.copy()
     expected = []
     for view in views:
         alone.reset()
@@ -51,7 +51,7 @@ def test_each_reading_is_that_of_a_step_from_rest(tiny: cs.Simulator, threads: i
 
 def test_the_sensor_itself_is_left_alone(tiny: cs.Simulator) -> None:
     """Its walk goes on as if there had been no batch."""
-    other = tiny.sibling()
+    other = tiny.copy()
     walk = scenes(6)
     for sim in (tiny, other):
         sim.step(walk[1])

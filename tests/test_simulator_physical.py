@@ -25,7 +25,7 @@ def describe(scene: cs.Scene) -> str:
 def assert_scene_is_physical(sim: cs.Simulator, scene: cs.Scene) -> Array:
     reading = sim.step(scene)
     try:
-        assert np.isfinite(reading.stats.error_estimate)
+        assert np.isfinite(reading.stats.solver_error)
         assert_physical(reading.capacitance, SLACK)
     except AssertionError as error:
         raise AssertionError(f"{error}\n{describe(scene)}") from error

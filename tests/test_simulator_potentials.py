@@ -30,7 +30,7 @@ def points() -> np.ndarray:
 def test_empty_scene(simulator: cs.Simulator, points: np.ndarray) -> None:
     """Invariant: φ⁰ of the background field, before any step and after an empty one."""
     phi = np.clip(simulator.background.green.phi0(points), 0.0, 1.0)
-    np.testing.assert_array_equal(simulator.sibling().potentials(points), phi)
+    np.testing.assert_array_equal(simulator.copy().potentials(points), phi)
     simulator.step(cs.Scene([bar()]))
     simulator.step(cs.Scene())
     np.testing.assert_array_equal(simulator.potentials(points), phi)
@@ -92,6 +92,6 @@ def test_between_the_conductors(simulator: cs.Simulator, points: np.ndarray) -> 
 def test_refusals(simulator: cs.Simulator) -> None:
     """The other method says which one does; points have three coordinates."""
     with pytest.raises(ValueError, match='use "surface"'):
-        cs.Simulator("six_patch", method="masked").potentials(np.zeros((1, 3)))
+        cs.Simulator("six_patch", method="fem_masked").potentials(np.zeros((1, 3)))
     with pytest.raises(SceneError, match="points have shape"):
         simulator.potentials(np.zeros(3))

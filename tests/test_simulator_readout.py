@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 
 Make = Callable[..., cs.Simulator]
 COLUMNS = ("time", "channel", "code", "capacitance", "flags")
@@ -31,7 +31,7 @@ def scene_at(time: float) -> cs.Scene:
 
 def by_hand(sim: cs.Simulator, seed: int = 0, start: float = 0.0) -> list[cs.Counts]:
     """What the chip reports when it is told every reading."""
-    chip = cs.ReadOut.preset("fdc1004", sim.electrode_names)
+    chip = cs.Readout.preset("fdc1004", sim.electrode_names)
     chip.reset(seed=seed, start=start)
     return [chip.sample(start + t, sim.step(scene_at(t))) for t in TIMES]
 
@@ -46,12 +46,12 @@ def same(found: list[cs.Counts], expected: list[cs.Counts]) -> bool:
     )
 
 
-@pytest.mark.parametrize("method", ["surface", "masked"])
+@pytest.mark.parametrize("method", ["surface", "fem_masked"])
 def test_counts_are_those_of_the_chip(make: Make, method: str) -> None:
-    """Differential: a chip's name, or a read-out; and again after a reset, or with other noise."""
+    """Differential: a chip's name, or a readout; and again after a reset, or with other noise."""
     plain = make(method=method)
     expected = by_hand(plain)
-    for choice in ("fdc1004", cs.ReadOut.preset("fdc1004", plain.electrode_names)):
+    for choice in ("fdc1004", cs.Readout.preset("fdc1004", plain.electrode_names)):
         sim = make(method=method, readout=choice)
         for _ in range(2):
             found = [sim.step(scene_at(t), time=t).counts for t in TIMES]
@@ -65,14 +65,14 @@ def test_counts_are_those_of_the_chip(make: Make, method: str) -> None:
 
 
 def test_copies_go_on(make: Make) -> None:
-    """A pickled sensor reports what the original does; siblings and batches have no chip."""
+    """A pickled sensor reports what the original does; copies and batches have no chip."""
     sim = make(readout="fdc1004")
     for t in TIMES[:5]:
         sim.step(scene_at(t), time=t)
     twin = pickle.loads(pickle.dumps(sim))
     rest = [[s.step(scene_at(t), time=t).counts for t in TIMES[5:]] for s in (sim, twin)]
     assert same(*rest)
-    assert sim.sibling().readout is None
+    assert sim.copy().readout is None
     assert all(r.counts is None for r in sim.step_batch([scene_at(t) for t in TIMES]))
     sim.use_readout(None)
     assert sim.step(scene_at(0.0)).counts is None
@@ -81,14 +81,14 @@ def test_copies_go_on(make: Make) -> None:
 def test_refused(make: Make, tmp_path: Path) -> None:
     """By name, before anything is solved."""
     sim = make(readout="fdc1004")
-    with pytest.raises(ReadOutError, match=r"write step\(scene, time=…\)"):
+    with pytest.raises(ReadoutError, match=r"write step\(scene, time=…\)"):
         sim.step(scene_at(0.0))
     assert sim.steps == 0
     sim.step(scene_at(0.0), time=1.0)
-    with pytest.raises(ReadOutError, match="time must not go back"):
+    with pytest.raises(ReadoutError, match="time must not go back"):
         sim.step(scene_at(0.0), time=0.5)
     for choice in ("fdc1005", tmp_path / "none.toml", 3):
-        with pytest.raises(ReadOutError):
+        with pytest.raises(ReadoutError):
             make(readout=choice)
 
 
@@ -113,7 +113,7 @@ def test_recorded(make: Make, tmp_path: Path) -> None:
     steps = list(cs.open_recording(tmp_path / "a.mcap").steps())
     there = [s.reading.counts for s in steps if s.reading.counts is not None]
     assert same([c for c in there if len(c)], [c for c in expected if len(c)])
-    with pytest.raises(ReadOutError, match="read-out of its own"):
+    with pytest.raises(ReadoutError, match="readout of its own"):
         cs.record(tmp_path / "b.mcap", sim, readout="fdc1004")
 
 

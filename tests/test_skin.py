@@ -9,7 +9,7 @@ import pytest
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
-from capsense.errors import SceneError, SkinError
+from capsense.errors import FieldError, SceneError, SkinError
 from capsense.skin import make_simulators
 
 Array = np.ndarray
@@ -30,7 +30,7 @@ def tiny(field_cache: Path) -> cs.Simulator:
 
 def skin_of(tiny: cs.Simulator, **options: object) -> cs.Skin:
     """Four sensors, all fresh."""
-    return cs.Skin({n: (tiny.sibling(), p) for n, p in POSES.items()}, **options)
+    return cs.Skin({n: (tiny.copy(), p) for n, p in POSES.items()}, **options)
 
 
 def scenes(count: int = 12) -> list[cs.Scene]:
@@ -65,7 +65,7 @@ def same(a: cs.Reading, b: cs.Reading) -> bool:
 def test_the_same_as_one_by_one_to_the_last_bit(tiny: cs.Simulator, threads: int) -> None:
     """Differential: a walk of scenes, against single sensors that are given the same views."""
     skin = skin_of(tiny, threads=threads)
-    alone = {name: tiny.sibling() for name in POSES}
+    alone = {name: tiny.copy() for name in POSES}
     for scene in scenes():
         together = skin.step(scene)
         assert list(together) == list(POSES)
@@ -81,7 +81,7 @@ def test_every_sensor_sees_the_world_from_its_own_frame(tiny: cs.Simulator) -> N
         for name, pose in POSES.items():
             inverse = pose.inverse()
             whole = cs.Scene([b.moved(inverse @ b.pose) for b in scene])
-            expected = tiny.sibling().step(whole).delta
+            expected = tiny.copy().step(whole).delta
             assert readings[name].delta == pytest.approx(expected, rel=1e-4, abs=1e-19)
         assert not readings["far"].delta.any()
 
@@ -104,20 +104,20 @@ def test_sensors_move(tiny: cs.Simulator) -> None:
     skin = skin_of(tiny)
     there = skin.step(cs.Scene([ball]), {"far": pose})["far"].delta
     assert skin.poses["far"] == pose
-    expected = tiny.sibling().step(cs.Scene([ball.moved(pose.inverse() @ ball.pose)])).delta
+    expected = tiny.copy().step(cs.Scene([ball.moved(pose.inverse() @ ball.pose)])).delta
     assert np.array_equal(there, expected)
     skin.reset()
     assert np.array_equal(skin.step(cs.Scene([ball]))["far"].delta, expected)
 
 
 def test_sensors_of_one_design_share_its_field(tiny: cs.Simulator) -> None:
-    """A given simulator is used once; siblings have its field and settings, not its state."""
+    """A given simulator is used once; copies have its field and settings, not its state."""
     made = make_simulators({"a": tiny, "b": tiny, "c": "arm_segment", "d": "arm_segment"})
     assert made["a"] is tiny
     assert made["b"] is not tiny
     assert made["b"].background is tiny.background
     assert made["c"].background is made["d"].background
-    for name in ("method", "preset", "frequency", "settings", "design"):
+    for name in ("method", "preset", "excitation_frequency", "settings", "design"):
         assert getattr(made["b"], name) == getattr(tiny, name)
     assert made["b"].steps == 0
 
@@ -133,7 +133,7 @@ def test_a_failing_sensor_does_not_lose_the_others(tiny: cs.Simulator) -> None:
     assert list(caught.value.readings) == ["left", "right", "far"]
     assert list(caught.value.failures) == ["middle"]
     assert isinstance(caught.value.failures["middle"], SceneError)
-    expected = tiny.sibling().step(skin.views(good)["left"])
+    expected = tiny.copy().step(skin.views(good)["left"])
     assert same(caught.value.readings["left"], expected)
     views["right"] = None
     with pytest.raises(SkinError, match=r"2 of 4 sensors failed; 'middle': .*so did 'right'"):
@@ -161,5 +161,5 @@ def test_refused(tiny: cs.Simulator) -> None:
 
 def test_a_field_of_another_design_is_refused(tiny: cs.Simulator) -> None:
     """A simulator does not take the field of other terminals."""
-    with pytest.raises(cs.FieldError, match="leave it out"):
+    with pytest.raises(FieldError, match="leave it out"):
         cs.Simulator("six_patch", background=tiny.background)

@@ -1,11 +1,13 @@
 """CapSense: real-time simulation of capacitive proximity sensors for robots.
 
-The public names are listed in ``__all__``. They are imported at first use, so ``import capsense``
-itself is light.
+The public names are listed in ``docs/conventions.md``. They are imported at first use, so that
+``import capsense`` itself is light: the imports below are seen by type checkers only, and
+:func:`__getattr__` looks up there where a name is from.
 """
 
 from __future__ import annotations
 
+import ast
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,30 +17,28 @@ from capsense._kernel_cache import ensure_place
 if TYPE_CHECKING:
     from capsense import humans
     from capsense.adapters import assistive_gym, coppeliasim, mujoco, pybullet
+    from capsense.adapters.attached import AttachedSensor
     from capsense.design.loader import available_designs, load_design
     from capsense.design.model import Design
     from capsense.errors import (
+        AdapterError,
         BatchError,
         CapSenseError,
         DesignError,
-        FieldError,
-        MeshError,
-        MissingDependencyError,
         ProtocolError,
-        ReadOutError,
         RecordingError,
         ScenarioError,
         SceneError,
-        ServerError,
-        SimulatorError,
         SkinError,
         SolveError,
     )
     from capsense.fleet.fleet import Fleet, FleetReading
-    from capsense.reading import Reading
+    from capsense.reading import Reading, StepStats
+    from capsense.readout.calibration import calibrate
+    from capsense.readout.chips import available_chips
     from capsense.readout.config import load_readout
     from capsense.readout.counts import Counts
-    from capsense.readout.read_out import ReadOut
+    from capsense.readout.readout import Readout
     from capsense.recording.reader import open_recording
     from capsense.recording.recorder import Recorder, record
     from capsense.recording.replay import replay
@@ -52,9 +52,10 @@ if TYPE_CHECKING:
     from capsense.scene.mesh_shape import TriMesh
     from capsense.scene.point_surface import point_surface
     from capsense.scene.pose import Pose
-    from capsense.scene.raster import rasterise
+    from capsense.scene.raster import render_depth
     from capsense.scene.scene import Scene
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
+    from capsense.server.client import Client
     from capsense.simulator import Simulator
     from capsense.skin import Skin
     from capsense.viewer.show import show
@@ -62,121 +63,34 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "MATERIALS",
-    "BatchError",
-    "Body",
-    "Box",
-    "CapSenseError",
-    "Capsule",
-    "Counts",
-    "Cylinder",
-    "DeformableSurface",
-    "DepthFrame",
-    "Design",
-    "DesignError",
-    "Ellipsoid",
-    "FieldError",
-    "Fleet",
-    "FleetReading",
-    "Layers",
-    "Material",
-    "MeshError",
-    "MissingDependencyError",
-    "OrthographicCamera",
-    "PerspectiveCamera",
-    "Pose",
-    "ProtocolError",
-    "ReadOut",
-    "ReadOutError",
-    "Reading",
-    "Recorder",
-    "RecordingError",
-    "Scenario",
-    "ScenarioError",
-    "Scene",
-    "SceneError",
-    "ServerError",
-    "Simulator",
-    "SimulatorError",
-    "Skin",
-    "SkinError",
-    "SolveError",
-    "Sphere",
-    "TriMesh",
-    "__version__",
-    "assistive_gym",
-    "available_designs",
-    "coppeliasim",
-    "decode_permittivity",
-    "encode_permittivity",
-    "humans",
-    "load_design",
-    "load_readout",
-    "load_scenario",
-    "mujoco",
-    "open_recording",
-    "point_surface",
-    "pybullet",
-    "rasterise",
-    "record",
-    "replay",
-    "show",
-]
+    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "Body", "Box", "CapSenseError",
+    "Capsule", "Client", "Counts", "Cylinder", "DeformableSurface", "DepthFrame", "Design",
+    "DesignError", "Ellipsoid", "Fleet", "FleetReading", "Layers", "Material",
+    "OrthographicCamera", "PerspectiveCamera", "Pose", "ProtocolError", "Reading", "Readout",
+    "Recorder", "RecordingError", "Scenario", "ScenarioError", "Scene", "SceneError",
+    "Simulator", "Skin", "SkinError", "SolveError", "Sphere", "StepStats", "TriMesh",
+    "__version__", "assistive_gym", "available_chips", "available_designs", "calibrate",
+    "coppeliasim", "decode_permittivity", "encode_permittivity", "humans", "load_design",
+    "load_readout", "load_scenario", "mujoco", "open_recording", "point_surface", "pybullet",
+    "record", "render_depth", "replay", "show",
+]  # fmt: skip
 
-_HOMES = {
-    "capsense.design.loader": ("available_designs", "load_design"),
-    "capsense.design.model": ("Design",),
-    "capsense.errors": (
-        "BatchError",
-        "CapSenseError",
-        "DesignError",
-        "FieldError",
-        "MeshError",
-        "MissingDependencyError",
-        "ProtocolError",
-        "ReadOutError",
-        "RecordingError",
-        "ScenarioError",
-        "SceneError",
-        "ServerError",
-        "SimulatorError",
-        "SkinError",
-        "SolveError",
-    ),
-    "capsense.readout.config": ("load_readout",),
-    "capsense.readout.counts": ("Counts",),
-    "capsense.readout.read_out": ("ReadOut",),
-    "capsense.reading": ("Reading",),
-    "capsense.recording.reader": ("open_recording",),
-    "capsense.recording.recorder": ("Recorder", "record"),
-    "capsense.recording.replay": ("replay",),
-    "capsense.scenario": ("Scenario", "load_scenario"),
-    "capsense.scene.body": ("Body",),
-    "capsense.scene.camera": ("OrthographicCamera", "PerspectiveCamera"),
-    "capsense.scene.deformable": ("DeformableSurface",),
-    "capsense.scene.depth": ("DepthFrame", "decode_permittivity", "encode_permittivity"),
-    "capsense.scene.layers": ("Layers",),
-    "capsense.scene.materials": ("MATERIALS", "Material"),
-    "capsense.scene.mesh_shape": ("TriMesh",),
-    "capsense.scene.point_surface": ("point_surface",),
-    "capsense.scene.pose": ("Pose",),
-    "capsense.scene.raster": ("rasterise",),
-    "capsense.scene.scene": ("Scene",),
-    "capsense.scene.shapes": ("Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"),
-    "capsense.simulator": ("Simulator",),
-    "capsense.fleet.fleet": ("Fleet", "FleetReading"),
-    "capsense.viewer.show": ("show",),
-    "capsense.skin": ("Skin",),
-}
-_SUBMODULES = {
-    "assistive_gym": "capsense.adapters.assistive_gym",
-    "coppeliasim": "capsense.adapters.coppeliasim",
-    "humans": "capsense.humans",
-    "mujoco": "capsense.adapters.mujoco",
-    "pybullet": "capsense.adapters.pybullet",
-}
 ensure_place(Path(__file__).parent)
-_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def _homes() -> dict[str, str]:
+    """The module of each public name, by the imports above."""
+    source = ast.parse(Path(__file__).read_text(encoding="utf-8"))
+    seen = next(node for node in source.body if isinstance(node, ast.If))
+    return {
+        name.name: str(node.module)
+        for node in seen.body
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    }
+
+
+_HOMES = _homes()
 
 
 def __getattr__(name: str) -> Any:
@@ -186,12 +100,12 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         value = version("capsense")
-    elif name in _HOME_OF:
-        value = getattr(import_module(_HOME_OF[name]), name)
-    elif name in _SUBMODULES:
-        value = import_module(_SUBMODULES[name])
-    else:
+    elif name not in _HOMES:
         raise AttributeError(f"module 'capsense' has no attribute {name!r}")
+    elif _HOMES[name] in ("capsense", "capsense.adapters"):
+        value = import_module(f"{_HOMES[name]}.{name}")
+    else:
+        value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
 

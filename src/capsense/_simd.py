@@ -1,9 +1,9 @@
 """Eight numbers as one value inside compiled code.
 
 The functions below are one or a few LLVM instructions each, whatever the processor's own width:
-``splat(s)`` fills all lanes, ``vadd(u, v)`` is ``u + v``, ``madd(s, v, w)`` is ``s v + w`` with a
-scalar s, ``vmadd(u, v, w)`` is ``u v + w`` lane by lane, ``lane_sum(v)`` adds the lanes up, and
-``muladd(a, b, c)`` is ``a b + c`` of scalars.
+``splat(s)`` fills all elements, ``vadd(u, v)`` is ``u + v``, ``madd(s, v, w)`` is ``s v + w`` with
+a scalar s, ``vmadd(u, v, w)`` is ``u v + w`` element by element, ``horizontal_sum(v)`` adds the
+elements, and ``muladd(a, b, c)`` is ``a b + c`` of scalars.
 
 ``at(x, k)`` is element k of a C-ordered array of any shape, ``span`` is the eight from k on, and
 ``put_span`` writes them: unlike ``x[k]``, which counts from the end where k is negative, they do
@@ -24,21 +24,21 @@ from numba import types
 from numba.core.cgutils import get_or_insert_function
 from numba.extending import intrinsic, models, register_model
 
-LANES = 8
+SIMD_WIDTH = 8
 
 _INT = ir.IntType(32)
 
 
 class _VectorType(types.Type):
     def __init__(self, element: Any) -> None:
-        super().__init__(name=f"{element}x{LANES}")
+        super().__init__(name=f"{element}x{SIMD_WIDTH}")
         self.element = element
 
 
 _SINGLE, _DOUBLE = _VectorType(types.float32), _VectorType(types.float64)
 _CODE = {
-    types.float32: ir.VectorType(ir.FloatType(), LANES),
-    types.float64: ir.VectorType(ir.DoubleType(), LANES),
+    types.float32: ir.VectorType(ir.FloatType(), SIMD_WIDTH),
+    types.float64: ir.VectorType(ir.DoubleType(), SIMD_WIDTH),
 }
 
 
@@ -64,9 +64,9 @@ def _from(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -
 
 
 def _fill(builder: Any, scalar: Any) -> Any:
-    blank = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
+    blank = ir.Constant(ir.VectorType(scalar.type, SIMD_WIDTH), ir.Undefined)
     first = builder.insert_element(blank, scalar, ir.Constant(_INT, 0))
-    zeros = ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES)
+    zeros = ir.Constant(ir.VectorType(_INT, SIMD_WIDTH), [0] * SIMD_WIDTH)
     return builder.shuffle_vector(first, blank, zeros)
 
 
@@ -74,7 +74,7 @@ def multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     """Emit ``a b + c`` of scalars or vectors, fused where the processor can."""
     name = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}
     kind = a.type
-    suffix = f"v{LANES}{name[kind.element]}" if isinstance(kind, ir.VectorType) else name[kind]
+    suffix = f"v{SIMD_WIDTH}{name[kind.element]}" if isinstance(kind, ir.VectorType) else name[kind]
     signature = ir.FunctionType(kind, [kind] * 3)
     code = get_or_insert_function(builder.module, signature, f"llvm.fmuladd.{suffix}")
     return builder.call(code, [a, b, c])
@@ -117,7 +117,7 @@ def put_span(typing: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def splat(typing: Any, scalar: Any) -> Any:
-    """A number in all lanes."""
+    """A number in all elements."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return _fill(builder, args[0])
@@ -127,7 +127,7 @@ def splat(typing: Any, scalar: Any) -> Any:
 
 @intrinsic
 def vadd(typing: Any, left: Any, right: Any) -> Any:
-    """``left + right``, lane by lane."""
+    """``left + right``, element by element."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fadd(*args)
@@ -147,7 +147,7 @@ def madd(typing: Any, scalar: Any, value: Any, addend: Any) -> Any:
 
 @intrinsic
 def vmadd(typing: Any, left: Any, right: Any, addend: Any) -> Any:
-    """``left * right + addend``, lane by lane."""
+    """``left * right + addend``, element by element."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return multiply_add(builder, *args)
@@ -156,22 +156,22 @@ def vmadd(typing: Any, left: Any, right: Any, addend: Any) -> Any:
 
 
 @intrinsic
-def lane_sum(typing: Any, value: Any) -> Any:
-    """The sum of all lanes."""
+def horizontal_sum(typing: Any, value: Any) -> Any:
+    """The sum of all elements."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        lanes, width = args[0], LANES
+        parts, width = args[0], SIMD_WIDTH
         while width > 1:
             width //= 2
-            blank = ir.Constant(lanes.type, ir.Undefined)
+            blank = ir.Constant(parts.type, ir.Undefined)
             low, high = (
                 builder.shuffle_vector(
-                    lanes, blank, ir.Constant(ir.VectorType(_INT, width), list(range(k, k + width)))
+                    parts, blank, ir.Constant(ir.VectorType(_INT, width), list(range(k, k + width)))
                 )
                 for k in (0, width)
             )
-            lanes = builder.fadd(low, high)
-        return builder.extract_element(lanes, ir.Constant(_INT, 0))
+            parts = builder.fadd(low, high)
+        return builder.extract_element(parts, ir.Constant(_INT, 0))
 
     return value.element(value), code
 
@@ -202,7 +202,7 @@ def rsqrt(typing: Any, value: Any) -> Any:
         def each(element: Any, number: float) -> Any:
             if value == types.float32:
                 return ir.Constant(element, number)
-            return ir.Constant(ir.VectorType(element, LANES), [number] * LANES)
+            return ir.Constant(ir.VectorType(element, SIMD_WIDTH), [number] * SIMD_WIDTH)
 
         bits = each(_INT, 1).type
         half = builder.lshr(builder.bitcast(args[0], bits), each(_INT, 1))

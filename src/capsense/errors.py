@@ -39,7 +39,7 @@ class FieldError(CapSenseError, RuntimeError):
     """The background field could not be built."""
 
 
-class SimulatorError(CapSenseError, RuntimeError):
+class AdapterError(CapSenseError, RuntimeError):
     """A robot simulator cannot be reached, refused a call, or is too old."""
 
 
@@ -75,8 +75,8 @@ class MissingDependencyError(CapSenseError, ImportError):
     """An optional dependency is missing; the message gives the command that installs it."""
 
 
-class ReadOutError(CapSenseError, ValueError):
-    """A read-out, its configuration or what is given to it is wrong."""
+class ReadoutError(CapSenseError, ValueError):
+    """A readout, its configuration or what is given to it is wrong."""
 
 
 class RecordingError(CapSenseError, ValueError):

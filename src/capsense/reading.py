@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 class StepStats:
     """How a step was solved."""
 
-    error_estimate: float
+    solver_error: float
     """Estimated error of a capacitance that more unknowns or iterations would remove [F]."""
     wall_time: float
     """Time the step took [s]."""
@@ -40,7 +40,7 @@ class Reading:
     electrode_names: tuple[str, ...]
     _shield_coupling: Array = field(repr=False)
     counts: Counts | None = None
-    """What the chip has reported since the reading before, where a read-out is configured."""
+    """What the chip has reported since the reading before, where a readout is configured."""
     jacobian: Array | None = None
     """How ``capacitance`` changes as each body of the scene moves along the sensor frame's x, y, z
     [F/m], then turns about axes parallel to these through its own origin [F/rad], where it was

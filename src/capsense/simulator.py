@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._crew import Crew, OneAtATime, some_failed
+from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.errors import BatchError, FieldError, ReadOutError, SceneError
+from capsense.errors import BatchError, FieldError, ReadoutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
@@ -30,10 +30,10 @@ from capsense.scene.shape import as_points
 if TYPE_CHECKING:
     from capsense.masked import MeshSensor
     from capsense.mesh import TetMesh
-    from capsense.readout.read_out import ReadOut
+    from capsense.readout.readout import Readout
 
 Array = NDArray[np.float64]
-Method = Literal["surface", "masked"]
+Method = Literal["surface", "fem_masked"]
 PresetName = Literal["standard", "learning", "fine"]
 
 
@@ -54,19 +54,19 @@ class Simulator:
 
     Args:
         design: A design, a packaged name, or the path of a design file.
-        method: ``"surface"``: charges on the surfaces of the bodies. ``"masked"``: the scheme of
-            Schöffmann et al. 2022, where objects are staircases of tetrahedra. By default
-            ``"masked"`` on a mesh, else ``"surface"``.
+        method: ``"surface"``: charges on the surfaces of the bodies. ``"fem_masked"``: the scheme
+            of Schöffmann et al. 2022, where objects are staircases of tetrahedra. By default
+            ``"fem_masked"`` on a mesh, else ``"surface"``.
         preset: How finely surfaces are resolved: ``"standard"``, ``"learning"`` (faster, some
             3 % rms) or ``"fine"``.
-        frequency: Excitation frequency [Hz]; decides which materials conduct.
+        excitation_frequency: Excitation frequency [Hz]; decides which materials conduct.
         settings: Numerical settings of the background field; default from ``design.build``.
         cache_dir: Where built fields are kept; default the user's cache directory.
         progress: Called with a stage's name and the fraction done while a field is built.
         background: The field of this design with these settings, if it is at hand; it is shared,
-            not copied. :meth:`sibling` passes its own.
+            not copied. :meth:`copy` passes its own.
         readout: What steps report through, as :meth:`use_readout` takes it.
-        mesh: In place of a design, for ``"masked"``: a tetrahedral mesh, or a
+        mesh: In place of a design, for ``"fem_masked"``: a tetrahedral mesh, or a
             :class:`~capsense.masked.MeshSensor`, which tells how its node groups are held. The
             baseline is then that of the mesh.
 
@@ -74,7 +74,7 @@ class Simulator:
         DesignError: The design is wrong.
         MeshError: The mesh is not around the sensor frame's origin, or lacks a node group.
         ValueError: Neither or both of design and mesh are given, or an option is wrong.
-        ReadOutError: There is no such chip or file, or the file is wrong.
+        ReadoutError: There is no such chip or file, or the file is wrong.
         FieldError: The background field could not be built, or ``background`` is of another design.
     """
 
@@ -84,15 +84,15 @@ class Simulator:
         *,
         method: Method | None = None,
         preset: PresetName = "standard",
-        frequency: float = 250e3,
+        excitation_frequency: float = 250e3,
         settings: BuildSettings | None = None,
         cache_dir: Path | None = None,
         progress: Callable[[str, float], None] | None = None,
         background: BackgroundField | None = None,
-        readout: ReadOut | str | Path | None = None,
+        readout: Readout | str | Path | None = None,
         mesh: TetMesh | MeshSensor | None = None,
     ) -> None:
-        method = method or ("surface" if mesh is None else "masked")
+        method = method or ("surface" if mesh is None else "fem_masked")
         for what, chosen, known in (
             ("method", method, get_args(Method)), ("preset", preset, get_args(PresetName)),
         ):  # fmt: skip
@@ -100,11 +100,13 @@ class Simulator:
                 raise ValueError(
                     f"{what} is {chosen!r}; choose one of {', '.join(map(repr, known))}"
                 )
-        if not (np.isfinite(frequency) and frequency > 0):
-            raise ValueError(f"frequency is {frequency!r}; give a positive number")
+        if not (np.isfinite(excitation_frequency) and excitation_frequency > 0):
+            raise ValueError(
+                f"excitation_frequency is {excitation_frequency!r}; give a positive number"
+            )
         self.method: Method = method
         self.preset: PresetName = preset
-        self.frequency = frequency
+        self.excitation_frequency = excitation_frequency
         if (mesh is None) == (design is None):
             raise ValueError("give either a design or mesh=…, a TetMesh or a MeshSensor")
         self.mesh = None if mesh is None else self._on_mesh(mesh)
@@ -135,32 +137,35 @@ class Simulator:
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
         self.baseline.setflags(write=False)
-        self.readout: ReadOut | None = None
+        self.readout: Readout | None = None
         """The chip that turns capacitances into counts, if any."""
         self.use_readout(readout)
 
     def _on_mesh(self, mesh: TetMesh | MeshSensor) -> MeshSensor:
         from capsense.masked.mesh_sensor import mesh_sensor
 
-        if self.method != "masked":
-            raise ValueError(f'method {self.method!r} takes a design, not a mesh; use "masked"')
+        if self.method != "fem_masked":
+            raise ValueError(f'method {self.method!r} takes a design, not a mesh; use "fem_masked"')
         return mesh_sensor(mesh)
 
     def _make_solver(self) -> tuple[_Solver, Array]:
         """The solver, and the matrix of all terminals in the empty domain [F]."""
-        if self.method == "masked":
+        if self.method == "fem_masked":
             from capsense.masked.mesh_sensor import lattice_sensor
             from capsense.masked.scenes import MaskedScenes
 
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)
-            scenes = MaskedScenes(sensor, self.frequency)
+            scenes = MaskedScenes(sensor, self.excitation_frequency)
             return scenes, self.background.capacitance if self.mesh is None else scenes.empty
         from capsense.surface.solver import PRESETS, SurfaceSolver
 
         field = self.background
         return SurfaceSolver(
-            field.green, self.design, frequency=self.frequency, preset=PRESETS[self.preset]
+            field.green,
+            self.design,
+            excitation_frequency=self.excitation_frequency,
+            preset=PRESETS[self.preset],
         ), field.capacitance
 
     @property
@@ -184,16 +189,16 @@ class Simulator:
         """The reading of an empty scene, which no chip has seen."""
         return self._reading(np.zeros_like(self._terminals.empty), StepStats(0.0, 0.0))
 
-    def use_readout(self, readout: ReadOut | str | Path | None, *, start: float = 0.0) -> None:
+    def use_readout(self, readout: Readout | str | Path | None, *, start: float = 0.0) -> None:
         """Read through a chip from now on.
 
         Args:
-            readout: A read-out of this sensor alone, the name of a chip with its usual settings,
-                the path of a read-out file (``.toml``), or None.
+            readout: A readout of this sensor alone, the name of a chip with its usual settings,
+                the path of a readout file (``.toml``), or None.
             start: Time at which it is switched on [s].
 
         Raises:
-            ReadOutError: There is no such chip or file, or the file is wrong.
+            ReadoutError: There is no such chip or file, or the file is wrong.
         """
         self.readout = make_readout(readout, self)
         if self.readout is not None:
@@ -209,21 +214,21 @@ class Simulator:
 
         Args:
             scene: What stands around the sensor.
-            time: Time of the scene [s], not before that of the last step; a read-out needs it.
+            time: Time of the scene [s], not before that of the last step; a readout needs it.
             jacobian: Whether to work out ``reading.jacobian`` as well, for half a step's time.
 
         Raises:
             SceneError: ``scene`` is neither a scene nor a depth frame, or has no Jacobian.
             SolveError: The solver found no solution.
-            ReadOutError: A read-out is given no time, or time went back.
+            ReadoutError: A readout is given no time, or time went back.
             ValueError: A Jacobian is asked for of a method that has none.
         """
         start = perf_counter()
         _check_view("step takes", scene)
-        if jacobian and self.method == "masked":
-            raise ValueError('method "masked" has no Jacobian; use "surface"')
+        if jacobian and self.method == "fem_masked":
+            raise ValueError('method "fem_masked" has no Jacobian; use "surface"')
         if self.readout is not None and time is None:
-            raise ReadOutError("a read-out needs the time; write step(scene, time=…), in seconds")
+            raise ReadoutError("a readout needs the time; write step(scene, time=…), in seconds")
         if isinstance(scene, DepthFrame):
             scene = scene.scene()
         with self._one:
@@ -247,7 +252,9 @@ class Simulator:
         if found.loss is None:
             return reading
         n = terminals.electrodes
-        return replace(reading, conductance=-2 * np.pi * self.frequency * change.imag[:n, :n])
+        return replace(
+            reading, conductance=-2 * np.pi * self.excitation_frequency * change.imag[:n, :n]
+        )
 
     def _reading(self, change: Array, stats: StepStats, slope: Array | None = None) -> Reading:
         """A reading by the change of the matrix of electrodes and shields [F]."""
@@ -267,7 +274,7 @@ class Simulator:
     ) -> list[Reading]:
         """Return the readings of many scenes, each solved on whichever thread is free.
 
-        Readings are those of :meth:`reset` and :meth:`step`, to the last bit, without a read-out.
+        Readings are those of :meth:`reset` and :meth:`step`, to the last bit, without a readout.
         They do not depend on the number of threads, nor on what stands beside them in the batch.
         This sensor's own last step and count stay as they are.
 
@@ -287,14 +294,14 @@ class Simulator:
             try:
                 sensor = self._idle.popleft()
             except IndexError:
-                sensor = self.sibling()
+                sensor = self.copy()
             try:
                 sensor.reset()
                 return sensor.step(scene)
             finally:
                 self._idle.append(sensor)
 
-        readings, failures = Crew(threads).run(
+        readings, failures = ThreadPool(threads).run(
             {k: partial(from_rest, scene) for k, scene in enumerate(scenes)}
         )
         if failures:
@@ -317,31 +324,31 @@ class Simulator:
 
         Raises:
             SceneError: The points do not have shape (n, 3).
-            ValueError: The method is ``"masked"``, which solves on a mesh of its own.
+            ValueError: The method is ``"fem_masked"``, which solves on a mesh of its own.
         """
         with self._one:
             return self._solver.potentials(as_points(points))
 
-    def sibling(self) -> Simulator:
+    def copy(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field.
 
-        It has no read-out: a chip belongs to one sensor.
+        It has no readout: a chip belongs to one sensor.
         """
         return Simulator(
             None if self.mesh else self.design, method=self.method, preset=self.preset,
-            frequency=self.frequency, settings=self.settings, background=self._background,
-            mesh=self.mesh,
+            excitation_frequency=self.excitation_frequency, settings=self.settings,
+            background=self._background, mesh=self.mesh,
         )  # fmt: skip
 
     def reset(self, *, seed: int | None = None, start: float = 0.0) -> None:
-        """Forget the previous step, which ``"masked"`` starts the next one from; restart the chip.
+        """Forget the step before, from which ``"fem_masked"`` starts; restart the chip.
 
         Args:
-            seed: Of the read-out's noise from now on; by default its random numbers repeat.
+            seed: Of the readout's noise from now on; by default its random numbers repeat.
             start: Time at which it is switched on [s].
 
         Raises:
-            ReadOutError: The seed is no whole number from 0 on.
+            ReadoutError: The seed is no whole number from 0 on.
         """
         with self._one:
             self._solver.reset()
@@ -364,21 +371,21 @@ class Simulator:
         }  # fmt: skip
 
 
-def make_readout(readout: ReadOut | str | Path | None, simulator: Simulator) -> ReadOut | None:
-    """The read-out given, or that of a chip or a file for a simulator's electrodes.
+def make_readout(readout: Readout | str | Path | None, simulator: Simulator) -> Readout | None:
+    """The readout given, or that of a chip or a file for a simulator's electrodes.
 
     Raises:
-        ReadOutError: There is no such chip or file, or the file is wrong.
+        ReadoutError: There is no such chip or file, or the file is wrong.
     """
     if readout is None:
         return None
     from capsense.readout.config import choose_readout
-    from capsense.readout.read_out import ReadOut
+    from capsense.readout.readout import Readout
 
-    if isinstance(readout, ReadOut):
+    if isinstance(readout, Readout):
         return readout
     if not isinstance(readout, str | Path):
-        raise ReadOutError(f"readout is {readout!r}; give a chip's name, a file, or a ReadOut")
+        raise ReadoutError(f"readout is {readout!r}; give a chip's name, a file, or a Readout")
     return choose_readout(readout, simulator.electrode_names, simulator.empty)
 
 

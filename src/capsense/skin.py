@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._crew import Crew, OneAtATime, some_failed
+from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
 from capsense._validate import suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError, SkinError
@@ -44,7 +44,7 @@ class Skin:
             if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], Pose)):
                 raise SceneError(f"sensor {name!r} is {pair!r}; give a pair (design, Pose(…))")
             designs[name], self.poses[name] = pair
-        self._crew, self._one = Crew(threads), OneAtATime()
+        self._pool, self._one = ThreadPool(threads), OneAtATime()
         self.simulators: dict[str, Simulator] = make_simulators(designs)
         """The sensors themselves."""
 
@@ -97,7 +97,7 @@ class Skin:
             return lambda: simulator.step(view)
 
         return read_all(
-            self._crew, {n: task(self.simulators[n], view) for n, view in views.items()}
+            self._pool, {n: task(self.simulators[n], view) for n, view in views.items()}
         )
 
     def reset(self) -> None:
@@ -130,7 +130,7 @@ class Skin:
 def make_simulators(designs: Mapping[str, AnyDesign]) -> dict[str, Simulator]:
     """Simulators by name; where the same design comes again, one that shares its field.
 
-    A simulator that is given is used once, and its siblings after that.
+    A simulator that is given is used once, and copies of it after that.
 
     Raises:
         SceneError: There is none.
@@ -144,20 +144,20 @@ def make_simulators(designs: Mapping[str, AnyDesign]) -> dict[str, Simulator]:
     for name, design in designs.items():
         key = design if isinstance(design, str | Path) else id(design)
         if key in first:
-            simulators[name] = first[key].sibling()
+            simulators[name] = first[key].copy()
             continue
         made = design if isinstance(design, Simulator) else Simulator(design)
         simulators[name] = first[key] = made
     return simulators
 
 
-def read_all(crew: Crew, tasks: Mapping[str, Callable[[], Reading]]) -> dict[str, Reading]:
+def read_all(pool: ThreadPool, tasks: Mapping[str, Callable[[], Reading]]) -> dict[str, Reading]:
     """Read sensors together: name → what reads it.
 
     Raises:
         SkinError: Some of them failed; it holds the readings of the others.
     """
-    readings, failures = crew.run(tasks)
+    readings, failures = pool.run(tasks)
     if failures:
         raise SkinError(some_failed("sensors", failures, len(tasks)), readings, failures)
     return readings

@@ -55,7 +55,7 @@ def test_a_forearm_reads_as_its_shape_does(env: Env, tiny_simulator: cs.Simulato
 
 
 def test_it_follows_resets(env: Env, tiny_simulator: cs.Simulator) -> None:
-    """Differential: another person in another client, and a read-out that starts anew."""
+    """Differential: another person in another client, and a readout that starts anew."""
     sensor = cs.assistive_gym.attach(
         env, pose_in_link=NEAR, design=tiny_simulator, readout="fdc1004", exclude=BESIDE
     )
@@ -179,11 +179,15 @@ def test_a_person_of_one_mesh_has_no_limbs(env: Env, tiny_simulator: cs.Simulato
 def test_by_depth_camera(env: Env, tiny_simulator: cs.Simulator) -> None:
     """What is drawn, in the person's material; groundings by name are for shapes alone."""
     sensor = cs.assistive_gym.attach(
-        env, pose_in_link=NEAR, design=tiny_simulator, world="depth", materials={"human": "glass"}
+        env,
+        pose_in_link=NEAR,
+        design=tiny_simulator,
+        perception="depth_camera",
+        materials={"human": "glass"},
     )
     frame = sensor.view()
     assert isinstance(frame, cs.DepthFrame)
     assert set(np.unique(frame.permittivity)) == {0.0, 5.0}
     assert sensor.read().delta[0, 0] > 0
-    with pytest.raises(cs.SceneError, match='grounding goes with world="geometry"'):
-        cs.assistive_gym.attach(env, world="depth", grounding={"human": "floating"})
+    with pytest.raises(cs.SceneError, match='grounding goes with perception="geometry"'):
+        cs.assistive_gym.attach(env, perception="depth_camera", grounding={"human": "floating"})

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.errors import SceneError, SkinError
+from capsense.errors import ReadoutError, SceneError, SkinError
 
 MJCF = """
 <mujoco><option gravity="0 0 0"/>
@@ -125,8 +125,8 @@ def test_the_same_as_attached_one_by_one(
     arm: Any, tiny_simulator: cs.Simulator, threads: int
 ) -> None:
     """Differential, to the last bit; a sensor does not see its own link, but the others."""
-    skin = arm.skin(tiny_simulator.sibling(), threads=threads)
-    alone = {name: arm.single(name, tiny_simulator.sibling()) for name in MOUNTS}
+    skin = arm.skin(tiny_simulator.copy(), threads=threads)
+    alone = {name: arm.single(name, tiny_simulator.copy()) for name in MOUNTS}
     for k in range(5):
         arm.move(k)
         readings = skin.read()
@@ -143,7 +143,7 @@ def test_the_same_as_attached_one_by_one(
 
 def test_the_world_is_taken_over_once(arm: Any, tiny_simulator: cs.Simulator) -> None:
     """All sensors share the solids, and their fields; refreshing one source serves them all."""
-    skin = arm.skin(tiny_simulator.sibling())
+    skin = arm.skin(tiny_simulator.copy())
     a, b, c = skin.sensors.values()
     assert a.source is b.source is c.source
     assert a.simulator.background is tiny_simulator.background is b.simulator.background
@@ -158,8 +158,8 @@ def test_the_world_is_taken_over_once(arm: Any, tiny_simulator: cs.Simulator) ->
 
 def test_designs_of_their_own(arm: Any, tiny_simulator: cs.Simulator) -> None:
     """Each sensor may have another design."""
-    other = tiny_simulator.sibling()
-    skin = arm.skin({"a": tiny_simulator.sibling(), "b": other, "c": "six_patch_bare"})
+    other = tiny_simulator.copy()
+    skin = arm.skin({"a": tiny_simulator.copy(), "b": other, "c": "six_patch_bare"})
     assert skin.sensors["b"].simulator is other
     assert [len(r.electrode_names) for r in skin.read().values()] == [2, 2, 6]
     with pytest.raises(SceneError, match="design: no sensor is named 'd'"):
@@ -170,7 +170,7 @@ def test_designs_of_their_own(arm: Any, tiny_simulator: cs.Simulator) -> None:
 
 def test_one_failing_sensor(arm: Any, tiny_simulator: cs.Simulator) -> None:
     """Readings of the others come with the error."""
-    skin = arm.skin(tiny_simulator.sibling())
+    skin = arm.skin(tiny_simulator.copy())
     expected = skin.read()
     skin.reset()
 
@@ -185,7 +185,7 @@ def test_one_failing_sensor(arm: Any, tiny_simulator: cs.Simulator) -> None:
 
 
 def test_each_sensor_has_its_own_chip() -> None:
-    """With a read-out, every reading holds counts, time-stamped by the simulator."""
+    """With a readout, every reading holds counts, time-stamped by the simulator."""
     arm = MujocoArm()
     skin = arm.skin("six_patch_bare", readout="fdc1004")
     chips = {id(s.readout) for s in skin.sensors.values()}
@@ -240,13 +240,13 @@ def test_seeds_of_a_skin() -> None:
     single.reset(seed=1 + 2**32)
     arm.data.time = 0.1
     assert single.read().counts.code.tolist() == second["b"]
-    with pytest.raises(cs.ReadOutError, match="seed is -1"):
+    with pytest.raises(ReadoutError, match="seed is -1"):
         single.reset(seed=-1)
 
 
 def test_a_readout_is_not_shared(tiny_simulator: cs.Simulator) -> None:
-    readout = cs.ReadOut.preset("fdc1004", tiny_simulator.electrode_names)
-    with pytest.raises(cs.ReadOutError, match="would be shared by all sensors"):
+    readout = cs.Readout.preset("fdc1004", tiny_simulator.electrode_names)
+    with pytest.raises(ReadoutError, match="would be shared by all sensors"):
         MujocoArm().skin(tiny_simulator, readout=readout)
 
 
@@ -274,7 +274,7 @@ def test_pybullet_mounts(tmp_path: Path, tiny_simulator: cs.Simulator) -> None:
     ):
         with pytest.raises(SceneError, match=words):
             cs.pybullet.attach_skin(arm.client, arm.body, mounts, tiny_simulator)
-    skin = arm.skin(tiny_simulator.sibling())
+    skin = arm.skin(tiny_simulator.copy())
     before = skin.read()
     shape = p.createCollisionShape(p.GEOM_SPHERE, radius=0.02, physicsClientId=arm.client)
     p.createMultiBody(0, shape, basePosition=(0.08, 0, 0.04), physicsClientId=arm.client)

@@ -92,7 +92,7 @@ def test_a_wrong_camera_is_told(
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with pytest.warns(UserWarning, match=message):
-        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator, world="depth")
+        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator, perception="depth_camera")
     assert len(sensor.check()) == 1
 
 

@@ -15,6 +15,7 @@ import pytest
 from adapter_worlds import Thing, Way, plain_reading
 
 import capsense as cs
+from capsense.errors import ReadoutError
 
 SensorIn = Callable[..., Any]
 
@@ -275,23 +276,23 @@ def test_an_open_mesh_is_taken(shape_way: Way, shapes_in: SensorIn) -> None:
 
 
 def test_a_readout_may_be_a_file(sensor_in: SensorIn, tmp_path: Path) -> None:
-    """As text or as a path; what is neither a name, nor a file, nor a read-out is refused."""
+    """As text or as a path; what is neither a name, nor a file, nor a readout is refused."""
     sensor = sensor_in([], cs.Pose())
     file = tmp_path / "chip.toml"
     file.write_text('chip = "fdc1004"\nrate = 400\n', encoding="utf-8")
     for choice in (file, str(file)):
         sensor.use_readout(choice)
         assert sensor.readout.schedule.conversion == pytest.approx(2.5e-3, rel=1e-12)
-    with pytest.raises(cs.ReadOutError, match="readout is 3; give a chip's name, a file, or a"):
+    with pytest.raises(ReadoutError, match="readout is 3; give a chip's name, a file, or a"):
         sensor.use_readout(3)
 
 
 def test_a_reading_holds_the_counts_of_its_chip(sensor_in: SensorIn, way: Way) -> None:
-    """Differential: the same conversions as of a read-out fed by hand; none without one."""
+    """Differential: the same conversions as of a readout fed by hand; none without one."""
     sensor = sensor_in([], cs.Pose())
     assert sensor.read().counts is None
     sensor.use_readout("fdc1004")
-    by_hand = cs.ReadOut.preset("fdc1004", sensor.electrode_names)
+    by_hand = cs.Readout.preset("fdc1004", sensor.electrode_names)
     start = sensor.time if way.has_clock else 0.0
     by_hand.reset(start=start)
     total = 0

@@ -24,7 +24,7 @@ def quat(pose: cs.Pose) -> str:
     return numbers((w, x, y, z))
 
 
-def mujoco_eye(
+def mujoco_camera(
     things: list[Thing], simulator: cs.Simulator, folder: Path, resolution: int = 64, **options: Any
 ) -> Any:
     """A sensor in MuJoCo that sees a square image of 0.1 m."""
@@ -46,10 +46,10 @@ def mujoco_eye(
     )
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
-    return cs.mujoco.attach(model, data, "pad", simulator, world="depth", **options)
+    return cs.mujoco.attach(model, data, "pad", simulator, perception="depth_camera", **options)
 
 
-def pybullet_eye(
+def pybullet_camera(
     things: list[Thing], simulator: cs.Simulator, folder: Path, resolution: int = 64, **options: Any
 ) -> Any:
     """A sensor in PyBullet that sees a square image of 0.1 m; things are named after it."""
@@ -60,11 +60,11 @@ def pybullet_eye(
         load(client, urdf(thing.name, urdf_geometry(thing, folder)), SENSOR @ thing.pose, folder)
     pad = load(client, urdf("pad", '<box size="0.1 0.1 0.002"/>'), SENSOR, folder)
     return cs.pybullet.attach(
-        client, pad, design=simulator, world="depth", resolution=resolution, **options
+        client, pad, design=simulator, perception="depth_camera", resolution=resolution, **options
     )
 
 
-def coppeliasim_eye(
+def coppeliasim_camera(
     things: list[Thing], simulator: cs.Simulator, folder: Path, resolution: int = 64, **options: Any
 ) -> Any:
     """A sensor in the stand-in for CoppeliaSim that sees a square image of 0.1 m."""
@@ -82,11 +82,11 @@ def coppeliasim_eye(
     return sensor
 
 
-EYES = {"coppeliasim": coppeliasim_eye, "mujoco": mujoco_eye, "pybullet": pybullet_eye}
+CAMERAS = {"coppeliasim": coppeliasim_camera, "mujoco": mujoco_camera, "pybullet": pybullet_camera}
 MODULES = {"coppeliasim": "coppeliasim_zmqremoteapi_client"}
 
 
-@pytest.fixture(params=sorted(EYES))
+@pytest.fixture(params=sorted(CAMERAS))
 def adapter(request: pytest.FixtureRequest) -> str:
     """The name of an adapter whose simulator, or its client, is installed."""
     module = MODULES.get(request.param, request.param)
@@ -95,12 +95,14 @@ def adapter(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def eye(adapter: str, tiny_simulator: cs.Simulator, tmp_path: Path) -> Iterator[Callable[..., Any]]:
-    """``eye(things, **options)``: a sensor that sees a depth image."""
+def attached(
+    adapter: str, tiny_simulator: cs.Simulator, tmp_path: Path
+) -> Iterator[Callable[..., Any]]:
+    """``attached(things, **options)``: a sensor that sees a depth image."""
     sensors: list[Any] = []
 
     def make(things: list[Thing], **options: Any) -> Any:
-        sensors.append(EYES[adapter](things, tiny_simulator, tmp_path, **options))
+        sensors.append(CAMERAS[adapter](things, tiny_simulator, tmp_path, **options))
         tiny_simulator.reset()
         return sensors[-1]
 
@@ -126,18 +128,18 @@ def error(found: cs.Reading, expected: cs.Reading) -> float:
 
 
 def test_a_block_reads_as_its_shape_does(
-    eye: Callable[..., Any], tiny_simulator: cs.Simulator
+    attached: Callable[..., Any], tiny_simulator: cs.Simulator
 ) -> None:
     """Differential: within 7 % at 64 x 64, its thickness known; sensor anywhere in the world."""
     things = [Thing("block", BLOCK, AHEAD)]
-    found = eye(things, back=0.01).read()
+    found = attached(things, back=0.01).read()
     assert error(found, plain_reading(things, cs.Pose(), tiny_simulator)) < 0.07
 
 
-def test_the_image_is_the_right_way_round(eye: Callable[..., Any]) -> None:
+def test_the_image_is_the_right_way_round(attached: Callable[..., Any]) -> None:
     """Three balls, each in its place: no mirrored rows or columns, no shift beyond half a pixel."""
     places = {"a": (0.02, 0.03, 0.03), "b": (-0.03, 0.01, 0.05), "c": (0.01, -0.025, 0.07)}
-    sensor = eye([Thing(k, cs.Sphere(0.008), cs.Pose(v)) for k, v in places.items()])
+    sensor = attached([Thing(k, cs.Sphere(0.008), cs.Pose(v)) for k, v in places.items()])
     points = sensor.frame().points()
     assert np.isfinite(points).all()
     for centre in places.values():
@@ -149,14 +151,14 @@ def test_the_image_is_the_right_way_round(eye: Callable[..., Any]) -> None:
     assert sensor.pose.position == pytest.approx(SENSOR.position, abs=1e-6)
 
 
-def test_an_empty_view_changes_nothing(eye: Callable[..., Any]) -> None:
+def test_an_empty_view_changes_nothing(attached: Callable[..., Any]) -> None:
     """The sensor's own link is not seen."""
-    sensor = eye([Thing("behind", BLOCK, cs.Pose((0, 0, -0.05)))])
+    sensor = attached([Thing("behind", BLOCK, cs.Pose((0, 0, -0.05)))])
     assert not sensor.frame().valid.any()
     assert np.abs(sensor.read().delta).max() == 0.0
 
 
-def test_wrong_options_are_refused(adapter: str, eye: Callable[..., Any]) -> None:
+def test_wrong_options_are_refused(adapter: str, attached: Callable[..., Any]) -> None:
     """By name; so are those of the other world, where there is one."""
     things = [Thing("block", BLOCK, AHEAD)]
     cases: list[tuple[dict[str, Any], str]] = [
@@ -165,17 +167,17 @@ def test_wrong_options_are_refused(adapter: str, eye: Callable[..., Any]) -> Non
     ]
     if adapter != "coppeliasim":
         cases += [
-            ({"grounding": {"block": "floating"}}, 'grounding goes with world="geometry"'),
-            ({"hull": ["block"]}, 'hull goes with world="geometry"'),
+            ({"grounding": {"block": "floating"}}, 'grounding goes with perception="geometry"'),
+            ({"hull": ["block"]}, 'hull goes with perception="geometry"'),
         ]
     for options, message in cases:
         with pytest.raises(cs.SceneError, match=message):
-            eye(things, **options).read()
+            attached(things, **options).read()
 
 
 def test_all_simulators_see_the_same(tiny_simulator: cs.Simulator, tmp_path: Path) -> None:
     """Differential: one scene through all depth paths, within 1 %."""
-    for name in EYES:
+    for name in CAMERAS:
         module = MODULES.get(name, name)
         pytest.importorskip(module, reason=f"{module} is not installed")
     things = [
@@ -183,7 +185,7 @@ def test_all_simulators_see_the_same(tiny_simulator: cs.Simulator, tmp_path: Pat
         Thing("ball", cs.Sphere(0.01), cs.Pose((0.03, 0.03, 0.06))),
     ]
     readings = []
-    for make in EYES.values():
+    for make in CAMERAS.values():
         tiny_simulator.reset()
         sensor = make(things, tiny_simulator, tmp_path)
         readings.append(sensor.read())
@@ -199,7 +201,7 @@ def test_materials_of_drawn_links(tiny_simulator: cs.Simulator, tmp_path: Path) 
         Thing(n, cs.Sphere(0.008), cs.Pose((x, 0, 0.03)))
         for n, x in (("glass", -0.03), ("steel", 0.0), ("gone", 0.03))
     ]
-    sensor = pybullet_eye(
+    sensor = pybullet_camera(
         things, tiny_simulator, tmp_path,
         materials={"glass": "glass"}, exclude=["gone"], default_grounding="floating",
     )  # fmt: skip
@@ -217,18 +219,18 @@ def test_wrong_cameras_are_refused(tiny_simulator: cs.Simulator) -> None:
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><geom size=".1"/><site name="pad"/><camera name="wide"/>'
         '<camera name="idle" projection="orthographic" resolution="8 8" fovy=".1"/>'
-        '<camera name="eye" projection="orthographic" resolution="8 8" fovy=".1"/></body>'
-        '</worldbody><sensor><rangefinder camera="eye" data="depth"/></sensor></mujoco>'
+        '<camera name="front" projection="orthographic" resolution="8 8" fovy=".1"/></body>'
+        '</worldbody><sensor><rangefinder camera="front" data="depth"/></sensor></mujoco>'
     )
     data = mujoco.MjData(model)
 
     def attach(camera: str | None, **options: Any) -> Any:
         return cs.mujoco.attach(
-            model, data, "pad", tiny_simulator, world="depth", camera=camera, **options
+            model, data, "pad", tiny_simulator, perception="depth_camera", camera=camera, **options
         )
 
     for camera, message in (
-        ("ey", "no camera named 'ey'; did you mean 'eye'"),
+        ("frnt", "no camera named 'frnt'; did you mean 'front'"),
         (None, "no camera named 'pad'"),
         ("wide", "'wide' is in perspective.*orthographic"),
         ("idle", "nothing reads the depths of camera 'idle'; add <rangefinder"),
@@ -236,10 +238,10 @@ def test_wrong_cameras_are_refused(tiny_simulator: cs.Simulator) -> None:
         with pytest.raises(cs.SceneError, match=message):
             attach(camera)
     with pytest.raises(cs.SceneError, match="hold no poses yet"):
-        attach("eye").read()
-    with pytest.raises(cs.SceneError, match='camera goes with world="depth"'):
-        cs.mujoco.attach(model, data, "pad", tiny_simulator, camera="eye")
-    with pytest.raises(cs.SceneError, match=r"world is .image."):
-        cs.mujoco.attach(model, data, "pad", tiny_simulator, world="image")
-    with pytest.raises(cs.SceneError, match='groups goes with world="geometry"'):
-        attach("eye", groups=[0])
+        attach("front").read()
+    with pytest.raises(cs.SceneError, match='camera goes with perception="depth_camera"'):
+        cs.mujoco.attach(model, data, "pad", tiny_simulator, camera="front")
+    with pytest.raises(cs.SceneError, match=r"perception is .image."):
+        cs.mujoco.attach(model, data, "pad", tiny_simulator, perception="image")
+    with pytest.raises(cs.SceneError, match='groups goes with perception="geometry"'):
+        attach("front", groups=[0])

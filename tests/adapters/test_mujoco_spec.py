@@ -52,9 +52,9 @@ def test_a_site_is_where_it_was_asked_for(tiny_simulator: cs.Simulator) -> None:
 def test_a_camera_looks_along_the_sensor(tiny_simulator: cs.Simulator) -> None:
     """Differential: the image's middle is as far as the ball; the reading is that of our camera."""
     spec = mujoco.MjSpec.from_string(MODEL)
-    cs.mujoco.add_sensor(spec, "link", ON_LINK, "eye", camera=0.1, resolution=32)
+    cs.mujoco.add_sensor(spec, "link", ON_LINK, "pad", camera=0.1, resolution=32)
     sensor = cs.mujoco.attach(
-        *build(spec, cs.Pose((0.02, 0, 0.045))), "eye", tiny_simulator, world="depth"
+        *build(spec, cs.Pose((0.02, 0, 0.045))), "pad", tiny_simulator, perception="depth_camera"
     )
     (depth,) = sensor.frame().depth
     assert depth.shape == (32, 32)

@@ -34,10 +34,10 @@ def world(body: str = "") -> tuple[Any, Any]:
     return model, data
 
 
-@pytest.fixture(params=["sensor", "read-out", "depth", "cloth", "skin"])
+@pytest.fixture(params=["sensor", "readout", "depth", "cloth", "skin"])
 def sensor(request: pytest.FixtureRequest, tiny_simulator: cs.Simulator) -> Any:
     """One of each kind, used once."""
-    simulator = tiny_simulator.sibling()
+    simulator = tiny_simulator.copy()
     if request.param == "skin":
         made = cs.mujoco.attach_skin(*world(), ["a", "b"], simulator, threads=2)
     elif request.param == "depth":
@@ -47,11 +47,11 @@ def sensor(request: pytest.FixtureRequest, tiny_simulator: cs.Simulator) -> Any:
         model = spec.compile()
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        made = cs.mujoco.attach(model, data, "a", simulator, world="depth")
+        made = cs.mujoco.attach(model, data, "a", simulator, perception="depth_camera")
     else:
         made = cs.mujoco.attach(
             *world(CLOTH if request.param == "cloth" else ""), "a", simulator,
-            readout="fdc1004" if request.param == "read-out" else None,
+            readout="fdc1004" if request.param == "readout" else None,
         )  # fmt: skip
     made.read()
     return made
@@ -112,7 +112,7 @@ def test_plain_skins_and_batches(tiny_simulator: cs.Simulator) -> None:
 
 def test_a_spawned_process_reads_the_same(tiny_simulator: cs.Simulator) -> None:
     """A process that shares nothing but the pickled skin."""
-    skin = cs.mujoco.attach_skin(*world(), ["a", "b"], tiny_simulator.sibling(), threads=2)
+    skin = cs.mujoco.attach_skin(*world(), ["a", "b"], tiny_simulator.copy(), threads=2)
     here = skin.read()
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         there = pool.apply(skin.read)

@@ -235,8 +235,8 @@ def test_wrong_calls_are_refused(
         ({"client": "direct"}, "client is 'direct'"),
         ({"shapes": "drawn"}, "shapes is 'drawn'; choose"),
         ({"pose_in_link": (0, 0, 0)}, "pose_in_link is"),
-        ({"resolution": 128}, 'resolution goes with world="depth"'),
-        ({"size": 0.2}, 'size goes with world="depth"'),
+        ({"resolution": 128}, 'resolution goes with perception="depth_camera"'),
+        ({"size": 0.2}, 'size goes with perception="depth_camera"'),
     ):
         call = {"client": client, "body": sensor.body, "design": tiny_simulator, **options}
         with pytest.raises(cs.SceneError, match=message):
@@ -254,9 +254,9 @@ def test_named_bodies_may_leave(client: int, tiny_simulator: cs.Simulator) -> No
         return int(body)
 
     first = ball()
-    for world in ("geometry", "depth"):
+    for perception in ("geometry", "depth_camera"):
         sensor = cs.pybullet.attach(
-            client, pad, design=tiny_simulator, world=world, materials={"ball": "human"}
+            client, pad, design=tiny_simulator, perception=perception, materials={"ball": "human"}
         )
         there = sensor.read().delta
         p.removeBody(first, physicsClientId=client)
@@ -268,8 +268,8 @@ def test_named_bodies_may_leave(client: int, tiny_simulator: cs.Simulator) -> No
         sensor.read()
 
 
-@pytest.mark.parametrize("world", ["geometry", "depth"])
-def test_a_world_that_was_reset(world: str, client: int, tiny_simulator: cs.Simulator) -> None:
+@pytest.mark.parametrize("perception", ["geometry", "depth_camera"])
+def test_a_world_that_was_reset(perception: str, client: int, tiny_simulator: cs.Simulator) -> None:
     """Bodies of the same numbers are others then."""
 
     def fill(radius: float) -> int:
@@ -283,7 +283,7 @@ def test_a_world_that_was_reset(world: str, client: int, tiny_simulator: cs.Simu
         p.createMultiBody(0, *shapes, basePosition=[0, 0, 0.04], physicsClientId=client)
         return int(pad)
 
-    sensor = cs.pybullet.attach(client, fill(0.01), design=tiny_simulator, world=world)
+    sensor = cs.pybullet.attach(client, fill(0.01), design=tiny_simulator, perception=perception)
     small = sensor.read().delta[0, 0]
     fill(0.02)
     assert sensor.read().delta[0, 0] > 1.5 * small

@@ -12,6 +12,7 @@ from capsense.adapters.meshes import height_field, joined_hulls, load_triangles,
 from capsense.adapters.rules import Tie
 from capsense.adapters.world import Frames, HalfSpace, Solid, World
 from capsense.design.model import Domain
+from capsense.errors import MissingDependencyError
 from capsense.scene import material
 
 STEEL = cs.MATERIALS["steel"]
@@ -175,5 +176,5 @@ def test_wrong_mesh_files_are_refused(tmp_path: object) -> None:
 def test_a_missing_simulator_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The error gives the command that installs it."""
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(cs.MissingDependencyError, match=rf"pip install 'capsense\[{name}\]'"):
+    with pytest.raises(MissingDependencyError, match=rf"pip install 'capsense\[{name}\]'"):
         getattr(cs, name).attach(None, None, "pad")

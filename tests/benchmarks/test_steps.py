@@ -84,10 +84,18 @@ def test_random_scenes_hold_one_body_over_the_sensor(parts: dict[str, ModuleType
 
 
 def test_every_method_runs_with_every_preset(parts: dict[str, ModuleType]) -> None:
-    found = parts["accuracy_map"].configurations(["surface"], ["learning", "fine"], ["frequency=1"])
+    found = parts["accuracy_map"].configurations(
+        ["surface"], ["learning", "fine"], ["excitation_frequency=1"]
+    )
     assert found == [
-        ("surface learning frequency=1", dict(method="surface", preset="learning", frequency=1)),
-        ("surface fine frequency=1", dict(method="surface", preset="fine", frequency=1)),
+        (
+            "surface learning excitation_frequency=1",
+            dict(method="surface", preset="learning", excitation_frequency=1),
+        ),
+        (
+            "surface fine excitation_frequency=1",
+            dict(method="surface", preset="fine", excitation_frequency=1),
+        ),
     ]
     assert parts["accuracy_map"].configurations([], [], []) == [("surface", {"method": "surface"})]
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FakeStats:
-    error_estimate: float
+    solver_error: float
     wall_time: float
     unknowns: int
     iterations: int

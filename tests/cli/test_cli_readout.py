@@ -14,10 +14,10 @@ from maxwell import random_maxwell
 from relative import near
 
 from capsense.cli.main import BAD_INPUT, OK, main
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, mutual_patterns, self_patterns
 from capsense.readout.chips import CHIPS
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.recording import load_recording
 
 
@@ -49,13 +49,13 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 def test_tables_hold_what_python_gives(run, capsys):
-    """Differential: the command's table against the read-out called directly."""
+    """Differential: the command's table against the readout called directly."""
     folder = run()
     assert main(["readout", str(folder), "--chip", "fdc1004", "--rate", "400", "--seed", "3"]) == OK
     rows = table(folder / "counts_fdc1004.csv")
     data = np.load(folder / "readings.npz")
     names = tuple(str(n) for n in data["electrode_names"])
-    readout = ReadOut.preset("fdc1004", names, rate=400, seed=3)
+    readout = Readout.preset("fdc1004", names, rate=400, seed=3)
     counts = readout(data["time"], data["capacitance"])
     assert len(rows) == len(counts) > 300
     assert [int(r["code"]) for r in rows] == counts.code.tolist()
@@ -121,7 +121,7 @@ def test_driven_shields_are_read_from_a_matrix_recording(run):
     summary = json.loads((folder / "summary.json").read_text("utf-8"))
     (folder / "summary.json").write_text(json.dumps({**summary, "shields": 1}), "utf-8")
     table = load_recording(folder / "readings.csv")
-    with pytest.raises(ReadOutError, match="what the sensor's shields do when they are driven"):
+    with pytest.raises(ReadoutError, match="what the sensor's shields do when they are driven"):
         table.channels(driven)
     still = ChannelBank(self_patterns(recording.electrodes, shield=0.0), recording.electrodes)
     diagonal = np.diagonal(arrays["capacitance"], axis1=1, axis2=2)
@@ -197,7 +197,7 @@ def test_listings(capsys):
         (["{}", "--chip", "fdc1004", "--plot", "x.txt"], "is no picture"),
         (["{}", "--chip", "fdc1004", "--plot", "none/x.png"], "there is no folder none"),
         (["{}", "--chip", "fdc1004", "--electrode", "E1"], "goes with --plot"),
-        (["{}", "--config", "none.toml"], "there is no read-out file"),
+        (["{}", "--config", "none.toml"], "there is no readout file"),
         (["{}", "--config", "none.toml", "--rate", "3"], "write them in the file"),
         (["{}", "--chip", "fdc1004", "--plot", "{}/x.png", "--electrode", "E9"], "electrode 'E9'"),
         (["{}/none", "--chip", "fdc1004"], "there is no recording"),
@@ -215,9 +215,9 @@ def test_bad_recordings_are_refused(run, tmp_path):
     folder = run("mutual")
     recording = load_recording(folder / "readings.csv")
     bank = ChannelBank(self_patterns(recording.electrodes), recording.electrodes)
-    with pytest.raises(ReadOutError, match=r"does not hold what channel 'E1' needs"):
+    with pytest.raises(ReadoutError, match=r"does not hold what channel 'E1' needs"):
         recording.channels(bank)
-    with pytest.raises(ReadOutError, match="holds no readings"):
+    with pytest.raises(ReadoutError, match="holds no readings"):
         load_recording(tmp_path / "mutual" / "..")
     broken = tmp_path / "broken"
     shutil.copytree(folder, broken)
@@ -231,23 +231,23 @@ def test_bad_recordings_are_refused(run, tmp_path):
         ("readings.csv", b"", "is no readings.csv"),
     ):
         (broken / name).write_bytes(content)
-        with pytest.raises(ReadOutError, match=words):
+        with pytest.raises(ReadoutError, match=words):
             load_recording(broken / name)
     with np.load(folder / "readings.npz") as data:
         older = {name: data[name] for name in data.files if name != "self_capacitance"}
     np.savez(broken / "readings.npz", **older)
     words = "no readings.npz of this version: it lacks 'self_capacitance'; run it again"
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         load_recording(broken / "readings.npz")
     names = tmp_path / "names.csv"
     names.write_bytes(b"time_s,Cm_a_b_c_F\n0,1e-12\n")
-    with pytest.raises(ReadOutError, match="electrodes of column 'Cm_a_b_c' are not clear"):
+    with pytest.raises(ReadoutError, match="electrodes of column 'Cm_a_b_c' are not clear"):
         load_recording(names)
     whole = tmp_path / "whole.mcap"
     whole.write_bytes(b"")
-    with pytest.raises(ReadOutError, match=r"capsense export .*whole.mcap -o whole.npz"):
+    with pytest.raises(ReadoutError, match=r"capsense export .*whole.mcap -o whole.npz"):
         load_recording(whole)
     odd = tmp_path / "odd.csv"
     odd.write_bytes(b"time_s,C_a_F,C_b_F,C_a_b_F\n0,1,1,1\n")
-    with pytest.raises(ReadOutError, match="may mean the pair or the electrode"):
+    with pytest.raises(ReadoutError, match="may mean the pair or the electrode"):
         load_recording(odd)

@@ -1,4 +1,4 @@
-"""Chips side by side, against one read-out for each sensor."""
+"""Chips side by side, against one readout for each sensor."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import pytest
 from test_fleet import BODIES, poses
 
 import capsense as cs
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.fleet import Fleet
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 
 COUNT, NAMES = 5, tuple(f"E{k}" for k in range(1, 7))
 
 
 def without_noise(chip="fdc1004"):
-    whole = ReadOut.preset(chip, NAMES)
-    return ReadOut(
+    whole = Readout.preset(chip, NAMES)
+    return Readout(
         whole.bank.patterns, NAMES, whole.schedule, whole.law, dac=whole.dac, wiring=whole.wiring
     )
 
@@ -48,7 +48,7 @@ def test_every_chip_is_as_one_alone(chip):
 def test_noise_is_that_of_the_chip_and_differs():
     """Measured: standard deviations as of one chip; no two chips, nor channels, go together."""
     matrix = np.broadcast_to(matrices(np.random.default_rng(2), 1), (40, 6, 6))
-    whole = ReadOut.preset("fdc1004", NAMES)
+    whole = Readout.preset("fdc1004", NAMES)
     many = SideBySide(whole, 40, seed=3)
     period = whole.schedule.period
     rows = np.array([many.sample(2 * period * k, matrix).capacitance for k in range(3, 203)])[5:]
@@ -65,7 +65,7 @@ def test_noise_is_that_of_the_chip_and_differs():
 def test_a_seed_repeats():
     """Invariant: to the last bit."""
     matrix = matrices(np.random.default_rng(4))
-    many = SideBySide(ReadOut.preset("fdc1004", NAMES), COUNT, seed=7)
+    many = SideBySide(Readout.preset("fdc1004", NAMES), COUNT, seed=7)
     first = [many.sample(0.01 * k, matrix).code for k in range(20)]
     many.reset()
     np.testing.assert_array_equal(first, [many.sample(0.01 * k, matrix).code for k in range(20)])
@@ -95,10 +95,10 @@ def test_refused():
     """Errors name the thing and the fix."""
     fleet = Fleet("six_patch", BODIES[:1], 2)
     fleet.use_readout("fdc1004")
-    with pytest.raises(ReadOutError, match=r"needs the time; write step\(poses, time=…\)"):
+    with pytest.raises(ReadoutError, match=r"needs the time; write step\(poses, time=…\)"):
         fleet.step(poses(np.random.default_rng(6), 2, 1))
-    with pytest.raises(ReadOutError, match="electrodes"):
-        fleet.use_readout(ReadOut.preset("fdc1004", ("a", "b")))
+    with pytest.raises(ReadoutError, match="electrodes"):
+        fleet.use_readout(Readout.preset("fdc1004", ("a", "b")))
     many = SideBySide(without_noise(), COUNT)
-    with pytest.raises(ReadOutError, match=r"shape \(4, 6, 6\); give matrices of 5 sensors"):
+    with pytest.raises(ReadoutError, match=r"shape \(4, 6, 6\); give matrices of 5 sensors"):
         many.sample(0.0, matrices(np.random.default_rng(7), 4))

@@ -51,7 +51,7 @@ def image_reading(things: Sequence[Thing], sensor: cs.Pose, simulator: cs.Simula
     for thing in things:
         mesh = thing.shape.to_trimesh()
         vertices = (sensor.inverse() @ thing.pose).apply(mesh.vertices)
-        raster = cs.rasterise(vertices, mesh.faces, (IMAGE, IMAGE), (PIXELS, PIXELS))
+        raster = cs.render_depth(vertices, mesh.faces, (IMAGE, IMAGE), (PIXELS, PIXELS))
         depth = np.fmin(depth, np.where(raster.depth > 0, raster.depth, np.nan))
     simulator.reset()
     return simulator.step(cs.DepthFrame(depth, camera=cs.OrthographicCamera(IMAGE, IMAGE)))
@@ -102,10 +102,10 @@ def mjcf(things: Sequence[Thing], sensor: cs.Pose, pixels: int | None = None) ->
         f'<body name="{t.name}" {frame(t.pose)}><freejoint/>{geom}</body>' for t, geom, _ in parts
     )
     offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
-    eye, reader = "", ""
+    camera, reader = "", ""
     if pixels is not None:
         view = frame(offset @ cs.Pose((0, 0, 0), (1, 0, 0, 0)))
-        eye = (
+        camera = (
             f'<camera name="pad" {view} projection="orthographic" fovy="{IMAGE}" '
             f'resolution="{pixels} {pixels}"/>'
         )
@@ -116,7 +116,7 @@ def mjcf(things: Sequence[Thing], sensor: cs.Pose, pixels: int | None = None) ->
         f'<body name="carrier" {frame(sensor @ offset.inverse())}><freejoint/>'
         f'<geom name="carrier_geom" type="box" size="{numbers(np.divide(CARRIER_BOX, 2))}" '
         f"{frame(offset)}/>"
-        f'<site name="pad" {frame(offset)}/>{eye}</body></worldbody>{reader}</mujoco>'
+        f'<site name="pad" {frame(offset)}/>{camera}</body></worldbody>{reader}</mujoco>'
     )
 
 
@@ -126,7 +126,9 @@ def mujoco_sensor(
     """A sensor in MuJoCo, after one step."""
     import mujoco
 
-    pixels = options.pop("resolution", PIXELS) if options.get("world") == "depth" else None
+    pixels = (
+        options.pop("resolution", PIXELS) if options.get("perception") == "depth_camera" else None
+    )
     model = mujoco.MjModel.from_xml_string(mjcf(things, sensor, pixels))
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
@@ -201,7 +203,7 @@ def pybullet_sensor(
     """
     import pybullet as p
 
-    if options.get("world") == "depth":
+    if options.get("perception") == "depth_camera":
         things = [Thing(t.name, _as_mesh(t.shape), t.pose) for t in things]
     client = p.connect(p.DIRECT)
     carrier, offset = fill_bullet(client, things, sensor, folder)
@@ -311,10 +313,16 @@ WAYS = {
     # rays hit round bodies, our rasteriser draws meshes of them; PyBullet draws one pixel of a
     # ball's rim more or less: measured 0.4 %
     "mujoco depth": Way(
-        "mujoco", mujoco_sensor, {"world": "depth"}, image_reading, 0.03, 1e-4, True
+        "mujoco", mujoco_sensor, {"perception": "depth_camera"}, image_reading, 0.03, 1e-4, True
     ),
     "pybullet depth": Way(
-        "pybullet", pybullet_sensor, {"world": "depth"}, image_reading, 8e-3, 1e-3, False
+        "pybullet",
+        pybullet_sensor,
+        {"perception": "depth_camera"},
+        image_reading,
+        8e-3,
+        1e-3,
+        False,
     ),
     "coppeliasim": Way(
         "coppeliasim_zmqremoteapi_client", coppeliasim_sensor, {}, image_reading, 0.02, 1e-3, True

@@ -3,9 +3,9 @@
 It speaks the wire format of the second version of the protocol (CBOR maps over a REP socket) as
 the server script of the simulator does (CoppeliaRobotics/zmqRemoteApi, ``addOns/ZMQ remote API
 server.lua``), and draws vision sensors as the simulator's OpenGL renderer does
-(CoppeliaRobotics/coppeliaSimLib, ``visionSensor.cpp``): the eye is the sensor's frame turned half
-round about y, images are read from the bottom row. It was written from those sources, not checked
-against the simulator.
+(CoppeliaRobotics/coppeliaSimLib, ``visionSensor.cpp``): the camera is the sensor's frame turned
+half round about y, images are read from the bottom row. It was written from those sources, not
+checked against the simulator.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ CONSTANTS = {
     "visionintparam_resolution_y": 1003,
 }  # fmt: skip
 _NAMES = {v: k for k, v in CONSTANTS.items() if k.startswith("vision")}
-_EYE = np.diag([-1.0, 1.0, -1.0])
-"""From a vision sensor's frame to that of OpenGL's eye."""
+_CAMERA = np.diag([-1.0, 1.0, -1.0])
+"""From a vision sensor's frame to that of OpenGL's camera."""
 
 
 @dataclass
@@ -128,9 +128,9 @@ class StandIn:
             raise RefusedError("Object does not exist.")
         return self.things[handle]
 
-    def _draw(self, eye: Thing, place: cs.Pose) -> None:
+    def _draw(self, camera: Thing, place: cs.Pose) -> None:
         """Depth from 0 to 1 and colours, from the bottom row, as OpenGL has them."""
-        get = eye.parameters
+        get = camera.parameters
         columns, rows = int(get["resolution_x"]), int(get["resolution_y"])
         near, far = get["near_clipping"], get["far_clipping"]
         pixel = get["ortho_size"] / max(columns, rows)
@@ -140,8 +140,9 @@ class StandIn:
             if thing.mesh is None or handle in hidden:
                 continue
             local = place.inverse() @ self.pose(handle)
-            seen = local.apply(thing.mesh.vertices) @ _EYE
-            view = cs.rasterise(  # depth grows along the eye's -z: mirrored, so faces turn round
+            seen = local.apply(thing.mesh.vertices) @ _CAMERA
+            # depth grows along the camera's -z: mirrored, so faces turn round
+            view = cs.render_depth(
                 seen * (1, 1, -1), thing.mesh.faces[:, ::-1], (columns * pixel, rows * pixel),
                 (rows, columns),
             )  # fmt: skip
@@ -158,7 +159,7 @@ class StandIn:
         if self.mirrored:
             depth, image = depth[::-1], image[::-1]
         metres = near + depth.astype(np.float32) * np.float32(far - near)
-        eye.depth, eye.image = metres.astype("<f4").tobytes(), image.tobytes()
+        camera.depth, camera.image = metres.astype("<f4").tobytes(), image.tobytes()
 
     # -- the wire ----------------------------------------------------------------------------
 
@@ -334,11 +335,11 @@ class StandIn:
             self._thing(handle).parameters[_NAMES[which].partition("param_")[2]] = value
 
     def handleVisionSensor(self, handle: int) -> tuple[int, list[float], list[float]]:
-        eye = self._thing(handle)
-        seen = int(eye.parameters["entity_to_render"])
+        camera = self._thing(handle)
+        seen = int(camera.parameters["entity_to_render"])
         if self.headless or (seen >= 0 and seen not in self.collections):
             return 0, [], []  # two packets at least, even if empty
-        self._draw(eye, self.pose(handle))
+        self._draw(camera, self.pose(handle))
         return 0, [0.0] * 15, []
 
     def getVisionSensorDepth(self, handle: int, options: int) -> tuple[bytes, list[int]]:

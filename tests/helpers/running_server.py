@@ -11,7 +11,7 @@ import urllib.request
 from typing import Any
 
 from capsense.server.client import Client
-from capsense.server.options import Options
+from capsense.server.options import ServerOptions
 from capsense.server.server import Server
 
 WAIT = 20.0
@@ -31,7 +31,7 @@ class RunningServer:
         logger = logging.Logger("test")
         logger.addHandler(_Collector(self.events))
         self.server = Server(
-            Options(designs or ("six_patch",), port=port, **options), logger=logger
+            ServerOptions(designs or ("six_patch",), port=port, **options), logger=logger
         )
         self._ready = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)

@@ -19,7 +19,7 @@ import capsense as cs
 from capsense.scenario import load_scenario
 from capsense.viewer.player import Player
 from capsense.viewer.source import ScenarioSource
-from capsense.viewer.view import View
+from capsense.viewer.view import LiveView
 
 SCENARIO = Path("examples/hand_approach.toml")
 SAMPLE = 130
@@ -34,7 +34,7 @@ def main(target: Path) -> None:
         player.go(index)
         while player.newest is None or player.newest.index != index:
             time.sleep(1e-3)
-    view, stop = View(player, port=0), threading.Event()
+    view, stop = LiveView(player, port=0), threading.Event()
     thread = threading.Thread(target=view.run, args=(stop,))
     thread.start()
     with browser_page(*SIZE) as page:

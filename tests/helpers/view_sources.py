@@ -12,7 +12,7 @@ import capsense as cs
 from capsense.errors import ProtocolError, SolveError
 from capsense.recording.session import reading_of
 from capsense.scenario.channels import Excitation, channels_of
-from capsense.viewer.source import Shot
+from capsense.viewer.source import Frame
 
 WAIT = 10.0
 """Longest wait for anything [s]."""
@@ -47,13 +47,13 @@ class Counting(Stated):
         self.asked: list[tuple[int, object]] = []
         self.broken: set[int] = set()
 
-    def shot(self, index: int, plane: object = None) -> Shot:
+    def frame(self, index: int, plane: object = None) -> Frame:
         self.asked.append((index, plane))
         if index in self.broken:
             raise SolveError(f"sample {index} was not solved")
         potentials = None if plane is None else np.full((3, 2), float(index))
         time = float(self.times[index])
-        return Shot(index, time, cs.Scene(), self.reading(index), plane, potentials)
+        return Frame(index, time, cs.Scene(), self.reading(index), plane, potentials)
 
 
 class Queued(Stated):
@@ -61,15 +61,15 @@ class Queued(Stated):
 
     def __init__(self) -> None:
         super().__init__("queued")
-        self.items: queue.Queue[Shot | ProtocolError] = queue.Queue()
+        self.items: queue.Queue[Frame | ProtocolError] = queue.Queue()
         self.count = 0
 
     def put(self, count: int = 1) -> None:
         for k in range(self.count, self.count + count):
-            self.items.put(Shot(k, 0.1 * k, cs.Scene(), self.reading(k)))
+            self.items.put(Frame(k, 0.1 * k, cs.Scene(), self.reading(k)))
         self.count += count
 
-    def next(self, timeout: float) -> Shot | None:
+    def next(self, timeout: float) -> Frame | None:
         try:
             item = self.items.get(timeout=timeout)
         except queue.Empty:
@@ -78,8 +78,8 @@ class Queued(Stated):
             raise item
         return item
 
-    def potentials(self, shot: Shot, plane: object) -> np.ndarray:
-        return np.full((3, 2), float(shot.index))
+    def potentials(self, frame: Frame, plane: object) -> np.ndarray:
+        return np.full((3, 2), float(frame.index))
 
 
 def until(condition: Callable[[], bool]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
+from capsense.errors import MissingDependencyError
 from capsense.humans import Build, Limb, arm, leg, load_smplx
 from capsense.humans.export import mjcf_body
 from capsense.humans.smplx import close_openings
@@ -256,7 +257,7 @@ def test_openings_are_closed() -> None:
 def test_smplx_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error gives the command."""
     monkeypatch.setitem(sys.modules, "smplx", None)
-    with pytest.raises(cs.MissingDependencyError, match="pip install smplx"):
+    with pytest.raises(MissingDependencyError, match="pip install smplx"):
         load_smplx("models")
 
 

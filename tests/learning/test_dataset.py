@@ -17,6 +17,7 @@ import pytest
 
 import capsense as cs
 from capsense.cli.main import main
+from capsense.errors import MissingDependencyError
 from capsense.learning.labels import Outline
 from capsense.learning.shards import COLUMNS, missing, run, shard_path
 from capsense.learning.spec import Spec, load_spec
@@ -318,7 +319,7 @@ def test_what_is_not_installed_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, extra: str, options: Any
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(cs.MissingDependencyError, match=rf"capsense\[{extra}\]"):
+    with pytest.raises(MissingDependencyError, match=rf"capsense\[{extra}\]"):
         run(spec_of(tmp_path), tmp_path / "out", **options)
 
 
@@ -326,7 +327,7 @@ def test_no_scheduler_there(tmp_path: Path) -> None:
     dask = pytest.importorskip("dask")
     with dask.config.set({"distributed.comm.timeouts.connect": "0.3s"}):
         spec = spec_of(tmp_path)
-        with pytest.raises(cs.SimulatorError, match="no Dask scheduler answers"):
+        with pytest.raises(cs.AdapterError, match="no Dask scheduler answers"):
             run(spec, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
+from capsense.errors import MissingDependencyError
 
 gymnasium = pytest.importorskip("gymnasium")
 pytest.importorskip("mujoco")
@@ -210,7 +211,7 @@ def test_wrapper_refuses_what_has_no_model() -> None:
 def test_missing_gymnasium_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium.envs.registration", None)
     monkeypatch.delitem(sys.modules, "capsense.learning.envs")
-    with pytest.raises(cs.MissingDependencyError, match=r"capsense\[gym\]"):
+    with pytest.raises(MissingDependencyError, match=r"capsense\[gym\]"):
         import capsense.learning.envs  # noqa: F401
 
 

@@ -7,7 +7,7 @@ import pytest
 from relative import near
 from scipy import stats
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.calibration import (
     CalibrationWarning,
     LinearSensor,
@@ -22,7 +22,7 @@ from capsense.readout.calibration import (
 from capsense.readout.channels import self_patterns
 from capsense.readout.converter import LinearLaw
 from capsense.readout.noise import Flicker, White
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
 
 GAIN, OFFSET, DRIFT = (
@@ -90,7 +90,7 @@ def saturated(top, random=0.0, seed=0):
     """True and measured capacitances, instants and flags of an approach, by a chip with a limit."""
     time = np.arange(0, 60, 0.05)
     true = (2 + 2 * np.exp(-(((time - 30) / 8) ** 2)))[:, None] * [1e-12, 0.9e-12]
-    readout = ReadOut(
+    readout = Readout(
         self_patterns(("A", "B"), shield=0.0), ("A", "B"), Schedule.simultaneous(2, 0.1),
         LinearLaw(1e-18, 0, round(top / 1e-18)), seed=seed,
         stages=(LinearSensor(1.03, 2e-13, 0.0, 0.0), White(1e-15)),
@@ -175,7 +175,7 @@ def test_intervals_cover_with_flicker():
     trials = 25
     for seed in range(trials):
         noise = (Flicker(5e-16), White(1e-15))
-        readout = ReadOut(
+        readout = Readout(
             bank, names, plan, LinearLaw(1e-21, -(10**12), 10**12), stages=noise, seed=seed
         )
         stamps, rows = readout(time, truth[0] * true + truth[1]).table()
@@ -209,10 +209,10 @@ def test_residual_is_the_noise():
 
 
 def test_a_calibrated_model_measures_like_the_sensor():
-    """Round trip: as a stage it distorts; calibrating the read-out's counts finds it again."""
+    """Round trip: as a stage it distorts; calibrating the readout's counts finds it again."""
     true, measured, time = recording(np.random.default_rng(3))
     sensor = calibrate(true, measured, time)
-    readout = ReadOut(
+    readout = Readout(
         self_patterns(("A", "B"), shield=0.0), ("A", "B"), Schedule.simultaneous(2, 0.1),
         LinearLaw(1e-21, -(10**12), 10**12), stages=(sensor, White(1e-16)),
     )  # fmt: skip
@@ -225,8 +225,8 @@ def test_a_calibrated_model_measures_like_the_sensor():
     drift_between = DRIFT * (again.epoch - sensor.epoch)
     assert again.offset == pytest.approx(OFFSET + drift_between, abs=5e-17)
     assert again.drift == near(DRIFT, rel=0.05)
-    with pytest.raises(ReadOutError, match="list of 3, one per channel"):
-        ReadOut(self_patterns(("A", "B", "C")), ("A", "B", "C"), Schedule.simultaneous(3, 0.1),
+    with pytest.raises(ReadoutError, match="list of 3, one per channel"):
+        Readout(self_patterns(("A", "B", "C")), ("A", "B", "C"), Schedule.simultaneous(3, 0.1),
                 LinearLaw(1e-15, 0, 9), stages=(sensor,))  # fmt: skip
 
 
@@ -287,5 +287,5 @@ RISING = np.linspace(1, 2, 10)[:, None]
     ],
 )
 def test_bad_recordings_are_refused(make, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()

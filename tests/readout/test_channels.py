@@ -7,7 +7,7 @@ import pytest
 from maxwell import random_maxwell
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
 
 NAMES = ("A", "B", "C", "D", "E")
@@ -131,19 +131,19 @@ def test_families():
     ],
 )
 def test_bad_patterns_are_refused(make, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()
 
 
 def test_bad_matrices_are_refused():
     bank = ChannelBank([Pattern("A")], NAMES)
-    with pytest.raises(ReadOutError, match=r"shape \(4, 4\); 5 electrodes need"):
+    with pytest.raises(ReadoutError, match=r"shape \(4, 4\); 5 electrodes need"):
         bank.values(np.eye(4))
     broken = np.eye(5)
     broken[0, 0] = np.nan
-    with pytest.raises(ReadOutError, match="not finite"):
+    with pytest.raises(ReadoutError, match="not finite"):
         bank.values(broken)
-    with pytest.raises(ReadOutError, match="complex128 values are no real numbers"):
+    with pytest.raises(ReadoutError, match="complex128 values are no real numbers"):
         bank.values(1j * np.eye(5))
-    with pytest.raises(ReadOutError, match="open electrodes have no capacitance"):
+    with pytest.raises(ReadoutError, match="open electrodes have no capacitance"):
         ChannelBank([Pattern("A", floating=("B",))], NAMES).values(np.zeros((5, 5)))

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.channels import Pattern, mutual_patterns
 from capsense.readout.chip import Status
 from capsense.readout.chips import CHIPS
 from capsense.readout.converter import Range
 from capsense.readout.noise import allan_deviation
-from capsense.readout.presets import Options, charge_for, schedule_of
+from capsense.readout.presets import ReadoutOptions, charge_for, schedule_of
 from capsense.readout.presets import build as build_chip
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.wiring import Wiring
 
 COUNT = 12
@@ -26,8 +26,8 @@ RATES = [(chip, rate) for chip in CHIPS.values() for rate in chip.rates]
 
 
 def still(chip, cycles, **options):
-    """A read-out of a still scene of 2 pF everywhere: counts of so many cycles."""
-    readout = ReadOut.preset(chip, NAMES, expected=LEVEL, **options)
+    """A readout of a still scene of 2 pF everywhere: counts of so many cycles."""
+    readout = Readout.preset(chip, NAMES, expected=LEVEL, **options)
     k = len(readout.bank)
     end = (cycles + 0.5) * readout.schedule.period
     return readout, readout([0.0, end], np.full((2, k), LEVEL))
@@ -106,7 +106,7 @@ def test_confirmed_figures():
 def test_rates_are_conversions_per_second():
     """Invariant: one chip finishes as many conversions in a second as its rate says."""
     for chip, rate in RATES:
-        readout = ReadOut.preset(chip.name, NAMES[:2], rate=rate.per_second, expected=LEVEL)
+        readout = Readout.preset(chip.name, NAMES[:2], rate=rate.per_second, expected=LEVEL)
         slots = len(readout.schedule.slots)
         assert slots / readout.schedule.period == near(rate.per_second, rel=1e-9)
 
@@ -122,7 +122,7 @@ def test_offset_dac_as_the_host_sets_it():
     """Analytic: codes count from what the DAC subtracts; by default, the nearest step does."""
     level = 5e-12
     for start, offset in ((None, 6.25e-12), (0, 0.0), (1, 3.125e-12)):
-        readout = ReadOut.preset("fdc1004", NAMES[:1], noise=False, capdac=start)
+        readout = Readout.preset("fdc1004", NAMES[:1], noise=False, capdac=start)
         counts = readout([0.0, 0.1], np.full((2, 1), level))
         assert counts.code[0] == round((level - offset) * 2**19 / 1e-12)
         assert counts.capacitance[0] == pytest.approx(level, abs=1e-18)
@@ -131,7 +131,7 @@ def test_offset_dac_as_the_host_sets_it():
 def test_saturation_reaches_the_flags():
     """Each chip's range, with its CAPDAC where the host left it."""
     for name, limit in (("ad7147", 8e-12), ("ad7746", 4.096e-12), ("ad7747", 8.192e-12)):
-        readout = ReadOut.preset(name, NAMES[:2], noise=False)
+        readout = Readout.preset(name, NAMES[:2], noise=False)
         k = len(readout.bank)
         for change, flag in ((0.9, Range.INSIDE), (1.1, Range.ABOVE), (-1.1, Range.BELOW)):
             levels = np.array([[10e-12], [10e-12], [10e-12 + change * limit]]) * np.ones(k)
@@ -152,13 +152,13 @@ def test_charge_set_up():
         assert law.low <= code <= law.high
         if 10e-12 < capacitance < 800e-12:
             assert code == near(law.low + 0.9 * (law.high - law.low), rel=0.05)
-    with pytest.raises(ReadOutError, match="outside of what an MPR121 can charge"):
+    with pytest.raises(ReadoutError, match="outside of what an MPR121 can charge"):
         charge_for(1e-14)
 
 
 def test_touch_of_a_chip():
     """A hand's 20 % on an MPR121 is a touch; a slow drift of as much is not."""
-    readout = ReadOut.preset("mpr121", NAMES[:1], expected=LEVEL, noise=False)
+    readout = Readout.preset("mpr121", NAMES[:1], expected=LEVEL, noise=False)
     times = np.arange(0, 20, 0.05)
     hand = LEVEL * np.where((times > 5) & (times < 10), 1.2, 1.0)
     touched = readout(times, hand[:, None])
@@ -178,15 +178,15 @@ def test_what_cannot_be_measured_at_once_is_not():
     }
     for rest, slots in plan.items():
         patterns = mutual_patterns(NAMES[:3], rest=rest)
-        assert ReadOut.preset("sdr", NAMES[:3], patterns=patterns).schedule.slots == slots
+        assert Readout.preset("sdr", NAMES[:3], patterns=patterns).schedule.slots == slots
     open_ = [Pattern("E1", {"E0": 1.0}), Pattern("E2", {"E0": 1.0}, floating=("E1",))]
-    assert ReadOut.preset("sdr", NAMES[:3], patterns=open_).schedule.slots == ((0,), (1,))
+    assert Readout.preset("sdr", NAMES[:3], patterns=open_).schedule.slots == ((0,), (1,))
 
 
 def test_leads_load_the_shunt():
     """Analytic: what leads have to ground takes current from the shunt, and the gain falls."""
     wiring = Wiring(trace=20e-12, cable=100e-12, shield_gain=0.9)
-    readout = ReadOut.preset("sdr", NAMES[:2], noise=False, wiring=wiring)
+    readout = Readout.preset("sdr", NAMES[:2], noise=False, wiring=wiring)
     level = 0.1e-12
     found = readout([0.0, 0.1], np.full((2, 1), level)).capacitance[0]
     expected = level / math.hypot(1, 2 * math.pi * 1e6 * 1e3 * 30e-12)
@@ -203,18 +203,18 @@ def test_drift_with_temperature():
         ("ad7147", {"gain_per_kelvin": 0.0}, empty),
     ]
     for name, options, expected in cases:
-        readout = ReadOut.preset(name, NAMES[:1], noise=False, temperature=35.0, **options)
+        readout = Readout.preset(name, NAMES[:1], noise=False, temperature=35.0, **options)
         found = readout([0.0, 1.0], np.full((2, 1), empty)).capacitance
         assert found == pytest.approx(np.full(len(found), expected), abs=0.13e-15)
     damp = {"humidity": 80.0, "offset_per_percent": 1e-16, "gain_per_percent": 1e-4}
-    readout = ReadOut.preset("fdc1004", NAMES[:1], noise=False, **damp)
+    readout = Readout.preset("fdc1004", NAMES[:1], noise=False, **damp)
     found = readout([0.0, 1.0], np.full((2, 1), empty)).capacitance
     assert found == pytest.approx(np.full(len(found), empty * 1.003 + 3e-15), abs=1e-18)
 
 
 def test_pace_and_latency_of_the_host():
     """A chip that is asked every 50 ms, and answers 4 ms later."""
-    readout = ReadOut.preset("fdc1004", NAMES[:2], period=0.05, latency=4e-3)
+    readout = Readout.preset("fdc1004", NAMES[:2], period=0.05, latency=4e-3)
     counts = readout([0.0, 0.25], np.full((2, 2), LEVEL))
     assert counts.of("E0").time == near(0.014 + 0.05 * np.arange(5), rel=1e-9)
     assert counts.of("E1").time == near(0.024 + 0.05 * np.arange(5), rel=1e-9)
@@ -247,22 +247,22 @@ def test_noise_of_ones_own():
         (("fdc1004", {"offset_per_percent": 1e-15}), "does nothing without a humidity"),
         (("fdc1005", {}), "unknown chip 'fdc1005'; did you mean 'fdc1004'"),
         (("fdc1004", {"rate": 150.0}), "no rate of 150.0 conversions per second; it has 100"),
-        (("fdc1004", {"rates": 100.0}), "no option 'rates' of a read-out; did you mean 'rate'"),
+        (("fdc1004", {"rates": 100.0}), "no option 'rates' of a readout; did you mean 'rate'"),
         (("mpr121", {"expected": -1.0}), "expected is -1.0"),
         (("fdc1004", {"mains": -1.0}), "amplitude is -1.0"),
     ],
 )
 def test_bad_options_are_refused(arguments, words):
     name, options = arguments
-    with pytest.raises(ReadOutError, match=words):
-        ReadOut.preset(name, NAMES, **options)
+    with pytest.raises(ReadoutError, match=words):
+        Readout.preset(name, NAMES, **options)
 
 
 def test_a_sensor_without_pairs_is_refused():
-    with pytest.raises(ReadOutError, match=r"electrodes \['E1'\] make none"):
-        ReadOut.preset("ad7746", ["E1"])
+    with pytest.raises(ReadoutError, match=r"electrodes \['E1'\] make none"):
+        Readout.preset("ad7746", ["E1"])
 
 
 def test_options_and_presets_are_one():
-    readout = build_chip("FDC1004", NAMES, Options(rate=400))
+    readout = build_chip("FDC1004", NAMES, ReadoutOptions(rate=400))
     assert readout.schedule.conversion == near(2.5e-3, rel=1e-12)

@@ -1,4 +1,4 @@
-"""Read-outs from TOML: what a file can say, and what is refused."""
+"""Readouts from TOML: what a file can say, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor, calibrate
 from capsense.readout.config import choose_readout, load_readout, parse_readout
 from capsense.readout.converter import ResonanceLaw, ShuntLaw
@@ -17,7 +17,7 @@ from capsense.readout.detector import ExponentialTracker, SteppingTracker
 from capsense.readout.front_end import ShuntFrontEnd
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
 from capsense.readout.presets import charge_for
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 
 NAMES = ("E1", "E2", "E3")
 FULL = """
@@ -107,12 +107,12 @@ def test_everything_is_taken_over():
 
 
 def test_a_calibration_goes_through_a_file():
-    """Round trip: what ``toml`` writes makes the same read-out."""
+    """Round trip: what ``toml`` writes makes the same readout."""
     rng = np.random.default_rng(0)
     true, time = rng.uniform(1e-12, 2e-12, (9, 3)), np.arange(9.0)
     fit = calibrate(true, 1.1 * true + 3e-13 + 1e-16 * time[:, None], time)
     from_file = parse('chip = "fdc1004"\nrandom = false\n' + fit.toml())
-    from_code = ReadOut.preset("fdc1004", NAMES, noise=False, stages=[fit])
+    from_code = Readout.preset("fdc1004", NAMES, noise=False, stages=[fit])
     codes = [r(time, true).code.tolist() for r in (from_file, from_code)]
     assert codes[0] == codes[1]
     assert codes[0] != parse('chip = "fdc1004"\nrandom = false')(time, true).code.tolist()
@@ -158,7 +158,7 @@ def test_a_tank_or_front_end_of_ones_own():
 def test_nonlinearity():
     """As in Python; the data sheet's is among the chip's facts, and off by default."""
     law = parse('chip = "ad7746"\nnonlinearity = 1e-4\n').law
-    assert law == ReadOut.preset("ad7746", NAMES, nonlinearity=1e-4).law
+    assert law == Readout.preset("ad7746", NAMES, nonlinearity=1e-4).law
     assert law.nonlinearity == 1e-4
     assert parse('chip = "ad7746"\n').law.nonlinearity == 0
 
@@ -166,7 +166,7 @@ def test_nonlinearity():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "my.toml: read-out: missing key 'chip'"),
+        ("", "my.toml: readout: missing key 'chip'"),
         ('chip = "fdc1005"', "chip = 'fdc1005' is not known; did you mean 'fdc1004'"),
         ('chip = "fdc1004"\nratee = 1', "unknown key 'ratee'; did you mean 'rate'"),
         ('chip = "fdc1004"\nrate = "fast"', "rate = 'fast' must be a number"),
@@ -215,7 +215,7 @@ def test_nonlinearity():
     ],
 )
 def test_wrong_files_are_refused(text, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         parse(text)
 
 
@@ -239,12 +239,12 @@ def test_choosing_by_name_or_file(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('chip = "fdc1004"\nrate = 400\n', encoding="utf-8")
     assert choose_readout(path, NAMES, empty).schedule.conversion == near(2.5e-3, rel=1e-12)
-    with pytest.raises(ReadOutError, match="unknown chip 'mpr122'; did you mean 'mpr121'"):
+    with pytest.raises(ReadoutError, match="unknown chip 'mpr122'; did you mean 'mpr121'"):
         choose_readout("mpr122", NAMES, empty)
 
 
 def test_missing_files_are_refused(tmp_path):
-    with pytest.raises(ReadOutError, match="there is no read-out file"):
+    with pytest.raises(ReadoutError, match="there is no readout file"):
         load_readout(tmp_path / "none.toml", NAMES)
-    with pytest.raises(ReadOutError, match="there is no read-out file fdc1004"):
+    with pytest.raises(ReadoutError, match="there is no readout file fdc1004"):
         load_readout("fdc1004", NAMES)

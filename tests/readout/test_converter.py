@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.converter import (
     CapDac,
     Conversion,
@@ -239,5 +239,5 @@ def test_dac_follows_both_ways_to_its_ends():
     ],
 )
 def test_bad_converters_are_refused(make, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.detector import Detector, ExponentialTracker, Filter, SteppingTracker
 
 
@@ -110,5 +110,5 @@ def test_channels_are_apart():
     ],
 )
 def test_bad_detectors_are_refused(make, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.front_end import ShuntFrontEnd, demodulate, demodulated
 
 PAPER = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0)
@@ -32,7 +32,7 @@ def test_output_solves_the_circuit():
         nodes = np.array([[1, j * c], [0, j * c + j * fe.parasitic + 1 / fe.shunt]])
         sources = np.array([j * c * fe.amplitude, j * c * fe.amplitude])
         _, receiver = np.linalg.solve(nodes, sources)
-        amplifier = fe.gain * fe.bandwidth / (fe.bandwidth + 1j * fe.frequency)
+        amplifier = fe.gain * fe.bandwidth / (fe.bandwidth + 1j * fe.excitation_frequency)
         found = fe.output(c)
         assert abs(found - amplifier * receiver) <= 1e-12 * abs(found)
 
@@ -90,7 +90,7 @@ def test_whole_periods_give_the_phasor():
     rng = np.random.default_rng(2)
     for c in (1e-15, 3e-13, 2e-12, 4e-11):
         samples = PAPER.waveform(c, 25e6, 2500)
-        phasor = demodulate(samples, PAPER.frequency, 25e6)
+        phasor = demodulate(samples, PAPER.excitation_frequency, 25e6)
         assert abs(phasor - PAPER.output(c)) < 1e-9 * abs(phasor)
         assert PAPER.recover(phasor) == near(c, rel=1e-7)
         assert demodulated(PAPER.output(c), 1e6, 1e6, 25e6, 2500) == pytest.approx(phasor)
@@ -111,7 +111,7 @@ def test_noise_of_demodulation():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"frequency": 0.0}, "frequency is 0.0"),
+        ({"excitation_frequency": 0.0}, "frequency is 0.0"),
         ({"shunt": -1.0}, "shunt is -1.0"),
         ({"gain": math.nan}, "gain is nan"),
         ({"amplitude": math.inf}, "amplitude is inf"),
@@ -120,7 +120,7 @@ def test_noise_of_demodulation():
     ],
 )
 def test_bad_front_ends_are_refused(settings, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         ShuntFrontEnd(**settings)
 
 
@@ -138,5 +138,5 @@ def test_bad_front_ends_are_refused(settings, words):
 )
 def test_bad_signals_are_refused(make, words):
     """Nothing becomes NaN in silence."""
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
 from capsense.constants import EPS0
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.imaging import (
     back_projection,
     electrode_pairs,
@@ -236,5 +236,5 @@ def test_landweber_takes_many_frames(field):
     ],
 )
 def test_bad_input_is_refused(make, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.noise import (
     ClimateDrift,
     Flicker,
@@ -61,7 +61,7 @@ def test_allan_deviation_is_its_definition():
     ramp = 3.0 * np.arange(100)
     assert allan_deviation(ramp, [10])[0] == near(3.0 * 10 / math.sqrt(2), rel=1e-9)
     assert allan_deviation(np.ones((50, 2, 3)), [5]).shape == (1, 2, 3)
-    with pytest.raises(ReadOutError, match="is 101; give a whole number from 1 to 100"):
+    with pytest.raises(ReadoutError, match="is 101; give a whole number from 1 to 100"):
         allan_deviation(values, [101])
 
 
@@ -234,5 +234,5 @@ def test_same_seed_same_bits_however_dealt(stage):
     ],
 )
 def test_bad_stages_are_refused(make, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()

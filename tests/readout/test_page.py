@@ -1,4 +1,4 @@
-"""The read-out's page: its snippets run, its files parse, its numbers hold."""
+"""The readout's page: its snippets run, its files parse, its numbers hold."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.schedule import Schedule
 
 
@@ -84,5 +84,5 @@ def test_inputs_of_several_chips_run_side_by_side():
     ],
 )
 def test_bad_schedules_are_refused(make, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         make()

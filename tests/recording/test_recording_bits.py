@@ -259,8 +259,8 @@ def test_replay_is_the_same_to_the_last_bit(recorded: Recorded) -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"frequency": 10e6},
-        {"method": "masked"},
+        {"excitation_frequency": 10e6},
+        {"method": "fem_masked"},
         {"preset": "fine"},
     ],
     ids=lambda o: "-".join(o),

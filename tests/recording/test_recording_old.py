@@ -65,7 +65,7 @@ def test_a_replay_names_another_method(
 def test_it_can_be_viewed(old: tuple[Path, list[cs.Reading]]) -> None:
     source = RecordingSource(cs.open_recording(old[0]))
     assert source.green is not None
-    np.testing.assert_array_equal(source.shot(1).reading.delta, old[1][1].delta)
+    np.testing.assert_array_equal(source.frame(1).reading.delta, old[1][1].delta)
 
 
 def test_other_methods_are_damage(old: tuple[Path, list[cs.Reading]]) -> None:
@@ -73,6 +73,8 @@ def test_other_methods_are_damage(old: tuple[Path, list[cs.Reading]]) -> None:
     data = json.loads(as_before(session.to_json()))
     mesh = read_session(json.dumps(data).encode(), session.design).settings.mesh
     assert mesh == MeshSettings().refined(0.5)
+    data["method"] = "masked"
+    assert read_session(json.dumps(data).encode(), session.design).method == "fem_masked"
     data["method"] = "guessing"
     with pytest.raises(RecordingError, match="damaged"):
         read_session(json.dumps(data).encode(), session.design)

@@ -13,7 +13,7 @@ import pytest
 import recorded_scenes
 
 import capsense as cs
-from capsense.errors import MissingDependencyError, ReadOutError, RecordingError
+from capsense.errors import MissingDependencyError, ReadoutError, RecordingError
 from capsense.scene import Shape
 
 
@@ -126,9 +126,9 @@ def test_names_and_readouts(
     for name in ("", "a b", "/tf", "1st"):
         with pytest.raises(RecordingError, match="letters"):
             cs.record(path, sim, name=name)
-    with pytest.raises(ReadOutError, match="fdc1004"):
+    with pytest.raises(ReadoutError, match="fdc1004"):
         cs.record(path, sim, readout="fdc1040")
-    with pytest.raises(ReadOutError, match="there is no"):
+    with pytest.raises(ReadoutError, match="there is no"):
         cs.record(path, sim, readout=path.with_suffix(".toml"))
     assert not path.exists()
     with cs.record(path, sim) as run, pytest.raises(RecordingError, match="write step"):
@@ -170,7 +170,7 @@ def test_missing_packages(
 
 def test_a_readout_of_ones_own(sim: cs.Simulator, path: Path) -> None:
     """Its counts are recorded; what it was made of is not known, so a replay leaves them out."""
-    own = cs.ReadOut.preset("ad7147", sim.electrode_names, seed=5)
+    own = cs.Readout.preset("ad7147", sim.electrode_names, seed=5)
     with cs.record(path, sim, readout=own) as run:
         first = [run.step(scene(k), 0.1 * k).counts for k in range(3)]
         run.reset()

@@ -72,7 +72,7 @@ def test_not_a_number_is_a_difference(sim: cs.Simulator, tmp_path: Path) -> None
 
 
 def test_counts_that_differ(sim: cs.Simulator, tmp_path: Path) -> None:
-    """The read-out was restarted behind the recorder's back, so its noise is another."""
+    """The readout was restarted behind the recorder's back, so its noise is another."""
     path = tmp_path / "counts.mcap"
     with cs.record(path, sim, readout="fdc1004") as run:
         for k in range(4):

@@ -283,13 +283,13 @@ def test_attached_sensor(simulators: Callable[..., cs.Simulator], tmp_path: Path
             euler="180 0 0"/></body>
         </worldbody><sensor><rangefinder camera="pad" data="depth"/></sensor></mujoco>"""
     )
-    for world in ("geometry", "depth"):
+    for perception in ("geometry", "depth_camera"):
         data = mujoco.MjData(model)
         data.qvel[-1] = 0.5
         sensor = cs.mujoco.attach(
-            model, data, "pad", simulators("six_patch"), world=world, readout="fdc1004"
+            model, data, "pad", simulators("six_patch"), perception=perception, readout="fdc1004"
         )
-        path = tmp_path / f"{world}.mcap"
+        path = tmp_path / f"{perception}.mcap"
         places = []
         with cs.record(path, sensor) as run:
             for _ in range(2):

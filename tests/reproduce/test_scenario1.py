@@ -137,7 +137,10 @@ def test_front_end_dilutes_by_the_stray_capacitance() -> None:
 @pytest.fixture(scope="module")
 def tables() -> dict[str, Any]:
     """Of both boards' pairs, coarser than the stored figures were fitted with."""
-    sims = {name: cs.Simulator(name, frequency=SETUP.frequency) for name in ("stripe", "patch")}
+    sims = {
+        name: cs.Simulator(name, excitation_frequency=SETUP.excitation_frequency)
+        for name in ("stripe", "patch")
+    }
     return {
         name: tabulate(sim, SETUP, coarser=2.0).table(SETUP.boards[name].pair)
         for name, sim in sims.items()

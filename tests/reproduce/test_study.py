@@ -13,7 +13,7 @@ from capsense.cli.main import main
 from capsense.reproduce import registry
 from capsense.reproduce.registry import STUDIES, load_study
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Outcome, Report, Row, Table, judged
+from capsense.reproduce.study import Outcome, Report, ReportTable, Row, judged
 from capsense.reproduce.write import MAX_ROWS, write_outcome
 
 
@@ -27,7 +27,7 @@ def sample_study(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     return Outcome(
         "A sample",
         (judged("sum", total, "F", above=0.5 if reduced else 0.2, source="made up"), Row("n", 2)),
-        {"values": Table(("k", "v [F]"), ((1, 1 / 3), (2, 2 / 3)))},
+        {"values": ReportTable(("k", "v [F]"), ((1, 1 / 3), (2, 2 / 3)))},
         {"picture": Figure()},
         ("It shows nothing.",),
         store.told(),
@@ -53,7 +53,7 @@ def test_judged() -> None:
     with pytest.raises(ValueError, match="nan"):
         Row("x", float("nan"))
     with pytest.raises(ValueError, match="1 cells for 2"):
-        Table(("a", "b"), ((1,),))
+        ReportTable(("a", "b"), ((1,),))
 
 
 @pytest.mark.usefixtures("registered")
@@ -112,7 +112,7 @@ def test_bad_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_long_tables_are_named(tmp_path: Path) -> None:
     """The report stays readable."""
-    long = Table(("k",), tuple((k,) for k in range(MAX_ROWS + 1)))
+    long = ReportTable(("k",), tuple((k,) for k in range(MAX_ROWS + 1)))
     write_outcome(Outcome("T", (), {"long": long}), tmp_path)
     assert f"- [long.csv](long.csv), {MAX_ROWS + 1} rows" in (tmp_path / "report.md").read_text()
 

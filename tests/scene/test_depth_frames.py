@@ -25,7 +25,7 @@ from capsense.scene import (
     Sphere,
     decode_permittivity,
     encode_permittivity,
-    rasterise,
+    render_depth,
 )
 
 # ---- the red channel ----
@@ -219,7 +219,7 @@ def test_peeled_layers_of_one_material():
     mesh = Sphere(0.03).to_trimesh()
     vertices = np.concatenate([mesh.vertices + np.array([0, 0, z]) for z in (0.1, 0.2)])
     faces = np.concatenate([mesh.faces, mesh.faces + len(mesh.vertices)])
-    raster = rasterise(vertices, faces, (0.5, 0.5), (65, 65))
+    raster = render_depth(vertices, faces, (0.5, 0.5), (65, 65))
     (body,) = DepthFrame(raster.front, "muscle", back=raster.back).scene()
     np.testing.assert_allclose(line(body), [[0.07, 0.13], [0.17, 0.23]], atol=1.5e-3)
 

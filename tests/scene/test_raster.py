@@ -13,12 +13,12 @@ from capsense.scene import (
     Capsule,
     Layers,
     Pose,
-    rasterise,
+    render_depth,
 )
 from capsense.scene.raster_kernels import LEAST_COSINE
 
 
-def rasterise_slowly(vertices, faces, size, resolution, thickness=0.0):
+def render_slowly(vertices, faces, size, resolution, thickness=0.0):
     """Intervals that the rays through all pixels meet, ``[row][column]``, by trying every triangle.
 
     Rays that meet an edge within rounding may count it twice or not at all.
@@ -85,8 +85,8 @@ def test_closed_meshes_match_the_slow_twin():
         rng = np.random.default_rng(seed)
         vertices, faces = random_closed(rng)
         size, resolution = (0.12, 0.1), (int(rng.integers(5, 25)), int(rng.integers(5, 25)))
-        raster = rasterise(vertices, faces, size, resolution)
-        slow = rasterise_slowly(vertices, faces, size, resolution)
+        raster = render_depth(vertices, faces, size, resolution)
+        slow = render_slowly(vertices, faces, size, resolution)
         for j, i in np.ndindex(*resolution):
             got = [s for s in intervals(raster, j, i) if s[1] - s[0] > 1e-6]
             expected = [s for s in slow[j][i] if s[1] - s[0] > 1e-6]
@@ -102,8 +102,8 @@ def test_sheets_match_the_slow_twin():
         rng = np.random.default_rng([9, seed])
         vertices, faces = cloth(9, 0.1)
         vertices = vertices + rng.normal(scale=0.01, size=vertices.shape) + np.array([0, 0, 0.1])
-        raster = rasterise(vertices, faces, (0.12, 0.12), (20, 17), thickness=0.002)
-        slow = rasterise_slowly(vertices, faces, (0.12, 0.12), (20, 17), 0.002)
+        raster = render_depth(vertices, faces, (0.12, 0.12), (20, 17), thickness=0.002)
+        slow = render_slowly(vertices, faces, (0.12, 0.12), (20, 17), 0.002)
         for j, i in np.ndindex(20, 17):
             np.testing.assert_allclose(intervals(raster, j, i), slow[j][i], atol=1e-7)
             hits += len(slow[j][i])
@@ -126,7 +126,7 @@ def test_shared_edges_leave_no_gaps():
     """Invariant: with vertices and edges exactly on rays, each ray of a cloth meets it once."""
     vertices, faces = cloth(16, 0.16)
     for shift in (0.0, 0.005, 0.0025):
-        raster = rasterise(vertices + np.array([shift, shift, 0.1]), faces, (0.2, 0.2), (20, 20),
+        raster = render_depth(vertices + np.array([shift, shift, 0.1]), faces, (0.2, 0.2), (20, 20),
                            thickness=0.001)  # fmt: skip
         met = np.isfinite(raster.front).sum(axis=0)
         assert met.max() == 1
@@ -137,7 +137,7 @@ def test_closed_meshes_on_rays_are_met_in_pairs():
     """Invariant: boxes whose edges lie on rays, in every direction, are whole solids."""
     box = Box((0.08, 0.06, 0.04)).to_trimesh()
     for _ in range(2):
-        raster = rasterise(box.vertices + np.array([0, 0, 0.1]), box.faces, (0.1, 0.1), (10, 10))
+        raster = render_depth(box.vertices + np.array([0, 0, 0.1]), box.faces, (0.1, 0.1), (10, 10))
         volume = np.nansum(raster.back - raster.front) * 0.01**2
         np.testing.assert_allclose(volume, 0.08 * 0.06 * 0.04, rtol=1e-6)
         box.apply_translation((0.005, 0.005, 0))
@@ -149,7 +149,7 @@ def test_mixed_winding_counts_every_second_stretch():
     faces = np.array(box.faces)
     upward = box.face_normals[:, 2] > 0.5
     faces[upward] = faces[upward][:, ::-1]
-    raster = rasterise(box.vertices + np.array([0, 0, 0.1]), faces, (0.1, 0.1), (21, 21))
+    raster = render_depth(box.vertices + np.array([0, 0, 0.1]), faces, (0.1, 0.1), (21, 21))
     hit = np.isfinite(raster.front[0])
     assert hit.any()
     np.testing.assert_allclose(raster.front[0][hit], 0.08)
@@ -162,7 +162,7 @@ def test_many_layers():
     for k, plate in enumerate(plates):
         plate.apply_translation((0, 0, 0.1 + 0.01 * k))
     stack = trimesh.util.concatenate(plates)
-    raster = rasterise(stack.vertices, stack.faces, (0.1, 0.1), (9, 9))
+    raster = render_depth(stack.vertices, stack.faces, (0.1, 0.1), (9, 9))
     np.testing.assert_allclose(raster.front[:, 4, 4], 0.098 + 0.01 * np.arange(9), atol=1e-8)
     np.testing.assert_allclose(raster.depth[4, 4], 0.098, atol=1e-8)
     assert raster.depth[0, 0] == np.inf
@@ -181,7 +181,7 @@ def test_bad_views_are_refused():
         ((vertices, faces[:0]), {}, "faces have shape"),
     ]:
         with pytest.raises(SceneError, match=message):
-            rasterise(*arguments, (0.1, 0.1), (4, 4), **options)
+            render_depth(*arguments, (0.1, 0.1), (4, 4), **options)
     for size, resolution, message in [
         ((0.1, -1), (4, 4), "size is"),
         ((0.1, 0.1), (0, 4), "resolution is"),
@@ -189,8 +189,8 @@ def test_bad_views_are_refused():
         ((0.1, 0.1), (4000, 4000), "resolution is"),
     ]:
         with pytest.raises(SceneError, match=message):
-            rasterise(vertices, faces, size, resolution)
-    empty = rasterise(vertices + np.array([5, 0, 0]), faces, (0.1, 0.1), (4, 4), thickness=1e-3)
+            render_depth(vertices, faces, size, resolution)
+    empty = render_depth(vertices + np.array([5, 0, 0]), faces, (0.1, 0.1), (4, 4), thickness=1e-3)
     assert not np.isfinite(empty.depth).any()
     with pytest.raises(SceneError, match="no pixel holds an interval"):
         empty.layers()
@@ -202,7 +202,7 @@ def test_volumes_converge():
     mesh = shape.to_trimesh()
     errors = []
     for n in (32, 128):
-        raster = rasterise(pose.apply(mesh.vertices), mesh.faces, (0.16, 0.16), (n, n))
+        raster = render_depth(pose.apply(mesh.vertices), mesh.faces, (0.16, 0.16), (n, n))
         layers = raster.layers()
         assert isinstance(layers, Layers)
         assert layers.volume == pytest.approx(

@@ -77,7 +77,7 @@ def test_reading_round_trip(m: int, conversions: int, random: object) -> None:
     found = unpack_reading(pack_reading(sent))
     for name in ("capacitance", "delta", "self_capacitance", "conversions"):
         assert np.array_equal(getattr(found, name), getattr(sent, name)), name
-    for name in ("sensor", "sequence", "time", "iterations", "error_estimate", "wall_time"):
+    for name in ("sensor", "sequence", "time", "iterations", "solver_error", "wall_time"):
         assert getattr(found, name) == getattr(sent, name), name
     assert found.dropped == 5
 
@@ -175,7 +175,7 @@ def test_the_page_describes_the_header() -> None:
 
 
 def test_the_page_describes_conversions() -> None:
-    """Offsets, types and names of the records of a read-out."""
+    """Offsets, types and names of the records of a readout."""
     formats = {"u8": "|u1", "u16": "<u2", "u32": "<u4", "i64": "<i8", "f64": "<f8"}
     rows = [row for row in table("Readings") if row[0].isdigit()]
     documented = [(row[2], formats[row[1]], int(row[0])) for row in rows]

@@ -11,7 +11,7 @@ from running_server import RunningServer
 
 import capsense as cs
 from capsense.errors import CapSenseError, ProtocolError, ServerError
-from capsense.server.options import Limits, Options
+from capsense.server.options import Limits, ServerOptions
 from capsense.server.sensor import ServedSensor
 from capsense.server.server import Server
 from capsense.simulator import Simulator
@@ -120,7 +120,7 @@ def test_several_sensors_and_clients(served: RunningServer, dome: np.ndarray) ->
 def test_readout(dome: np.ndarray) -> None:
     """Counts are those of the chip, between readings, from the first frame's time on."""
     simulator = Simulator("six_patch")
-    readout = cs.ReadOut.preset("fdc1004", simulator.electrode_names)
+    readout = cs.Readout.preset("fdc1004", simulator.electrode_names)
     with RunningServer(readout="fdc1004") as server, server.client() as client:
         sensor, other = client.open(), client.open()
         assert sensor.channel_names == readout.channel_names
@@ -334,9 +334,9 @@ def test_wrong_designs_and_readouts(
 
     monkeypatch.setattr("capsense.server.server.Simulator", build)
     with pytest.raises(CapSenseError, match=words):
-        Server(Options(designs, readout))
+        Server(ServerOptions(designs, readout))
     with pytest.raises(AssertionError, match="built"):
-        Server(Options(("patch",), "fdc1004"))
+        Server(ServerOptions(("patch",), "fdc1004"))
 
 
 @pytest.mark.parametrize(
@@ -352,12 +352,12 @@ def test_wrong_designs_and_readouts(
 def test_wrong_options(options: dict, words: str) -> None:
     """Refused before anything is built."""
     with pytest.raises(ServerError, match=words):
-        Options(**options)
+        ServerOptions(**options)
     for limit in ({"pixels": 0}, {"send_timeout": float("nan")}):
         with pytest.raises(ServerError, match="give a number above zero"):
             Limits(**limit)
-    assert Options(("patch",), host="0.0.0.0", token=TOKEN).token == TOKEN
-    assert Options(("patch",), host="::1").host == "::1"
+    assert ServerOptions(("patch",), host="0.0.0.0", token=TOKEN).token == TOKEN
+    assert ServerOptions(("patch",), host="::1").host == "::1"
 
 
 def test_the_client_comes_back() -> None:

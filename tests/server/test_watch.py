@@ -15,7 +15,7 @@ from running_server import RunningServer
 from capsense.errors import ProtocolError
 from capsense.recording.design_json import design_from_json
 from capsense.server.frames import DepthMessage, ReadingMessage
-from capsense.server.messages import Table, read_scene
+from capsense.server.messages import MessageTable, read_scene
 
 BALL = {"name": "ball", "shape": "sphere", "radius": 0.03, "material": "water"}
 WALL = {"name": "wall", "shape": "box", "size": [0.1, 0.1, 0.01], "grounding": 1e-10,
@@ -59,7 +59,7 @@ def test_sees_what_the_sensor_sees(watchable: RunningServer, dome: np.ndarray) -
         reading = sensor.step_poses({"ball": at(0.05)}, time=2.0)  # the wall stays
         seen, copied = watcher.receive(), watcher.receive()
         assert isinstance(seen, dict)
-        scene = read_scene(Table(seen, "message", "scene"), 9)
+        scene = read_scene(MessageTable(seen, "message", "scene"), 9)
         assert [b.pose.position[2] for b in scene.bodies] == [0.05, 0.2]
         assert [b.name for b in scene.bodies] == ["ball", "wall"]
         assert scene.bodies[1].grounding == 1e-10

@@ -26,7 +26,7 @@ from stopped_clock import StoppedClock
 
 from capsense.errors import ProtocolError
 from capsense.server import connection
-from capsense.server.connection import Door, GatedConnection
+from capsense.server.connection import AdmissionControl, RateLimitedConnection
 from capsense.server.frames import HEADER, pack_depth
 
 
@@ -157,13 +157,13 @@ def test_newcomers_are_let_in_slowly(
 
 def test_who_is_turned_away_keeps_nobody_out(clock: StoppedClock) -> None:
     """However many come meanwhile, every hundredth of a second one more is let in."""
-    door = Door(10**6)
-    assert [door.admits() for _ in range(1000)] == [True] * 100 + [False] * 900
+    admission = AdmissionControl(10**6)
+    assert [admission.admits() for _ in range(1000)] == [True] * 100 + [False] * 900
     clock.now += 0.0101
-    assert [door.admits() for _ in range(1000)] == [True] + [False] * 999
-    door.open = door.most + 1
+    assert [admission.admits() for _ in range(1000)] == [True] + [False] * 999
+    admission.open = admission.most + 1
     clock.now += 100
-    assert not door.admits()
+    assert not admission.admits()
 
 
 def test_reads_a_little_at_a_time(
@@ -171,13 +171,13 @@ def test_reads_a_little_at_a_time(
 ) -> None:
     """A large frame comes in pieces, between which it is the others' turn."""
     sizes: list[int] = []
-    update = GatedConnection.buffer_updated
+    update = RateLimitedConnection.buffer_updated
 
-    def watch(self: GatedConnection, nbytes: int) -> None:
+    def watch(self: RateLimitedConnection, nbytes: int) -> None:
         sizes.append(nbytes)
         update(self, nbytes)
 
-    monkeypatch.setattr(GatedConnection, "buffer_updated", watch)
+    monkeypatch.setattr(RateLimitedConnection, "buffer_updated", watch)
     with served.client() as client:
         large = np.kron(dome, np.ones((8, 8), np.float32))
         assert client.open().step(large).sequence == 0

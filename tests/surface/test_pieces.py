@@ -365,4 +365,4 @@ def test_sides_and_fronts_go_together(
     front, back = view(shape, pose, 256, 0.5)
     found = sim.step(cs.DepthFrame(front, back=back))
     assert np.abs(found.delta - expected).max() < 0.04 * np.abs(expected).max()
-    assert found.stats.error_estimate < 0.1 * np.abs(expected).max()
+    assert found.stats.solver_error < 0.1 * np.abs(expected).max()

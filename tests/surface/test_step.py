@@ -32,7 +32,7 @@ from capsense.surface.step import Solution, prepared, solve, solve_lossy
 from capsense.surface.vector_kernels import (
     cholesky,
     multiply,
-    multiply_lanes,
+    multiply_simd,
     point_potentials,
     rsqrt,
     source_potentials,
@@ -512,7 +512,7 @@ def test_multiply_lanes(rows: int, width: int) -> None:
     left = rng.normal(size=(rows, 45)).astype(np.float32)
     table = rng.normal(size=(45, width)).astype(np.float32)
     room = np.full((rows + 2, width), np.float32(7.0))
-    multiply_lanes(left, table, room[1:-1])
+    multiply_simd(left, table, room[1:-1])
     np.testing.assert_allclose(room[1:-1], left.astype(float) @ table, rtol=0, atol=2e-5)
     assert (room[[0, -1]] == 7.0).all()
 
@@ -1018,7 +1018,7 @@ def test_threads_that_meet_a_shape_share_its_arrays() -> None:
 def test_conductance_of_a_lossy_ball(sigma: float) -> None:
     """Analytic: a ball far off answers as its polarisability, (ε* − 1) / (ε* + 2)."""
     sim = simulator()
-    omega = 2 * math.pi * sim.frequency
+    omega = 2 * math.pi * sim.excitation_frequency
 
     def answer(material: cs.Material) -> cs.Reading:
         ball = cs.Body(cs.Sphere(0.02), cs.Pose((0.0, 0.0, 0.15)), material, "floating")

@@ -38,10 +38,10 @@ def test_the_robot_in_mujoco() -> None:
             reading = page.read()
         assert reading.delta.diagonal().min() > 0
         until(lambda: page._player.newest is not None and page._player.newest.index == 9)
-        shot = page._player.newest
-        assert shot is not None
-        assert shot.time == pytest.approx(data.time)
-        (carrier, at), (limb, there) = shot.around
+        frame = page._player.newest
+        assert frame is not None
+        assert frame.time == pytest.approx(data.time)
+        (carrier, at), (limb, there) = frame.around
         assert isinstance(carrier, cs.Box)
         np.testing.assert_allclose(at.position, (0, 0, -0.006), atol=1e-12)
         assert isinstance(limb, cs.Capsule)
@@ -65,9 +65,9 @@ def test_the_robot_in_pybullet() -> None:
     with cs.show(sensor, port=0) as page:
         page.read()
         until(lambda: page._player.newest is not None)
-        shot = page._player.newest
-        assert shot is not None
-        assert [type(shape) for shape, _ in shot.around] == [cs.Box, cs.Sphere]
+        frame = page._player.newest
+        assert frame is not None
+        assert [type(shape) for shape, _ in frame.around] == [cs.Box, cs.Sphere]
     p.disconnect(client)
 
 

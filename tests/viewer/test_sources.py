@@ -13,7 +13,7 @@ import capsense as cs
 from capsense.errors import ProtocolError, RecordingError, ServerError
 from capsense.scenario import parse_scenario
 from capsense.viewer.plane import Plane, region
-from capsense.viewer.source import RecordingSource, ScenarioSource, Shot
+from capsense.viewer.source import Frame, RecordingSource, ScenarioSource
 
 DATA = {
     "name": "a ball goes by",
@@ -37,21 +37,21 @@ def test_scenario() -> None:
     assert source.green is not None
     plane = Plane(source.green, region(source.design), 1, 0.0)
     for index, wanted in ((3, plane), (0, None), (5, plane)):
-        shot = source.shot(index, wanted)
-        assert (shot.index, shot.time) == (index, scenario.times[index])
-        expected = cs.Simulator("six_patch").step(scenario.scene_at(shot.time))
-        np.testing.assert_array_equal(shot.reading.delta, expected.delta)
-        assert shot.plane is wanted
-        assert (shot.potentials is None) == (wanted is None)
-    assert shot.potentials.shape == (len(plane.points), 6)
+        frame = source.frame(index, wanted)
+        assert (frame.index, frame.time) == (index, scenario.times[index])
+        expected = cs.Simulator("six_patch").step(scenario.scene_at(frame.time))
+        np.testing.assert_array_equal(frame.reading.delta, expected.delta)
+        assert frame.plane is wanted
+        assert (frame.potentials is None) == (wanted is None)
+    assert frame.potentials.shape == (len(plane.points), 6)
     source.close()
 
 
 def test_masked_gives_no_potentials() -> None:
     """The other method solves on a mesh of its own."""
-    source = ScenarioSource(parse_scenario(DATA), cs.Simulator("six_patch", method="masked"))
+    source = ScenarioSource(parse_scenario(DATA), cs.Simulator("six_patch", method="fem_masked"))
     assert source.green is None
-    assert source.shot(0).potentials is None
+    assert source.frame(0).potentials is None
 
 
 def test_recording(tmp_path: Path) -> None:
@@ -70,10 +70,10 @@ def test_recording(tmp_path: Path) -> None:
     np.testing.assert_allclose(source.times, scenario.times)
     plane = Plane(source.green, region(source.design), 2, 0.02)
     for index in (4, 1):
-        shot = source.shot(index, plane if index == 1 else None)
-        np.testing.assert_array_equal(shot.reading.delta, written[index].delta)
-        assert [b.name for b in shot.scene] == ["ball"]
-    assert shot.potentials.shape == (len(plane.points), 6)
+        frame = source.frame(index, plane if index == 1 else None)
+        np.testing.assert_array_equal(frame.reading.delta, written[index].delta)
+        assert [b.name for b in frame.scene] == ["ball"]
+    assert frame.potentials.shape == (len(plane.points), 6)
 
 
 def test_empty_recording(tmp_path: Path) -> None:
@@ -100,12 +100,12 @@ class TestWatched:
         pytest.importorskip("websockets", reason='needs websockets: pip install "capsense[serve]"')
 
     @staticmethod
-    def next_of(source: object) -> Shot:
+    def next_of(source: object) -> Frame:
         limit = time.monotonic() + 10.0
         while time.monotonic() < limit:
-            shot = source.next(0.1)
-            if shot is not None:
-                return shot
+            frame = source.next(0.1)
+            if frame is not None:
+                return frame
         raise AssertionError("nothing came")
 
     def test_bodies_and_depth(self) -> None:

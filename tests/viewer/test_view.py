@@ -20,9 +20,9 @@ from capsense._style import LOUD, QUIET
 from capsense.errors import ProtocolError, ServerError
 from capsense.viewer.follower import Follower
 from capsense.viewer.plane import Plane, region
+from capsense.viewer.scene_drawing import SHADES, SceneDrawing
 from capsense.viewer.source import charges_of
-from capsense.viewer.stage import SHADES, Stage
-from capsense.viewer.view import View, check_address
+from capsense.viewer.view import LiveView, check_address
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_designs(server: Any, name: str) -> None:
     """Every electrode, conductor and layer is a node of its own."""
     server.scene.reset()
     design = cs.load_design(name)
-    Stage(server, design)
+    SceneDrawing(server, design)
     assert len(nodes(server, "/axes/")) == 3
     for under, parts in (
         ("/electrodes/", design.electrodes), ("/conductors/", design.conductors),
@@ -57,7 +57,7 @@ def test_designs(server: Any, name: str) -> None:
 def test_bodies_of_every_shape(server: Any) -> None:
     """They stand where their poses say; those that only move are not made anew."""
     server.scene.reset()
-    stage = Stage(server, cs.load_design("six_patch"))
+    stage = SceneDrawing(server, cs.load_design("six_patch"))
     scene = scene_at(0)
     stage.show_bodies(scene)
     assert len(nodes(server, "/bodies/")) == len(bodies())
@@ -78,7 +78,7 @@ def test_bodies_of_every_shape(server: Any) -> None:
 def test_depth_images(server: Any) -> None:
     """A dot for each pixel, where the camera saw it."""
     server.scene.reset()
-    stage = Stage(server, cs.load_design("six_patch"))
+    stage = SceneDrawing(server, cs.load_design("six_patch"))
     frame = frame_at(0)
     scene = frame.scene()
     stage.show_bodies(scene)
@@ -98,7 +98,7 @@ def test_depth_images(server: Any) -> None:
 def test_deforming_surfaces(server: Any) -> None:
     """Triangles, from both sides, where they are now."""
     server.scene.reset()
-    stage = Stage(server, cs.load_design("six_patch"))
+    stage = SceneDrawing(server, cs.load_design("six_patch"))
     foil = cs.DeformableSurface(0.1 * np.eye(3), [[0, 1, 2]], material="steel")
     for k in range(2):
         foil.vertices = np.eye(3) * (0.1 + 0.1 * k)
@@ -111,7 +111,7 @@ def test_deforming_surfaces(server: Any) -> None:
 def test_signals(server: Any) -> None:
     """From quiet to loud, and no further; light does not change the colours."""
     server.scene.reset()
-    stage = Stage(server, cs.load_design("patch"))
+    stage = SceneDrawing(server, cs.load_design("patch"))
     stage.show_signals(np.array([0.0, 0.5, 1.0, 7.0]))
     shown = {
         n: h.glb_data for n, h in server.scene._handle_from_node_name.items()
@@ -133,7 +133,7 @@ def test_plane(server: Any) -> None:
     """Lines of equal potential on the plane; none once they are hidden."""
     server.scene.reset()
     simulator = cs.Simulator("six_patch")
-    stage = Stage(server, simulator.design)
+    stage = SceneDrawing(server, simulator.design)
     plane = Plane(simulator.background.green, region(simulator.design), 1, 0.0)
     simulator.step(cs.Scene())
     stage.show_plane(plane, simulator.potentials(plane.points)[:, 1])
@@ -149,7 +149,7 @@ def test_charges(server: Any) -> None:
     """On the surface of the ball, the densest nearest to the electrode; none without a body."""
     server.scene.reset()
     simulator = cs.Simulator("six_patch")
-    stage = Stage(server, simulator.design)
+    stage = SceneDrawing(server, simulator.design)
     x, y, _ = simulator.design.electrodes[1].surface.bounds.mean(axis=0)
     ball = cs.Body(cs.Sphere(0.02), cs.Pose((x, y, 0.04)), "steel", name="ball")
     scene = cs.Scene([ball])
@@ -175,7 +175,7 @@ def test_live_controls() -> None:
     """Hold and follow; the slider spans what is kept; what is wrong is said, as text."""
     stream = Queued()
     player = Follower(stream)  # type: ignore[arg-type]
-    view = View(player, port=0)
+    view = LiveView(player, port=0)
     try:
         view.refresh()
         stream.put(7)
@@ -206,7 +206,7 @@ def test_address_that_is_taken() -> None:
         with pytest.raises(ServerError, match=f"cannot listen at 127.0.0.1, port {port}"):
             check_address("127.0.0.1", port)
         with pytest.raises(ServerError, match="another --host or --port"):
-            View(None, port=port)  # type: ignore[arg-type]
+            LiveView(None, port=port)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 70000), ("no.such.host.invalid", 0)])

@@ -22,7 +22,7 @@ from capsense.scenario import Scenario, parse_scenario
 from capsense.viewer.plane import palette
 from capsense.viewer.player import Player
 from capsense.viewer.source import ScenarioSource
-from capsense.viewer.view import View
+from capsense.viewer.view import LiveView
 
 SCENARIO = {
     "name": "a ball <goes> by",
@@ -45,10 +45,10 @@ def scenario() -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def shown(scenario: Scenario) -> Iterator[tuple[Player, View]]:
+def shown(scenario: Scenario) -> Iterator[tuple[Player, LiveView]]:
     """A view that is served and kept up to date, on the first sample."""
     player = Player(ScenarioSource(scenario, cs.Simulator(scenario.design)))
-    view, stop = View(player, port=0), threading.Event()
+    view, stop = LiveView(player, port=0), threading.Event()
     thread = threading.Thread(target=view.run, args=(stop,))
     thread.start()
     yield player, view
@@ -59,7 +59,7 @@ def shown(scenario: Scenario) -> Iterator[tuple[Player, View]]:
 
 
 @pytest.fixture(scope="module")
-def page(shown: tuple[Player, View]) -> Iterator[Any]:
+def page(shown: tuple[Player, LiveView]) -> Iterator[Any]:
     """The page in a browser that has loaded it."""
     if browser_path() is None:
         pytest.skip(f"needs a browser, one of: {', '.join(BROWSERS)}")
@@ -102,7 +102,7 @@ def test_nothing_from_elsewhere(page: Any) -> None:
     assert [url for url in page.asked if not url.startswith(own)] == []
 
 
-def test_scrub(page: Any, shown: tuple[Player, View], scenario: Scenario) -> None:
+def test_scrub(page: Any, shown: tuple[Player, LiveView], scenario: Scenario) -> None:
     """The sample that is typed in is shown: in words, in the matrix, in the charts."""
     player, _ = shown
     box = page.locator("input[inputmode]").first

@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 import capsense as cs
 from capsense.viewer.player import Player
 from capsense.viewer.source import ScenarioSource
-from capsense.viewer.view import View
+from capsense.viewer.view import LiveView
 from capsense.viewer.visitors import welcome
 
 
@@ -32,7 +32,7 @@ def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     path.write_text(ball_scenario())
     scenario = cs.load_scenario(path)
     player = Player(ScenarioSource(scenario, cs.Simulator(scenario.design)))
-    view = View(player, port=0)
+    view = LiveView(player, port=0)
     yield int(view.url.rpartition(":")[2])
     view.stop()
     player.stop()

@@ -77,7 +77,7 @@ namespace CapSense
         /// <summary>Electrode names in matrix order; null until the server has opened the sensor.</summary>
         public IReadOnlyList<string> Electrodes { get; private set; }
 
-        /// <summary>Names of the read-out's channels; empty without one.</summary>
+        /// <summary>Names of the readout's channels; empty without one.</summary>
         public IReadOnlyList<string> Channels { get; private set; }
 
         /// <summary>Maxwell matrix of the empty scene [F].</summary>

@@ -86,7 +86,7 @@ namespace CapSense
         /// <summary>Time that the step took on the server [s].</summary>
         public double WallTime;
 
-        /// <summary>What the read-out has reported since the last reading.</summary>
+        /// <summary>What the readout has reported since the last reading.</summary>
         public Conversion[] Conversions;
     }
 

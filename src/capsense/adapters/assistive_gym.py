@@ -16,7 +16,7 @@ from capsense.adapters.attached import AttachedSensor, make_simulator, refuse_mi
 from capsense.adapters.pybullet_bodies import BODY_NAME, LINK_NAME
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Material, Pose, Scene
 from capsense.scene.body import Grounding
 from capsense.simulator import Simulator
@@ -49,7 +49,7 @@ def attach(
     *,
     materials: Mapping[str, Material | str] | None = None,
     grounding: Mapping[str, Grounding] | None = None,
-    readout: ReadOut | str | Path | None = None,
+    readout: Readout | str | Path | None = None,
     **options: Any,
 ) -> AssistiveGymSensor:
     """Attach a sensor to an agent of an environment that was reset; call ``read()`` after a step.
@@ -72,16 +72,16 @@ def attach(
         design: A design, a packaged name, a design file, or a ready simulator.
         materials: Name pattern → material; the first that fits decides.
         grounding: Name pattern → grounding; the first that fits decides. Geometry only.
-        readout: A read-out whose counts readings are to hold, a chip's name, or a file's; see
+        readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
-        options: As for :func:`capsense.adapters.pybullet.attach`: ``world``, ``shapes``,
+        options: As for :func:`capsense.adapters.pybullet.attach`: ``perception``, ``shapes``,
             ``exclude`` and so on.
 
     Raises:
         SceneError: The environment was not reset, has no such agent or link, or as for
             :func:`capsense.adapters.pybullet.attach`.
         DesignError: The design is wrong.
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
     """
     env = getattr(env, "unwrapped", env)
     if not hasattr(env, "agents") or not hasattr(env, "id"):
@@ -99,7 +99,7 @@ def attach(
         matter, ties = materials, grounding
         if "human" in agents:
             matter = _and_person(materials, "human")
-            if options.get("world") != "depth":
+            if options.get("perception") != "depth_camera":
                 ties = _and_person(grounding, PERSON)
         return pybullet.attach(
             env.id, agents[agent], number, pose_in_link, simulator,

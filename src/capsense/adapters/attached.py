@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._crew import OneAtATime
+from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.placement import nothing_seen, placement, turned_round
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.reading import Reading
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Simulator, make_readout
 
@@ -35,7 +35,7 @@ class AttachedSensor(ABC):
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         """The sensor itself."""
-        self.readout: ReadOut | None = simulator.readout
+        self.readout: Readout | None = simulator.readout
         """The chip that turns capacitances into counts, if any; a simulator's own is taken over."""
         simulator.use_readout(None)
         self._one = OneAtATime()
@@ -47,15 +47,15 @@ class AttachedSensor(ABC):
         call, with their time stamps, as ``reading.counts``.
 
         Args:
-            time: Time of the state [s], for the read-out; by default the simulator's own, where it
+            time: Time of the state [s], for the readout; by default the simulator's own, where it
                 tells it (MuJoCo does, PyBullet does not).
             view: What :meth:`view` has just given, if that was asked already.
 
         Raises:
-            SceneError: The simulator has not been stepped yet, or has diverged, or a read-out
+            SceneError: The simulator has not been stepped yet, or has diverged, or a readout
                 needs a time.
             SolveError: The solver did not reach its tolerance.
-            ReadOutError: Time went back; call :meth:`reset` when the simulator is set back.
+            ReadoutError: Time went back; call :meth:`reset` when the simulator is set back.
         """
         with self._one:
             world = self.view() if view is None else view
@@ -65,15 +65,15 @@ class AttachedSensor(ABC):
             reading = self.simulator.step(world)
             return replace(reading, counts=self.readout.sample(now, reading))
 
-    def use_readout(self, readout: ReadOut | str | Path | None) -> None:
+    def use_readout(self, readout: Readout | str | Path | None) -> None:
         """Read through a chip from now on: it starts at the simulator's time, or at 0 s.
 
         Args:
-            readout: A read-out of this sensor alone, the name of a chip with its usual settings,
-                the path of a read-out file (``.toml``), or None.
+            readout: A readout of this sensor alone, the name of a chip with its usual settings,
+                the path of a readout file (``.toml``), or None.
 
         Raises:
-            ReadOutError: There is no such chip or file, or the file is wrong.
+            ReadoutError: There is no such chip or file, or the file is wrong.
         """
         self.readout = make_readout(readout, self.simulator)
         self._restart_readout(None)
@@ -100,7 +100,7 @@ class AttachedSensor(ABC):
     def _time(self) -> float:
         """The simulator's time [s]."""
         raise SceneError(
-            "this simulator does not tell its time, which read-outs and recordings need; "
+            "this simulator does not tell its time, which readouts and recordings need; "
             "write read(time=…), in seconds"
         )
 
@@ -168,13 +168,13 @@ class AttachedSensor(ABC):
         return self.simulator.electrode_names
 
     def reset(self, seed: int | None = None) -> None:
-        """Forget the previous step, as after the simulator was set back; restart the read-out.
+        """Forget the previous step, as after the simulator was set back; restart the readout.
 
         Args:
-            seed: Of the read-out's noise from now on; by default its random numbers repeat.
+            seed: Of the readout's noise from now on; by default its random numbers repeat.
 
         Raises:
-            ReadOutError: The seed is no whole number from 0 on.
+            ReadoutError: The seed is no whole number from 0 on.
         """
         with self._one:
             self.simulator.reset()
@@ -324,25 +324,29 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
     return design if isinstance(design, Simulator) else Simulator(design)
 
 
-def check_world(
-    world: object, only_geometry: Mapping[str, object], only_depth: Mapping[str, object]
+def check_perception(
+    perception: object, only_geometry: Mapping[str, object], only_depth: Mapping[str, object]
 ) -> None:
-    """Refuse an unknown kind of world, and options that belong to the other kind.
+    """Refuse an unknown kind of perception, and options that belong to the other kind.
 
     Args:
-        world: What was asked for.
+        perception: What was asked for.
         only_geometry: Options that only geometry has; those that are false were not given.
-        only_depth: Options that only depth has.
+        only_depth: Options that only a depth camera has.
 
     Raises:
         SceneError: The first thing that is wrong.
     """
-    if world not in ("geometry", "depth"):
-        raise SceneError(f'world is {world!r}; choose "geometry" or "depth"')
-    other, options = ("depth", only_depth) if world == "geometry" else ("geometry", only_geometry)
+    if perception not in ("geometry", "depth_camera"):
+        raise SceneError(f'perception is {perception!r}; choose "geometry" or "depth_camera"')
+    other, options = "geometry", only_geometry
+    if perception == "geometry":
+        other, options = "depth_camera", only_depth
     for name, value in options.items():
         if value is not None and value is not False and value != () and value != {}:
-            raise SceneError(f'{name} goes with world="{other}"; leave it out of world="{world}"')
+            raise SceneError(
+                f'{name} goes with perception="{other}"; leave it out of perception="{perception}"'
+            )
 
 
 def check_image(size: Any, resolution: Any, domain_width: float) -> tuple[float, int]:

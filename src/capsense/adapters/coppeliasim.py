@@ -11,16 +11,16 @@ from capsense.adapters.attached import check_image, make_simulator
 from capsense.adapters.coppeliasim_calls import Remote, translated
 from capsense.adapters.coppeliasim_vision import (
     CoppeliaSensor,
-    Eye,
     Paint,
+    VisionSensor,
     carrier,
-    find_eye,
-    make_eye,
+    find_vision_sensor,
+    make_vision_sensor,
 )
 from capsense.adapters.rules import Rules, as_material
 from capsense.design.model import Design
-from capsense.errors import MissingDependencyError, SceneError, SimulatorError
-from capsense.readout.read_out import ReadOut
+from capsense.errors import AdapterError, MissingDependencyError, SceneError
+from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.body import Grounding, checked_grounding
 from capsense.simulator import Simulator, make_readout
@@ -47,7 +47,7 @@ def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -
 
     Raises:
         MissingDependencyError: The client is not installed.
-        SimulatorError: Nobody answers there, or in another version of the protocol.
+        AdapterError: Nobody answers there, or in another version of the protocol.
     """
     try:
         import zmq
@@ -57,7 +57,7 @@ def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -
             "CoppeliaSim's client is not installed; pip install 'capsense[coppelia]'"
         ) from None
     if not timeout > 0:
-        raise SimulatorError(f"timeout is {timeout!r}; give seconds above zero")
+        raise AdapterError(f"timeout is {timeout!r}; give seconds above zero")
     client = RemoteAPIClient(host, port)
     client.socket.setsockopt(zmq.LINGER, 0)
     for way in (zmq.SNDTIMEO, zmq.RCVTIMEO):
@@ -65,7 +65,7 @@ def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -
     try:
         return client.require("sim")
     except zmq.Again:
-        raise SimulatorError(
+        raise AdapterError(
             f"nobody answers at {host}:{port} within {timeout:g} s; start CoppeliaSim with its "
             "ZMQ remote API server, or give its host and port"
         ) from None
@@ -87,7 +87,7 @@ def running(sim: Any) -> Iterator[Callable[[], float]]:
         A function that makes one step and returns the simulation time [s].
 
     Raises:
-        SimulatorError: CoppeliaSim does not answer, does not start, or was stopped by someone
+        AdapterError: CoppeliaSim does not answer, does not start, or was stopped by someone
             else.
     """
     remote = Remote(sim)
@@ -99,7 +99,7 @@ def running(sim: Any) -> Iterator[Callable[[], float]]:
     def step() -> float:
         remote.call("step")
         if remote.is_stopped():
-            raise SimulatorError("the simulation was stopped from elsewhere; run it again")
+            raise AdapterError("the simulation was stopped from elsewhere; run it again")
         return float(remote.call("getSimulationTime"))
 
     def leave() -> None:
@@ -110,7 +110,7 @@ def running(sim: Any) -> Iterator[Callable[[], float]]:
     try:
         yield step
     except BaseException:
-        with suppress(SimulatorError):  # what went wrong first is what matters
+        with suppress(AdapterError):  # what went wrong first is what matters
             leave()
         raise
     leave()
@@ -122,7 +122,7 @@ def _start(remote: Remote) -> None:
         if not remote.is_stopped():
             return
         remote.call("step")
-    raise SimulatorError("the simulation does not start; look for messages in CoppeliaSim")
+    raise AdapterError("the simulation does not start; look for messages in CoppeliaSim")
 
 
 def attach(
@@ -139,7 +139,7 @@ def attach(
     size: float | None = None,
     resolution: int | None = None,
     back: str | float = "fill",
-    readout: ReadOut | str | Path | None = None,
+    readout: Readout | str | Path | None = None,
 ) -> CoppeliaSensor:
     """Attach a sensor to an object; call ``read()`` after every step.
 
@@ -172,29 +172,29 @@ def attach(
         resolution: Pixels along each side of the image, 64 by default.
         back: Where what is seen ends: ``"fill"``, at the end of the domain, or after an assumed
             thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`.
-        readout: A read-out whose counts readings are to hold, a chip's name, or a file's; see
+        readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
 
     Raises:
         SceneError: There is no such object, a pattern fits nothing, its vision sensor is in
             perspective or of another resolution, or options do not go with that.
-        SimulatorError: CoppeliaSim does not answer, or is too old.
+        AdapterError: CoppeliaSim does not answer, or is too old.
         DesignError: The design is wrong.
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
     """
     if pose_in_object is not None and not isinstance(pose_in_object, Pose):
         raise SceneError(f"pose_in_object is {pose_in_object!r}; give a Pose(position, quaternion)")
     remote = Remote(sim)
     handle = remote.find(object)
-    eye = find_eye(remote, handle)
+    vision_sensor = find_vision_sensor(remote, handle)
     grounding = checked_grounding(default_grounding)
-    if eye is not None:
+    if vision_sensor is not None:
         made_only = {
             "materials": materials is not None, "exclude": len(exclude) > 0,
             "pose_in_object": pose_in_object is not None, "size": size is not None,
             "exclude_own=False": not exclude_own,
         }  # fmt: skip
-        _check_own(eye, made_only, resolution)
+        _check_own(vision_sensor, made_only, resolution)
     material = None if default_material is None else as_material(default_material)
     rules = Rules(materials or {}, {}, material or "steel", exclude=exclude)
     simulator = make_simulator(design)
@@ -203,27 +203,31 @@ def attach(
     size, pixels = check_image(size, pixels, max(domain.size[:2]))
     chip = make_readout(readout, simulator)
     paint = None
-    if eye is None:  # all is checked: only now the scene is changed
+    if vision_sensor is None:  # all is checked: only now the scene is changed
         paint = Paint(remote, rules, carrier(remote, handle) if exclude_own else None)
         pose, far = pose_in_object or Pose(), float(domain.upper[2])
-        eye = make_eye(remote, handle, pose, size, far, pixels, paint.collection)
+        vision_sensor = make_vision_sensor(
+            remote, handle, pose, size, far, pixels, paint.collection
+        )
         material = None  # the colours say it
-    sensor = CoppeliaSensor(remote, eye, simulator, grounding, back, paint, material)
+    sensor = CoppeliaSensor(remote, vision_sensor, simulator, grounding, back, paint, material)
     sensor.use_readout(sensor.readout if readout is None else chip)
     return sensor
 
 
-def _check_own(eye: Eye, made_only: Mapping[str, bool], resolution: int | None) -> None:
+def _check_own(
+    vision_sensor: VisionSensor, made_only: Mapping[str, bool], resolution: int | None
+) -> None:
     """Refuse what does not go with a vision sensor of the scene's own."""
     for name, given in made_only.items():
         if given:
             raise SceneError(
-                f"{name} goes with a vision sensor that attach makes, but {eye.path!r} is there; "
-                "leave one of them out"
+                f"{name} goes with a vision sensor that attach makes, but {vision_sensor.path!r} "
+                "is there; leave one of them out"
             )
-    rows, columns = eye.resolution
+    rows, columns = vision_sensor.resolution
     if resolution is not None and (rows, columns) != (resolution, resolution):
         raise SceneError(
-            f"vision sensor {eye.path!r} has {columns} x {rows} pixels, not {resolution} x "
-            f"{resolution}; leave resolution out, or set it there"
+            f"vision sensor {vision_sensor.path!r} has {columns} x {rows} pixels, not "
+            f"{resolution} x {resolution}; leave resolution out, or set it there"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from capsense.adapters.attached import refuse_missing
-from capsense.errors import SceneError, SimulatorError
+from capsense.errors import AdapterError, SceneError
 
 _FUNCTIONS = (
     "addItemToCollection", "createCollection", "createVisionSensor", "destroyCollection",
@@ -37,18 +37,18 @@ class Remote:
         sim: What ``client.require("sim")`` returned.
 
     Raises:
-        SimulatorError: It lacks something that a sensor needs.
+        AdapterError: It lacks something that a sensor needs.
     """
 
     def __init__(self, sim: Any) -> None:
         missing = [n for n in (*_FUNCTIONS, *_CONSTANTS) if not hasattr(sim, n)]
         if "getObject" in missing or "getSimulationTime" in missing:
-            raise SimulatorError(
+            raise AdapterError(
                 f"sim is {sim!r}; give what capsense.coppeliasim.connect() or "
                 'client.require("sim") returned'
             )
         if missing:
-            raise SimulatorError(
+            raise AdapterError(
                 f"this CoppeliaSim has no sim.{missing[0]}, which the sensor needs; it takes "
                 f"CoppeliaSim {OLDEST} or later"
             )
@@ -58,7 +58,7 @@ class Remote:
         """Call a function of ``sim``.
 
         Raises:
-            SimulatorError: It does not answer, or refuses.
+            AdapterError: It does not answer, or refuses.
         """
         try:
             return getattr(self.sim, name)(*arguments)
@@ -96,22 +96,22 @@ class Remote:
         return bool(self.call("getSimulationState") == self.constant("simulation_stopped"))
 
 
-def translated(what: str, error: Exception) -> SimulatorError:
+def translated(what: str, error: Exception) -> AdapterError:
     """What the client raised at a call, as an error that names the mend."""
     import zmq
 
     if isinstance(error, zmq.Again):
-        return SimulatorError(
+        return AdapterError(
             f"CoppeliaSim did not answer {what} in time; is it still running? Connect again"
         )
     if isinstance(error, zmq.ZMQError):
-        return SimulatorError(
+        return AdapterError(
             f"the connection to CoppeliaSim is broken since a call failed ({what}: {error}); "
             "connect and attach again"
         )
     if isinstance(error, KeyError):  # the client misses the fields of its own protocol
-        return SimulatorError(
+        return AdapterError(
             f"CoppeliaSim answered {what} in another version of the remote API; it takes "
             f"CoppeliaSim {OLDEST} or later"
         )
-    return SimulatorError(f"{what}: {str(error).replace('_=NL=_', ' ').replace('_=TB=_', ' ')}")
+    return AdapterError(f"{what}: {str(error).replace('_=NL=_', ' ').replace('_=TB=_', ' ')}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import DepthSensor
 from capsense.adapters.coppeliasim_calls import Remote
 from capsense.adapters.rules import Rules
-from capsense.errors import SceneError, SimulatorError
+from capsense.errors import AdapterError, SceneError
 from capsense.scene import Material, Pose
 from capsense.scene.body import Grounding
 from capsense.scene.camera import OrthographicCamera
@@ -37,7 +37,7 @@ _ALIAS = "capsense"
 
 
 @dataclass(frozen=True)
-class Eye:
+class VisionSensor:
     """A vision sensor. Its frame is the sensor frame: z out of the sensor."""
 
     handle: int
@@ -52,7 +52,7 @@ class CoppeliaSensor(DepthSensor):
 
     Args:
         remote: The simulator.
-        eye: What it sees with.
+        vision_sensor: What it sees with.
         simulator: The sensor itself.
         grounding: Of all conductors.
         back: Where what is seen ends.
@@ -63,7 +63,7 @@ class CoppeliaSensor(DepthSensor):
     def __init__(
         self,
         remote: Remote,
-        eye: Eye,
+        vision_sensor: VisionSensor,
         simulator: Simulator,
         grounding: Grounding,
         back: str | float,
@@ -71,7 +71,7 @@ class CoppeliaSensor(DepthSensor):
         material: Material | None,
     ) -> None:
         super().__init__(simulator)
-        self.eye = eye
+        self.vision_sensor = vision_sensor
         """The vision sensor it sees with."""
         self._remote, self._paint = remote, paint
         self._grounding, self._back, self._material = grounding, back, material
@@ -82,7 +82,7 @@ class CoppeliaSensor(DepthSensor):
     @property
     def pose(self) -> Pose:
         world = self._remote.constant("handle_world")
-        numbers = self._remote.call("getObjectPose", self.eye.handle, world)
+        numbers = self._remote.call("getObjectPose", self.vision_sensor.handle, world)
         return Pose(numbers[:3], numbers[3:])
 
     def frame(self) -> DepthFrame:
@@ -90,9 +90,9 @@ class CoppeliaSensor(DepthSensor):
 
         Raises:
             SceneError: The simulation is not running, or the vision sensor was changed.
-            SimulatorError: CoppeliaSim does not answer, or draws nothing.
+            AdapterError: CoppeliaSim does not answer, or draws nothing.
         """
-        remote, handle = self._remote, self.eye.handle
+        remote, handle = self._remote, self.vision_sensor.handle
         if remote.is_stopped():
             raise SceneError(
                 "the simulation is not running; call sim.startSimulation() and sim.step(), or "
@@ -103,47 +103,51 @@ class CoppeliaSensor(DepthSensor):
         elif not _draws(remote, handle):
             self._paint.collect(handle)  # CoppeliaSim drops collections of scripts that end
             if not _draws(remote, handle):
-                raise SimulatorError(
-                    f"CoppeliaSim draws nothing for vision sensor {self.eye.path!r}; builds and "
-                    "machines without OpenGL do not, nor does it while vision sensors are "
-                    "disabled: start the usual build, on a machine without a display under xvfb-run"
+                raise AdapterError(
+                    f"CoppeliaSim draws nothing for vision sensor {self.vision_sensor.path!r}; "
+                    "builds and machines without OpenGL do not, nor does it while vision sensors "
+                    "are disabled: start the usual build, on a machine without a display under "
+                    "xvfb-run"
                 )
         depth = self._image("getVisionSensorDepth", np.dtype("<f4"), 1, 1)
         seen: Any = self._material
         if seen is None:
             seen = self._image("getVisionSensorImg", np.dtype("u1"), 3)
-        return DepthFrame(depth, seen, self.eye.camera, grounding=self._grounding, back=self._back)
+        return DepthFrame(
+            depth, seen, self.vision_sensor.camera, grounding=self._grounding, back=self._back
+        )
 
     def refresh(self) -> None:
         """Colour the world's shapes again, and collect anew which are seen, after some were added.
 
         Raises:
             SceneError: A name pattern fits nothing.
-            SimulatorError: CoppeliaSim does not answer.
+            AdapterError: CoppeliaSim does not answer.
         """
         if self._paint is not None:
-            self._paint.collect(self.eye.handle)
+            self._paint.collect(self.vision_sensor.handle)
 
     def remove(self) -> None:
         """Take the vision sensor that was made for this one out of the scene again.
 
         Raises:
-            SimulatorError: CoppeliaSim does not answer, or it is gone already.
+            AdapterError: CoppeliaSim does not answer, or it is gone already.
         """
         if self._paint is not None:
-            _remove_eye(self._remote, self.eye.handle)
+            _remove_vision_sensor(self._remote, self.vision_sensor.handle)
 
     def _image(
         self, name: str, kind: np.dtype[Any], channels: int, *options: int
     ) -> NDArray[np.generic]:
-        data, (columns, rows) = self._remote.call(name, self.eye.handle, *options)
-        if (rows, columns) != self.eye.resolution:
+        data, (columns, rows) = self._remote.call(name, self.vision_sensor.handle, *options)
+        known = self.vision_sensor.resolution
+        if (rows, columns) != known:
             raise SceneError(
-                f"vision sensor {self.eye.path!r} now has {columns} x {rows} pixels, not "
-                f"{self.eye.resolution[1]} x {self.eye.resolution[0]}; attach again"
+                f"vision sensor {self.vision_sensor.path!r} now has {columns} x {rows} pixels, not "
+                f"{known[1]} x {known[0]}; attach again"
             )
         if len(data) != rows * columns * channels * kind.itemsize:
-            raise SimulatorError(
+            raise AdapterError(
                 f"sim.{name} gave {len(data)} bytes for {columns} x {rows} pixels of "
                 f"{channels * kind.itemsize} bytes"
             )
@@ -172,17 +176,17 @@ class Paint:
         self.collection = self._paint(self._shapes())
         """Handle of the collection of what is seen."""
 
-    def collect(self, eye: int) -> None:
+    def collect(self, vision_sensor: int) -> None:
         """Colour the shapes that there are now, and show them to a vision sensor.
 
         Raises:
             SceneError: A name pattern fits nothing.
         """
         shapes = self._shapes()  # refuses wrong patterns before the scene is changed
-        with suppress(SimulatorError):  # it may be gone already
+        with suppress(AdapterError):  # it may be gone already
             self._remote.call("destroyCollection", self.collection)
         self.collection = self._paint(shapes)
-        show(self._remote, eye, self.collection)
+        show(self._remote, vision_sensor, self.collection)
 
     def _shapes(self) -> dict[int, tuple[tuple[str, str], float]]:
         """Names and code, from 0 to 1, of every shape in the scene.
@@ -216,28 +220,30 @@ class Paint:
         return collection
 
 
-def find_eye(remote: Remote, handle: int) -> Eye | None:
+def find_vision_sensor(remote: Remote, handle: int) -> VisionSensor | None:
     """The vision sensor that an object is, or carries; None where it has none.
 
-    Those that :func:`make_eye` made for it earlier do not count.
+    Those that :func:`make_vision_sensor` made for it earlier do not count.
 
     Raises:
         SceneError: It has several, or the one is in perspective.
     """
     if remote.call("getObjectType", handle) == remote.constant("sceneobject_visionsensor"):
-        return _read_eye(remote, handle)
-    found = [eye for eye, name in _children(remote, handle).items() if name != _ALIAS]
+        return _read_vision_sensor(remote, handle)
+    found = [
+        vision_sensor for vision_sensor, name in _children(remote, handle).items() if name != _ALIAS
+    ]
     if len(found) > 1:
         paths = ", ".join(repr(remote.path(h)) for h in found)
         raise SceneError(
             f"{remote.path(handle)!r} carries {len(found)} vision sensors ({paths}); name one"
         )
-    return _read_eye(remote, found[0]) if found else None
+    return _read_vision_sensor(remote, found[0]) if found else None
 
 
-def make_eye(
+def make_vision_sensor(
     remote: Remote, handle: int, pose: Pose, size: float, far: float, resolution: int, seen: int
-) -> Eye:
+) -> VisionSensor:
     """An orthographic vision sensor on an object, in the place of one made there earlier.
 
     Args:
@@ -251,31 +257,33 @@ def make_eye(
     """
     for old, name in _children(remote, handle).items():
         if name == _ALIAS:
-            _remove_eye(remote, old)
+            _remove_vision_sensor(remote, old)
     sizes = [NEAR, far, size, 0.01] + [0.0] * 7
-    eye = int(remote.call("createVisionSensor", _OPTIONS, [resolution] * 2 + [0, 0], sizes))
-    remote.call("setObjectAlias", eye, _ALIAS)
-    remote.call("setObjectParent", eye, handle, False)
-    remote.call("setObjectPose", eye, [*pose.position, *pose.quaternion], handle)
+    vision_sensor = int(
+        remote.call("createVisionSensor", _OPTIONS, [resolution] * 2 + [0, 0], sizes)
+    )
+    remote.call("setObjectAlias", vision_sensor, _ALIAS)
+    remote.call("setObjectParent", vision_sensor, handle, False)
+    remote.call("setObjectPose", vision_sensor, [*pose.position, *pose.quaternion], handle)
     mode = remote.constant("visionintparam_render_mode")
-    remote.call("setObjectInt32Param", eye, mode, _AUXILIARY_CHANNELS)
-    show(remote, eye, seen)
-    return _read_eye(remote, eye)
+    remote.call("setObjectInt32Param", vision_sensor, mode, _AUXILIARY_CHANNELS)
+    show(remote, vision_sensor, seen)
+    return _read_vision_sensor(remote, vision_sensor)
 
 
-def show(remote: Remote, eye: int, collection: int) -> None:
+def show(remote: Remote, vision_sensor: int, collection: int) -> None:
     """Let a vision sensor see what is in a collection."""
     entity = remote.constant("visionintparam_entity_to_render")
-    remote.call("setObjectInt32Param", eye, entity, collection)
+    remote.call("setObjectInt32Param", vision_sensor, entity, collection)
 
 
-def _draws(remote: Remote, eye: int) -> bool:
+def _draws(remote: Remote, vision_sensor: int) -> bool:
     """Let a vision sensor look; whether anything was drawn, be it the background alone.
 
     A vision sensor that drew returns figures of its image, fifteen numbers; one that could not,
     for want of OpenGL or of its collection, returns none.
     """
-    found = remote.call("handleVisionSensor", eye)
+    found = remote.call("handleVisionSensor", vision_sensor)
     return not isinstance(found, list | tuple) or len(found) < 2 or len(found[1]) > 0
 
 
@@ -287,22 +295,25 @@ def carrier(remote: Remote, handle: int) -> int | None:
     return handle if handle >= 0 else None
 
 
-def _remove_eye(remote: Remote, eye: int) -> None:
+def _remove_vision_sensor(remote: Remote, vision_sensor: int) -> None:
     """Remove a vision sensor made here, and the collection of what it sees."""
     entity = remote.constant("visionintparam_entity_to_render")
-    with suppress(SimulatorError):  # CoppeliaSim drops collections of scripts that end
-        remote.call("destroyCollection", remote.call("getObjectInt32Param", eye, entity))
-    remote.call("removeObjects", [eye])
+    with suppress(AdapterError):  # CoppeliaSim drops collections of scripts that end
+        remote.call("destroyCollection", remote.call("getObjectInt32Param", vision_sensor, entity))
+    remote.call("removeObjects", [vision_sensor])
 
 
 def _children(remote: Remote, handle: int) -> dict[int, str]:
     """The vision sensors that an object carries, and their names."""
     kind = remote.constant("sceneobject_visionsensor")
     found = remote.call("getObjectsInTree", handle, kind, _CHILDREN)
-    return {int(eye): str(remote.call("getObjectAlias", eye)) for eye in found}
+    return {
+        int(vision_sensor): str(remote.call("getObjectAlias", vision_sensor))
+        for vision_sensor in found
+    }
 
 
-def _read_eye(remote: Remote, handle: int) -> Eye:
+def _read_vision_sensor(remote: Remote, handle: int) -> VisionSensor:
     def number(name: str) -> float:
         get = "getObjectInt32Param" if name.startswith("visionint") else "getObjectFloatParam"
         return float(remote.call(get, handle, remote.constant(name)))
@@ -324,4 +335,4 @@ def _read_eye(remote: Remote, handle: int) -> Eye:
         far=number("visionfloatparam_far_clipping") * (1 - _SLACK),
         rows="+y", columns="-x",
     )  # fmt: skip
-    return Eye(handle, path, camera, (rows, columns))
+    return VisionSensor(handle, path, camera, (rows, columns))

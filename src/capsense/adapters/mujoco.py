@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import GeometrySensor, check_world, make_simulator
+from capsense.adapters.attached import GeometrySensor, check_perception, make_simulator
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
 from capsense.adapters.mujoco_spec import add_sensor
@@ -18,7 +18,7 @@ from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.scene import Material
 from capsense.scene.body import Grounding, checked_grounding
 from capsense.simulator import Simulator
@@ -42,7 +42,7 @@ def attach(
     site: str,
     design: Design | str | Path | Simulator = "six_patch",
     *,
-    world: Literal["geometry", "depth"] = "geometry",
+    perception: Literal["geometry", "depth_camera"] = "geometry",
     materials: Mapping[str, Material | str] | None = None,
     grounding: Mapping[str, Grounding] | None = None,
     default_material: Material | str = "steel",
@@ -53,13 +53,13 @@ def attach(
     groups: Collection[int] | None = None,
     camera: str | None = None,
     back: str | float = "fill",
-    readout: ReadOut | str | Path | None = None,
+    readout: Readout | str | Path | None = None,
 ) -> MujocoSensor | MujocoDepthSensor:
     """Attach a sensor to a site of a model; call ``read()`` after every ``mj_step``.
 
     The site's frame is the sensor frame: origin at the centre of the electrode plane, z out of
-    the sensor. With ``world="geometry"`` geoms become solids once, at this call, and only their
-    poses and the vertices of flexes are taken at a reading.
+    the sensor. With ``perception="geometry"`` geoms become solids once, at this call, and only
+    their poses and the vertices of flexes are taken at a reading.
 
     Patterns are shell patterns. They are tried on a geom's name (``geom3`` for the unnamed
     third, say), on its body's name, and on ``body/geom``; on a flex's name. The model can say the
@@ -68,11 +68,11 @@ def attach(
     then the model's texts, then the defaults. A capacitance to ground is that of all geoms that
     its pattern fits, together.
 
-    With ``world="depth"`` the sensor sees the image of an orthographic camera that a rangefinder
-    reads, which needs no OpenGL::
+    With ``perception="depth_camera"`` the sensor sees the image of an orthographic camera that a
+    rangefinder reads, which needs no OpenGL::
 
-        <camera name="eye" projection="orthographic" resolution="64 64" fovy="0.5"/>
-        <rangefinder camera="eye" data="depth"/>
+        <camera name="pad" projection="orthographic" resolution="64 64" fovy="0.5"/>
+        <rangefinder camera="pad" data="depth"/>
 
     The camera should sit on the body of the site and look along the site's z: its frame is the
     site's, turned half round about x. It does not see the geoms of that body. Its rays tell no
@@ -83,7 +83,8 @@ def attach(
         data: Its state.
         site: Name of the site that carries the sensor.
         design: A design, a packaged name, a design file, or a ready simulator.
-        world: ``"geometry"``, the shapes themselves, or ``"depth"``, the image of a camera.
+        perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, the image of a
+            camera.
         materials: Name pattern → material; the first that fits decides. Geometry only.
         grounding: Name pattern → grounding; the first that fits decides. Geometry only.
         default_material: Material of everything else.
@@ -96,16 +97,16 @@ def attach(
         camera: Name of the camera; by default that of the site. Depth only.
         back: Where what the camera sees ends: ``"fill"``, at the end of the domain, or after an
             assumed thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
-        readout: A read-out whose counts readings are to hold, a chip's name, or a file's; see
+        readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
         SceneError: There is no such site or camera, a pattern fits nothing, a shape is not
             supported, the camera is not orthographic or nothing reads it, the data belong to
-            another model, or an option belongs to the other kind of world.
+            another model, or an option belongs to the other kind of perception.
         DesignError: The design is wrong.
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
     """
     _require()
     _check_pair(model, data)
@@ -113,12 +114,12 @@ def attach(
         "materials": materials, "grounding": grounding, "exclude": exclude, "hull": hull,
         "groups": groups, "exclude_own=False": not exclude_own,
     }  # fmt: skip
-    check_world(world, only_geometry, {"camera": camera, "back": back != "fill"})
+    check_perception(perception, only_geometry, {"camera": camera, "back": back != "fill"})
     number = find_site(model, site)
-    if world == "depth":
-        eye = find_camera(model, site if camera is None else camera)
+    if perception == "depth_camera":
+        depth_camera = find_camera(model, site if camera is None else camera)
         sensor: MujocoSensor | MujocoDepthSensor = MujocoDepthSensor(
-            model, data, number, eye, make_simulator(design), default_material,
+            model, data, number, depth_camera, make_simulator(design), default_material,
             checked_grounding(default_grounding), back,
         )  # fmt: skip
         sensor.use_readout(sensor.readout if readout is None else readout)
@@ -170,7 +171,7 @@ def attach_skin(
         exclude_own: Leave out the geoms of the body that carries a sensor, for that sensor.
         hull: Name patterns of mesh geoms that are taken as their convex hulls.
         groups: See only geoms of these groups; default all.
-        readout: Name of the chip behind every sensor, or the path of a read-out file.
+        readout: Name of the chip behind every sensor, or the path of a readout file.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
@@ -178,7 +179,7 @@ def attach_skin(
         SceneError: There is no such site, a pattern fits nothing, a shape is not supported, or
             the data belong to another model.
         DesignError: A design is wrong.
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
     """
     _require()
     _check_pair(model, data)

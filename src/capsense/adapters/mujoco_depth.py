@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Eye:
+class DepthCamera:
     """A camera and where its depths lie among the sensor data."""
 
     number: int
@@ -46,7 +46,7 @@ class MujocoDepthSensor(DepthSensor):
         model: mujoco.MjModel,
         data: mujoco.MjData,
         site: int,
-        eye: Eye,
+        camera: DepthCamera,
         simulator: Simulator,
         material: Material | str,
         grounding: Grounding,
@@ -57,12 +57,12 @@ class MujocoDepthSensor(DepthSensor):
         """The model."""
         self.data = data
         """The state that readings are taken of."""
-        self._site, self._eye = site, eye
+        self._site, self._depth_camera = site, camera
         self._material, self._grounding, self._back = material, grounding, back
-        width = eye.height * eye.columns / eye.rows
+        width = camera.height * camera.columns / camera.rows
         far = float(simulator.design.domain.upper[2])
-        self._camera = OrthographicCamera.opengl(width, eye.height, Pose(), far=far)
-        self._same_body = model.site_bodyid[site] == model.cam_bodyid[eye.number]
+        self._camera = OrthographicCamera.opengl(width, camera.height, Pose(), far=far)
+        self._same_body = model.site_bodyid[site] == model.cam_bodyid[camera.number]
         self._placed: OrthographicCamera | None = None
         DepthFrame(np.zeros((1, 1)), material, grounding=grounding, back=back)  # checks them
 
@@ -73,30 +73,30 @@ class MujocoDepthSensor(DepthSensor):
             SceneError: The simulator has not been stepped yet.
         """
         check_stepped(self.data, self._site)
-        eye = self._eye
-        depth = self.data.sensordata[eye.start : eye.start + eye.rows * eye.columns]
+        camera = self._depth_camera
+        depth = self.data.sensordata[camera.start : camera.start + camera.rows * camera.columns]
         return DepthFrame(
-            depth.reshape(eye.rows, eye.columns), self._material, self._camera_now(),
+            depth.reshape(camera.rows, camera.columns), self._material, self._camera_now(),
             grounding=self._grounding, back=self._back,
         )  # fmt: skip
 
     def check(self) -> list[str]:
-        eye, size = self._eye, self._design.domain.size
-        name, far = self.model.camera(eye.number).name, self._camera.far
+        camera, size = self._depth_camera, self._design.domain.size
+        name, far = self.model.camera(camera.number).name, self._camera.far
         found = []
-        if eye.height > 4 * max(size[:2]):
+        if camera.height > 4 * max(size[:2]):
             found.append(
-                f"camera {name!r} shows {eye.height:g} m; give it the height of its image in "
+                f"camera {name!r} shows {camera.height:g} m; give it the height of its image in "
                 f'metres, like fovy="{max(size[:2]):g}" (without it, MuJoCo takes 45)'
             )
-        elif eye.height / eye.rows > max(size[:2]) / 16:
+        elif camera.height / camera.rows > max(size[:2]) / 16:
             found.append(
-                f"camera {name!r} has pixels of {1e3 * eye.height / eye.rows:.0f} mm; give it more "
-                'of them, like resolution="64 64"'
+                f"camera {name!r} has pixels of {1e3 * camera.height / camera.rows:.0f} mm; give "
+                'it more of them, like resolution="64 64"'
             )
-        if 0 < eye.cutoff < far:
+        if 0 < camera.cutoff < far:
             found.append(
-                f"the rangefinder of camera {name!r} is cut off at {eye.cutoff:g} m, where "
+                f"the rangefinder of camera {name!r} is cut off at {camera.cutoff:g} m, where "
                 f"everything beyond seems to stand; leave cutoff out, or let it be {far:g} or more"
             )
         if self._camera_now().pose.rotation[2, 2] < 0.5:
@@ -118,7 +118,7 @@ class MujocoDepthSensor(DepthSensor):
         """The camera in the sensor frame; a fixed one on the site's own body is placed once."""
         if self._placed is not None:
             return self._placed
-        number = self._eye.number
+        number = self._depth_camera.number
         view = self.pose.inverse() @ _pose(self.data.cam_xpos[number], self.data.cam_xmat[number])
         c = self._camera
         camera = OrthographicCamera.opengl(c.width, c.height, view, far=c.far)
@@ -142,7 +142,7 @@ def find_site(model: mujoco.MjModel, name: str) -> int:
     return int(site)
 
 
-def find_camera(model: mujoco.MjModel, name: str) -> Eye:
+def find_camera(model: mujoco.MjModel, name: str) -> DepthCamera:
     """An orthographic camera that a rangefinder reads.
 
     Raises:
@@ -170,7 +170,7 @@ def find_camera(model: mujoco.MjModel, name: str) -> Eye:
         if reads == wanted and int(model.sensor_dim[k]) == rows * columns:
             height = float(model.cam_fovy[number])
             cutoff = float(model.sensor_cutoff[k])
-            return Eye(int(number), int(model.sensor_adr[k]), rows, columns, height, cutoff)
+            return DepthCamera(int(number), int(model.sensor_adr[k]), rows, columns, height, cutoff)
     raise SceneError(
         f'nothing reads the depths of camera {name!r}; add <rangefinder camera="{name}" '
         'data="depth"/> to the <sensor> section'

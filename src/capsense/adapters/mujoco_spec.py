@@ -33,7 +33,7 @@ def add_sensor(
             z out of the sensor.
         name: Of the site, and of the camera.
         camera: Width and height [m] of the image of an orthographic camera with a rangefinder,
-            for ``attach(…, world="depth")``; by default there is none.
+            for ``attach(…, perception="depth_camera")``; by default there is none.
         resolution: Pixels along each side of the image.
 
     Returns:

@@ -11,9 +11,9 @@ import warp as wp
 from capsense.adapters.mujoco_depth import find_site
 from capsense.adapters.mujoco_model import ModelReader
 from capsense.adapters.parallel import (
-    Options,
+    ParallelOptions,
     ParallelSensors,
-    Part,
+    WorldShape,
     as_numbers,
     warn_left_out,
 )
@@ -48,8 +48,8 @@ class CapacitiveSensors(ParallelSensors):
         exclude_own: Leave out the geoms of the body that carries a sensor, for that sensor.
         hull: Name patterns of mesh geoms that are taken as their convex hulls.
         groups: See only geoms of these groups; default all.
-        options: Further keywords of :class:`~capsense.adapters.parallel.Options`: ``device``,
-            ``preset``, ``budget``.
+        options: Further keywords of :class:`~capsense.adapters.parallel.ParallelOptions`:
+            ``device``, ``preset``, ``budget``.
 
     Raises:
         SceneError: There is no such site, a pattern fits nothing, or nothing can be seen.
@@ -78,7 +78,7 @@ class CapacitiveSensors(ParallelSensors):
         )
         reader = ModelReader(model, rules)
         geoms: list[int] = []
-        parts: list[Part] = []
+        parts: list[WorldShape] = []
         flat: list[str] = []
         for geom in range(model.ngeom):
             if groups is not None and int(model.geom_group[geom]) not in groups:
@@ -92,7 +92,7 @@ class CapacitiveSensors(ParallelSensors):
             body = Body(solid.shape, Pose(), solid.material, solid.tie.grounding)
             geoms.append(geom)
             own = int(model.geom_bodyid[geom])
-            parts.append(Part((solid.label,), own if own > 0 else -1, body))
+            parts.append(WorldShape((solid.label,), own if own > 0 else -1, body))
         warn_left_out(flat, "a fleet sees no planes and terrains")
         numbers = [find_site(model, site) for site in sites]
         carriers = [
@@ -101,7 +101,7 @@ class CapacitiveSensors(ParallelSensors):
         device = data.geom_xpos.device
         super().__init__(
             parts, carriers, data.geom_xpos.shape[0],
-            Options(design, Rules(), exclude_own, **options), device,
+            ParallelOptions(design, Rules(), exclude_own, **options), device,
         )  # fmt: skip
         self._geoms = as_numbers(geoms, device)
         self._numbers = as_numbers(numbers, device)
@@ -111,10 +111,10 @@ class CapacitiveSensors(ParallelSensors):
 
         Args:
             data: ``mujoco_warp.Data`` after ``forward`` or ``step``.
-            time: As of :meth:`Fleet.step`, where a read-out is used.
+            time: As of :meth:`Fleet.step`, where a readout is used.
 
         Raises:
-            ReadOutError: As by :meth:`Fleet.step`.
+            ReadoutError: As by :meth:`Fleet.step`.
             SolveError: As by :meth:`Fleet.step`.
         """
         for position, matrix, number, out in (

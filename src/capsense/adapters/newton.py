@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from capsense.adapters.meshes import solid_mesh
 from capsense.adapters.parallel import (
-    Options,
+    ParallelOptions,
     ParallelSensors,
-    Part,
+    WorldShape,
     as_numbers,
     matching,
     warn_left_out,
@@ -56,8 +56,8 @@ class SensorCapacitance(ParallelSensors):
         exclude: Label patterns of shapes that no sensor sees.
         exclude_own: Leave out the shapes of the body that carries a sensor, for that sensor.
         hull: Label patterns of meshes that are taken as their convex hulls.
-        options: Further keywords of :class:`~capsense.adapters.parallel.Options`: ``device``,
-            ``preset``, ``budget``.
+        options: Further keywords of :class:`~capsense.adapters.parallel.ParallelOptions`:
+            ``device``, ``preset``, ``budget``.
 
     Raises:
         SceneError: There is no such site, a pattern fits nothing, nothing can be seen, or worlds
@@ -89,7 +89,7 @@ class SensorCapacitance(ParallelSensors):
         site = (model.shape_flags.numpy()[table[0]] & int(ShapeFlags.SITE)) != 0
         labels = [model.shape_label[k] for k in table[0].tolist()]
         reader = _Reader(model, rules)
-        parts: list[Part] = []
+        parts: list[WorldShape] = []
         columns: list[int] = []
         left: list[str] = []
         carrier = model.shape_body.numpy()
@@ -98,7 +98,7 @@ class SensorCapacitance(ParallelSensors):
                 left.append(labels[column])
                 continue
             bodies = [reader.body(k, labels[column]) for k in table[:, column].tolist()]
-            parts.append(Part((labels[column],), int(carrier[table[0, column]]), bodies))
+            parts.append(WorldShape((labels[column],), int(carrier[table[0, column]]), bodies))
             columns.append(column)
         warn_left_out(left, "a fleet sees no planes, height fields, cones and Gaussians")
         known = np.flatnonzero(site)
@@ -107,7 +107,11 @@ class SensorCapacitance(ParallelSensors):
         carriers = [(labels[k], int(carrier[table[0, k]])) for k in chosen.tolist()]
         device = model.shape_transform.device
         super().__init__(
-            parts, carriers, len(table), Options(design, rules, exclude_own, **options), device
+            parts,
+            carriers,
+            len(table),
+            ParallelOptions(design, rules, exclude_own, **options),
+            device,
         )
         local = model.shape_transform.numpy()
         seen = np.array([columns[k] for k in self.chosen])
@@ -129,10 +133,10 @@ class SensorCapacitance(ParallelSensors):
 
         Args:
             state: The state, whose ``body_q`` is up to date.
-            time: As of :meth:`Fleet.step`, where a read-out is used.
+            time: As of :meth:`Fleet.step`, where a readout is used.
 
         Raises:
-            ReadOutError: As by :meth:`Fleet.step`.
+            ReadoutError: As by :meth:`Fleet.step`.
             SolveError: As by :meth:`Fleet.step`.
         """
         bodies = state.body_q

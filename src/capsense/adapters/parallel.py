@@ -22,7 +22,7 @@ _SHOWN = 6
 
 
 @dataclass(frozen=True)
-class Options:
+class ParallelOptions:
     """What a sensor in many worlds is, and how it is solved."""
 
     design: Design | str | Path = "six_patch"
@@ -39,7 +39,7 @@ class Options:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class WorldShape:
     """One shape of a world, in all worlds."""
 
     names: Names
@@ -66,10 +66,10 @@ class ParallelSensors:
 
     def __init__(
         self,
-        parts: Sequence[Part],
+        parts: Sequence[WorldShape],
         sites: Sequence[tuple[str, int]],
         worlds: int,
-        options: Options,
+        options: ParallelOptions,
         device: Any,
     ) -> None:
         options.rules.check([part.names for part in parts])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from capsense.design.model import Conductor, Design, Electrode
 from capsense.scene import Body, Layers, Scene, TriMesh
-from capsense.scene.mesh_shape import Triangles
+from capsense.scene.mesh_shape import TriangleShape
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS
 
@@ -105,13 +105,13 @@ def _coarse(body: Body, panels: int) -> list[str]:
 def distances(body: Body, points: Array) -> Array:
     """Distances of points to a body [m], negative inside; of an open mesh, by its winding."""
     local, shape = body.pose.inverse().apply(points), body.shape
-    if not isinstance(shape, Triangles) or shape.closed:
+    if not isinstance(shape, TriangleShape) or shape.closed:
         return shape.signed_distance(local)
     off = shape.distance(local)
     return np.where(_wound(shape, local), -off, off)
 
 
-def _wound(shape: Triangles, points: Array) -> NDArray[np.bool_]:
+def _wound(shape: TriangleShape, points: Array) -> NDArray[np.bool_]:
     """Points that an open surface winds round by more than a half.
 
     A. Jacobson, L. Kavan, O. Sorkine-Hornung, *Robust inside-outside segmentation using

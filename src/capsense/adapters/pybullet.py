@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import (
     GeometrySensor,
     check_image,
-    check_world,
+    check_perception,
     make_simulator,
     refuse_missing,
 )
@@ -24,7 +24,7 @@ from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.body import Grounding
 from capsense.simulator import Simulator
@@ -45,7 +45,7 @@ def attach(
     pose_in_link: Pose = _NO_POSE,
     design: Design | str | Path | Simulator = "six_patch",
     *,
-    world: Literal["geometry", "depth"] = "geometry",
+    perception: Literal["geometry", "depth_camera"] = "geometry",
     shapes: Shapes = "collision",
     materials: Mapping[str, Material | str] | None = None,
     grounding: Mapping[str, Grounding] | None = None,
@@ -57,12 +57,12 @@ def attach(
     size: float | None = None,
     resolution: int = 64,
     back: str | float = "fill",
-    readout: ReadOut | str | Path | None = None,
+    readout: Readout | str | Path | None = None,
 ) -> PybulletSensor | PybulletDepthSensor:
     """Attach a sensor to a link; call ``read()`` after every ``stepSimulation``.
 
-    With ``world="geometry"`` shapes become solids once, at this call, and again when bodies were
-    added or removed; only poses and the vertices of soft bodies are taken at a reading.
+    With ``perception="geometry"`` shapes become solids once, at this call, and again when bodies
+    were added or removed; only poses and the vertices of soft bodies are taken at a reading.
 
     Patterns are shell patterns. They are tried on a link's name, on its body's name, and on
     ``body/link``; bodies without a name are called ``body3``, say. A body can say the same in its
@@ -70,9 +70,9 @@ def attach(
     ``"capsense.grounding"``. What is given here comes first, then user data, then the defaults.
     A capacitance to ground is that of all links that its pattern fits, together.
 
-    With ``world="depth"`` the sensor sees what TinyRenderer draws from the sensor's origin along
-    its z, which needs no OpenGL: visual shapes, each with its material. All conductors in the
-    image are one body. What is left out still hides what stands behind it.
+    With ``perception="depth_camera"`` the sensor sees what TinyRenderer draws from the sensor's
+    origin along its z, which needs no OpenGL: visual shapes, each with its material. All
+    conductors in the image are one body. What is left out still hides what stands behind it.
 
     Args:
         client: What ``pybullet.connect`` returned, or a ``BulletClient``.
@@ -81,7 +81,7 @@ def attach(
         pose_in_link: The sensor frame in the link's frame (the URDF frame, not the centre of
             mass): origin at the centre of the electrode plane, z out of the sensor.
         design: A design, a packaged name, a design file, or a ready simulator.
-        world: ``"geometry"``, the shapes themselves, or ``"depth"``, a rendered image.
+        perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, a rendered image.
         shapes: ``"collision"``: what Bullet collides with, where a mesh is the convex hull of
             each of its connected parts; or ``"visual"``: what it draws, meshes as they are.
             Geometry only.
@@ -98,15 +98,15 @@ def attach(
         resolution: Pixels along each side of the image. Depth only.
         back: Where what is drawn ends: ``"fill"``, at the end of the domain, or after an assumed
             thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
-        readout: A read-out whose counts readings are to hold, a chip's name, or a file's; see
+        readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
         SceneError: There is no such client, body or link, a pattern fits nothing, a shape is
-            not supported, or an option is out of range or belongs to the other kind of world.
+            not supported, or an option is out of range or belongs to the other kind of perception.
         DesignError: The design is wrong.
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
     """
     _require()
     _check_shapes(shapes)
@@ -114,7 +114,7 @@ def attach(
         "grounding": grounding, "hull": hull, 'shapes="visual"': shapes == "visual",
     }  # fmt: skip
     only_depth = {"size": size, "resolution": resolution != 64, "back": back != "fill"}
-    check_world(world, only_geometry, only_depth)
+    check_perception(perception, only_geometry, only_depth)
     if not isinstance(pose_in_link, Pose):
         raise SceneError(f"pose_in_link is {pose_in_link!r}; give a Pose(position, quaternion)")
     rules = Rules(
@@ -123,7 +123,7 @@ def attach(
     number = _client_number(client)
     index = _find_link(number, body, link)
     simulator = make_simulator(design)
-    if world == "depth":
+    if perception == "depth_camera":
         size, resolution = check_image(size, resolution, max(simulator.design.domain.size[:2]))
         sensor: PybulletSensor | PybulletDepthSensor = PybulletDepthSensor(
             number, body, index, pose_in_link, simulator, rules,
@@ -175,7 +175,7 @@ def attach_skin(
         exclude: Name patterns of links that no sensor sees.
         exclude_own: Leave out the link that carries a sensor, for that sensor.
         hull: Name patterns of links whose visual meshes are taken as their convex hulls.
-        readout: Name of the chip behind every sensor, or the path of a read-out file.
+        readout: Name of the chip behind every sensor, or the path of a readout file.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
@@ -183,7 +183,7 @@ def attach_skin(
         SceneError: There is no such client, body or link, a pattern fits nothing, or a shape is
             not supported.
         DesignError: A design is wrong.
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
     """
     _require()
     _check_shapes(shapes)

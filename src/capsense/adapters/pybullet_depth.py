@@ -23,11 +23,11 @@ from capsense.simulator import Simulator
 Array = NDArray[np.float64]
 
 _WITHDRAWN = 5.0
-"""How far behind the sensor the renderer's eye stands [m]. TinyRenderer drops the faces that are
-turned away from the eye as in a perspective view, which eats silhouettes away where it is near."""
+"""Distance of the renderer's camera behind the sensor [m]. TinyRenderer drops the faces that are
+turned away from the camera as in a perspective view, which erodes silhouettes where it is near."""
 _NEAR = 1e-4
 """Depth from which on things are seen [m]; what stands before is cut off."""
-_EYE = Pose((0.0, 0.0, -_WITHDRAWN), (1.0, 0.0, 0.0, 0.0))
+_CAMERA = Pose((0.0, 0.0, -_WITHDRAWN), (1.0, 0.0, 0.0, 0.0))
 """The OpenGL camera, which looks along its −z, in the sensor frame."""
 
 
@@ -76,7 +76,7 @@ class PybulletDepthSensor(DepthSensor):
             if (self.body, self.link) not in [(k.body, k.link) for k in links]:
                 raise gone(self.body)
         n = self._resolution
-        view = (self.pose @ _EYE).inverse().matrix.T.ravel().tolist()
+        view = (self.pose @ _CAMERA).inverse().matrix.T.ravel().tolist()
         image = p.getCameraImage(
             n, n, view, self._projection, renderer=p.ER_TINY_RENDERER,
             flags=p.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX, physicsClientId=self.client,

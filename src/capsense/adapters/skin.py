@@ -6,12 +6,12 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from capsense._crew import Crew, OneAtATime
+from capsense._thread_pool import OneAtATime, ThreadPool
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
-from capsense.errors import ReadOutError, SceneError
+from capsense.errors import ReadoutError, SceneError
 from capsense.reading import Reading
-from capsense.readout.read_out import SEED_STRIDE, ReadOut
+from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene import Pose
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign, make_simulators, read_all
@@ -24,26 +24,26 @@ class AttachedSkin:
 
     Args:
         sensors: Name → sensor; they share one source of their world.
-        readout: Name of the chip behind every sensor, the path of a read-out file, or None. Each
+        readout: Name of the chip behind every sensor, the path of a readout file, or None. Each
             has noise of its own, see :meth:`reset`.
         threads: How many threads read; by default as many as the process may use processors.
 
     Raises:
         SceneError: ``threads`` is not a positive whole number.
-        ReadOutError: There is no such chip or file, or the file is wrong.
+        ReadoutError: There is no such chip or file, or the file is wrong.
     """
 
     def __init__(
         self, sensors: Mapping[str, GeometrySensor], readout: str | Path | None, threads: int | None
     ) -> None:
-        if isinstance(readout, ReadOut):
-            raise ReadOutError(
+        if isinstance(readout, Readout):
+            raise ReadoutError(
                 f"{readout!r} would be shared by all sensors; give a chip's name or a file"
             )
         self.sensors = dict(sensors)
         """The sensors, as ``attach`` makes them."""
         self._source = next(iter(self.sensors.values())).source
-        self._crew, self._one = Crew(threads), OneAtATime()
+        self._pool, self._one = ThreadPool(threads), OneAtATime()
         for sensor in self.sensors.values():
             sensor.use_readout(readout)
         first = next(iter(self.sensors.values())).readout
@@ -56,7 +56,7 @@ class AttachedSkin:
         They are those that the sensors would give one by one, to the last bit.
 
         Args:
-            time: Time of the state [s], for read-outs; by default the simulator's own, where it
+            time: Time of the state [s], for readouts; by default the simulator's own, where it
                 tells it.
 
         Raises:
@@ -71,7 +71,7 @@ class AttachedSkin:
             links = self._source.links()
             for sensor in self.sensors.values():
                 sensor.catch_up()
-            return read_all(self._crew, {name: task(s) for name, s in self.sensors.items()})
+            return read_all(self._pool, {name: task(s) for name, s in self.sensors.items()})
 
     def check(self) -> dict[str, list[str]]:
         """What is wrong with each sensor, by name; see :meth:`AttachedSensor.check`.
@@ -119,14 +119,14 @@ class AttachedSkin:
                 sensor.catch_up()
 
     def reset(self, seed: int | None = None) -> None:
-        """Forget the previous step, as after the simulator was set back; restart read-outs.
+        """Forget the previous step, as after the simulator was set back; restart readouts.
 
         Args:
-            seed: Of the first sensor's read-out; those of the others follow at steps of 2³², so
+            seed: Of the first sensor's readout; those of the others follow at steps of 2³², so
                 that noise is not shared. By default all random numbers repeat.
 
         Raises:
-            ReadOutError: The seed is no whole number from 0 on.
+            ReadoutError: The seed is no whole number from 0 on.
         """
         with self._one:
             for number, sensor in enumerate(self.sensors.values()):

@@ -12,7 +12,7 @@ NAME = "dataset"
 HELP = "make a data set of random scenes for learning"
 DESCRIPTION = """\
 Draw random scenes as a file describes them, and write capacitance matrices, the counts of a
-read-out and labels as Parquet files with a manifest.
+readout and labels as Parquet files with a manifest.
 
 A scene depends on the file, its seed and the scene's number alone, so that any shard can be made
 on any machine. A shard appears once it is complete, and what is complete is not made again: after

@@ -10,7 +10,7 @@ HELP = "turn a recording into .csv, .npz or .parquet, or make one whole that was
 DESCRIPTION = """\
 Turn a recording into another file. The ending chooses the format:
   .csv, .parquet   the columns of readings.csv of capsense run, and the episode
-  .npz             the arrays of readings.npz, the episode, and the counts of a read-out;
+  .npz             the arrays of readings.npz, the episode, and the counts of a readout;
                    capsense readout takes it
   .mcap            the recording again; one whose recorder was killed gets its index
   .json            a layout in which Foxglove shows the recording
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--counts", action="store_true",
-        help="the conversions of the read-out in place of the readings (.csv, .parquet)",
+        help="the conversions of the readout in place of the readings (.csv, .parquet)",
     )  # fmt: skip
     parser.add_argument("--force", action="store_true", help="replace a file that is there")
 

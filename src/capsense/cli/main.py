@@ -44,7 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="capsense",
         description="Simulate capacitive proximity sensors: from electrodes and bodies in front of "
-        "them to the capacitances that a read-out would see.",
+        "them to the capacitances that a readout would see.",
         epilog=EXIT_CODES + "\n'capsense COMMAND --help' explains a command, with examples.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

@@ -22,7 +22,7 @@ from capsense._style import (
     unit_of,
 )
 from capsense.cli.plot_views import draw_views
-from capsense.cli.recorder import Recorder
+from capsense.cli.recorder import RunWriter
 from capsense.scenario import Channel, Excitation
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class _Family:
     """The same with nothing in front of the sensor [F], shape (k,)."""
 
 
-def plot_run(recorder: Recorder) -> Figure:
+def plot_run(recorder: RunWriter) -> Figure:
     """Draw a run.
 
     Parameters
@@ -84,7 +84,7 @@ def plot_run(recorder: Recorder) -> Figure:
     return figure
 
 
-def _families(recorder: Recorder) -> list[_Family]:
+def _families(recorder: RunWriter) -> list[_Family]:
     channels = recorder.scenario.channels
     selves = [k for k, c in enumerate(channels) if c.row == c.column]
     pairs = [k for k, c in enumerate(channels) if c.row != c.column]
@@ -128,7 +128,7 @@ def _pair_styles(channels: list[Channel]) -> list[tuple[str, Any]]:
     ]
 
 
-def _strongest(recorder: Recorder) -> int:
+def _strongest(recorder: RunWriter) -> int:
     """The sample with the largest relative change; the middle one where it stays that large."""
     scale = np.maximum(np.abs(recorder.levels), 1e-18)
     change = (np.abs(recorder.values - recorder.levels) / scale).max(axis=1)

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from capsense._style import FAINT, INK, LABELS, LEGEND, TIME_COLOURS, TITLES, bare
-from capsense.cli.recorder import Recorder
+from capsense.cli.recorder import RunWriter
 from capsense.design import Design
 from capsense.design.draw import LAYER_COLOUR, ROLE_COLOURS, outline_patch, outlines
 from capsense.scene import Body
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def draw_views(recorder: Recorder, peak: int, colours: list[str], above: Axes, side: Axes) -> None:
+def draw_views(recorder: RunWriter, peak: int, colours: list[str], above: Axes, side: Axes) -> None:
     """Draw sensor, domain, bodies and their ways, in millimetres and to one scale.
 
     Parameters
@@ -68,7 +68,7 @@ def draw_views(recorder: Recorder, peak: int, colours: list[str], above: Axes, s
         above.figure.legend(handles=handles, loc="outside lower right", ncols=2, **LEGEND)
 
 
-def _window(recorder: Recorder, peak: int) -> tuple[Array, Array]:
+def _window(recorder: RunWriter, peak: int) -> tuple[Array, Array]:
     """Corners [mm] of what there is to see: sensor, bodies and ways inside the domain."""
     design = recorder.scenario.design
     points = [e.surface.bounds for e in design.electrodes]
@@ -98,7 +98,7 @@ def _draw_domain(design: Design, axes: Axes, a: int, b: int) -> None:
 
 
 def _draw_bodies(
-    recorder: Recorder, peak: int, axes: Axes, plane: list[int], shown: tuple[float, float]
+    recorder: RunWriter, peak: int, axes: Axes, plane: list[int], shown: tuple[float, float]
 ) -> None:
     for number, moving in enumerate(recorder.scenario.bodies):
         track = recorder.positions[:, number][:, plane] * 1e3

@@ -6,15 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from capsense.readout.chip import Chip
     from capsense.readout.counts import Counts
-    from capsense.readout.read_out import ReadOut
-    from capsense.readout.recording import Recording
+    from capsense.readout.readout import Readout
+    from capsense.readout.recording import CapacitanceRecord
 
 NAME = "readout"
 HELP = "turn recorded capacitances into what a chip reports"
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--chip", metavar="NAME", action="append", default=[],
         help="a chip; may be repeated; 'all' for all of them",
     )  # fmt: skip
-    parser.add_argument("--config", metavar="FILE.toml", type=Path, help="a read-out file")
+    parser.add_argument("--config", metavar="FILE.toml", type=Path, help="a readout file")
     parser.add_argument(
         "--rate", metavar="HZ", type=float, help="conversions per second, one of the chip's"
     )
@@ -97,29 +97,35 @@ def execute(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> None:
     """Refuse what does not go together before anything is computed."""
     if args.recording is None:
-        raise ReadOutError("no recording given; name the output folder of capsense run, or --list")
+        raise ReadoutError("no recording given; name the output folder of capsense run, or --list")
     if bool(args.chip) == (args.config is not None):
-        raise ReadOutError("give --chip NAME or --config FILE.toml, one of them")
+        raise ReadoutError("give --chip NAME or --config FILE.toml, one of them")
     if args.config is not None and (args.rate is not None or args.seed or args.no_noise):
-        raise ReadOutError("--rate, --seed and --no-noise go with --chip; write them in the file")
+        raise ReadoutError("--rate, --seed and --no-noise go with --chip; write them in the file")
     if args.seed < 0:
-        raise ReadOutError(f"--seed {args.seed} must be zero or more")
+        raise ReadoutError(f"--seed {args.seed} must be zero or more")
     if args.electrode is not None and args.plot is None:
-        raise ReadOutError("--electrode goes with --plot; the tables hold all channels")
+        raise ReadoutError("--electrode goes with --plot; the tables hold all channels")
     if args.plot is not None:
         if args.plot.suffix.lower() not in PICTURES:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"--plot {args.plot} is no picture; give a name that ends in {', '.join(PICTURES)}"
             )
         if not args.plot.parent.is_dir():
-            raise ReadOutError(f"--plot {args.plot}: there is no folder {args.plot.parent}")
+            raise ReadoutError(f"--plot {args.plot}: there is no folder {args.plot.parent}")
 
 
-def _build(args: argparse.Namespace, recording: Recording) -> dict[str, ReadOut]:
-    """The read-outs asked for, by a name for files."""
+def _build(args: argparse.Namespace, recording: CapacitanceRecord) -> dict[str, Readout]:
+    """The readouts asked for, by a name for files."""
     from capsense.readout.channels import ChannelBank
     from capsense.readout.config import load_readout
-    from capsense.readout.presets import Options, build, chip_of, default_patterns, expected_of
+    from capsense.readout.presets import (
+        ReadoutOptions,
+        build,
+        chip_of,
+        default_patterns,
+        expected_of,
+    )
 
     if args.config is not None:
         return {args.config.stem: load_readout(args.config, recording.electrodes)}
@@ -131,7 +137,7 @@ def _build(args: argparse.Namespace, recording: Recording) -> dict[str, ReadOut]
         chip = chip_of(name)
         patterns = default_patterns(chip, recording.electrodes)
         empty = recording.empty_channels(ChannelBank(patterns, recording.electrodes))
-        options = Options(
+        options = ReadoutOptions(
             patterns=patterns, rate=args.rate, seed=args.seed, noise=not args.no_noise,
             expected=expected_of(empty),
         )  # fmt: skip
@@ -143,16 +149,16 @@ def _prepare(folder: Path, targets: Iterable[Path], force: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for target in targets:
         if target.exists() and not force:
-            raise ReadOutError(f"{target} is there already; give -o DIR, or --force to replace it")
+            raise ReadoutError(f"{target} is there already; give -o DIR, or --force to replace it")
 
 
-def report(readout: ReadOut, counts: Counts, path: Path) -> str:
+def report(readout: Readout, counts: Counts, path: Path) -> str:
     """What came out, for people."""
     from capsense.cli.tables import facts, seconds, table
 
     plan = readout.schedule
     head = [
-        ("read-out", readout.name),
+        ("readout", readout.name),
         ("conversions", f"{len(counts)}, {seconds(plan.conversion)} each"),
         ("a channel's period", seconds(plan.period)),
     ]

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from capsense._style import COLOURS, FAINT, INK, LABELS, LEGEND, TITLES, bare
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from capsense.readout.read_out import ReadOut
-    from capsense.readout.recording import Recording
+    from capsense.readout.readout import Readout
+    from capsense.readout.recording import CapacitanceRecord
 
 Array = NDArray[np.float64]
 SELF_COLOUR, MUTUAL_COLOUR, OUTSIDE = COLOURS[0], COLOURS[2], COLOURS[3]
@@ -24,18 +24,18 @@ LINEAR_BELOW = 1.0
 
 
 def plot_chips(
-    recording: Recording, readouts: dict[str, ReadOut], electrode: str | None = None
+    recording: CapacitanceRecord, readouts: dict[str, Readout], electrode: str | None = None
 ) -> Figure:
     """Draw the change of one channel against the empty scene: true, and read out by each chip.
 
     Args:
         recording: The capacitances.
-        readouts: Read-outs by name.
+        readouts: Readouts by name.
         electrode: The electrode shown: its self capacitance, or its first pair; default the
             first electrode.
 
     Raises:
-        ReadOutError: No channel of a read-out has the electrode.
+        ReadoutError: No channel of a readout has the electrode.
     """
     name = recording.electrodes[0] if electrode is None else electrode
     columns = min(3, len(readouts) + 1)
@@ -67,12 +67,12 @@ def plot_chips(
     return figure
 
 
-def _channel_of(readout: ReadOut, electrode: str) -> int:
+def _channel_of(readout: Readout, electrode: str) -> int:
     """The first channel that reads an electrode, or drives it."""
     for number, pattern in enumerate(readout.bank.patterns):
         if electrode == pattern.sense or electrode in pattern.drive:
             return number
-    raise ReadOutError(
+    raise ReadoutError(
         f"no channel of {readout.name} has the electrode {electrode!r}; channels are "
         f"{', '.join(readout.channel_names)}"
     )
@@ -87,8 +87,8 @@ def _draw_truth(axes: Axes, time: Array, shown: dict[str, tuple[Array, str]]) ->
 
 
 def _draw_chip(
-    axes: Axes, readout: ReadOut, channel: int, recording: Recording, truth: Array, empty: float,
-    colour: str,
+    axes: Axes, readout: Readout, channel: int, recording: CapacitanceRecord, truth: Array,
+    empty: float, colour: str,
 ) -> None:  # fmt: skip
     sign = 1 if readout.bank.patterns[channel].is_self else -1
     counts = readout(recording.time, truth)

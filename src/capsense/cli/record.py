@@ -17,7 +17,7 @@ NAME = "record"
 HELP = "simulate a scenario file and record every step as MCAP, for ROS 2 and Foxglove"
 DESCRIPTION = """\
 Simulate a scenario, and record every step in an MCAP file of ROS 2 messages: bodies and their
-poses, capacitance matrices, transforms, markers, and the counts of a read-out. Foxglove and
+poses, capacitance matrices, transforms, markers, and the counts of a readout. Foxglove and
 'ros2 bag' open it; 'capsense replay' simulates it again and compares; 'capsense export' makes
 tables of it.
 
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--readout", metavar="CHIP|FILE.toml",
-        help="record what a chip reports, too: its name, or a read-out file",
+        help="record what a chip reports, too: its name, or a readout file",
     )  # fmt: skip
     parser.add_argument(
         "--name", default="sensor", help="of the sensor: its frame, and the beginning of its topics"

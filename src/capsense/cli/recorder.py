@@ -60,7 +60,7 @@ def prepare_folder(folder: Path, *, force: bool) -> None:
         ) from None
 
 
-class Recorder:
+class RunWriter:
     """Takes samples, writes ``readings.csv`` row by row, and the other files at the end.
 
     Parameters
@@ -107,7 +107,7 @@ class Recorder:
         stats = reading.stats
         self._stats[k] = (
             stats.iterations,
-            stats.error_estimate,
+            stats.solver_error,
             stats.wall_time,
             stats.unknowns,
         )

@@ -16,7 +16,7 @@ NAME = "replay"
 HELP = "simulate a recording again and verify that every reading is the same"
 DESCRIPTION = """\
 Simulate a recording again, from the design, settings and bodies in it, and compare every reading
-bit for bit; and the counts of a read-out given by a chip's name or a file. The first difference
+bit for bit; and the counts of a readout given by a chip's name or a file. The first difference
 is printed.
 
 Exit code 0: all the same. 3: something differs. 2: the file is no recording, or damaged.
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--method",
-        choices=("surface", "masked"),
+        choices=("surface", "fem_masked"),
         help="simulate with this method instead of the recorded one",
     )
     parser.add_argument(

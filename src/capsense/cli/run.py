@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from capsense.cli.interrupt import Interrupt
-    from capsense.cli.recorder import Recorder
+    from capsense.cli.recorder import RunWriter
     from capsense.scenario import Sample, Scenario
     from capsense.simulator import Simulator
 
@@ -65,7 +65,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the scenario and return the exit code."""
     from capsense.cli.interrupt import Interrupt
     from capsense.cli.main import INTERRUPTED, OK, say
-    from capsense.cli.recorder import Recorder, prepare_folder
+    from capsense.cli.recorder import RunWriter, prepare_folder
     from capsense.cli.tables import field_figures
     from capsense.scenario import load_scenario
     from capsense.scene import Scene
@@ -80,7 +80,7 @@ def execute(args: argparse.Namespace) -> int:
     with Interrupt() as interrupt:
         try:
             simulator = build_simulator(scenario, quiet=args.quiet)
-            recorder = Recorder(args.output, scenario, simulator.step(Scene()))
+            recorder = RunWriter(args.output, scenario, simulator.step(Scene()))
         except BaseException:
             if made:
                 with contextlib.suppress(OSError):
@@ -172,7 +172,7 @@ def play_samples(
                 break
 
 
-def _write(recorder: Recorder, summary: dict[str, Any]) -> None:
+def _write(recorder: RunWriter, summary: dict[str, Any]) -> None:
     from capsense.cli.plot import plot_run
 
     recorder.write_arrays()

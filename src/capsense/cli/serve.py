@@ -74,10 +74,10 @@ def execute(args: argparse.Namespace) -> int:
 
     from capsense.cli.main import OK
     from capsense.cli.progress import BuildProgress
-    from capsense.server.options import Options
+    from capsense.server.options import ServerOptions
     from capsense.server.server import Server
 
-    options = Options(
+    options = ServerOptions(
         tuple(args.design), args.readout, args.host, args.port, read_token(args.token_file),
         tuple(args.origin), _limits(args), args.watch,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from capsense.cli.serve import read_token
 
 if TYPE_CHECKING:
     from capsense.viewer.player import Playback
-    from capsense.viewer.view import View
+    from capsense.viewer.view import LiveView
 
 NAME = "view"
 HELP = "show a sensor at work, live in a web browser"
@@ -61,13 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Show it until told to stop, and return the exit code."""
     from capsense.cli.main import OK
-    from capsense.viewer.view import View, check_address
+    from capsense.viewer.view import LiveView, check_address
 
     _check(args)
     check_address(args.host, args.port)
     player = _player(args)
     try:
-        view = View(player, host=args.host, port=args.port)
+        view = LiveView(player, host=args.host, port=args.port)
         try:
             _announce(view, args)
             if args.paused:
@@ -147,7 +147,7 @@ def _player(args: argparse.Namespace) -> Playback:
     return Player(ScenarioSource(scenario, build_simulator(scenario, quiet=args.quiet)))
 
 
-def _announce(view: View, args: argparse.Namespace) -> None:
+def _announce(view: LiveView, args: argparse.Namespace) -> None:
     """Say where the page is, and how to get at it."""
     from capsense.cli.main import say
 

@@ -12,7 +12,7 @@ from shapely.geometry.polygon import orient
 from capsense.design.contact import in_plane_of
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Electrode
-from capsense.design.schema import Table
+from capsense.design.schema import DesignTable
 
 SLIVER = 1e-5
 """Remainders narrower than this [m] are dropped: no board house would etch them."""
@@ -20,7 +20,7 @@ GRID = 1e-9
 """Coordinates of cut outlines are snapped to this grid [m]."""
 
 
-def cut_clearance(table: Table, surface: Surface, electrodes: Sequence[Electrode]) -> Surface:
+def cut_clearance(table: DesignTable, surface: Surface, electrodes: Sequence[Electrode]) -> Surface:
     """Cut ``clearance`` [m] around every electrode that lies in a facet's plane.
 
     The gap's outline is the electrode's, offset with mitred corners. What remains may be several

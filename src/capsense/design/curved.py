@@ -19,7 +19,7 @@ from shapely.geometry.polygon import orient
 from capsense.design.contact import TOUCH
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.placement import Placement
-from capsense.design.schema import Table
+from capsense.design.schema import DesignTable
 from capsense.design.shapes import circle_segments
 from capsense.errors import DesignError
 
@@ -29,7 +29,7 @@ STRIP_ERROR = 1e-4
 """A strip leaves the round surface by about this much [m], unless that takes too many strips."""
 
 
-def read_bend(table: Table) -> float:
+def read_bend(table: DesignTable) -> float:
     """The radius [m] of a ``[bend]`` table."""
     table.only(("radius",))
     return table.length("radius")
@@ -113,7 +113,7 @@ def _lines(geometry: shapely.Geometry) -> Sequence[shapely.Geometry]:
     return [g for g in shapely.get_parts(merged) if g.geom_type == "LineString"]
 
 
-def cylinder_surface(table: Table, placement: Placement) -> Surface:
+def cylinder_surface(table: DesignTable, placement: Placement) -> Surface:
     """The closed surface of a cylinder: ``radius`` and ``length`` [m], about its own z axis."""
     radius, length = table.length("radius"), table.length("length")
     count = circle_segments(radius, STRIP_ERROR)

@@ -17,7 +17,7 @@ from capsense.design.geometry import Surface
 from capsense.design.materials import LAYER_EPS_R
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import Table
+from capsense.design.schema import DesignTable
 from capsense.design.shapes import SHAPES, box_surface, planar_surface
 from capsense.errors import DesignError
 
@@ -103,20 +103,20 @@ def parse_design(
     DesignError
         If anything is wrong; the message names the item, the value and the mend.
     """
-    top = Table(data, source, "design")
+    top = DesignTable(data, source, "design")
     top.only(TOP_KEYS)
     name = top.string("name")
     description = top.text("description")
-    domain = _read_domain(Table(top.raw("domain", "a [domain] table"), source, "domain"))
+    domain = _read_domain(DesignTable(top.raw("domain", "a [domain] table"), source, "domain"))
     limit = max(domain.size)
     where = folder if folder is not None else Path()
 
-    def items(key: str) -> list[Table]:
+    def items(key: str) -> list[DesignTable]:
         out = []
         for number, raw in enumerate(top.tables(key), start=1):
             label = raw.get("name") if isinstance(raw, Mapping) else None
             tag = f'{key} "{label}"' if isinstance(label, str) and label else f"{key} {number}"
-            out.append(Table(raw, source, tag, limit))
+            out.append(DesignTable(raw, source, tag, limit))
         return out
 
     electrodes = [_read_electrode(t, where, domain) for t in items("electrode")]
@@ -128,7 +128,7 @@ def parse_design(
     conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
     conductors = [Conductor(c.name, c.role, snap_to_layers(c.surface, stack)) for c in conductors]
     if "bend" in data:
-        radius = read_bend(Table(data["bend"], source, "bend", limit))
+        radius = read_bend(DesignTable(data["bend"], source, "bend", limit))
         if layers:
             raise DesignError(
                 f'{source}: layer "{layers[0].name}": layers are flat boxes and cannot be bent; '
@@ -136,7 +136,7 @@ def parse_design(
             )
         electrodes = [Electrode(e.name, _bent(e, radius, source)) for e in electrodes]
         conductors = [Conductor(c.name, c.role, _bent(c, radius, source)) for c in conductors]
-    build = _read_build(Table(data.get("build", {}), source, "build"))
+    build = _read_build(DesignTable(data.get("build", {}), source, "build"))
     design = Design(
         name=name,
         domain=domain,
@@ -150,7 +150,7 @@ def parse_design(
     return design
 
 
-def _read_domain(table: Table) -> Domain:
+def _read_domain(table: DesignTable) -> Domain:
     table.only(("size", "backplane"))
     sx, sy, sz = table.sizes("size", 3, "[x, y, z] in metres")
     backplane = table.length("backplane")
@@ -162,12 +162,14 @@ def _read_domain(table: Table) -> Domain:
     return Domain((sx, sy, sz), backplane)
 
 
-def _read_build(table: Table) -> dict[str, float]:
+def _read_build(table: DesignTable) -> dict[str, float]:
     table.only(("resolution",))
     return {"resolution": table.number("resolution", 0.25, 4.0, 1.0)}
 
 
-def _read_surface(table: Table, folder: Path, domain: Domain, extra: tuple[str, ...]) -> Surface:
+def _read_surface(
+    table: DesignTable, folder: Path, domain: Domain, extra: tuple[str, ...]
+) -> Surface:
     """Read ``shape``, where it sits, and its own keys; ``extra`` are keys of the item itself."""
     names = [*SHAPES, "box", "cylinder", "stl"]
     shape = table.choice("shape", names)
@@ -195,18 +197,18 @@ def _bent(sheet: Electrode | Conductor, radius: float, source: str) -> Surface:
     return bend_sheet(item, sheet.surface, radius)
 
 
-def _read_electrode(table: Table, folder: Path, domain: Domain) -> Electrode:
+def _read_electrode(table: DesignTable, folder: Path, domain: Domain) -> Electrode:
     return Electrode(table.string("name"), _read_surface(table, folder, domain, ()))
 
 
-def _read_stl_group(table: Table, folder: Path, domain: Domain) -> list[Electrode]:
+def _read_stl_group(table: DesignTable, folder: Path, domain: Domain) -> list[Electrode]:
     from capsense.design.stl_shape import read_imprint_group
 
     return read_imprint_group(table, folder, domain)
 
 
 def _read_conductor(
-    table: Table, folder: Path, domain: Domain, electrodes: list[Electrode]
+    table: DesignTable, folder: Path, domain: Domain, electrodes: list[Electrode]
 ) -> Conductor:
     name = table.string("name")
     surface = _read_surface(table, folder, domain, ("role", "clearance"))
@@ -216,7 +218,7 @@ def _read_conductor(
     return Conductor(name, role, surface)
 
 
-def _read_layer(table: Table) -> Layer:
+def _read_layer(table: DesignTable) -> Layer:
     table.only(("name", "material", "eps_r", "size", "center", "z"))
     name = table.string("name")
     if "material" in table and "eps_r" in table:

@@ -45,7 +45,7 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Electrode:
-    """One electrode: a conducting sheet that the read-out drives or listens to."""
+    """One electrode: a conducting sheet that the readout drives or listens to."""
 
     name: str
     surface: Surface

@@ -13,7 +13,7 @@ from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
 from capsense.design.geometry import Facet, Surface, boundary_segments
-from capsense.design.schema import Table
+from capsense.design.schema import DesignTable
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def quaternion_matrix(quaternion: Sequence[float]) -> Array:
     )
 
 
-def read_placement(table: Table) -> Placement:
+def read_placement(table: DesignTable) -> Placement:
     """Read ``center``, ``z``, ``rotation``, ``tilt`` and ``quaternion`` of an item.
 
     ``rotation`` turns about the shape's own z axis; ``tilt`` = [rx, ry, rz] then turns about the

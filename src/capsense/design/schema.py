@@ -6,7 +6,7 @@ from capsense import _validate
 from capsense.errors import DesignError
 
 
-class Table(_validate.Table):
+class DesignTable(_validate.Table):
     """One table of a design file; whatever is wrong raises :class:`DesignError`."""
 
     error_type = DesignError

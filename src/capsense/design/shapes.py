@@ -20,7 +20,7 @@ from shapely.geometry import box as rectangle_between
 
 from capsense.design.geometry import Facet, Surface
 from capsense.design.placement import Placement, place_polygons
-from capsense.design.schema import Table
+from capsense.design.schema import DesignTable
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def _bar(width: float, height: float, x: float = 0.0, y: float = 0.0) -> Polygon
     return rectangle_between(x - width / 2, y - height / 2, x + width / 2, y + height / 2)
 
 
-def rectangle(table: Table) -> list[Polygon]:
+def rectangle(table: DesignTable) -> list[Polygon]:
     """``size`` = [x, y] [m]; optional ``corner_radius`` [m]."""
     sx, sy = table.sizes("size", 2, "[x, y] in metres")
     radius = table.length("corner_radius", 0.0, zero=True)
@@ -75,7 +75,7 @@ def rectangle(table: Table) -> list[Polygon]:
     return [_rounded(_bar(sx, sy), radius)]
 
 
-def polygon(table: Table) -> list[Polygon]:
+def polygon(table: DesignTable) -> list[Polygon]:
     """``points`` = [[x, y], …] [m]; optional ``holes``, a list of such lists."""
     points = table.points("points", 3)
     raw_holes = table.data.get("holes", [])
@@ -96,12 +96,12 @@ def polygon(table: Table) -> list[Polygon]:
     return [shapely.geometry.polygon.orient(shape)]
 
 
-def disc(table: Table) -> list[Polygon]:
+def disc(table: DesignTable) -> list[Polygon]:
     """``radius`` [m]."""
     return [_circle(table.length("radius"))]
 
 
-def ring(table: Table) -> list[Polygon]:
+def ring(table: DesignTable) -> list[Polygon]:
     """``inner_radius`` < ``outer_radius`` [m]."""
     inner, outer = table.length("inner_radius"), table.length("outer_radius")
     if inner >= outer:
@@ -121,7 +121,7 @@ def _slot(sx: float, sy: float) -> Polygon:
     return line.buffer(radius, quad_segs=circle_segments(radius) // 4)
 
 
-def stripes(table: Table) -> list[Polygon]:
+def stripes(table: DesignTable) -> list[Polygon]:
     """``count`` stripes of ``size`` = [x, y] [m] at ``pitch`` along x; optional ``rounded``."""
     count = table.integer("count", 1, 1000)
     sx, sy = table.sizes("size", 2, "[x, y] in metres, of one stripe")
@@ -137,7 +137,7 @@ def stripes(table: Table) -> list[Polygon]:
     return [shapely.affinity.translate(one, float(dx)) for dx in offsets]
 
 
-def comb(table: Table) -> list[Polygon]:
+def comb(table: DesignTable) -> list[Polygon]:
     """``fingers`` of ``finger_size`` = [width, length] at ``pitch`` on a spine of ``spine_width``.
 
     The origin is the centre of the bounding box. ``side`` says where the spine is: "bottom" (−y,
@@ -168,7 +168,7 @@ def comb(table: Table) -> list[Polygon]:
     return [shapely.affinity.rotate(Polygon(points), turn, origin=(0, 0))]
 
 
-def meander(table: Table) -> list[Polygon]:
+def meander(table: DesignTable) -> list[Polygon]:
     """A serpentine track of ``width``: ``turns`` U-turns, ``length`` in y, ``pitch`` in x.
 
     ``length`` is the full extent in y [m].
@@ -189,7 +189,7 @@ def meander(table: Table) -> list[Polygon]:
     return [shapely.union_all(parts).simplify(0.0)]
 
 
-def box_surface(table: Table, placement: Placement) -> Surface:
+def box_surface(table: DesignTable, placement: Placement) -> Surface:
     """The closed surface of a box: ``size`` = [x, y, z] [m] about ``center``."""
     half = np.array(table.sizes("size", 3, "[x, y, z] in metres")) / 2
     facets, corners = [], np.eye(3)
@@ -214,7 +214,7 @@ class PlanarShape:
     """A planar shape: the keys it reads and the function that makes its polygons."""
 
     keys: tuple[str, ...]
-    build: Callable[[Table], list[Polygon]]
+    build: Callable[[DesignTable], list[Polygon]]
 
 
 SHAPES: dict[str, PlanarShape] = {
@@ -229,14 +229,14 @@ SHAPES: dict[str, PlanarShape] = {
 """Planar shapes by name."""
 
 
-def add_leads(table: Table, polygons: list[Polygon]) -> list[Polygon]:
+def add_leads(table: DesignTable, polygons: list[Polygon]) -> list[Polygon]:
     """Unite polygons with the tracks in ``leads`` = [{points = [[x, y], …], width = …}, …].
 
     Lead points are in the shape's own plane and frame, and each lead must touch the shape.
     """
     out = shapely.union_all(polygons)
     for number, raw in enumerate(table.tables("leads")):
-        lead = Table(raw, table.source, f"{table.item}: leads[{number}]", table.limit)
+        lead = DesignTable(raw, table.source, f"{table.item}: leads[{number}]", table.limit)
         lead.only(("points", "width"))
         path = LineString(lead.points("points", 2))
         track = path.buffer(lead.length("width") / 2, cap_style="flat", join_style="mitre")
@@ -249,7 +249,7 @@ def add_leads(table: Table, polygons: list[Polygon]) -> list[Polygon]:
     return [out] if isinstance(out, Polygon) else list(out.geoms)
 
 
-def planar_surface(table: Table, shape: str, placement: Placement) -> Surface:
+def planar_surface(table: DesignTable, shape: str, placement: Placement) -> Surface:
     """Build one of :data:`SHAPES`, with its leads, and place it."""
     polygons = SHAPES[shape].build(table)
     if "leads" in table:

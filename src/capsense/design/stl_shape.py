@@ -12,7 +12,7 @@ from capsense._validate import UNITS
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Domain, Electrode
 from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import Table
+from capsense.design.schema import DesignTable
 from capsense.design.stl import SheetMesh, read_stl, sheet_surface, weld
 from capsense.errors import DesignError
 
@@ -24,7 +24,7 @@ SIZE_TOLERANCE = 1e-5
 """By how much [m] an imprinted box may differ from the domain."""
 
 
-def _read_triangles(table: Table, folder: Path) -> Array:
+def _read_triangles(table: DesignTable, folder: Path) -> Array:
     """Triangles [m] of the item's file, shape (n, 3, 3)."""
     file = table.string("file")
     unit = table.choice("unit", list(UNITS))
@@ -51,14 +51,14 @@ def _read_triangles(table: Table, folder: Path) -> Array:
     return triangles
 
 
-def _weld(table: Table, triangles: Array) -> SheetMesh:
+def _weld(table: DesignTable, triangles: Array) -> SheetMesh:
     try:
         return weld(triangles)
     except DesignError as error:
         raise table.error(f'file = "{table.data["file"]}": {error}') from None
 
 
-def _require_closed(table: Table, mesh: SheetMesh, why: str) -> None:
+def _require_closed(table: DesignTable, mesh: SheetMesh, why: str) -> None:
     if not mesh.closed:
         raise table.error(
             f'file = "{table.data["file"]}" is open: it has {len(mesh.boundary)} boundary edges, '
@@ -66,7 +66,7 @@ def _require_closed(table: Table, mesh: SheetMesh, why: str) -> None:
         )
 
 
-def read_stl_surface(table: Table, folder: Path, domain: Domain) -> Surface:
+def read_stl_surface(table: DesignTable, folder: Path, domain: Domain) -> Surface:
     """Read an item of shape "stl": an open sheet, a closed shell, or one part of an imprinted box.
 
     Raises
@@ -96,7 +96,7 @@ def read_stl_surface(table: Table, folder: Path, domain: Domain) -> Surface:
     return sheet_surface(mesh)
 
 
-def _read_part(table: Table, folder: Path, domain: Domain) -> Surface:
+def _read_part(table: DesignTable, folder: Path, domain: Domain) -> Surface:
     for key in ("scale", "closed", *PLACEMENT_KEYS):
         if key in table:
             raise table.error(
@@ -112,7 +112,7 @@ def _read_part(table: Table, folder: Path, domain: Domain) -> Surface:
     return parts[table.integer("part", 1, len(parts)) - 1]
 
 
-def read_imprint_group(table: Table, folder: Path, domain: Domain) -> list[Electrode]:
+def read_imprint_group(table: DesignTable, folder: Path, domain: Domain) -> list[Electrode]:
     """Read an ``[[electrodes_from_stl]]`` item: every part of an imprinted box.
 
     Keys are ``file``, ``unit`` and ``name``, in which "{}" becomes the part's number from 1.
@@ -130,7 +130,7 @@ def read_imprint_group(table: Table, folder: Path, domain: Domain) -> list[Elect
     return [Electrode(name.replace("{}", str(k)), p) for k, p in enumerate(parts, start=1)]
 
 
-def imprinted_parts(table: Table, folder: Path, domain: Domain) -> list[Surface]:
+def imprinted_parts(table: DesignTable, folder: Path, domain: Domain) -> list[Surface]:
     """Electrodes imprinted on the floor of a box, sorted by centre y, then x.
 
     The file holds a watertight solid, a box whose floor is pushed in by flat-topped mesas. Every

@@ -17,7 +17,7 @@ from capsense.mesh.settings import MeshSettings
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 9
+NUMERICS = 10
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 
@@ -29,7 +29,7 @@ class BuildSettings:
     panel_scale: float = 1.0
     """Panel sizes of the boundary elements, as multiples of the default."""
     mesh: MeshSettings = field(default_factory=MeshSettings)
-    """Mesh of the method ``"masked"``, which the field does not depend on."""
+    """Mesh of the method ``"fem_masked"``, which the field does not depend on."""
 
     def refined(self, factor: float) -> BuildSettings:
         """Return settings with panels and mesh finer by a factor along each axis."""

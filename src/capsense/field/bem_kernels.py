@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._crew import filled
 from capsense._jit import compiled, kernel
+from capsense._thread_pool import filled
 
 Array = NDArray[np.float64]
 

@@ -34,6 +34,10 @@ _FEW_FACETS = 64
 """Sheets of more facets than this are curved; their facets are not searched for narrow gaps."""
 _FAR_PLANE = 0.01
 """Parallel sheets farther apart than this [m] need no panels of their distance."""
+_AMPLE, _FINEST = 4_500, 0.5
+"""Designs of fewer panels than this are cut finer, down to this share of the default sizes."""
+_GROWTH = 1.7
+"""The number of panels goes with their size to minus this power."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Accuracy:
     """Panel sizes of the boundary-element solution, as multiples of the default."""
 
     scale: float = 1.0
-    """Larger is coarser and faster."""
+    """Larger is coarser and faster. Up to 1, designs of few panels are cut finer still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +87,26 @@ def terminals(design: Design) -> list[str]:
 
 
 def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryModel:
-    """Cut all conductors, interfaces and walls of a design into panels."""
-    accuracy = accuracy or Accuracy()
+    """Cut all conductors, interfaces and walls of a design into panels.
+
+    Raises:
+        FieldError: The design needs more panels than fit in memory.
+    """
+    scale = (accuracy or Accuracy()).scale
+    if scale <= 1.0:
+        few = len(_cut(design, 1.0).panels) / _AMPLE
+        scale *= float(np.clip(few ** (1 / _GROWTH), _FINEST, 1.0))
+    model = _cut(design, scale)
+    if len(model.panels) > _MAX_PANELS:
+        raise FieldError(
+            f"design {design.name!r} needs {len(model.panels)} boundary panels, more than the "
+            f"{_MAX_PANELS} that fit in memory; simplify its outlines or coarsen its STL files"
+        )
+    return model
+
+
+def _cut(design: Design, scale: float) -> BoundaryModel:
+    """Cut a design into panels of the default sizes times ``scale``."""
     floor = float(design.domain.lower[2])
     names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
@@ -125,24 +147,18 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
     reach = 2.5 * thin if math.isfinite(thin) else 0.0
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
         width = 2 * facet.polygon.area / facet.polygon.length
-        edge = accuracy.scale * max(min(0.02 * width, 0.15 * gap, 1e-4), 1e-5)
-        largest = accuracy.scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
-        add(facet, owner, _grading(facet, edge, largest, accuracy.scale), 2.5 * spacing)
+        edge = scale * max(min(0.01 * width, 0.075 * gap, 5e-5), 5e-6)
+        largest = scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
+        add(facet, owner, _grading(facet, edge, largest, scale), 2.5 * spacing)
     for facet, thickness in _interfaces(design, sheets):
-        edge = accuracy.scale * min(3e-4, 0.3 * thickness)
-        largest = accuracy.scale * min(0.006, max(3 * thickness, 0.002))
-        add(facet, INTERFACE, _grading(facet, edge, largest, accuracy.scale), reach)
+        edge = scale * min(3e-4, 0.3 * thickness)
+        largest = scale * min(0.006, max(1.25 * thickness, 0.001))
+        add(facet, INTERFACE, _grading(facet, edge, largest, scale), reach)
     for facet in _walls(design):
-        add(facet, GROUND, Grading(0.01, largest=accuracy.scale * 0.04 * room_scale(design)), 0.0)
+        add(facet, GROUND, Grading(0.01, largest=scale * 0.04 * room_scale(design)), 0.0)
 
-    panels = concatenate(parts)
-    if len(panels) > _MAX_PANELS:
-        raise FieldError(
-            f"design {design.name!r} needs {len(panels)} boundary panels, more than the "
-            f"{_MAX_PANELS} that fit in memory; simplify its outlines or coarsen its STL files"
-        )
     return BoundaryModel(
-        panels, np.concatenate(owners), np.concatenate(front), np.concatenate(back), floor,
+        concatenate(parts), np.concatenate(owners), np.concatenate(front), np.concatenate(back), floor,
         len(names),
     )  # fmt: skip
 

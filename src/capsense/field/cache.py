@@ -42,7 +42,7 @@ Progress = Callable[[str, float], None]
 
 
 def cache_key(design: Design, settings: BuildSettings) -> str:
-    """Hash of everything a background field depends on; the mesh of ``"masked"`` is not of it.
+    """Hash of everything a background field depends on; the mesh of ``"fem_masked"`` is not of it.
 
     The content hash of a design leaves the order of shields and floating conductors out, but their
     columns of a field come in that order, so it enters here.

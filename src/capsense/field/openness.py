@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._crew import filled
 from capsense._jit import kernel
+from capsense._thread_pool import filled
 from capsense.design.model import Design
 
 Array = NDArray[np.float64]

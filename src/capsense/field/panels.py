@@ -96,7 +96,8 @@ def cut_facet(facet: Facet, rims: Array, grading: Grading, reach: float = 0.0) -
     """Split a facet's polygon into graded pieces.
 
     ``rims`` are 3-D segments, shape (k, 2, 3); those within ``reach`` (at least 1 µm) of the
-    facet's plane are projected onto it and graded to, from a distance of half their height on.
+    facet's plane are projected onto it and graded to, from an eighth of their height on: what they
+    induce varies over their height.
     """
     pieces: list[Polygon] = []
     lines, heights = _project_rims(facet, rims, reach)
@@ -104,7 +105,7 @@ def cut_facet(facet: Facet, rims: Array, grading: Grading, reach: float = 0.0) -
     distance = grading.edge
     size = max(grading.smallest, grading.aspect * distance)
     while len(lines) and size < grading.largest and not rest.is_empty:
-        seen = lines[heights <= 2 * distance + 1e-6]
+        seen = lines[heights <= 8 * distance + 1e-6]
         if len(seen):
             merged = shapely.line_merge(shapely.union_all(seen))
             near = merged.buffer(distance, cap_style="square", join_style="mitre")

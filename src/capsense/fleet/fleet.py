@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._crew import in_parts
 from capsense._patience import first_use
+from capsense._thread_pool import in_parts
 from capsense.design import load_design
 from capsense.design.model import Design, Role
 from capsense.errors import (
     DesignError,
     MissingDependencyError,
-    ReadOutError,
+    ReadoutError,
     SceneError,
     SolveError,
 )
@@ -25,7 +25,7 @@ from capsense.field.cache import default_settings, load_or_build
 from capsense.field.terminals import Terminals
 from capsense.fleet.step_kernels import Bodies, Found, Poses, Sensor, step_rows
 from capsense.readout.counts import Held
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
@@ -67,7 +67,7 @@ class FleetReading:
     """Charge on each electrode per volt on all shields together [F], shape (e, s, n); None on
     Warp."""
     held: Held | None = None
-    """What the chips' registers hold, where there is a read-out, each of shape (e, s, channels)."""
+    """What the chips' registers hold, where there is a readout, each of shape (e, s, channels)."""
     jacobian: Array | None = None
     """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
     about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
@@ -108,7 +108,7 @@ class Fleet:
             ``"cuda:0"``, or ``"warp:cpu"``, which is for tests.
         preset: Accuracy on the CPU, as of :class:`Simulator`.
         budget: Clusters of each body on Warp: 32, 64 or 128.
-        frequency: Excitation frequency [Hz].
+        excitation_frequency: Excitation frequency [Hz].
 
     Raises:
         DesignError: The design is wrong, or has floating conductors, on Warp.
@@ -128,7 +128,7 @@ class Fleet:
         device: str = "cpu",
         preset: Preset = "learning",
         budget: int = 64,
-        frequency: float = 250e3,
+        excitation_frequency: float = 250e3,
     ) -> None:
         for what, number in (("count", count), ("sensors", sensors)):
             if isinstance(number, bool) or not isinstance(number, int) or number < 1:
@@ -149,7 +149,10 @@ class Fleet:
         if device != "cpu":
             chosen_preset = replace(chosen_preset, panels=_PANELS * budget)
         self._solver = SurfaceSolver(
-            field.green, self.design, frequency=frequency, preset=chosen_preset
+            field.green,
+            self.design,
+            excitation_frequency=excitation_frequency,
+            preset=chosen_preset,
         )
         self._terminals = Terminals(self.design, field.capacitance)
         n = self._terminals.electrodes
@@ -261,10 +264,11 @@ class Fleet:
             return -1, 1.0, 0.0, 0.0, 1
         if not isinstance(body, Body):
             raise SceneError(f"{body!r} is not a Body")
-        matter = matter_of([body], self._solver.frequency)
+        matter = matter_of([body], self._solver.excitation_frequency)
         if matter.lossy:
+            hertz = self._solver.excitation_frequency
             raise SceneError(
-                f"{body.material.name!r} has losses at {self._solver.frequency:g} Hz, which a "
+                f"{body.material.name!r} has losses at {hertz:g} Hz, which a "
                 "fleet does not know; give the body a conductor's or a lossless material"
             )
         shape, size = self._solver.functions_of(body.shape)
@@ -293,31 +297,31 @@ class Fleet:
             )
         return found
 
-    def use_readout(self, readout: ReadOut | str | None, *, seed: int = 0) -> None:
+    def use_readout(self, readout: Readout | str | None, *, seed: int = 0) -> None:
         """Read every sensor through a chip of its own from now on.
 
         All are switched on together, at 0 s; noise differs from chip to chip.
 
         Args:
-            readout: A read-out for this design's electrodes, the name of a chip, or None.
+            readout: A readout for this design's electrodes, the name of a chip, or None.
             seed: Of all random numbers.
 
         Raises:
-            ReadOutError: There is no such chip, or the read-out is of other electrodes; or the
+            ReadoutError: There is no such chip, or the readout is of other electrodes; or the
                 design has shields, and the fleet is on Warp, where these are not looked at.
         """
         self._chips = None
         if readout is None:
             return
         if isinstance(readout, str):
-            readout = ReadOut.preset(readout, self.electrode_names)
+            readout = Readout.preset(readout, self.electrode_names)
         if readout.bank.electrodes != self.electrode_names:
-            raise ReadOutError(
-                f"the read-out is of electrodes {readout.bank.electrodes}, the fleet of "
+            raise ReadoutError(
+                f"the readout is of electrodes {readout.bank.electrodes}, the fleet of "
                 f"{self.electrode_names}"
             )
         if self._warp is not None and self._terminals.driven > len(self.electrode_names):
-            raise ReadOutError('a design with shields is read through chips on device "cpu" only')
+            raise ReadoutError('a design with shields is read through chips on device "cpu" only')
         self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
 
     def step(
@@ -332,26 +336,26 @@ class Fleet:
 
         On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
         not looked at; nothing waits for the device, so that a step can go into a CUDA graph. Chips
-        are on the host: with a read-out, matrices are copied there.
+        are on the host: with a readout, matrices are copied there.
 
         Args:
             poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
                 shape (e, b, 7).
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
-            time: Time of the scenes [s], not before that of the last step; a read-out needs it.
+            time: Time of the scenes [s], not before that of the last step; a readout needs it.
             jacobian: Whether to work out ``reading.jacobian`` as well, on the CPU only.
 
         Raises:
             SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long.
             SolveError: Some environments have no solution; the message names the first.
-            ReadOutError: A read-out is given no time, or time went back.
+            ReadoutError: A readout is given no time, or time went back.
             ValueError: A Jacobian is asked for on Warp.
         """
         if self._chips is None:
             return self.solved(poses, sensors, jacobian=jacobian)
         if time is None:
-            raise ReadOutError("a read-out needs the time; write step(poses, time=…), in seconds")
+            raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
         reading = self.solved(poses, sensors, jacobian=jacobian)
         matrix = reading.capacitance
         host = matrix if isinstance(matrix, np.ndarray) else matrix.numpy()
@@ -434,7 +438,7 @@ class Fleet:
             if self._warp is None else self.solved(where, at).delta.numpy()
         )  # fmt: skip
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
-        simulator = Simulator(self.design, frequency=self._solver.frequency)
+        simulator = Simulator(self.design, excitation_frequency=self._solver.excitation_frequency)
         errors = np.empty((len(drawn), s, *self.baseline.shape))
         for row, k in enumerate(drawn.tolist()):
             for j in range(s):

@@ -44,7 +44,7 @@ class WarpCore:
         def room(*shape: int, dtype: Any = wp.float32) -> Any:
             return wp.zeros(shape, dtype=dtype, device=self.device)
 
-        cut = kernels.Cut()
+        cut = kernels.WarpCut()
         cut.pose = room(places, views, dtype=wp.transform)
         for name in ("node", "split", "number"):
             setattr(cut, name, room(n, views, dtype=wp.int32))

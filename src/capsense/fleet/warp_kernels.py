@@ -88,7 +88,7 @@ class Response:
 
 
 @wp.struct
-class Cut:
+class WarpCut:
     """Clusters and functions of every view, K for each place; n = b K."""
 
     pose: wp.array2d(dtype=wp.transform)  # of the bodies in the sensor frame, (b, v)
@@ -133,7 +133,7 @@ def _need(shapes: Shapes, green: Response, at: wp.transform, scale: float, node:
 @wp.kernel
 def choose(
     shapes: Shapes, places: Places, green: Response, bodies: wp.array2d(dtype=wp.transform),
-    sensors: wp.array2d(dtype=wp.transform), clusters: int, cut: Cut,
+    sensors: wp.array2d(dtype=wp.transform), clusters: int, cut: WarpCut,
 ):  # fmt: skip
     """Cut every body that a sensor sees into clusters."""
     b, v = wp.tid()
@@ -216,7 +216,9 @@ def _lift(p: wp.vec3, gap: float, green: Response):
 
 
 @wp.kernel
-def place(shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: Cut):
+def place(
+    shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
+):
     """Points of all clusters in the sensor frame, and where they stand to design and walls."""
     i, v = wp.tid()
     k = cut.node[i, v]
@@ -262,7 +264,7 @@ def _unit(p: wp.vec3, source: wp.vec3, floor: float, least: float):
 
 
 @wp.kernel
-def rows(green: Response, cut: Cut, out: wp.array3d(dtype=wp.float32)):
+def rows(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
     """Means of φ⁰ and ψ over all clusters, (n, w, v): 64 columns a thread."""
     i, part, v = wp.tid()
     total = row()
@@ -295,7 +297,7 @@ def rows(green: Response, cut: Cut, out: wp.array3d(dtype=wp.float32)):
 
 
 @wp.func
-def _mean(cut: Cut, i: int, j: int, v: int, mirrored: float, floor: float):
+def _mean(cut: WarpCut, i: int, j: int, v: int, mirrored: float, floor: float):
     """Mean of 1/r between two clusters, the second one mirrored in the floor where that is 1."""
     a0 = cut.points[i, 0, v]
     a1 = cut.points[i, 1, v]
@@ -341,7 +343,7 @@ def _soft(d: wp.vec3, fourth: float):
 
 
 @wp.kernel
-def pairs(green: Response, cut: Cut, clusters: int, out: wp.array3d(dtype=wp.float32)):
+def pairs(green: Response, cut: WarpCut, clusters: int, out: wp.array3d(dtype=wp.float32)):
     """Mean of 1/r between bodies, and of -1/r to images in the floor, (n, n, v)."""
     i, j, v = wp.tid()
     if j > i:
@@ -359,7 +361,7 @@ def pairs(green: Response, cut: Cut, clusters: int, out: wp.array3d(dtype=wp.flo
 
 
 @wp.kernel
-def to_functions(cut: Cut, clusters: int, values: wp.array3d(dtype=wp.float32)):
+def to_functions(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.float32)):
     """Integrate what clusters have in the first index with the charge functions, in place."""
     b, c, v = wp.tid()
     o = b * clusters
@@ -376,7 +378,7 @@ def to_functions(cut: Cut, clusters: int, values: wp.array3d(dtype=wp.float32)):
 
 @wp.kernel
 def assemble(
-    shapes: Shapes, places: Places, cut: Cut, sensors: int, clusters: int, lead: int,
+    shapes: Shapes, places: Places, cut: WarpCut, sensors: int, clusters: int, lead: int,
     potentials: wp.array3d(dtype=wp.float32), matrix: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """The matrix of all functions, its lower half, from their pairs; in place."""
@@ -408,7 +410,7 @@ def assemble(
 
 @wp.kernel
 def factorise(
-    cut: Cut, matrix: wp.array3d(dtype=wp.float32), terminals: int,
+    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), terminals: int,
     potentials: wp.array3d(dtype=wp.float32), dropped: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Cholesky factor L of every matrix; φ⁰ of the functions is replaced by L⁻¹ φ⁰."""

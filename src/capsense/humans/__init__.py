@@ -7,7 +7,7 @@
 """
 
 from capsense.humans.anthropometry import Build
-from capsense.humans.limb import Joint, Limb, Part, Segment, arm, leg
+from capsense.humans.limb import Joint, Limb, LimbPart, Segment, arm, leg
 from capsense.humans.smplx import load_smplx
 
-__all__ = ["Build", "Joint", "Limb", "Part", "Segment", "arm", "leg", "load_smplx"]
+__all__ = ["Build", "Joint", "Limb", "LimbPart", "Segment", "arm", "leg", "load_smplx"]

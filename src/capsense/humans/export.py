@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from capsense.humans.limb import Limb, Part, Segment
+from capsense.humans.limb import Limb, LimbPart, Segment
 from capsense.scene import Material, Pose, material
 from capsense.scene.body import Grounding, checked_grounding
 
@@ -141,7 +141,7 @@ def _urdf_link(root: Element, name: str, segment: Segment | None) -> None:
             )
 
 
-def _centre(parts: tuple[Part, ...]) -> tuple[float, ...]:
+def _centre(parts: tuple[LimbPart, ...]) -> tuple[float, ...]:
     """Centre of volume [m] of the parts."""
     volume = sum(p.shape.volume for p in parts)
     return tuple(sum(p.shape.volume * p.pose.position[k] for p in parts) / volume for k in range(3))

@@ -26,7 +26,7 @@ Side = Literal["left", "right"]
 
 
 @dataclass(frozen=True)
-class Part:
+class LimbPart:
     """A capsule of a segment, in the segment's frame."""
 
     start: Vec3
@@ -72,7 +72,7 @@ class Segment:
     """Its joint centre [m] in the frame of the segment before, or of the limb."""
     joints: tuple[Joint, ...]
     """Its joints; the first turns all the others."""
-    parts: tuple[Part, ...]
+    parts: tuple[LimbPart, ...]
     mass: float
     """Mass [kg]."""
 
@@ -147,7 +147,7 @@ class Limb:
             for name, part in self.named_parts(segment)
         ]
 
-    def named_parts(self, segment: Segment) -> list[tuple[str, Part]]:
+    def named_parts(self, segment: Segment) -> list[tuple[str, LimbPart]]:
         """The parts of a segment with the names of their bodies."""
         return [(f"{self.name}_{segment.name}_{k}", p) for k, p in enumerate(segment.parts, 1)]
 
@@ -301,34 +301,36 @@ def _hinge(name: str, axis: tuple[float, float, float], lower: float, upper: flo
     return Joint(name, (x, y, z), math.radians(lower), math.radians(upper))
 
 
-def _along(length: float, profile: Iterable[tuple[float, float, float]]) -> tuple[Part, ...]:
+def _along(length: float, profile: Iterable[tuple[float, float, float]]) -> tuple[LimbPart, ...]:
     """Coaxial capsules down a segment: from, to as fractions of its length, radius [m]."""
-    return tuple(Part((0.0, 0.0, -a * length), (0.0, 0.0, -b * length), r) for a, b, r in profile)
+    return tuple(
+        LimbPart((0.0, 0.0, -a * length), (0.0, 0.0, -b * length), r) for a, b, r in profile
+    )
 
 
-def _hand(build: Build) -> tuple[Part, ...]:
+def _hand(build: Build) -> tuple[LimbPart, ...]:
     """Four fingers side by side, down to the wrist, and a thumb along the foremost."""
     radius = 0.5 * build.hand_thickness
     length, breadth = build.length("hand"), build.hand_breadth
     tip = -(length - radius)
     row = np.linspace(-0.5 * breadth + radius, 0.5 * breadth - radius, 4)
-    fingers = [Part((float(x), 0.0, 0.0), (float(x), 0.0, tip), radius) for x in row]
+    fingers = [LimbPart((float(x), 0.0, 0.0), (float(x), 0.0, tip), radius) for x in row]
     front = float(row[-1])
-    thumb = Part(
+    thumb = LimbPart(
         (front, 0.0, -0.15 * length), (front + 1.5 * radius, 0.0, -0.5 * length), 0.8 * radius
     )
     return (*fingers, thumb)
 
 
-def _foot(build: Build, outwards: float) -> tuple[Part, ...]:
+def _foot(build: Build, outwards: float) -> tuple[LimbPart, ...]:
     """Two capsules along the sole and one from the ankle down to the heel."""
     length, breadth = build.length("foot"), build.length("foot breadth")
     radius = 0.25 * breadth
     sole = -build.length("ankle height") + radius
     heel, toe = -0.25 * length + radius, 0.75 * length - radius
     sides = [
-        Part((heel, y, sole), (toe, y, sole), radius)
+        LimbPart((heel, y, sole), (toe, y, sole), radius)
         for y in (-outwards * radius, outwards * radius)
     ]
     thick = 1.4 * radius
-    return (*sides, Part((0.0, 0.0, 0.0), (heel + radius, 0.0, sole + thick - radius), thick))
+    return (*sides, LimbPart((0.0, 0.0, 0.0), (heel + radius, 0.0, sole + thick - radius), thick))

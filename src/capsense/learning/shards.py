@@ -12,17 +12,17 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from capsense._crew import processors
+from capsense._thread_pool import processors
 from capsense.errors import (
+    AdapterError,
     MissingDependencyError,
     ScenarioError,
     SceneError,
-    SimulatorError,
     SolveError,
 )
 from capsense.learning.settle import settled, settling
 from capsense.learning.spec import Spec
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.recording.tables import replacing
 from capsense.recording.versions import versions
 from capsense.simulator import Simulator, make_readout
@@ -45,7 +45,7 @@ COLUMNS = {
     "sigma": "conductivity of that, S/m",
     "bodies": "how many bodies the scene holds",
 }
-"""Columns, and what they are; those of a read-out only where one is given."""
+"""Columns, and what they are; those of a readout only where one is given."""
 _KEY = b"capsense"
 """Of what a shard says of itself, in its file's metadata."""
 
@@ -87,11 +87,11 @@ def make_shard(spec: Spec, folder: Path, shard: int) -> int:
     return shard
 
 
-def make_spec_readout(spec: Spec, simulator: Simulator) -> ReadOut | None:
-    """The read-out of a data set, if it has one.
+def make_spec_readout(spec: Spec, simulator: Simulator) -> Readout | None:
+    """The readout of a data set, if it has one.
 
     Raises:
-        ReadOutError: There is no such chip or file, or the file is wrong.
+        ReadoutError: There is no such chip or file, or the file is wrong.
     """
     choice = spec.readout
     if isinstance(choice, str) and choice.endswith(".toml"):
@@ -99,7 +99,7 @@ def make_spec_readout(spec: Spec, simulator: Simulator) -> ReadOut | None:
     return make_readout(choice, simulator)
 
 
-def _row(spec: Spec, number: int, simulator: Simulator, readout: ReadOut | None) -> dict[str, Any]:
+def _row(spec: Spec, number: int, simulator: Simulator, readout: Readout | None) -> dict[str, Any]:
     scene, near, rng = spec.scene(number)
     try:
         reading = simulator.step(scene)
@@ -126,7 +126,7 @@ def _row(spec: Spec, number: int, simulator: Simulator, readout: ReadOut | None)
     return row
 
 
-def _table(spec: Spec, rows: list[dict[str, Any]], readout: ReadOut | None, electrodes: int) -> Any:
+def _table(spec: Spec, rows: list[dict[str, Any]], readout: Readout | None, electrodes: int) -> Any:
     """The rows as a table of plain columns and lists of fixed size."""
     import pyarrow as pa
 
@@ -174,7 +174,7 @@ def run(
 
     Raises:
         ScenarioError: The folder holds another data set, or a scene cannot be drawn.
-        SimulatorError: The scheduler does not answer.
+        AdapterError: The scheduler does not answer.
         ChildProcessError: Worker processes were killed.
         SolveError: A scene was not solved.
         MissingDependencyError: pyarrow or Dask is not installed.
@@ -234,7 +234,7 @@ def _on_cluster(job: Callable[[int], int], todo: Iterable[int], scheduler: str) 
     try:
         client = Client(scheduler)
     except (OSError, TimeoutError, ValueError) as error:
-        raise SimulatorError(
+        raise AdapterError(
             f"no Dask scheduler answers at {scheduler}: {error}; start one with dask scheduler"
         ) from None
     with client:

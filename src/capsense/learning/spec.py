@@ -21,7 +21,7 @@ from capsense.humans import Build, arm, leg
 from capsense.learning.labels import Near, Outline
 from capsense.scenario.bodies import read_body, read_grounding, read_material, read_pose
 from capsense.scenario.loader import read_design
-from capsense.scenario.schema import Table
+from capsense.scenario.schema import ScenarioTable
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import PresetName
 
@@ -123,12 +123,12 @@ class Spec:
 
     def _drawn(self, raw: Mapping[str, Any], rng: Generator) -> list[Body]:
         """The bodies that a table stands for, in one scene."""
-        table = Table(raw, self.source, f'body "{raw.get("name")}"')
+        table = ScenarioTable(raw, self.source, f'body "{raw.get("name")}"')
         chance = table.number("chance", 0.0, 1.0, 1.0)
         if rng.random() >= chance:
             return []
         data = {k: _draw(v, rng, table) for k, v in raw.items() if k != "chance"}
-        table = Table(data, self.source, table.item)
+        table = ScenarioTable(data, self.source, table.item)
         try:
             if data.get("shape") in LIMBS:
                 return _limb(table)
@@ -149,13 +149,15 @@ def load_spec(path: str | Path) -> Spec:
         DesignError: Something is wrong in the design file it names.
     """
     file = Path(path)
-    top = Table(read_toml(file, "data set", ScenarioError), file.name, "data set")
+    top = ScenarioTable(read_toml(file, "data set", ScenarioError), file.name, "data set")
     top.only(TOP_KEYS)
     folder = file.resolve().parent
     bodies = tuple(top.tables("body"))
     if not bodies:
         raise top.error("holds no body; add a [[body]]")
-    names = [Table(b, file.name, f"body {n}").string("name") for n, b in enumerate(bodies, 1)]
+    names = [
+        ScenarioTable(b, file.name, f"body {n}").string("name") for n, b in enumerate(bodies, 1)
+    ]
     if len(set(names)) < len(names):
         raise top.error(f"names of bodies repeat: {', '.join(names)}; names must differ")
     readout: str | Path | None = top.string("readout") if "readout" in top else None
@@ -182,7 +184,7 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(item)
 
 
-def _draw(value: Any, rng: Generator, table: Table) -> Any:
+def _draw(value: Any, rng: Generator, table: ScenarioTable) -> Any:
     """A value with everything random in it decided.
 
     ``{ from = a, to = b }`` is a number, ``{ any = [...] }`` one of several, and
@@ -198,7 +200,7 @@ def _draw(value: Any, rng: Generator, table: Table) -> Any:
             raise table.error(f"{dict(value)} must be {{ any = [one, another, …] }}")
         return _draw(options[rng.integers(len(options))], rng, table)
     if "from" in value or "to" in value:
-        return _number(Table(value, table.source, f"{table.item}: {{ from, to }}"), rng)
+        return _number(ScenarioTable(value, table.source, f"{table.item}: {{ from, to }}"), rng)
     out = {k: _draw(v, rng, table) for k, v in value.items()}
     if out.get("quaternion") == "uniform":
         four = rng.standard_normal(4)
@@ -206,7 +208,7 @@ def _draw(value: Any, rng: Generator, table: Table) -> Any:
     return out
 
 
-def _number(span: Table, rng: Generator) -> float:
+def _number(span: ScenarioTable, rng: Generator) -> float:
     """A number between two; with ``log`` uniform in its logarithm, with ``steps`` one of so many.
 
     Steps suit sizes: a body of new proportions takes the solver many times as long as others.
@@ -220,7 +222,7 @@ def _number(span: Table, rng: Generator) -> float:
     return float(low * (high / low) ** share if log else low + (high - low) * share)
 
 
-def _limb(table: Table) -> list[Body]:
+def _limb(table: ScenarioTable) -> list[Body]:
     """An arm or a leg; its pose is that of the middle of one segment, z along the segment."""
     table.only(LIMB_KEYS)
     build = Build(
@@ -230,11 +232,13 @@ def _limb(table: Table) -> list[Body]:
     )
     side = table.choice("side", ("left", "right"), "right")
     limb = LIMBS[table.string("shape")](build, side)  # type: ignore[arg-type]
-    angles = Table(table.data.get("angles", {}), table.source, f"{table.item}: angles")
+    angles = ScenarioTable(table.data.get("angles", {}), table.source, f"{table.item}: angles")
     bent = {joint: angles.number(joint, -180.0, 180.0) for joint in angles.data}
     named = {s.name: s for s in limb.segments}
     segment = named[table.choice("segment", list(named), limb.segments[1].name)]
-    pose = read_pose(Table(table.raw("pose", "{ position = [x, y, z] }"), table.source, table.item))
+    pose = read_pose(
+        ScenarioTable(table.raw("pose", "{ position = [x, y, z] }"), table.source, table.item)
+    )
     ends = np.array([p for part in segment.parts for p in (part.start, part.end)])
     middle = Pose(0.5 * (ends.min(axis=0) + ends.max(axis=0)))
     root = pose @ (limb.forward(bent, degrees=True)[segment.name] @ middle).inverse()

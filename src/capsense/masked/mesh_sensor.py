@@ -118,7 +118,7 @@ def lattice_sensor(design: Design, terminals: Sequence[str], settings: MeshSetti
     missing = [name for name, nodes in groups.items() if not len(nodes)]
     if missing:
         raise SceneError(
-            f"method 'masked' needs mesh nodes on every electrode; {missing[0]!r} has none: "
+            f"method 'fem_masked' needs mesh nodes on every electrode; {missing[0]!r} has none: "
             "raise [build] resolution, or use method 'surface'"
         )
     mesh = mesh.with_groups(node_groups={**groups, GROUND: np.flatnonzero(owner == WALL)})

@@ -24,8 +24,10 @@ class MaskedScenes:
 
     FLOATING_EPS_R = 1e4
 
-    def __init__(self, sensor: MeshSensor, frequency: float, *, warm_start: bool = True) -> None:
-        self._frequency = frequency
+    def __init__(
+        self, sensor: MeshSensor, excitation_frequency: float, *, warm_start: bool = True
+    ) -> None:
+        self._excitation_frequency = excitation_frequency
         self._mesh = sensor.mesh
         self._centroids = sensor.mesh.centroids
         self._solver = MaskedSolver(
@@ -56,23 +58,25 @@ class MaskedScenes:
             if not isinstance(body.grounding, str):
                 raise SceneError(
                     f"body {body.name or i} is tied to ground through {body.grounding} F; method "
-                    "'masked' knows only grounded and floating bodies"
+                    "'fem_masked' knows only grounded and floating bodies"
                 )
             if not getattr(body.shape, "closed", True):
                 raise SceneError(
-                    f"body {body.name or i} is an open surface, and method 'masked' needs an "
+                    f"body {body.name or i} is an open surface, and method 'fem_masked' needs an "
                     "inside: close it, give a DepthFrame, or use method 'surface'"
                 )
             local = body.pose.inverse().apply(self._centroids)
             within = body.shape.signed_distance(local) < 0
-            conducts = body.material.is_conductor(self._frequency)
+            conducts = body.material.is_conductor(self._excitation_frequency)
             if conducts:
                 eps[i] = GROUNDED if body.grounding == "grounded" else self.FLOATING_EPS_R
                 inside[within] = i
             else:
-                eps[i] = body.material.at(self._frequency).eps_r
+                eps[i] = body.material.at(self._excitation_frequency).eps_r
                 taken = inside >= 0
-                conductor = np.array([b.material.is_conductor(self._frequency) for b in scene])
+                conductor = np.array(
+                    [b.material.is_conductor(self._excitation_frequency) for b in scene]
+                )
                 inside[within & ~(taken & conductor[inside])] = i
         matrix = self._solver.step(inside, eps.tolist())
         stats = self._solver.stats

@@ -40,7 +40,7 @@ class MshData:
 
 
 @dataclass
-class _Block:
+class _ElementGroup:
     """Elements of one type that are in the same physical groups."""
 
     kind: int
@@ -181,19 +181,21 @@ def _node_count(kind: int) -> int:
     return _NODES_OF[kind]
 
 
-def _elements_41(numbers: _Numbers, physical: dict[tuple[int, int], list[int]]) -> list[_Block]:
+def _elements_41(
+    numbers: _Numbers, physical: dict[tuple[int, int], list[int]]
+) -> list[_ElementGroup]:
     blocks = []
     for _ in range(int(numbers.take(4, "u8")[0])):
         dim, entity, kind = (int(value) for value in numbers.take(3, "i4"))
         count, width = int(numbers.take(1, "u8")[0]), 1 + _node_count(kind)
         table = numbers.take(count * width, "u8").reshape(count, width)
-        blocks.append(_Block(kind, physical.get((dim, entity), []), table[:, 1:]))
+        blocks.append(_ElementGroup(kind, physical.get((dim, entity), []), table[:, 1:]))
     return blocks
 
 
-def _elements_22(numbers: _Numbers, count: int, binary: bool) -> list[_Block]:
+def _elements_22(numbers: _Numbers, count: int, binary: bool) -> list[_ElementGroup]:
     """Records of one type and tag count come in runs; a run is cut up by physical group."""
-    blocks: list[_Block] = []
+    blocks: list[_ElementGroup] = []
     done = 0
     while done < count:
         if binary:
@@ -217,7 +219,7 @@ def _elements_22(numbers: _Numbers, count: int, binary: bool) -> list[_Block]:
         groups = np.abs(table[:, lead]) if n_tags else np.zeros(run, np.int64)
         for group in np.unique(groups):
             corners = table[groups == group, lead + n_tags :]
-            blocks.append(_Block(kind, [int(group)] if group else [], corners))
+            blocks.append(_ElementGroup(kind, [int(group)] if group else [], corners))
         done += run
     return blocks
 
@@ -225,7 +227,7 @@ def _elements_22(numbers: _Numbers, count: int, binary: bool) -> list[_Block]:
 def _assemble(
     tags: IntArray,
     points: NDArray[np.float64],
-    blocks: list[_Block],
+    blocks: list[_ElementGroup],
     names: dict[tuple[int, int], str],
 ) -> MshData:
     if len(tags) == 0:

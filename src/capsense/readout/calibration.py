@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Bools, Ints, finite, per_channel, require
 from capsense.readout.noise import Flicker
 from capsense.readout.stage import Context, Process
@@ -30,11 +30,11 @@ def base_capacitance(values: ArrayLike) -> Array:
         values: Readings [F or codes], shape (n, ...).
 
     Raises:
-        ReadOutError: There are no readings, or one is not finite.
+        ReadoutError: There are no readings, or one is not finite.
     """
     array = finite("readings", values)
     if not array.size or array.ndim < 1:
-        raise ReadOutError("base capacitance needs readings, at least one; give some")
+        raise ReadoutError("base capacitance needs readings, at least one; give some")
     return array.mean(axis=0)
 
 
@@ -46,7 +46,7 @@ def tare(values: ArrayLike, base: ArrayLike) -> Array:
         base: Of each channel, shape (...).
 
     Raises:
-        ReadOutError: The shapes do not fit, or a number is not finite.
+        ReadoutError: The shapes do not fit, or a number is not finite.
     """
     readings, level = _against(values, base)
     return readings - level
@@ -60,18 +60,18 @@ def relative_to(values: ArrayLike, base: ArrayLike) -> Array:
         base: Of each channel, shape (...).
 
     Raises:
-        ReadOutError: A base is zero, the shapes do not fit, or a number is not finite.
+        ReadoutError: A base is zero, the shapes do not fit, or a number is not finite.
     """
     readings, level = _against(values, base)
     if (level == 0).any():
-        raise ReadOutError("a base is 0, to which nothing is relative; use tare() instead")
+        raise ReadoutError("a base is 0, to which nothing is relative; use tare() instead")
     return readings / level
 
 
 def _against(values: ArrayLike, base: ArrayLike) -> tuple[Array, Array]:
     readings, level = finite("readings", values), finite("base", base)
     if level.ndim and readings.shape[readings.ndim - level.ndim :] != level.shape:
-        raise ReadOutError(
+        raise ReadoutError(
             f"readings have shape {readings.shape}, the base {level.shape}; give one base a channel"
         )
     return readings, level
@@ -81,14 +81,14 @@ def unit_range(values: ArrayLike) -> Array:
     """Each channel stretched to run from 0 to 1 over a recording, shape (n, ...).
 
     Raises:
-        ReadOutError: A channel is constant, or a number is not finite.
+        ReadoutError: A channel is constant, or a number is not finite.
     """
     array = finite("readings", values)
     if not array.size:
-        raise ReadOutError("there are no readings to stretch; give some")
+        raise ReadoutError("there are no readings to stretch; give some")
     low, span = array.min(axis=0), np.ptp(array, axis=0)
     if (span == 0).any():
-        raise ReadOutError("a channel is constant and has no range; leave it out")
+        raise ReadoutError("a channel is constant and has no range; leave it out")
     return (array - low) / span
 
 
@@ -98,15 +98,15 @@ def cross_correlation(one: ArrayLike, other: ArrayLike) -> float:
     ``Σ (a − ā)(b − b̄) / √(Σ (a − ā)² Σ (b − b̄)²)``
 
     Raises:
-        ReadOutError: The signals differ in length, one is constant, or a number is not finite.
+        ReadoutError: The signals differ in length, one is constant, or a number is not finite.
     """
     a, b = finite("signal", one), finite("signal", other)
     if a.shape != b.shape:
-        raise ReadOutError(f"signals have shapes {a.shape} and {b.shape}; make them the same")
+        raise ReadoutError(f"signals have shapes {a.shape} and {b.shape}; make them the same")
     a, b = a - a.mean(), b - b.mean()
     size = math.sqrt(float((a * a).sum() * (b * b).sum()))
     if size == 0:
-        raise ReadOutError("a signal is constant and correlates with nothing; leave it out")
+        raise ReadoutError("a signal is constant and correlates with nothing; leave it out")
     return float((a * b).sum()) / size
 
 
@@ -114,10 +114,10 @@ def cross_correlation(one: ArrayLike, other: ArrayLike) -> float:
 class LinearSensor:
     """How a sensor measures: ``measured = gain · true + offset + drift · (t − epoch)``.
 
-    As a stage of a read-out it makes the simulated sensor measure like the real one.
+    As a stage of a readout it makes the simulated sensor measure like the real one.
 
     Raises:
-        ReadOutError: A figure is not finite, or a gain is zero.
+        ReadoutError: A figure is not finite, or a gain is zero.
     """
 
     gain: Array
@@ -134,7 +134,7 @@ class LinearSensor:
             figures = finite(f"calibration: {name}", getattr(self, name))
             object.__setattr__(self, name, figures)
         if (self.gain == 0).any():
-            raise ReadOutError("calibration: a gain is 0; leave that channel out")
+            raise ReadoutError("calibration: a gain is 0; leave that channel out")
         require("calibration", "epoch", self.epoch, -math.inf, "s")
 
     def correct(self, measured: ArrayLike, time: ArrayLike | None = None) -> Array:
@@ -149,7 +149,7 @@ class LinearSensor:
         return np.asarray(true, dtype=float) * self.gain + self._shift(time)
 
     def toml(self) -> str:
-        """The figures as the table ``[calibration]`` of a read-out file."""
+        """The figures as the table ``[calibration]`` of a readout file."""
         lines = [f"{key} = {getattr(self, key).tolist()}" for key in ("gain", "offset", "drift")]
         return "\n".join(["[calibration]", *lines, f"epoch = {float(self.epoch)!r}", ""])
 
@@ -161,10 +161,10 @@ class LinearSensor:
         return self.offset + self.drift * (at - self.epoch)
 
     def start(self, context: Context) -> Process:
-        """The process of a read-out's stage.
+        """The process of a readout's stage.
 
         Raises:
-            ReadOutError: There are figures for another number of channels.
+            ReadoutError: There are figures for another number of channels.
         """
         gain, offset, drift = (
             per_channel("calibration", name, getattr(self, name), context.channels)
@@ -235,17 +235,17 @@ def calibrate(
         floor: Allan deviation of the flicker floor [F]; needs times that rise.
 
     Raises:
-        ReadOutError: Shapes do not fit, numbers are not finite, samples are too few, or the
+        ReadoutError: Shapes do not fit, numbers are not finite, samples are too few, or the
             recording does not tell the figures apart (a channel that never changes).
     """
     c, m = finite("true", true), finite("measured", measured)
     if c.ndim != 2 or c.shape != m.shape or not c.shape[1]:
-        raise ReadOutError(f"true has shape {c.shape}, measured {m.shape}; give both as (n, K)")
+        raise ReadoutError(f"true has shape {c.shape}, measured {m.shape}; give both as (n, K)")
     n, k = c.shape
     require("calibrate", "floor", floor, 0.0, "F")
     t = _times(time, n, k, drift or floor > 0)
     if floor > 0 and (np.diff(t, axis=0) <= 0).any():
-        raise ReadOutError("with a floor, times must rise; sort the samples")
+        raise ReadoutError("with a floor, times must rise; sort the samples")
     unknowns, kept = 3 if drift else 2, _kept(flags, c)
     epoch = float(t.mean())
     figures, covariance = np.zeros((k, 3)), np.zeros((k, 3, 3))
@@ -254,7 +254,7 @@ def calibrate(
         used = kept[:, channel]
         at, x, y = (values[used, channel] for values in (t, c, m))
         if len(at) <= unknowns:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"channel {channel}: {len(at)} samples for {unknowns} unknowns; record more"
             )
         columns = np.stack([x, np.ones(len(at)), at - epoch][:unknowns], axis=1)
@@ -280,7 +280,7 @@ def _kept(flags: ArrayLike | None, values: Array) -> Bools:
         return np.ones(values.shape, np.bool_)
     given = np.asarray(flags)
     if given.shape != values.shape:
-        raise ReadOutError(
+        raise ReadoutError(
             f"flags have shape {given.shape}, measured {values.shape}; make them one"
         )
     return given == 0
@@ -315,14 +315,14 @@ def _times(time: ArrayLike | None, count: int, channels: int, needed: bool) -> A
     """Times of each channel's samples [s], shape (count, channels)."""
     if time is None:
         if needed:
-            raise ReadOutError(
+            raise ReadoutError(
                 "drift and floor need the times of the samples; give time, or drift=False and "
                 "no floor"
             )
         return np.zeros((count, channels))
     t = finite("time", time)
     if t.shape not in ((count,), (count, channels)):
-        raise ReadOutError(f"time has shape {t.shape}; give {count} numbers, one a sample")
+        raise ReadoutError(f"time has shape {t.shape}; give {count} numbers, one a sample")
     return np.broadcast_to(t if t.ndim == 2 else t[:, None], (count, channels))
 
 
@@ -333,7 +333,7 @@ def _least_squares(
     scale = np.sqrt((design**2).mean(axis=0))
     # A column that is a constant, or a multiple of another one, tells nothing of its own.
     if (scale == 0).any() or np.linalg.cond(design / np.where(scale > 0, scale, 1.0)) > 1e6:
-        raise ReadOutError(
+        raise ReadoutError(
             f"channel {channel}: the recording does not tell gain, offset and drift apart; move "
             "the body so that the capacitance changes, and not along with time only"
         )

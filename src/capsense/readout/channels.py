@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._validate import suggest
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, real, require
 
 Rest = Literal["grounded", "floating", "guard"]
@@ -28,7 +28,7 @@ class Pattern:
     """One measurement: potentials on some electrodes, and the electrode whose charge is read.
 
     Raises:
-        ReadOutError: Nothing is driven, a weight is not a finite number, an electrode is both
+        ReadoutError: Nothing is driven, a weight is not a finite number, an electrode is both
             driven and floating, or a receiver other than the transmitter is driven.
     """
 
@@ -53,16 +53,16 @@ class Pattern:
         for electrode, weight in (*drive.items(), ("shield", self.shield)):
             require(where, f"the drive of {electrode!r}", weight, -math.inf, "")
         if all(weight == 0.0 for weight in drive.values()):
-            raise ReadOutError(f"{where}: nothing is driven; give one electrode a weight")
+            raise ReadoutError(f"{where}: nothing is driven; give one electrode a weight")
         if self.rest not in RESTS:
-            raise ReadOutError(f"{where}: rest = {self.rest!r}; {suggest(str(self.rest), RESTS)}")
+            raise ReadoutError(f"{where}: rest = {self.rest!r}; {suggest(str(self.rest), RESTS)}")
         for electrode in self.floating:
             if electrode in drive or electrode == self.sense:
-                raise ReadOutError(
+                raise ReadoutError(
                     f"{where}: electrode {electrode!r} is floating, and driven or read; keep one"
                 )
         if self.sense in drive and len(drive) > 1:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"{where}: {self.sense!r} is read and driven together with other electrodes; "
                 'read it alone, with the others as rest = "guard"'
             )
@@ -102,14 +102,14 @@ def mutual_patterns(
     """Pairs (transmitter, receiver); by default every pair once, in the order of the electrodes.
 
     Raises:
-        ReadOutError: A pair names one electrode twice.
+        ReadoutError: A pair names one electrode twice.
     """
     chosen = list(pairs) or [
         (one, two) for k, one in enumerate(electrodes) for two in electrodes[k + 1 :]
     ]
     for tx, rx in chosen:
         if tx == rx:
-            raise ReadOutError(f"pair {[tx, rx]} names one electrode twice; give two")
+            raise ReadoutError(f"pair {[tx, rx]} names one electrode twice; give two")
     return tuple(Pattern(rx, {tx: 1.0}, rest=rest) for tx, rx in chosen)
 
 
@@ -121,30 +121,30 @@ class ChannelBank:
         electrodes: Electrode names in matrix order.
 
     Raises:
-        ReadOutError: A pattern names an electrode that is not there, or two have one name.
+        ReadoutError: A pattern names an electrode that is not there, or two have one name.
     """
 
     def __init__(self, patterns: Sequence[Pattern], electrodes: Sequence[str]) -> None:
         if isinstance(electrodes, str):
-            raise ReadOutError(f"electrodes are {electrodes!r}; give a list of names")
+            raise ReadoutError(f"electrodes are {electrodes!r}; give a list of names")
         if not patterns:
-            raise ReadOutError(
-                f"a read-out needs at least one channel; electrodes {list(electrodes)} make none"
+            raise ReadoutError(
+                f"a readout needs at least one channel; electrodes {list(electrodes)} make none"
             )
         for pattern in patterns:
             if not isinstance(pattern, Pattern):
-                raise ReadOutError(f"channel {pattern!r} is no Pattern; make one, Pattern('E1')")
+                raise ReadoutError(f"channel {pattern!r} is no Pattern; make one, Pattern('E1')")
         self.patterns = tuple(patterns)
         self.electrodes = tuple(electrodes)
         self.names = tuple(p.name for p in patterns)
         for name in self.names:
             if self.names.count(name) > 1:
-                raise ReadOutError(f"two channels are named {name!r}; give them names")
+                raise ReadoutError(f"two channels are named {name!r}; give them names")
         index = {name: k for k, name in enumerate(self.electrodes)}
         for pattern in self.patterns:
             for name in (pattern.sense, *pattern.drive, *pattern.floating):
                 if name not in index:
-                    raise ReadOutError(
+                    raise ReadoutError(
                         f"channel {pattern.name!r} names no electrode {name!r} of the sensor; "
                         f"{suggest(name, self.electrodes)}"
                     )
@@ -174,12 +174,12 @@ class ChannelBank:
             Channel capacitances [F], shape (..., K).
 
         Raises:
-            ReadOutError: The shape does not fit the electrodes, or a number is not finite.
+            ReadoutError: The shape does not fit the electrodes, or a number is not finite.
         """
         matrix = real("capacitance", capacitance)
         m = len(self.electrodes)
         if matrix.shape[-2:] != (m, m):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"capacitance has shape {matrix.shape}; {m} electrodes need (..., {m}, {m})"
             )
         rows = matrix[..., self._sense, :]
@@ -190,7 +190,7 @@ class ChannelBank:
             out[..., k] += self._induced(matrix, shield_coupling, k)
         out = self._sign * out
         if not np.isfinite(out).all():
-            raise ReadOutError("capacitance holds a number that is not finite; mend the readings")
+            raise ReadoutError("capacitance holds a number that is not finite; mend the readings")
         return out
 
     def _induced(self, matrix: Array, coupling: Array | None, k: int) -> Array:
@@ -203,7 +203,7 @@ class ChannelBank:
         try:
             volts = -np.linalg.solve(own, charge[..., None])[..., 0]
         except np.linalg.LinAlgError:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"channel {self.names[k]!r}: its open electrodes have no capacitance; mend the "
                 "readings"
             ) from None

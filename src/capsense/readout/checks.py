@@ -1,4 +1,4 @@
-"""Numbers as a read-out takes them: what is none, not finite or of the wrong size is refused."""
+"""Numbers as a readout takes them: what is none, not finite or of the wrong size is refused."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._validate import as_number
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -23,7 +23,7 @@ def require(
     if not math.isfinite(number) or number < low or (open_ and number == low):
         bound = f"above {low:g}" if open_ else f"at least {low:g}"
         wanted = "a finite number" if low == -math.inf else f"a number {bound} {unit}".rstrip()
-        raise ReadOutError(f"{owner}: {name} is {value!r}; give {wanted}")
+        raise ReadoutError(f"{owner}: {name} is {value!r}; give {wanted}")
 
 
 def require_whole(owner: str, name: str, value: object, low: int, high: float = math.inf) -> None:
@@ -31,21 +31,21 @@ def require_whole(owner: str, name: str, value: object, low: int, high: float = 
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or not low <= as_number(value) <= high:
         bound = f"from {low} on" if high == math.inf else f"from {low} to {high}"
-        raise ReadOutError(f"{owner}: {name} is {value!r}; give a whole number {bound}")
+        raise ReadoutError(f"{owner}: {name} is {value!r}; give a whole number {bound}")
 
 
 def real(what: str, values: object) -> Array:
     """Real numbers as an array of any shape.
 
     Raises:
-        ReadOutError: They are not; ``what`` names them.
+        ReadoutError: They are not; ``what`` names them.
     """
     try:
         array = np.asarray(values)
     except ValueError:
-        raise ReadOutError(f"{what}: rows differ in length; make them the same") from None
+        raise ReadoutError(f"{what}: rows differ in length; make them the same") from None
     if array.dtype.kind not in "fiu":
-        raise ReadOutError(f"{what}: {array.dtype} values are no real numbers; give such")
+        raise ReadoutError(f"{what}: {array.dtype} values are no real numbers; give such")
     return np.asarray(array, dtype=float)
 
 
@@ -53,11 +53,11 @@ def finite(what: str, values: object) -> Array:
     """Finite real numbers as an array of any shape.
 
     Raises:
-        ReadOutError: They are not; ``what`` names them.
+        ReadoutError: They are not; ``what`` names them.
     """
     array = real(what, values)
     if not np.isfinite(array).all():
-        raise ReadOutError(f"{what}: a number is not finite; leave it out, or mend it")
+        raise ReadoutError(f"{what}: a number is not finite; leave it out, or mend it")
     return array
 
 
@@ -65,11 +65,11 @@ def per_channel(owner: str, name: str, value: object, channels: int) -> Array:
     """One number for all channels, or one per channel, as an array of shape (K,).
 
     Raises:
-        ReadOutError: The count does not fit, or a number is not finite.
+        ReadoutError: The count does not fit, or a number is not finite.
     """
     array = finite(f"{owner}: {name}", value)
     if array.shape not in ((), (channels,)):
-        raise ReadOutError(
+        raise ReadoutError(
             f"{owner}: {name} is {value!r}; give a number, or a list of {channels}, one per channel"
         )
     return np.broadcast_to(array, (channels,)).copy()

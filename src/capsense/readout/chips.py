@@ -245,3 +245,8 @@ CHIPS: dict[str, Chip] = {
     chip.name: chip for chip in (AD7147, FDC1004, FDC2214, AD7746, AD7747, MPR121, TEENSY, SDR)
 }
 """The known chips by name."""
+
+
+def available_chips() -> tuple[str, ...]:
+    """Names of the chips that a readout can be made of, sorted."""
+    return tuple(sorted(CHIPS))

@@ -1,4 +1,4 @@
-"""Read-outs from TOML files that lie beside a design."""
+"""Readouts from TOML files that lie beside a design."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any, cast
 
 from capsense import _validate
 from capsense._validate import read_toml, suggest
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
 from capsense.readout.chip import Chip
 from capsense.readout.chips import CHIPS
 from capsense.readout.converter import Law, ResonanceLaw, ShuntLaw
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
-from capsense.readout.presets import Options, build, chip_of, expected_of
-from capsense.readout.read_out import Reading, ReadOut
+from capsense.readout.presets import ReadoutOptions, build, chip_of, expected_of
+from capsense.readout.readout import ReadingLike, Readout
 from capsense.readout.wiring import Wiring
 
 TOP_KEYS = (
@@ -31,58 +31,58 @@ Limits = Mapping[str, tuple[float, float, str]]
 """Key → least and largest number, and their unit."""
 
 
-class Table(_validate.Table):
-    """One table of a read-out file; whatever is wrong raises :class:`ReadOutError`."""
+class ReadoutTable(_validate.Table):
+    """One table of a readout file; whatever is wrong raises :class:`ReadoutError`."""
 
-    error_type = ReadOutError
+    error_type = ReadoutError
 
 
-def load_readout(path: str | Path, electrodes: Sequence[str]) -> ReadOut:
-    """Load a read-out file.
+def load_readout(path: str | Path, electrodes: Sequence[str]) -> Readout:
+    """Load a readout file.
 
     Args:
         path: The ``.toml`` file.
         electrodes: Electrode names of the sensor, in matrix order.
 
     Raises:
-        ReadOutError: There is no such file, or anything in it is wrong; the message names the
+        ReadoutError: There is no such file, or anything in it is wrong; the message names the
             file, the item, the value and the mend.
     """
     file = Path(path)
-    return parse_readout(read_toml(file, "read-out", ReadOutError), electrodes, source=file.name)
+    return parse_readout(read_toml(file, "readout", ReadoutError), electrodes, source=file.name)
 
 
-def choose_readout(choice: str | Path, electrodes: Sequence[str], empty: Reading) -> ReadOut:
-    """A read-out by the name of a chip, or from a file.
+def choose_readout(choice: str | Path, electrodes: Sequence[str], empty: ReadingLike) -> Readout:
+    """A readout by the name of a chip, or from a file.
 
     Args:
-        choice: A chip's name, or the path of a read-out file, ``.toml``.
+        choice: A chip's name, or the path of a readout file, ``.toml``.
         electrodes: Electrode names of the sensor, in matrix order.
         empty: The sensor's reading of an empty scene. A named chip that adapts to its electrodes
             is set up for it; a file says ``expected`` itself.
 
     Raises:
-        ReadOutError: There is no such chip or file, or the file is wrong.
+        ReadoutError: There is no such chip or file, or the file is wrong.
     """
     content = file_content(choice, electrodes, empty)
     return parse_readout(content, electrodes, source=Path(choice).name)
 
 
 def file_content(
-    choice: str | Path, electrodes: Sequence[str], empty: Reading | None = None
+    choice: str | Path, electrodes: Sequence[str], empty: ReadingLike | None = None
 ) -> dict[str, Any]:
-    """What a read-out file holds, or would hold to say the same as the name of a chip.
+    """What a readout file holds, or would hold to say the same as the name of a chip.
 
     Args:
-        choice: A chip's name, or the path of a read-out file, ``.toml``.
+        choice: A chip's name, or the path of a readout file, ``.toml``.
         electrodes: Electrode names of the sensor, in matrix order.
         empty: The sensor's reading of an empty scene, which a named chip is set up for.
 
     Raises:
-        ReadOutError: There is no such chip or file, or it is not TOML.
+        ReadoutError: There is no such chip or file, or it is not TOML.
     """
     if str(choice).endswith(".toml"):
-        return read_toml(Path(choice), "read-out", ReadOutError)
+        return read_toml(Path(choice), "readout", ReadoutError)
     chip = chip_of(str(choice))
     if empty is None:
         return {"chip": chip.name}
@@ -91,14 +91,14 @@ def file_content(
 
 
 def parse_readout(
-    data: Mapping[str, Any], electrodes: Sequence[str], *, source: str = "read-out"
-) -> ReadOut:
-    """Build a read-out from the content of its file, given as nested dicts.
+    data: Mapping[str, Any], electrodes: Sequence[str], *, source: str = "readout"
+) -> Readout:
+    """Build a readout from the content of its file, given as nested dicts.
 
     Raises:
-        ReadOutError: Anything is wrong.
+        ReadoutError: Anything is wrong.
     """
-    top = Table(data, source, "read-out")
+    top = ReadoutTable(data, source, "readout")
     top.only(TOP_KEYS)
     chip = chip_of(top.choice("chip", tuple(CHIPS)))
     options: dict[str, Any] = {"patterns": _patterns(top, chip.mode, electrodes)}
@@ -118,15 +118,15 @@ def parse_readout(
         ("calibration", _calibration),
     ):  # fmt: skip
         if key in top:
-            table = Table(top.data[key], source, key)
+            table = ReadoutTable(top.data[key], source, key)
             options.update(read(table))
     try:
-        return build(chip, electrodes, Options.of(options))
-    except ReadOutError as error:
+        return build(chip, electrodes, ReadoutOptions.of(options))
+    except ReadoutError as error:
         raise top.error(str(error)) from None
 
 
-def _given(table: Table, limits: Limits) -> dict[str, float]:
+def _given(table: ReadoutTable, limits: Limits) -> dict[str, float]:
     """Numbers of the keys that a table holds, within their limits."""
     return {
         key: table.number(key, low, high, unit=unit)
@@ -135,7 +135,7 @@ def _given(table: Table, limits: Limits) -> dict[str, float]:
     }
 
 
-def _law(top: Table, chip: Chip) -> Law:
+def _law(top: ReadoutTable, chip: Chip) -> Law:
     """A tank or front end of one's own; what the file leaves out is as the chip has it."""
     law = chip.law
     for key, kind in (("tank", ResonanceLaw), ("front_end", ShuntLaw)):
@@ -143,7 +143,7 @@ def _law(top: Table, chip: Chip) -> Law:
             fitting = ", ".join(c.name for c in CHIPS.values() if isinstance(c.law, kind))
             raise top.error(f"the {chip.name} has no {key}; it goes with chip = {fitting}")
     if isinstance(law, ResonanceLaw):
-        table = Table(top.data["tank"], top.source, "tank")
+        table = ReadoutTable(top.data["tank"], top.source, "tank")
         table.only(("inductance", "capacitance", "reference"))
         return replace(
             law,
@@ -152,7 +152,7 @@ def _law(top: Table, chip: Chip) -> Law:
             reference=table.number("reference", 1e5, 1e9, law.reference, "Hz"),
         )
     assert isinstance(law, ShuntLaw)
-    table = Table(top.data["front_end"], top.source, "front_end")
+    table = ReadoutTable(top.data["front_end"], top.source, "front_end")
     limits = {
         "frequency": (1.0, 1e10, "Hz"), "shunt": (1e-3, 1e12, "Ω"), "gain": (1e-6, 1e9, ""),
         "amplitude": (1e-6, 1e6, "V"), "bandwidth": (1.0, 1e12, "Hz"),
@@ -161,20 +161,23 @@ def _law(top: Table, chip: Chip) -> Law:
     table.only((*limits, "full_scale", "bits"))
     full_scale = table.number("full_scale", 1e-9, 1e6, law.full_scale, "V")
     bits = table.integer("bits", 2, 32, law.bits)
+    given = _given(table, limits)
+    if "frequency" in given:
+        given["excitation_frequency"] = given.pop("frequency")
     try:
-        return ShuntLaw(replace(law.front_end, **_given(table, limits)), full_scale, bits)
-    except ReadOutError as error:
+        return ShuntLaw(replace(law.front_end, **given), full_scale, bits)
+    except ReadoutError as error:
         raise table.error(str(error)) from None
 
 
-def _patterns(top: Table, mode: str, electrodes: Sequence[str]) -> tuple[Pattern, ...]:
+def _patterns(top: ReadoutTable, mode: str, electrodes: Sequence[str]) -> tuple[Pattern, ...]:
     """Channels from [[channel]], or from ``mode``, ``pairs`` and ``rest``."""
     if "channel" in top:
         for key in ("mode", "pairs", "rest"):
             if key in top:
                 raise top.error(f"{key} and [[channel]] both choose the channels; keep one")
         return tuple(
-            _pattern(Table(raw, top.source, f"channel {number}"), electrodes)
+            _pattern(ReadoutTable(raw, top.source, f"channel {number}"), electrodes)
             for number, raw in enumerate(top.tables("channel"), start=1)
         )
     mode = top.choice("mode", ("self", "mutual"), mode)
@@ -185,11 +188,11 @@ def _patterns(top: Table, mode: str, electrodes: Sequence[str]) -> tuple[Pattern
         return self_patterns(electrodes, rest=rest)
     try:
         return mutual_patterns(electrodes, _pairs(top, electrodes), rest=rest)
-    except ReadOutError as error:
+    except ReadoutError as error:
         raise top.error(str(error)) from None
 
 
-def _pairs(top: Table, electrodes: Sequence[str]) -> list[tuple[str, str]]:
+def _pairs(top: ReadoutTable, electrodes: Sequence[str]) -> list[tuple[str, str]]:
     what = 'a list of [transmitter, receiver] names, like [["E1", "E2"]]'
     if "pairs" not in top:
         return []
@@ -206,11 +209,11 @@ def _pairs(top: Table, electrodes: Sequence[str]) -> list[tuple[str, str]]:
     return [(tx, rx) for tx, rx in value]
 
 
-def _pattern(table: Table, electrodes: Sequence[str]) -> Pattern:
+def _pattern(table: ReadoutTable, electrodes: Sequence[str]) -> Pattern:
     table.only(("name", "sense", "drive", "floating", "rest", "shield"))
     sense = table.string("sense")
     _require_electrode(table, "sense", sense, electrodes)
-    drive_table = Table(table.data.get("drive", {}), table.source, f"{table.item}: drive")
+    drive_table = ReadoutTable(table.data.get("drive", {}), table.source, f"{table.item}: drive")
     drive = {}
     for name in drive_table.data:
         _require_electrode(table, "drive", name, electrodes)
@@ -224,16 +227,16 @@ def _pattern(table: Table, electrodes: Sequence[str]) -> Pattern:
     shield = table.number("shield", -1e3, 1e3, 0.0 if drive else 1.0)
     try:
         return Pattern(sense, drive, tuple(floating), rest, shield, table.text("name"))
-    except ReadOutError as error:
+    except ReadoutError as error:
         raise table.error(str(error)) from None
 
 
-def _require_electrode(table: Table, key: str, name: str, electrodes: Sequence[str]) -> None:
+def _require_electrode(table: ReadoutTable, key: str, name: str, electrodes: Sequence[str]) -> None:
     if name not in electrodes:
         raise table.error(f"{key} names no electrode {name!r}; {suggest(name, electrodes)}")
 
 
-def _wiring(table: Table) -> dict[str, Any]:
+def _wiring(table: ReadoutTable) -> dict[str, Any]:
     table.only(("trace", "cable", "shield_gain", "crosstalk", "coupling"))
     capacitances = {
         key: table.series(key, 0.0, 1e-6, "F")
@@ -249,7 +252,7 @@ def _wiring(table: Table) -> dict[str, Any]:
     }
 
 
-def _noise(table: Table) -> dict[str, Any]:
+def _noise(table: ReadoutTable) -> dict[str, Any]:
     limits = {
         "white": (0.0, 1e-9, "F"), "flicker": (0.0, 1e-9, "F"), "walk": (0.0, 1e-9, "F/√s"),
         "mains": (0.0, 1e-9, "F"), "mains_frequency": (1.0, 1e3, "Hz"),
@@ -258,7 +261,7 @@ def _noise(table: Table) -> dict[str, Any]:
     return _given(table, limits)
 
 
-def _climate(table: Table) -> dict[str, Any]:
+def _climate(table: ReadoutTable) -> dict[str, Any]:
     coefficients = {
         "offset_per_kelvin": (-1e-9, 1e-9, "F/K"), "gain_per_kelvin": (-1.0, 1.0, "1/K"),
         "offset_per_percent": (-1e-9, 1e-9, "F"), "gain_per_percent": (-1.0, 1.0, ""),
@@ -274,7 +277,7 @@ def _climate(table: Table) -> dict[str, Any]:
     return out
 
 
-def _detector(table: Table) -> dict[str, Any]:
+def _detector(table: ReadoutTable) -> dict[str, Any]:
     table.only(("touch", "release", "debounce", "tracker", "samples"))
     kind = table.choice("tracker", ("exponential", "stepping"), "exponential")
     tracker: Tracker = SteppingTracker()
@@ -287,7 +290,7 @@ def _detector(table: Table) -> dict[str, Any]:
     return {"detector": Detector(touch, release, tracker, table.integer("debounce", 1, 10**6, 1))}
 
 
-def _calibration(table: Table) -> dict[str, Any]:
+def _calibration(table: ReadoutTable) -> dict[str, Any]:
     """What ``Calibration.toml`` writes: one number for all channels, or one per channel."""
     limits = {"gain": (-1e6, 1e6, ""), "offset": (-1e-6, 1e-6, "F"), "drift": (-1e-6, 1e-6, "F/s")}
     table.only((*limits, "epoch"))
@@ -298,5 +301,5 @@ def _calibration(table: Table) -> dict[str, Any]:
     epoch = table.number("epoch", -1e12, 1e12, 0.0)
     try:
         return {"stages": (LinearSensor(**figures, epoch=epoch),)}
-    except ReadOutError as error:
+    except ReadoutError as error:
         raise table.error(str(error)) from None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_number
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Ints, require, require_whole
 from capsense.readout.front_end import ShuntFrontEnd
 from capsense.readout.stage import rounds
@@ -74,7 +74,7 @@ class LinearLaw:
         require("linear law", "lsb", self.lsb, 0.0, "F", open_=True)
         _require_codes(self.low, self.high)
         if not abs(as_number(self.nonlinearity)) <= _MOST_CURVED:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"linear law: nonlinearity is {self.nonlinearity!r}; give a share of the range, up "
                 f"to {_MOST_CURVED} of it"
             )
@@ -232,7 +232,7 @@ class ShuntLaw:
 
 def _require_codes(low: int, high: int) -> None:
     if not low < high:
-        raise ReadOutError(
+        raise ReadoutError(
             f"the codes run from {low} to {high}; widen the range (at a reciprocal law, raise the "
             "supply or lower the headroom; at a shunt law, lower the full scale)"
         )

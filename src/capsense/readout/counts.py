@@ -1,4 +1,4 @@
-"""What a read-out reports: integer codes with time stamps."""
+"""What a readout reports: integer codes with time stamps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._validate import suggest
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Ints
 
 COLUMNS = ("time", "channel", "code", "capacitance", "flags", "baseline", "touched")
@@ -36,7 +36,7 @@ class Counts:
     """Finished conversions in the order of time, n of them."""
 
     channel_names: tuple[str, ...]
-    """Names of the read-out's channels."""
+    """Names of the readout's channels."""
     time: Array
     """Time stamps: when the result could be read [s], shape (n,)."""
     channel: Ints
@@ -52,7 +52,7 @@ class Counts:
     touched: NDArray[np.bool_] | None = None
     """Touch or proximity states, shape (n,); None without a detector."""
     until: float | None = None
-    """When the read-out was asked [s]; None for a part, a recording or many instants at once."""
+    """When the readout was asked [s]; None for a part, a recording or many instants at once."""
     earlier: Counts | None = None
     """The last conversion of each channel that had one before these."""
 
@@ -81,10 +81,10 @@ class Counts:
         """The conversions of one channel.
 
         Raises:
-            ReadOutError: There is no such channel.
+            ReadoutError: There is no such channel.
         """
         if name not in self.channel_names:
-            raise ReadOutError(f"no channel {name!r}; {suggest(name, self.channel_names)}")
+            raise ReadoutError(f"no channel {name!r}; {suggest(name, self.channel_names)}")
         return self[self.channel == self.channel_names.index(name)]
 
     def latest(self) -> dict[str, float]:
@@ -128,12 +128,12 @@ class Counts:
             cycle, as those of a whole recording do.
 
         Raises:
-            ReadOutError: The conversions do not start with a cycle or leave some out, or they do
+            ReadoutError: The conversions do not start with a cycle or leave some out, or they do
                 not hold ``what``.
         """
         kinds = [name for name in COLUMNS[2:] if getattr(self, name) is not None]
         if what not in kinds:
-            raise ReadOutError(f"the conversions hold no {what!r}; {suggest(str(what), kinds)}")
+            raise ReadoutError(f"the conversions hold no {what!r}; {suggest(str(what), kinds)}")
         k = len(self.channel_names)
         shape = (len(self) // k, k)
         time, channel, cells = (
@@ -141,18 +141,18 @@ class Counts:
         )
         order = np.argsort(channel, axis=1)
         if (np.take_along_axis(channel, order, axis=1) != np.arange(k)).any():
-            raise ReadOutError("the conversions are not whole cycles; use of(name) instead")
+            raise ReadoutError("the conversions are not whole cycles; use of(name) instead")
         return np.take_along_axis(time, order, axis=1), np.take_along_axis(cells, order, axis=1)
 
 
 def join(parts: Sequence[Counts]) -> Counts:
-    """Successive conversions of one read-out, one after another.
+    """Successive conversions of one readout, one after another.
 
     Raises:
-        ReadOutError: There are no parts.
+        ReadoutError: There are no parts.
     """
     if not parts:
-        raise ReadOutError("there are no counts to join; give at least one")
+        raise ReadoutError("there are no counts to join; give at least one")
 
     def column(name: str) -> NDArray | None:
         columns = [getattr(p, name) for p in parts]

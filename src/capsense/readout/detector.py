@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from capsense._validate import as_number
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Bools, Ints, require, require_whole
 from capsense.readout.stage import rounds
 
@@ -126,7 +126,7 @@ class Detector:
     """Touch or proximity decision with hysteresis and debouncing, over a tracked baseline.
 
     Raises:
-        ReadOutError: Thresholds are not ``0 < release <= touch``, or debounce is below 1.
+        ReadoutError: Thresholds are not ``0 < release <= touch``, or debounce is below 1.
     """
 
     touch: float
@@ -139,7 +139,7 @@ class Detector:
 
     def __post_init__(self) -> None:
         if not 0 < as_number(self.release) <= as_number(self.touch) < math.inf:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"detector: touch = {self.touch!r} and release = {self.release!r}; give "
                 "0 < release <= touch, in codes"
             )

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, finite, require, require_whole
 
 Phasors = NDArray[np.complex128]
@@ -32,11 +32,11 @@ class ShuntFrontEnd:
     """Voltage divider of capacitance and shunt, with amplifier.
 
     Raises:
-        ReadOutError: A number is not finite or not positive (``parasitic`` may be zero,
+        ReadoutError: A number is not finite or not positive (``parasitic`` may be zero,
             ``bandwidth`` infinite).
     """
 
-    frequency: float = 1e6
+    excitation_frequency: float = 1e6
     """Excitation frequency [Hz]."""
     shunt: float = 1e3
     """R_S [Ω]."""
@@ -50,7 +50,12 @@ class ShuntFrontEnd:
     """C_p [F]."""
 
     def __post_init__(self) -> None:
-        for name, unit in (("frequency", "Hz"), ("shunt", "Ω"), ("gain", ""), ("amplitude", "V")):
+        for name, unit in (
+            ("excitation_frequency", "Hz"),
+            ("shunt", "Ω"),
+            ("gain", ""),
+            ("amplitude", "V"),
+        ):
             require("front end", name, getattr(self, name), 0.0, unit, open_=True)
         require("front end", "parasitic", self.parasitic, 0.0, "F")
         if self.bandwidth != math.inf:
@@ -59,7 +64,7 @@ class ShuntFrontEnd:
     @property
     def omega(self) -> float:
         """Angular frequency [rad/s]."""
-        return 2 * math.pi * self.frequency
+        return 2 * math.pi * self.excitation_frequency
 
     def output(self, capacitance: ArrayLike) -> Phasors:
         """Phasor at the amplifier's output [V], for capacitances [F] of any shape.
@@ -69,7 +74,7 @@ class ShuntFrontEnd:
         """
         admittance = 1j * self.omega * np.asarray(capacitance)
         divider = admittance / (1 / self.shunt + admittance + 1j * self.omega * self.parasitic)
-        amplifier = self.gain / (1 + 1j * self.frequency / self.bandwidth)
+        amplifier = self.gain / (1 + 1j * self.excitation_frequency / self.bandwidth)
         return amplifier * self.amplitude * divider
 
     def recover(self, output: ArrayLike) -> Array:
@@ -79,11 +84,11 @@ class ShuntFrontEnd:
         is the error that calibration is there to take out. An output of zero gives 0 F.
 
         Raises:
-            ReadOutError: An output is not a number.
+            ReadoutError: An output is not a number.
         """
         v_o = np.asarray(output)
         if np.isnan(v_o).any():
-            raise ReadOutError("front end: an output is not a number; leave it out")
+            raise ReadoutError("front end: an output is not a number; leave it out")
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.abs(self.gain * self.amplitude / v_o - 1.0)
             return 1.0 / (self.omega * self.shunt * distance)
@@ -92,7 +97,7 @@ class ShuntFrontEnd:
         """Samples of the amplifier's output [V], from phase 0 of the transmitter on, (count,).
 
         Raises:
-            ReadOutError: The rate is not above zero, or the count not a whole number from 1 on.
+            ReadoutError: The rate is not above zero, or the count not a whole number from 1 on.
         """
         _require_window(sample_rate, count)
         phase = self.omega * np.arange(count) / sample_rate
@@ -114,7 +119,7 @@ def demodulate(samples: ArrayLike, frequency: float, sample_rate: float) -> Phas
         Phasors I + jQ [V], shape (...).
 
     Raises:
-        ReadOutError: There are no samples, one is not finite, or the rate is not above zero.
+        ReadoutError: There are no samples, one is not finite, or the rate is not above zero.
     """
     signal = finite("samples", samples)
     _require_window(sample_rate, signal.shape[-1] if signal.ndim else 0)
@@ -145,7 +150,7 @@ def demodulated(
         I + jQ [V], of the shape of ``phasor``.
 
     Raises:
-        ReadOutError: The rate is not above zero, or the count not a whole number from 1 on.
+        ReadoutError: The rate is not above zero, or the count not a whole number from 1 on.
     """
     _require_window(sample_rate, count)
     p = np.asarray(phasor, dtype=complex)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from capsense._validate import as_number
 from capsense.constants import EPS0
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, finite, require, require_whole
 
 Axes = tuple[ArrayLike, ArrayLike, ArrayLike]
@@ -48,7 +48,7 @@ def sensitivity(potentials: ArrayLike, axes: Axes, pairs: Sequence[tuple[int, in
         (negative) entry of C, and positive above, where both fields point the same way.
 
     Raises:
-        ReadOutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
+        ReadoutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
     """
     phi, (x, y, z) = _field(potentials, axes, pairs)
     volume = EPS0 * x[:, None, None] * y[None, :, None] * z[None, None, :]
@@ -81,7 +81,7 @@ def grounded_sensitivity(
         J, without unit, shape (len(pairs), voxels); an image is capacitance in voxels [F].
 
     Raises:
-        ReadOutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
+        ReadoutError: Shapes do not fit, an axis does not rise, or an electrode does not exist.
     """
     phi, _ = _field(potentials, axes, pairs)
     out = []
@@ -104,16 +104,16 @@ def _field(
     """Checked potentials, and the spacings of the axes."""
     phi = finite("potentials", potentials)
     if len(axes) != 3:
-        raise ReadOutError(f"{len(axes)} axes are given; give node coordinates along x, y and z")
+        raise ReadoutError(f"{len(axes)} axes are given; give node coordinates along x, y and z")
     steps = tuple(_axis(name, a) for name, a in zip("xyz", axes, strict=True))
     if phi.ndim != 4 or phi.shape[:3] != tuple(len(s) + 1 for s in steps):
-        raise ReadOutError(
+        raise ReadoutError(
             f"potentials have shape {phi.shape}; these axes need "
             f"{(*(len(s) + 1 for s in steps), 'M')}"
         )
     for pair in pairs:
         if len(pair) != 2:
-            raise ReadOutError(f"pair {pair} names {len(pair)} electrodes; give two")
+            raise ReadoutError(f"pair {pair} names {len(pair)} electrodes; give two")
         for electrode in pair:
             require_whole(f"pair {pair}", "an electrode", electrode, 0, phi.shape[3] - 1)
     return phi, steps
@@ -123,7 +123,7 @@ def _axis(name: str, nodes: ArrayLike) -> Array:
     """Spacings of an axis."""
     array = finite(f"axis {name}", nodes)
     if array.ndim != 1 or len(array) < 2 or not (np.diff(array) > 0).all():
-        raise ReadOutError(f"axis {name} must hold at least two rising coordinates in metres")
+        raise ReadoutError(f"axis {name} must hold at least two rising coordinates in metres")
     return np.diff(array)
 
 
@@ -149,7 +149,7 @@ def back_projection(matrix: ArrayLike) -> Array:
         R, shape (voxels, pairs).
 
     Raises:
-        ReadOutError: J is no matrix, or a number is not finite.
+        ReadoutError: J is no matrix, or a number is not finite.
     """
     return _unit_columns(_checked(matrix)).T
 
@@ -171,7 +171,7 @@ def tikhonov(matrix: ArrayLike, strength: float = 1e-2, *, standardised: bool = 
         R, shape (voxels, pairs).
 
     Raises:
-        ReadOutError: ``strength`` is not above zero, J is no matrix or zero, or a number is not
+        ReadoutError: ``strength`` is not above zero, J is no matrix or zero, or a number is not
             finite.
     """
     j = _checked(matrix)
@@ -208,16 +208,16 @@ def landweber(
 
     Returns:
         A function that takes d, changes of capacitance [F], shape (pairs,) or (n, pairs), to
-        images, shape (voxels,) or (n, voxels). It raises :class:`ReadOutError` if the shape does
+        images, shape (voxels,) or (n, voxels). It raises :class:`ReadoutError` if the shape does
         not fit.
 
     Raises:
-        ReadOutError: J is no matrix or zero, or bounds or iterations are out of range.
+        ReadoutError: J is no matrix or zero, or bounds or iterations are out of range.
     """
     j = _checked(matrix)
     require_whole("Landweber", "iterations", iterations, 1)
     if not as_number(low) < as_number(high):
-        raise ReadOutError(f"low = {low!r}, high = {high!r}; give numbers, low below high")
+        raise ReadoutError(f"low = {low!r}, high = {high!r}; give numbers, low below high")
     j = _unit_columns(j) if unit_voxels else j
     return partial(_landweber, j, 1.0 / _largest(j @ j.T), iterations, low, high)
 
@@ -227,7 +227,7 @@ def _landweber(
 ) -> Array:
     d = finite("change", change)
     if d.shape[-1:] != (len(j),):
-        raise ReadOutError(f"change has shape {d.shape}; give {len(j)} numbers an image")
+        raise ReadoutError(f"change has shape {d.shape}; give {len(j)} numbers an image")
     image = np.clip(np.zeros((*d.shape[:-1], j.shape[1])), low, high)
     for _ in range(iterations):
         image = np.clip(image + step * ((d - image @ j.T) @ j), low, high)
@@ -237,7 +237,7 @@ def _landweber(
 def _checked(matrix: ArrayLike) -> Array:
     j = finite("J", matrix)
     if j.ndim != 2 or not j.size:
-        raise ReadOutError(f"J has shape {j.shape}; give it as (pairs, voxels)")
+        raise ReadoutError(f"J has shape {j.shape}; give it as (pairs, voxels)")
     return j
 
 
@@ -251,5 +251,5 @@ def _largest(normal: Array) -> float:
     """Largest eigenvalue of J Jᵀ."""
     largest = float(np.linalg.eigvalsh(normal)[-1])
     if largest <= 0:
-        raise ReadOutError("the sensitivity matrix is zero; check the potentials")
+        raise ReadoutError("the sensitivity matrix is zero; check the potentials")
     return largest

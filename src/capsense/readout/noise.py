@@ -21,7 +21,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Ints, finite, require, require_whole
 from capsense.readout.stage import Context, Process
 
@@ -154,7 +154,7 @@ class Mains:
         require("mains", "amplitude", self.amplitude, 0.0, "F")
         require("mains", "frequency", self.frequency, 0.0, "Hz", open_=True)
         if self.order not in (1, 2, 3, 4):
-            raise ReadOutError(f"mains: order is {self.order!r}; give 1, 2, 3 or 4")
+            raise ReadoutError(f"mains: order is {self.order!r}; give 1, 2, 3 or 4")
 
     def start(self, context: Context) -> Process:
         """Return the process."""
@@ -179,13 +179,13 @@ class Profile:
         """From a constant, or from (time [s], value) points.
 
         Raises:
-            ReadOutError: The points are none, not pairs, not finite, or times do not rise.
+            ReadoutError: The points are none, not pairs, not finite, or times do not rise.
         """
         points = finite(name, [(0.0, value)] if np.isscalar(value) else value)
         if points.ndim != 2 or points.shape[1] != 2:
-            raise ReadOutError(f"{name} is {value!r}; give a number or [[time, value], …]")
+            raise ReadoutError(f"{name} is {value!r}; give a number or [[time, value], …]")
         if (np.diff(points[:, 0]) <= 0).any():
-            raise ReadOutError(f"{name} is {value!r}; times must rise from point to point")
+            raise ReadoutError(f"{name} is {value!r}; times must rise from point to point")
         return cls(tuple(points[:, 0].tolist()), tuple(points[:, 1].tolist()))
 
     def at(self, time: Array) -> Array:
@@ -243,7 +243,7 @@ def allan_deviation(values: ArrayLike, averages: Sequence[int] | NDArray[np.int6
         Deviations in the unit of the samples, shape (len(averages), ...).
 
     Raises:
-        ReadOutError: A number m is out of range.
+        ReadoutError: A number m is out of range.
     """
     samples = finite("samples", values)
     total = np.concatenate([np.zeros((1, *samples.shape[1:])), np.cumsum(samples, axis=0)])

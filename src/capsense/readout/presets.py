@@ -1,4 +1,4 @@
-"""Read-outs built from a chip's figures and a few options."""
+"""Readouts built from a chip's figures and a few options."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from capsense._validate import suggest
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
 from capsense.readout.checks import Array, require
 from capsense.readout.chip import Chip
@@ -18,7 +18,7 @@ from capsense.readout.chips import CHIPS, MPR121_CURRENTS, MPR121_SUPPLY, MPR121
 from capsense.readout.converter import CapDac, Law, LinearLaw, ReciprocalLaw, ShuntLaw
 from capsense.readout.detector import Detector
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule, idle_of
 from capsense.readout.stage import Stage
 from capsense.readout.wiring import Wiring
@@ -30,7 +30,7 @@ LEAST_EXPECTED = 0.2e-12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class ReadoutOptions:
     """What may be chosen about a chip."""
 
     patterns: Sequence[Pattern] = ()
@@ -82,16 +82,16 @@ class Options:
     """Digital logic, instead of the chip's."""
 
     @classmethod
-    def of(cls, options: Mapping[str, Any]) -> Options:
+    def of(cls, options: Mapping[str, Any]) -> ReadoutOptions:
         """Options by name.
 
         Raises:
-            ReadOutError: There is no such option.
+            ReadoutError: There is no such option.
         """
         known = [f.name for f in dataclasses.fields(cls)]
         for name in options:
             if name not in known:
-                raise ReadOutError(f"no option {name!r} of a read-out; {suggest(name, known)}")
+                raise ReadoutError(f"no option {name!r} of a readout; {suggest(name, known)}")
         return cls(**options)
 
 
@@ -99,16 +99,18 @@ def chip_of(name: str) -> Chip:
     """The chip of a name; upper and lower case are the same.
 
     Raises:
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
     """
     key = name.strip().lower() if isinstance(name, str) else ""
     if key not in CHIPS:
-        raise ReadOutError(f"unknown chip {name!r}; {suggest(str(name), CHIPS)}")
+        raise ReadoutError(f"unknown chip {name!r}; {suggest(str(name), CHIPS)}")
     return CHIPS[key]
 
 
-def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None = None) -> ReadOut:
-    """A read-out with a chip's figures.
+def build(
+    chip: str | Chip, electrodes: Sequence[str], options: ReadoutOptions | None = None
+) -> Readout:
+    """A readout with a chip's figures.
 
     Args:
         chip: A known chip's name, or a chip.
@@ -116,21 +118,21 @@ def build(chip: str | Chip, electrodes: Sequence[str], options: Options | None =
         options: What is chosen.
 
     Raises:
-        ReadOutError: No such chip, a rate it does not have, or an option is wrong.
+        ReadoutError: No such chip, a rate it does not have, or an option is wrong.
     """
     part = chip if isinstance(chip, Chip) else chip_of(chip)
-    chosen = options or Options()
+    chosen = options or ReadoutOptions()
     patterns = tuple(chosen.patterns) or default_patterns(part, electrodes)
     ChannelBank(patterns, electrodes)  # refuses what is wrong before a schedule is made of it
     rate = part.rate(chosen.rate)
     if rate is None:
         rates = ", ".join(f"{r.per_second:.4g}" for r in part.rates)
-        raise ReadOutError(
+        raise ReadoutError(
             f"{part.name} has no rate of {chosen.rate!r} conversions per second; it has {rates}"
         )
     plan = schedule_of(part, patterns, 1.0 / rate.per_second - part.gap)
     idle = idle_of(chosen.period, plan.period)
-    return ReadOut(
+    return Readout(
         patterns,
         electrodes,
         dataclasses.replace(plan, idle=idle, latency=chosen.latency),
@@ -173,7 +175,7 @@ def _excitation(pattern: Pattern) -> Hashable:
     return driven, frozenset(pattern.floating), pattern.shield, alone
 
 
-def law_of(chip: Chip, options: Options, channels: int) -> Law:
+def law_of(chip: Chip, options: ReadoutOptions, channels: int) -> Law:
     """The chip's law, as it is set up and wired.
 
     One that charges is set up for the capacitance expected. Over a shunt lies what the leads have
@@ -182,7 +184,7 @@ def law_of(chip: Chip, options: Options, channels: int) -> Law:
     law = options.law or chip.law
     if options.nonlinearity:
         if not isinstance(law, LinearLaw):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"nonlinearity is {options.nonlinearity!r}, but the law of the {chip.name} is "
                 "curved by itself; leave it out"
             )
@@ -193,7 +195,7 @@ def law_of(chip: Chip, options: Options, channels: int) -> Law:
         return dataclasses.replace(law, front_end=loaded)
     if options.law is None and isinstance(law, ReciprocalLaw):
         expected = EXPECTED if options.expected is None else options.expected
-        require("read-out", "expected", expected, 0.0, "F", open_=True)
+        require("readout", "expected", expected, 0.0, "F", open_=True)
         return charge_for(expected)
     return law
 
@@ -203,7 +205,7 @@ def _dac_of(chip: Chip, start: int | None) -> CapDac | None:
     if start is None:
         return chip.dac
     if chip.dac is None:
-        raise ReadOutError(
+        raise ReadoutError(
             f"capdac is {start!r}, but the {chip.name} has no offset DAC; leave it out"
         )
     return dataclasses.replace(chip.dac, start=start)
@@ -221,7 +223,7 @@ def charge_for(capacitance: float) -> ReciprocalLaw:
     """MPR121 current and time with which a capacitance [F] reads nearest to 90 % of the range.
 
     Raises:
-        ReadOutError: No setting brings it into the range.
+        ReadoutError: No setting brings it into the range.
     """
     laws = [
         ReciprocalLaw(current, time, MPR121_SUPPLY)
@@ -231,7 +233,7 @@ def charge_for(capacitance: float) -> ReciprocalLaw:
     wanted = np.array(capacitance)
     fitting = [law for law in laws if law.low <= float(law.level(wanted)) <= law.high]
     if not fitting:
-        raise ReadOutError(
+        raise ReadoutError(
             f"expected = {capacitance:g} F is outside of what an MPR121 can charge; give 0.2e-12 "
             "to 2800e-12 F"
         )
@@ -239,7 +241,7 @@ def charge_for(capacitance: float) -> ReciprocalLaw:
     return min(fitting, key=lambda law: abs(float(law.level(wanted)) - goal))
 
 
-def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
+def _stages(chip: Chip, rms: float, options: ReadoutOptions) -> list[Stage]:
     """Climate, random walk, flicker, mains and white noise, those that are not zero."""
     out = _climate(chip, options)
     if options.walk:
@@ -256,7 +258,7 @@ def _stages(chip: Chip, rms: float, options: Options) -> list[Stage]:
     return out
 
 
-def _climate(chip: Chip, options: Options) -> list[Stage]:
+def _climate(chip: Chip, options: ReadoutOptions) -> list[Stage]:
     """Drift with temperature and humidity, where one is given; what would do nothing is refused."""
     known = {"temperature": chip.offset_per_kelvin or chip.gain_per_kelvin, "humidity": 0.0}
     for quantity, unit in (("temperature", "kelvin"), ("humidity", "percent")):
@@ -264,9 +266,9 @@ def _climate(chip: Chip, options: Options) -> list[Stage]:
         if getattr(options, quantity) is None:
             for name, value in given.items():
                 if value:
-                    raise ReadOutError(f"{name} does nothing without a {quantity}; give one")
+                    raise ReadoutError(f"{name} does nothing without a {quantity}; give one")
         elif not known[quantity] and all(value is None for value in given.values()):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"{quantity} changes nothing, as no such drift of the {chip.name} is known; give "
                 f"{' or '.join(given)}"
             )

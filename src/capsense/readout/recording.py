@@ -1,4 +1,4 @@
-"""Recorded capacitances: what ``capsense run`` writes, as the channels of a read-out."""
+"""Recorded capacitances: what ``capsense run`` writes, as the channels of a readout."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern
 from capsense.readout.checks import Array
 
@@ -19,7 +19,7 @@ _MOST = 4_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class CapacitanceRecord:
     """Capacitances against time, by the columns of ``readings.csv``."""
 
     path: Path
@@ -37,13 +37,13 @@ class Recording:
     """Whether the sensor is known to have driven shields."""
 
     def channels(self, bank: ChannelBank) -> Array:
-        """Channel values of a read-out [F], shape (n, K).
+        """Channel values of a readout [F], shape (n, K).
 
         From the whole Maxwell matrix if the recording has it; otherwise each channel must be
         recorded itself, as a self or mutual capacitance with all other electrodes grounded.
 
         Raises:
-            ReadOutError: The recording does not hold what a channel needs.
+            ReadoutError: The recording does not hold what a channel needs.
         """
         return self._values({k: v[:, None] for k, v in self.columns.items()}, bank)
 
@@ -51,7 +51,7 @@ class Recording:
         """Channel values with an empty scene [F], shape (K,); the first sample's if unknown.
 
         Raises:
-            ReadOutError: The recording does not hold what a channel needs.
+            ReadoutError: The recording does not hold what a channel needs.
         """
         if not self.empty:
             return self.channels(bank)[0]
@@ -66,7 +66,7 @@ class Recording:
                 own = np.concatenate([a for a in alone if a is not None], axis=1)
                 coupling = own - np.diagonal(matrix, axis1=1, axis2=2)
             elif self.shields and any(p.shield for p in bank.patterns):
-                raise ReadOutError(
+                raise ReadoutError(
                     f"{self.path} does not hold what the sensor's shields do when they are driven; "
                     "read its readings.npz, or set shield = 0 for each channel"
                 )
@@ -93,13 +93,13 @@ class Recording:
             for name in names:
                 if name in columns:
                     return weight * columns[name]
-        raise ReadOutError(
+        raise ReadoutError(
             f"{self.path} does not hold what channel {pattern.name!r} needs; it has "
             f'{", ".join(list(columns)[:8])}…; record with excitation = "matrix" to have all'
         )
 
 
-def load_recording(path: str | Path) -> Recording:
+def load_recording(path: str | Path) -> CapacitanceRecord:
     """Load what ``capsense run`` wrote.
 
     Args:
@@ -107,57 +107,57 @@ def load_recording(path: str | Path) -> Recording:
             arrays are read if they are there.
 
     Raises:
-        ReadOutError: There is no such recording, or it is damaged or empty.
+        ReadoutError: There is no such recording, or it is damaged or empty.
     """
     given = Path(path)
     if given.is_dir():
         files = [given / name for name in ("readings.npz", "readings.csv")]
         present = [f for f in files if f.is_file()]
         if not present:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"folder {given} holds no readings.npz and no readings.csv; give the output "
                 "folder of capsense run"
             )
         given = present[0]
     if not given.is_file():
-        raise ReadOutError(f"there is no recording {given}; check the path")
+        raise ReadoutError(f"there is no recording {given}; check the path")
     if given.suffix == ".mcap":
-        raise ReadOutError(
+        raise ReadoutError(
             f"{given} is to be exported first: capsense export {given} -o "
             f"{given.with_suffix('.npz').name}"
         )
     if given.suffix not in (".npz", ".csv"):
-        raise ReadOutError(f"{given} is no recording; give a .npz, a .csv, or their folder")
+        raise ReadoutError(f"{given} is no recording; give a .npz, a .csv, or their folder")
     recording = _load_arrays(given) if given.suffix == ".npz" else _load_table(given)
     _check(recording)
     return recording
 
 
-def _check(recording: Recording) -> None:
+def _check(recording: CapacitanceRecord) -> None:
     path, time = recording.path, recording.time
     if not len(time):
-        raise ReadOutError(f"{path} holds no samples; record some")
+        raise ReadoutError(f"{path} holds no samples; record some")
     if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-        raise ReadOutError(f"{path}: times do not rise; the file is damaged")
+        raise ReadoutError(f"{path}: times do not rise; the file is damaged")
     known = set(recording.electrodes)
     for one in known:
         for other in known:
             if f"{one}_{other}" in known:
-                raise ReadOutError(
+                raise ReadoutError(
                     f"{path}: column C_{one}_{other} may mean the pair or the electrode of that "
                     "name; rename the electrode"
                 )
     for name, values in recording.columns.items():
         if values.shape != time.shape or not np.isfinite(values).all():
-            raise ReadOutError(f"{path}: column {name!r} holds no number somewhere; it is damaged")
+            raise ReadoutError(f"{path}: column {name!r} holds no number somewhere; it is damaged")
 
 
-def _load_arrays(path: Path) -> Recording:
+def _load_arrays(path: Path) -> CapacitanceRecord:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > _MOST:
-            raise ReadOutError(f"{path} would take up {size:,} bytes of memory; it is damaged")
+            raise ReadoutError(f"{path} would take up {size:,} bytes of memory; it is damaged")
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         names = tuple(str(n) for n in arrays["electrode_names"])
@@ -176,18 +176,18 @@ def _load_arrays(path: Path) -> Recording:
         empty.update(zip(alone, arrays["self_baseline"].tolist(), strict=True))
         columns.update(zip(channels, arrays["channels"].T, strict=True))
         empty.update(zip(channels, arrays["channel_baseline"].tolist(), strict=True))
-        return Recording(path, arrays["time"], names, columns, empty)
-    except ReadOutError:
+        return CapacitanceRecord(path, arrays["time"], names, columns, empty)
+    except ReadoutError:
         raise
     except KeyError as error:
-        raise ReadOutError(
+        raise ReadoutError(
             f"{path} is no readings.npz of this version: it lacks {error}; run it again"
         ) from None
     except Exception as error:  # zip, inflate and numpy's reader each complain differently
-        raise ReadOutError(f"{path} is no readings.npz of capsense run: {error}") from None
+        raise ReadoutError(f"{path} is no readings.npz of capsense run: {error}") from None
 
 
-def _load_table(path: Path) -> Recording:
+def _load_table(path: Path) -> CapacitanceRecord:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             header, *rows = list(csv.reader(file))
@@ -195,9 +195,9 @@ def _load_table(path: Path) -> Recording:
         whole = [row for row in rows if len(row) == len(header)]
         values = np.array(whole, dtype=float).reshape(len(whole), len(header))
     except (ValueError, OSError, UnicodeDecodeError) as error:
-        raise ReadOutError(f"{path} is no readings.csv of capsense run: {error}") from None
+        raise ReadoutError(f"{path} is no readings.csv of capsense run: {error}") from None
     if not header or header[0] != "time_s":
-        raise ReadOutError(f"{path} is no readings.csv of capsense run: no column time_s")
+        raise ReadoutError(f"{path} is no readings.csv of capsense run: no column time_s")
     table = {name: values[:, k] for k, name in enumerate(header)}
     columns = {
         name[:-2]: column
@@ -211,7 +211,7 @@ def _load_table(path: Path) -> Recording:
     }
     electrodes, shields = _summary(path)
     names = electrodes or _electrodes(path, list(columns))
-    return Recording(path, values[:, 0], names, columns, empty, shields)
+    return CapacitanceRecord(path, values[:, 0], names, columns, empty, shields)
 
 
 def _summary(path: Path) -> tuple[tuple[str, ...], bool]:
@@ -234,7 +234,7 @@ def _electrodes(path: Path, columns: list[str]) -> tuple[str, ...]:
         else:
             parts = rest.split("_") if column.startswith("Cm_") else [rest]
         if column.startswith("Cm_") and len(parts) != 2:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"{path}: the electrodes of column {column!r} are not clear; keep summary.json "
                 "beside it"
             )

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Ints, require, require_whole
 
 
@@ -23,7 +23,7 @@ class Schedule:
     """A repeated sequence of conversions.
 
     Raises:
-        ReadOutError: A time is negative or not finite, or channels are left out or repeated.
+        ReadoutError: A time is negative or not finite, or channels are left out or repeated.
     """
 
     slots: tuple[tuple[int, ...], ...]
@@ -43,10 +43,10 @@ class Schedule:
         require("schedule", "idle", self.idle, 0.0, "s")
         require("schedule", "latency", self.latency, 0.0, "s")
         if not all(self.slots):
-            raise ReadOutError("schedule: a slot holds no channel; leave it out")
+            raise ReadoutError("schedule: a slot holds no channel; leave it out")
         channels = sorted(c for slot in self.slots for c in slot)
         if not channels or channels != list(range(len(channels))):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"schedule: the slots hold channels {channels}; list each of 0, 1, 2, … once"
             )
 
@@ -66,7 +66,7 @@ class Schedule:
             period: Time from one cycle to the next [s]; default as soon as it is done.
 
         Raises:
-            ReadOutError: A count is below one, a time out of range, or the period too short.
+            ReadoutError: A count is below one, a time out of range, or the period too short.
         """
         per_chip = channels if inputs is None else inputs
         require_whole("schedule", "the number of channels", channels, 1)
@@ -85,7 +85,7 @@ class Schedule:
         """All channels at once, every ``period`` [s], by default back to back.
 
         Raises:
-            ReadOutError: As of :meth:`sequential`.
+            ReadoutError: As of :meth:`sequential`.
         """
         require_whole("schedule", "the number of channels", channels, 1)
         require("schedule", "conversion", conversion, 0.0, "s", open_=True)
@@ -144,13 +144,13 @@ def idle_of(period: float | None, busy: float) -> float:
     """What is left of a cycle's period [s] after ``busy`` seconds of conversions.
 
     Raises:
-        ReadOutError: The period is no positive number, or too short.
+        ReadoutError: The period is no positive number, or too short.
     """
     if period is None:
         return 0.0
     require("schedule", "period", period, 0.0, "s", open_=True)
     if period < busy * (1 - 1e-12):
-        raise ReadOutError(
+        raise ReadoutError(
             f"schedule: a period of {period} s is too short for its conversions, which take "
             f"{busy:g} s"
         )

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, require_whole
 from capsense.readout.counts import Held
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 
 
 class _Columns:
@@ -31,16 +31,16 @@ class SideBySide:
     conversion of all chips is as much work for Python as one of a single chip.
 
     Args:
-        readout: A read-out of one sensor with K channels; it stays as it is.
+        readout: A readout of one sensor with K channels; it stays as it is.
         count: How many chips, N.
         seed: Of all random numbers.
 
     Raises:
-        ReadOutError: A number is out of range.
+        ReadoutError: A number is out of range.
     """
 
-    def __init__(self, readout: ReadOut, count: int, *, seed: int = 0) -> None:
-        require_whole("read-out", "the number of chips", count, 1)
+    def __init__(self, readout: Readout, count: int, *, seed: int = 0) -> None:
+        require_whole("readout", "the number of chips", count, 1)
         self._one, self._count = readout, count
         k = len(readout.bank)
         many = copy.copy(readout)
@@ -63,7 +63,7 @@ class SideBySide:
         return self._one.channel_names
 
     def reset(self, *, start: float = 0.0, seed: int | None = None) -> None:
-        """Switch all chips on anew, see :meth:`ReadOut.reset`."""
+        """Switch all chips on anew, see :meth:`Readout.reset`."""
         self._many.reset(start=start, seed=seed)
 
     def sample(
@@ -82,11 +82,11 @@ class SideBySide:
             The last conversion of every channel, each of shape (..., K), and its age.
 
         Raises:
-            ReadOutError: Time goes back or is not finite, or the capacitances do not fit.
+            ReadoutError: Time goes back or is not finite, or the capacitances do not fit.
         """
         values = self._one._wired(self._one.bank.values(np.asarray(capacitance), shield_coupling))
         if values.size != len(self._many.bank):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"capacitance has shape {np.shape(capacitance)}; give matrices of {self._count} "
                 "sensors"
             )

@@ -1,6 +1,6 @@
-"""What the analogue stages of a read-out have in common.
+"""What the analogue stages of a readout have in common.
 
-A stage is a small frozen description. When a read-out starts it makes a *process* of it, which
+A stage is a small frozen description. When a readout starts it makes a *process* of it, which
 holds what changes: random numbers, filters' memories. Stages are applied in their order; each takes
 the capacitances of a batch of samples and returns new ones. A batch is a run of successive samples
 of the schedule, of any length; a process with a memory for each channel goes through it in
@@ -20,7 +20,7 @@ from capsense.readout.checks import Array, Ints
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What a stage is told when a read-out starts."""
+    """What a stage is told when a readout starts."""
 
     channels: int
     """Number of channels K."""
@@ -35,7 +35,7 @@ class Context:
 class Process(Protocol):
     """A stage at work.
 
-    A copy of a read-out copies its processes: keep what changes in objects that can be copied, as
+    A copy of a readout copies its processes: keep what changes in objects that can be copied, as
     the arguments of a ``functools.partial``, and not in the variables of an enclosing function.
     """
 

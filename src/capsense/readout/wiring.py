@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._validate import as_number
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, finite, per_channel
 
 
@@ -44,11 +44,11 @@ class Wiring:
         """Capacitance of each channel's lead to ground [F], shape (K,).
 
         Raises:
-            ReadOutError: A size does not fit the channels, a number is negative or not finite,
+            ReadoutError: A size does not fit the channels, a number is negative or not finite,
                 or the shield's gain is not between 0 and 1.
         """
         if not 0.0 <= as_number(self.shield_gain) <= 1.0:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"wiring: shield_gain is {self.shield_gain!r}; give a number from 0 to 1"
             )
         trace, cable = self._capacitances("trace", channels), self._capacitances("cable", channels)
@@ -64,12 +64,12 @@ class Wiring:
             The matrix, shape (K, K), and offsets [F], shape (K,).
 
         Raises:
-            ReadOutError: As of :meth:`ground`.
+            ReadoutError: As of :meth:`ground`.
         """
         channels = len(is_self)
         share = finite("wiring: crosstalk", self.crosstalk)
         if share.shape not in ((), (channels, channels)):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"wiring: crosstalk is {self.crosstalk!r}; give a number, or {channels} lists of "
                 f"{channels}"
             )
@@ -82,5 +82,5 @@ class Wiring:
     def _capacitances(self, name: str, channels: int) -> Array:
         values = per_channel("wiring", name, getattr(self, name), channels)
         if (values < 0).any():
-            raise ReadOutError(f"wiring: {name} holds {values.min():g} F; give zero or more")
+            raise ReadoutError(f"wiring: {name} holds {values.min():g} F; give zero or more")
         return values

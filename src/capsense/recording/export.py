@@ -42,7 +42,7 @@ def export(recording: Recording, path: Path, *, counts: bool = False) -> int:
     Args:
         recording: What to export.
         path: The file; one that is there is replaced.
-        counts: Write the read-out's conversions in place of the readings; ``.csv``, ``.parquet``.
+        counts: Write the readout's conversions in place of the readings; ``.csv``, ``.parquet``.
 
     Returns:
         Rows, samples, messages or layouts written.
@@ -133,7 +133,7 @@ def _npz(recording: Recording, path: Path) -> int:
         channels=session.channels, values=np.array([_values(session, s) for s in steps]),
         levels=_levels(session), bodies=list(names), positions=positions, quaternions=quaternions,
         iterations=[s.iterations for s in stats],
-        error_estimate=[s.error_estimate for s in stats], step_time=[s.wall_time for s in stats],
+        error_estimate=[s.solver_error for s in stats], step_time=[s.wall_time for s in stats],
     )  # fmt: skip
     arrays["episode"] = np.array([s.episode for s in steps])
     counts = [c for c in (s.reading.counts for s in steps) if c is not None]
@@ -156,7 +156,7 @@ def _all_counts(recording: Recording) -> Counts:
     parts = [s.reading.counts for s in recording.steps()]
     found = [c for c in parts if c is not None]
     if not found:
-        raise RecordingError(f"{recording.path} holds no counts; record with a read-out")
+        raise RecordingError(f"{recording.path} holds no counts; record with a readout")
     return join(found)
 
 

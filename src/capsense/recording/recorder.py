@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from capsense.adapters.attached import AttachedSensor
-from capsense.errors import ReadOutError, RecordingError
+from capsense.errors import ReadoutError, RecordingError
 from capsense.reading import Reading
 from capsense.readout.config import file_content, parse_readout
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.recording.design_json import design_to_json
 from capsense.recording.live import LiveTopics
 from capsense.recording.mcap_file import McapFile
@@ -45,8 +45,8 @@ class Recorder:
         path: The file, by custom one that ends in ``.mcap``.
         source: A simulator, or a sensor attached to one.
         name: Of the sensor; its frame and the beginning of its topics.
-        readout: A read-out whose counts are recorded too: a chip's name, the path of a read-out
-            file, or a read-out. An attached sensor brings its own.
+        readout: A readout whose counts are recorded too: a chip's name, the path of a readout
+            file, or a readout. An attached sensor brings its own.
         scenario: What is played, if it is one; tables made from the file take its channels.
         overwrite: Whether a file that is there may be replaced.
         ros_domain: Experimental: publish the topics of standard types, as they are recorded, to the
@@ -54,7 +54,7 @@ class Recorder:
 
     Raises:
         RecordingError: The file is there already or cannot be made, or ``name`` is no name.
-        ReadOutError: The read-out is wrong, or there are two.
+        ReadoutError: The readout is wrong, or there are two.
         MissingDependencyError: The optional packages are not installed.
         OSError: The beginning could not be written.
     """
@@ -65,7 +65,7 @@ class Recorder:
         source: Simulator | AttachedSensor,
         *,
         name: str = "sensor",
-        readout: ReadOut | str | Path | None = None,
+        readout: Readout | str | Path | None = None,
         scenario: Scenario | None = None,
         overwrite: bool = False,
         ros_domain: int | None = None,
@@ -79,7 +79,7 @@ class Recorder:
         self._simulator = source if isinstance(source, Simulator) else source.simulator
         check_name(name)
         if readout is not None and source.readout is not None:
-            raise ReadOutError("the sensor has a read-out of its own; leave out readout=")
+            raise ReadoutError("the sensor has a readout of its own; leave out readout=")
         empty = self._simulator.empty
         self._readout, config = make_readout(readout, self._simulator.electrode_names, empty)
         self.reset()
@@ -126,7 +126,7 @@ class Recorder:
         Raises:
             RecordingError: No sensor is recorded; otherwise as for :meth:`step`.
             OSError: As for :meth:`step`.
-            SceneError, SolveError, ReadOutError: As for the sensor.
+            SceneError, SolveError, ReadoutError: As for the sensor.
         """
         if self._sensor is None:
             raise RecordingError("a simulator is recorded, not a sensor; write step(world, time)")
@@ -137,7 +137,7 @@ class Recorder:
         return self._write(now, view, scene, self._sensor.read(now, scene))
 
     def reset(self) -> None:
-        """Reset the simulator, or the sensor and its read-out. Time may start anew."""
+        """Reset the simulator, or the sensor and its readout. Time may start anew."""
         (self._sensor or self._simulator).reset()
         if self._readout is not None:
             self._readout.reset()
@@ -151,7 +151,7 @@ class Recorder:
             reading: What it returned.
 
         Returns:
-            The reading, with the counts of a read-out that was given to the recorder.
+            The reading, with the counts of a readout that was given to the recorder.
 
         Raises:
             RecordingError: Time is wrong, or other steps went before that were not recorded.
@@ -284,19 +284,19 @@ def check_name(name: str) -> None:
 
 
 def make_readout(
-    readout: ReadOut | str | Path | None, electrodes: Sequence[str], empty: Reading | None = None
-) -> tuple[ReadOut | None, Mapping[str, Any] | None]:
-    """A read-out, and the content of its file where it has one or could have.
+    readout: Readout | str | Path | None, electrodes: Sequence[str], empty: Reading | None = None
+) -> tuple[Readout | None, Mapping[str, Any] | None]:
+    """A readout, and the content of its file where it has one or could have.
 
     Args:
-        readout: A chip's name, the path of a read-out file, a read-out, or None.
+        readout: A chip's name, the path of a readout file, a readout, or None.
         electrodes: Electrode names in matrix order.
         empty: The reading of an empty scene, which a named chip is set up for.
 
     Raises:
-        ReadOutError: There is no such chip or file, or anything in it is wrong.
+        ReadoutError: There is no such chip or file, or anything in it is wrong.
     """
-    if readout is None or isinstance(readout, ReadOut):
+    if readout is None or isinstance(readout, Readout):
         return readout, None
     config = file_content(readout, electrodes, empty)
     return parse_readout(config, electrodes, source=str(readout)), config

@@ -53,7 +53,7 @@ class Replay:
     largest: float
     """Largest difference of a capacitance [F], allowed or not."""
     counts: int | None
-    """Conversions of the read-out that were compared; None where it cannot be built again."""
+    """Conversions of the readout that were compared; None where it cannot be built again."""
     changed: dict[str, tuple[str, str]]
     """Versions and the processor, where they are others: as recorded, and here."""
 
@@ -145,7 +145,7 @@ class _Comparison:
         self._farads(index, time, names, was, now)
 
     def counts(self, index: int, time: float, recorded: Counts | None, replayed: Counts) -> None:
-        """Compare what a read-out reported; bit by bit, as codes are whole numbers."""
+        """Compare what a readout reported; bit by bit, as codes are whole numbers."""
         if self._tolerance > 0:
             return
         was = 0 if recorded is None else len(recorded)

@@ -17,10 +17,10 @@ from capsense.field.background import BuildSettings
 from capsense.mesh.settings import MeshSettings
 from capsense.reading import Reading, StepStats
 from capsense.readout.config import parse_readout
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.recording.versions import versions
 from capsense.scenario.channels import Channel, Excitation, channels_of
-from capsense.scenario.model import METHODS
+from capsense.scenario.model import FORMER_METHODS, METHODS
 from capsense.simulator import Method, PresetName, Simulator
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ class Session:
     """The simulator's; one of ``METHODS``, or of :data:`GONE`."""
     preset: PresetName
     """The simulator's."""
-    frequency: float
+    excitation_frequency: float
     """The simulator's [Hz]."""
     settings: BuildSettings
     """Of the background field."""
@@ -59,7 +59,7 @@ class Session:
     pairs: tuple[tuple[str, str], ...]
     """For mutual excitation: the pairs; all of them if empty."""
     readout: Mapping[str, Any] | None
-    """Content of the read-out's file, where replaying can build it again."""
+    """Content of the readout's file, where replaying can build it again."""
     versions: Mapping[str, str]
     """Of what the numbers depend on, see :func:`~capsense.recording.versions.versions`."""
 
@@ -89,15 +89,15 @@ class Session:
             )
         return Simulator(
             self.design, method=method or cast("Method", self.method), preset=self.preset,
-            frequency=self.frequency, settings=self.settings, cache_dir=cache_dir,
-            progress=progress,
+            excitation_frequency=self.excitation_frequency, settings=self.settings,
+            cache_dir=cache_dir, progress=progress,
         )  # fmt: skip
 
-    def new_readout(self) -> ReadOut | None:
-        """The read-out, as it was at the start; None where replaying cannot build it.
+    def new_readout(self) -> Readout | None:
+        """The readout, as it was at the start; None where replaying cannot build it.
 
         Raises:
-            ReadOutError: The chip is not known to this version.
+            ReadoutError: The chip is not known to this version.
         """
         if self.readout is None:
             return None
@@ -124,7 +124,7 @@ class Session:
                 "title": self.title,
                 "method": self.method,
                 "preset": self.preset,
-                "frequency_Hz": self.frequency,
+                "frequency_Hz": self.excitation_frequency,
                 "settings": asdict(self.settings),
                 "electrodes": list(self.design.electrode_names),
                 "empty_F": self.empty.capacitance.tolist(),
@@ -157,8 +157,8 @@ def describe(
     if s.mesh is not None:
         raise RecordingError("a simulator on a mesh cannot be recorded; use one of a design")
     return Session(
-        name, title, s.design, s.method, s.preset, s.frequency, s.settings, empty, excitation,
-        pairs, readout, versions(),
+        name, title, s.design, s.method, s.preset, s.excitation_frequency, s.settings, empty,
+        excitation, pairs, readout, versions(),
     )  # fmt: skip
 
 
@@ -176,14 +176,15 @@ def read_session(text: bytes, design: Design) -> Session:
                 f"it was made by capsense {data['versions']['capsense']}"
             )
         preset = data.get("preset", "standard")  # older files have none
-        known = data["method"] in (*METHODS, *GONE) and preset in get_args(PresetName)
+        method = FORMER_METHODS.get(data["method"], data["method"])
+        known = method in (*METHODS, *GONE) and preset in get_args(PresetName)
         if not known or tuple(data["electrodes"]) != design.electrode_names:
             raise RecordingError("the recording's settings do not fit its design; it is damaged")
         capacitance = np.array(data["empty_F"], dtype=float)
         coupling = np.array(data["empty_shield_coupling_F"], dtype=float)
         empty = reading_of(design, capacitance, np.zeros_like(capacitance), coupling)
         return Session(
-            data["name"], data["title"], design, data["method"], preset, data["frequency_Hz"],
+            data["name"], data["title"], design, method, preset, data["frequency_Hz"],
             _read_settings(data["settings"]), empty, Excitation(data["excitation"]),
             tuple((a, b) for a, b in data["pairs"]), data["readout"], data["versions"],
         )  # fmt: skip

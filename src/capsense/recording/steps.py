@@ -157,7 +157,7 @@ class StepMessages:
             poses=[self._compose.pose(b.pose) for b in scene],
             capacitance=reading.capacitance.ravel(), delta=reading.delta.ravel(),
             shield_coupling=shield_coupling(reading), iterations=stats.iterations,
-            error_estimate=stats.error_estimate, tolerance=0.0,
+            error_estimate=stats.solver_error, tolerance=0.0,
             wall_time=stats.wall_time,
         )  # fmt: skip
 

@@ -24,7 +24,7 @@ from capsense.bench import moving_bar, reference_bar, time_steps
 from capsense.field.background import BuildSettings
 from capsense.masked.planes import plan_axes
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Cell, Outcome, Report, Row, Table, judged
+from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
 from capsense.simulator import Method, PresetName
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ Galerkin boundary elements, two panel densities extrapolated, good to 4.4e-4 pF 
 of cases that share their discretisation, better than that."""
 MIDDLE = (1, 4)
 """Indices of the middle electrodes."""
-_LABELS: dict[Method, str] = {"surface": "CapSense", "masked": "paper's scheme, this machine"}
+_LABELS: dict[Method, str] = {"surface": "CapSense", "fem_masked": "paper's scheme, this machine"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +148,8 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     store = Store(folder)
     meshes = REDUCED if reduced else REFINEMENTS
     todo: list[tuple[Method, str]] = [("surface", preset) for preset in PRESETS]
-    todo += [("masked", f"{refinement:g}") for refinement in meshes]
-    counts = {"surface": 30 if reduced else 600, "masked": 5 if reduced else 25}
+    todo += [("fem_masked", f"{refinement:g}") for refinement in meshes]
+    counts = {"surface": 30 if reduced else 600, "fem_masked": 5 if reduced else 25}
     points = []
     for k, (method, setting) in enumerate(todo):
         report(f"{_LABELS[method]}, {setting}", k / len(todo))
@@ -167,7 +167,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
 
 def _curve(points: list[Point]) -> tuple[Array, Array]:
     """Tetrahedra and times [ms] of the paper's scheme."""
-    mine = [p for p in points if p.method == "masked"]
+    mine = [p for p in points if p.method == "fem_masked"]
     return np.array([p.tetrahedra for p in mine], float), np.array([p.median for p in mine])
 
 
@@ -194,7 +194,7 @@ def _rows(points: list[Point]) -> list[Row]:
     ]  # fmt: skip
 
 
-def _table(points: list[Point]) -> Table:
+def _table(points: list[Point]) -> ReportTable:
     columns = ("method", "preset or refinement", "tetrahedra", "unknowns", "median [ms]",
                "95 % [ms]", "99 % [ms]",
                *(f"error at {gap} mm [%]" for gap in REFERENCE))  # fmt: skip
@@ -203,12 +203,12 @@ def _table(points: list[Point]) -> Table:
          *(100 * e for e in p.errors))
         for p in points
     ]  # fmt: skip
-    return Table(columns, tuple(rows))
+    return ReportTable(columns, tuple(rows))
 
 
-def _paper_table() -> Table:
+def _paper_table() -> ReportTable:
     rows: list[tuple[Cell, ...]] = [(int(n), t) for n, t in zip(*paper_figure(), strict=True)]
-    return Table(("elements", "time [ms]"), tuple(rows))
+    return ReportTable(("elements", "time [ms]"), tuple(rows))
 
 
 def _plot(points: list[Point]) -> Figure:
@@ -217,7 +217,7 @@ def _plot(points: list[Point]) -> Figure:
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     times, errors = figure.subplots(1, 2, sharex=True)
     times.loglog(*paper_figure(), "s-", color=INK, label="the paper, i7 3.4 GHz, 3 electrodes")
-    for method, colour, marker in (("masked", COLOURS[1], "^"), ("surface", COLOURS[0], "o")):
+    for method, colour, marker in (("fem_masked", COLOURS[1], "^"), ("surface", COLOURS[0], "o")):
         mine = [p for p in points if p.method == method]
         sizes = [p.tetrahedra or p.unknowns for p in mine]
         label = f"{_LABELS[mine[0].method]}, 6 electrodes"
@@ -236,10 +236,10 @@ NOTES = (
     "solve, an i7 at 3.40 GHz. CapSense's are whole calls of `Simulator.step` on this machine: "
     "bodies in, six electrodes, full matrix out. Both of this machine's are what the processor "
     "spent, which is what the clock shows where nothing else runs.",
-    'The paper\'s scheme is `method="masked"`: every tetrahedron whose centroid lies in the bar is '
-    "held at 0 V, and Jacobi-CG solves the whole problem for one electrode after the other, from "
-    "the last step's solution. At many steps the bar passes no centroid, the staircase stays as it "
-    "was and there is nothing to solve: then the median is the time of finding that out.",
+    'The paper\'s scheme is `method="fem_masked"`: every tetrahedron whose centroid lies in the '
+    "bar is held at 0 V, and Jacobi-CG solves the whole problem for one electrode after the other, "
+    "from the last step's solution. At many steps the bar passes no centroid, the staircase stays "
+    "as it was and there is nothing to solve: then the median is the time of finding that out.",
     "CapSense has no mesh: its unknowns are functions of charge on the surfaces of bodies, so that "
     "sizes of the two cannot be compared, only times and errors.",
     "Parts hold measured times, and are taken up again on the machine that measured them only.",

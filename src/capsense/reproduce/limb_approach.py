@@ -18,8 +18,8 @@ from capsense.reproduce.limb_curves import (
     RADII,
     RANGES,
     SIZES,
-    Curves,
-    Setup,
+    LimbCurves,
+    LimbSetup,
     counts,
     distances,
     read_curves,
@@ -29,17 +29,17 @@ from capsense.reproduce.limb_curves import (
 from capsense.reproduce.limb_fit import ARM, EDGES, FAR, WITHIN, ArmFit, fit_arm
 from capsense.reproduce.limb_plots import plot_approach
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Cell, Outcome, Report, Row, Table, judged
+from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     """Carry the study out; see :class:`capsense.reproduce.study.Study`."""
     store = Store(folder)
     box = 1.0 if reduced else BOX
-    setups = [Setup(s, b, box) for s, b in product(SIZES[:1] if reduced else SIZES, BACKINGS)]
-    boxes = [Setup(box=e, backing=b) for b, e in product(BACKINGS, BOXES)]
+    setups = [LimbSetup(s, b, box) for s, b in product(SIZES[:1] if reduced else SIZES, BACKINGS)]
+    boxes = [LimbSetup(box=e, backing=b) for b, e in product(BACKINGS, BOXES)]
     if reduced:
-        boxes = [Setup(box=e) for e in (0.5, 1.0)]
+        boxes = [LimbSetup(box=e) for e in (0.5, 1.0)]
     todo = list(dict.fromkeys([*setups, *boxes, CHECK]))
     curves = {}
     for k, setup in enumerate(todo):
@@ -51,7 +51,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     report("done", 1.0)
     cases = {setup: curves[setup] for setup in setups}
     in_boxes = {setup: curves[setup] for setup in boxes}
-    first = curves[Setup(box=box)]
+    first = curves[LimbSetup(box=box)]
     return Outcome(
         "Limb approach: one electrode above a forearm",
         (*_rows(first, cases, in_boxes, curves[CHECK]), *_arm_rows(fits)),
@@ -63,7 +63,10 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
 
 
 def _rows(
-    first: Curves, cases: dict[Setup, Curves], boxes: dict[Setup, Curves], fine: Curves
+    first: LimbCurves,
+    cases: dict[LimbSetup, LimbCurves],
+    boxes: dict[LimbSetup, LimbCurves],
+    fine: LimbCurves,
 ) -> list[Row]:
     hardware = np.array([_fit_slopes(*fit) for fit in FITS.values()])
     rows = []
@@ -87,7 +90,7 @@ def _rows(
     rows.append(judged("curves that rise anywhere with distance", rising, below=1))
     pair = [
         np.array(slopes(c.distance, c.change(tared=False)))
-        for c in (fine, boxes[Setup(box=CHECK.box)])
+        for c in (fine, boxes[LimbSetup(box=CHECK.box)])
     ]
     rows.append(
         judged(
@@ -104,7 +107,7 @@ def _fits(store: Store, report: Report) -> dict[str, ArmFit]:
     for backing in BACKINGS:
         report(f"fit to a human arm, {backing}", 0.9)
         curves = [
-            read_curves(store, Setup(e, backing), (MAIN,), ("100 pF",), 6, FAR) for e in EDGES
+            read_curves(store, LimbSetup(e, backing), (MAIN,), ("100 pF",), 6, FAR) for e in EDGES
         ]
         change = np.array([c.change(MAIN, "100 pF", tared=False) for c in curves])
         found[backing] = fit_arm(EDGES, curves[0].distance, change)
@@ -122,7 +125,7 @@ def _arm_rows(fits: dict[str, ArmFit]) -> list[Row]:
     return rows
 
 
-def _arm_table(fits: dict[str, ArmFit]) -> Table:
+def _arm_table(fits: dict[str, ArmFit]) -> ReportTable:
     """Slopes and fitted figures, and the figures' ranges."""
     units = (1e3, 1e3, 1e2)
     rows: list[tuple[Cell, ...]] = [("human arm", *_cells(list(ARM)), "", "", "")]
@@ -134,7 +137,7 @@ def _arm_table(fits: dict[str, ArmFit]) -> Table:
         ]
         rows.append((f"{name}: all within {WITHIN}", "", "", "", "", *(spans or ["nowhere"] * 3)))
     names = ("edge [mm]", "offset [mm]", "tare [% of the reading at 15 cm]")
-    return Table(("behind the electrode", *HEADINGS, *names), tuple(rows))
+    return ReportTable(("behind the electrode", *HEADINGS, *names), tuple(rows))
 
 
 def _fit_slopes(k: float, b: float) -> list[float]:
@@ -151,8 +154,8 @@ HEADINGS = tuple(f"slope {_range(n)}" for n in range(len(RANGES)))
 
 
 def _tables(
-    first: Curves, cases: dict[Setup, Curves], boxes: dict[Setup, Curves]
-) -> dict[str, Table]:
+    first: LimbCurves, cases: dict[LimbSetup, LimbCurves], boxes: dict[LimbSetup, LimbCurves]
+) -> dict[str, ReportTable]:
     slope_rows: list[tuple[Cell, ...]] = []
     curve_rows: list[tuple[Cell, ...]] = []
     for setup, found in cases.items():
@@ -179,13 +182,15 @@ def _tables(
     zero = 1e2 * zero_distance(first.distance, first.change())
     main = [row for row in slope_rows if row[2] == 1e3 * MAIN]
     return {
-        "slopes": Table((*case_names, *HEADINGS), tuple(main)),
-        "hardware": Table(
+        "slopes": ReportTable((*case_names, *HEADINGS), tuple(main)),
+        "hardware": ReportTable(
             ("sensor", *HEADINGS, "zero [cm]"), (*sensors, ("simulated, 30 mm free", *ours, zero))
         ),
-        "boxes": Table(("box [m]", "behind it", "tare", *HEADINGS), tuple(box_rows)),
-        "slopes_all": Table((*case_names, *HEADINGS), tuple(slope_rows)),
-        "curves": Table((*case_names, "distance [mm]", "change [fF]", "counts"), tuple(curve_rows)),
+        "boxes": ReportTable(("box [m]", "behind it", "tare", *HEADINGS), tuple(box_rows)),
+        "slopes_all": ReportTable((*case_names, *HEADINGS), tuple(slope_rows)),
+        "curves": ReportTable(
+            (*case_names, "distance [mm]", "change [fF]", "counts"), tuple(curve_rows)
+        ),
     }
 
 

@@ -67,7 +67,7 @@ there rises from touch to 15 cm at 1 cm/s, tared 20 cm along the arm and 20 cm t
 
 
 @dataclass(frozen=True)
-class Setup:
+class LimbSetup:
     """An electrode and the box around it."""
 
     size: float = 0.03
@@ -98,12 +98,12 @@ class Setup:
         return BuildSettings(panel_scale=1.7 if self.box <= 1.0 else 2.0)
 
 
-CHECK = Setup(box=0.5, fine=True)
+CHECK = LimbSetup(box=0.5, fine=True)
 """Tells what the coarser panels cost."""
 
 
 @dataclass(frozen=True, eq=False)
-class Curves:
+class LimbCurves:
     """What one electrode reads, for each limb radius and grounding."""
 
     radii: tuple[float, ...]
@@ -156,12 +156,12 @@ def zero_distance(distance: Array, change: Array) -> float:
 
 def read_curves(
     store: Store,
-    setup: Setup,
+    setup: LimbSetup,
     radii: tuple[float, ...],
     names: tuple[str, ...],
     per_range: int,
     far: tuple[float, ...] = (),
-) -> Curves:
+) -> LimbCurves:
     """The curves of one electrode over limbs of these radii [m] and groundings.
 
     They come from disk if they are there. ``far`` adds distances [m] beyond the ranges.
@@ -187,7 +187,7 @@ def read_curves(
     label = f"{setup.size * 1e3:.0f}mm-{setup.backing.replace(' ', '-')}-{setup.box:g}m"
     label = f"far-{label}" if far else label
     found = store.get(label, inputs, compute)
-    return Curves(radii, names, z, found["away"], found["value"], found["retreat"])
+    return LimbCurves(radii, names, z, found["away"], found["value"], found["retreat"])
 
 
 def _read(
@@ -203,7 +203,7 @@ def _read(
 
 def counts(values: Array, tare: float) -> Array:
     """Tared codes of an AD7147 that rests half a second at each reading [F], averaged, (n,)."""
-    readout = cs.ReadOut.preset("ad7147", ["E1"], seed=1)
+    readout = cs.Readout.preset("ad7147", ["E1"], seed=1)
     held = np.concatenate([[tare], values])
     start = 0.5 * np.arange(len(held))
     times = np.stack([start, start + 0.499], axis=1).ravel()

@@ -16,13 +16,15 @@ from capsense.reproduce.limb_curves import (
     GROUNDINGS,
     MAIN,
     SIZES,
-    Curves,
-    Setup,
+    LimbCurves,
+    LimbSetup,
     counts,
 )
 
 
-def plot_approach(cases: Mapping[Setup, Curves], boxes: Mapping[Setup, Curves]) -> Figure:
+def plot_approach(
+    cases: Mapping[LimbSetup, LimbCurves], boxes: Mapping[LimbSetup, LimbCurves]
+) -> Figure:
     """Curves against distance: by electrode, as counts and as capacitance; by grounding; by box."""
     figure = Figure(figsize=(9.6, 8.0), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True).ravel()
@@ -52,7 +54,7 @@ def plot_approach(cases: Mapping[Setup, Curves], boxes: Mapping[Setup, Curves]) 
     return figure
 
 
-def _groundings(axis: Axes, found: Curves) -> None:
+def _groundings(axis: Axes, found: LimbCurves) -> None:
     """Limbs tied to ground in several ways; the hardware's fits, laid on the grounded one."""
     z, change = found.distance, found.change()
     for name, colour in zip(GROUNDINGS, COLOURS, strict=False):
@@ -65,5 +67,5 @@ def _groundings(axis: Axes, found: Curves) -> None:
         axis.plot(1e2 * z, 1e15 * seen, color=INK, lw=1, ls=line, label=f"hardware, {name}")
 
 
-def _line(setup: Setup) -> Any:
+def _line(setup: LimbSetup) -> Any:
     return DASHES[setup.backing != "free"]

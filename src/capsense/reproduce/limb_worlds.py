@@ -17,7 +17,7 @@ from capsense.reproduce.limb_rides import Course
 from capsense.scene import Pose
 from capsense.scene.body import Grounding
 
-View = Literal["geometry", "depth"]
+View = Literal["geometry", "depth_camera"]
 
 PIXELS = 64
 """Rows and columns of the depth image."""
@@ -25,7 +25,7 @@ WIDTH = 0.5
 """Width and height of the depth image [m], as wide as the domain."""
 
 
-class World(Protocol):
+class LimbWorld(Protocol):
     """A simulated world with a sensor in it."""
 
     sensor: AttachedSensor
@@ -53,7 +53,7 @@ class MujocoWorld:
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
         self.sensor = cs.mujoco.attach(
-            self._model, self._data, "pad", sim, world=view, default_material="human",
+            self._model, self._data, "pad", sim, perception=view, default_material="human",
             default_grounding=grounding,
         )  # fmt: skip
 
@@ -85,9 +85,11 @@ class PybulletWorld:
                 physicsClientId=client,
             )  # fmt: skip
         self._body = p.createMultiBody(0, physicsClientId=client)
-        image: dict[str, Any] = {"size": WIDTH, "resolution": PIXELS} if view == "depth" else {}
+        image: dict[str, Any] = (
+            {"size": WIDTH, "resolution": PIXELS} if view == "depth_camera" else {}
+        )
         self.sensor = cs.pybullet.attach(
-            client, self._body, design=sim, world=view, default_material="human",
+            client, self._body, design=sim, perception=view, default_material="human",
             default_grounding=grounding, **image,
         )  # fmt: skip
 
@@ -102,7 +104,7 @@ class PybulletWorld:
 @contextmanager
 def opened(
     simulator: str, place: Course, sim: cs.Simulator, view: View, grounding: Grounding
-) -> Iterator[World]:
+) -> Iterator[LimbWorld]:
     """A world in ``"mujoco"`` or ``"pybullet"``."""
     if simulator == "mujoco":
         yield MujocoWorld(place, sim, view, grounding)
@@ -116,7 +118,7 @@ def opened(
         p.disconnect(client)
 
 
-def read_poses(world: World, poses: tuple[Pose, ...]) -> np.ndarray:
+def read_poses(world: LimbWorld, poses: tuple[Pose, ...]) -> np.ndarray:
     """Self-capacitances at poses one after another [F], shape (n, electrodes)."""
     world.sensor.reset()
     out = []

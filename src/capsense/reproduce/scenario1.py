@@ -23,15 +23,15 @@ from capsense.reproduce.scenario1_setup import (
     ZIGZAG,
     Array,
     Board,
-    Curves,
     Panel,
-    Setup,
+    PaperCurves,
+    Scenario1Setup,
     load_curves,
     load_setup,
 )
 from capsense.reproduce.scenario1_signal import matrices, mutual, normalised
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Outcome, Report, Row, Table, judged
+from capsense.reproduce.study import Outcome, Report, ReportTable, Row, judged
 from capsense.simulator import Simulator
 
 
@@ -62,7 +62,7 @@ class Curve:
     """With the noise of the set-up."""
 
 
-def cases_of(setup: Setup, *, reduced: bool) -> list[Case]:
+def cases_of(setup: Scenario1Setup, *, reduced: bool) -> list[Case]:
     """All boards, trajectories and speeds; reduced, the paper's panels only.
 
     At the panels' speed these have as many samples as in the paper; other cases last once round.
@@ -80,24 +80,24 @@ def cases_of(setup: Setup, *, reduced: bool) -> list[Case]:
 
 
 @lru_cache(maxsize=3)
-def _simulator(board: Board, pour: str, frequency: float) -> Simulator:
-    return Simulator(board.sensor(pour), frequency=frequency)
+def _simulator(board: Board, pour: str, excitation_frequency: float) -> Simulator:
+    return Simulator(board.sensor(pour), excitation_frequency=excitation_frequency)
 
 
-def curve_of(setup: Setup, case: Case, store: Store) -> Curve:
+def curve_of(setup: Scenario1Setup, case: Case, store: Store) -> Curve:
     """Simulate a case, or take its capacitances from the store, and read them."""
     board, times = setup.boards[case.panel.board], setup.times(case.panel)
     poses = setup.poses(board.design, case.panel.trajectory, case.speed, times)
 
     def compute() -> dict[str, Array]:
-        sim = _simulator(board, setup.pour, setup.frequency)
+        sim = _simulator(board, setup.pour, setup.excitation_frequency)
         values = mutual(matrices(sim, setup, poses), sim.electrode_names, board.pair)
         return {"values": values, "empty": mutual(sim.baseline, sim.electrode_names, board.pair)}
 
     inputs = {
         "design": board.sensor(setup.pour).content_hash(),
         "pair": board.pair,
-        "frequency": setup.frequency,
+        "frequency": setup.excitation_frequency,
         "bar": [setup.size, setup.material],
         "positions": np.array([pose.position for pose in poses]),
     }
@@ -145,7 +145,9 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     return Outcome(title, rows, tables, plots, NOTES, store.told())
 
 
-def _compare(shown: dict[str, Curve], panels: dict[str, Curves]) -> tuple[tuple[Row, ...], Table]:
+def _compare(
+    shown: dict[str, Curve], panels: dict[str, PaperCurves]
+) -> tuple[tuple[Row, ...], ReportTable]:
     """Our curves and the paper's simulation, each against hardware."""
     rows: list[Row] = []
     cells: list[tuple[str | float, ...]] = []
@@ -170,28 +172,28 @@ def _compare(shown: dict[str, Curve], panels: dict[str, Curves]) -> tuple[tuple[
                 rows.append(Row(label, ours))
             cells.append((title, what, ours, theirs))
     header = ("panel", "against hardware", "CapSense", "the paper's simulation")
-    return tuple(rows), Table(header, tuple(cells))
+    return tuple(rows), ReportTable(header, tuple(cells))
 
 
-def _table_1(setup: Setup) -> Table:
+def _table_1(setup: Scenario1Setup) -> ReportTable:
     """The paper's Table I, simulation against hardware over all trajectories."""
     rows = [
         (speed, *(correlations(1)[f"{speed:g}"][name] for name in setup.boards))
         for speed in setup.speeds
     ]
-    return Table(("speed [m/s]", *setup.boards), tuple(rows))
+    return ReportTable(("speed [m/s]", *setup.boards), tuple(rows))
 
 
-def _fitted(setup: Setup) -> Table:
+def _fitted(setup: Scenario1Setup) -> ReportTable:
     rows = [(key, setup.value(key), u) for key, u in setup.uncertainty.items()]
-    return Table(
+    return ReportTable(
         ("figure (SI units; tilt in degrees)", "value", "standard uncertainty"), tuple(rows)
     )
 
 
-def _listed(curves: list[Curve]) -> Table:
+def _listed(curves: list[Curve]) -> ReportTable:
     header = ("board", "trajectory", "speed [m/s]", "samples", "least", "most")
-    return Table(
+    return ReportTable(
         header,
         tuple(
             (c.case.panel.board, c.case.panel.trajectory, c.case.speed, c.case.panel.samples,
@@ -201,17 +203,17 @@ def _listed(curves: list[Curve]) -> Table:
     )  # fmt: skip
 
 
-def _panel(curve: Curve, panel: Curves) -> Table:
+def _panel(curve: Curve, panel: PaperCurves) -> ReportTable:
     columns = (panel.measured, panel.simulated, curve.reading, curve.noisy)
     rows = zip(range(1, len(curve.times) + 1), *(c.tolist() for c in columns), strict=True)
     header = ("sample", "measured", "the paper's simulation", "CapSense", "CapSense with noise")
-    return Table(header, tuple(rows))
+    return ReportTable(header, tuple(rows))
 
 
-def _curve(curve: Curve) -> Table:
+def _curve(curve: Curve) -> ReportTable:
     columns = (curve.times, curve.reading, curve.noisy)
     rows = zip(range(1, len(curve.times) + 1), *(c.tolist() for c in columns), strict=True)
-    return Table(("sample", "time [s]", "reading", "reading with noise"), tuple(rows))
+    return ReportTable(("sample", "time [s]", "reading", "reading with noise"), tuple(rows))
 
 
 NOTES = (

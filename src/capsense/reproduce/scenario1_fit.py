@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import least_squares
 
-from capsense.reproduce.scenario1_setup import Array, Setup, load_curves
+from capsense.reproduce.scenario1_setup import Array, Scenario1Setup, load_curves
 from capsense.reproduce.scenario1_signal import matrices, mutual
 from capsense.scene import Pose
 from capsense.simulator import Simulator
@@ -25,7 +25,7 @@ NEAREST, FARTHEST, HEIGHTS = 0.005, 0.160, 36
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class ResponseTable:
     """Relative change of a pair's capacitance over the bar's place."""
 
     empty: float
@@ -57,14 +57,16 @@ class Grid:
     thickness: float
     """Of the bar [m]."""
 
-    def table(self, pair: tuple[str, str]) -> Table:
+    def table(self, pair: tuple[str, str]) -> ResponseTable:
         """The table of a pair."""
         empty = float(mutual(self.empty, self.names, pair))
         change = mutual(self.matrices, self.names, pair) / empty - 1
-        return Table(empty, RectBivariateSpline(self.x, np.log(self.gaps), change), self.thickness)
+        return ResponseTable(
+            empty, RectBivariateSpline(self.x, np.log(self.gaps), change), self.thickness
+        )
 
 
-def tabulate(sim: Simulator, setup: Setup, coarser: float = 1.0) -> Grid:
+def tabulate(sim: Simulator, setup: Scenario1Setup, coarser: float = 1.0) -> Grid:
     """Step the bar through a grid of places.
 
     Args:
@@ -81,7 +83,7 @@ def tabulate(sim: Simulator, setup: Setup, coarser: float = 1.0) -> Grid:
     return Grid(sim.electrode_names, sim.baseline, x, gaps, stacked, setup.size[2])
 
 
-def predicted(setup: Setup, panel: str, table: Table) -> Array:
+def predicted(setup: Scenario1Setup, panel: str, table: ResponseTable) -> Array:
     """A panel's curve by its board's table, without rounding and noise, shape (samples,)."""
     shown = setup.panels[panel]
     poses = setup.poses(shown.board, shown.trajectory, setup.panel_speed, setup.times(shown))
@@ -94,7 +96,7 @@ def predicted(setup: Setup, panel: str, table: Table) -> Array:
 class Fit:
     """The outcome of a fit."""
 
-    setup: Setup
+    setup: Scenario1Setup
     """The set-up with the fitted figures and their uncertainties."""
     cost: float
     """Half the sum of squared differences over all panels."""
@@ -105,7 +107,7 @@ class Fit:
     covariance: Array
     """Of these figures, in their units, shape (len(keys), len(keys))."""
 
-    def drawn(self, count: int, seed: int = 0) -> list[Setup]:
+    def drawn(self, count: int, seed: int = 0) -> list[Scenario1Setup]:
         """Set-ups whose fitted figures are drawn at random from their covariance."""
         random = np.random.default_rng(seed)
         values = [self.setup.value(key) for key in self.keys]
@@ -114,8 +116,8 @@ class Fit:
 
 
 def fit(
-    setup: Setup,
-    tables: Mapping[str, Table],
+    setup: Scenario1Setup,
+    tables: Mapping[str, ResponseTable],
     *,
     panels: Sequence[str] | None = None,
     keys: Sequence[str] | None = None,
@@ -166,7 +168,9 @@ def fit(
     return Fit(fitted, float(best.cost), memory, tuple(keys), covariance)
 
 
-def own_figures(setup: Setup, tables: Mapping[str, Table], panel: str) -> list[str]:
+def own_figures(
+    setup: Scenario1Setup, tables: Mapping[str, ResponseTable], panel: str
+) -> list[str]:
     """The fitted figures on which the curve of no other recorded panel depends."""
     others = [name for name in _recorded(setup) if name != panel]
     before = np.concatenate(_curves(setup, tables, others))
@@ -179,7 +183,9 @@ def own_figures(setup: Setup, tables: Mapping[str, Table], panel: str) -> list[s
     return [key for key, after in moved.items() if np.array_equal(before, after)]
 
 
-def fit_without(setup: Setup, tables: Mapping[str, Table], panel: str) -> Setup:
+def fit_without(
+    setup: Scenario1Setup, tables: Mapping[str, ResponseTable], panel: str
+) -> Scenario1Setup:
     """Fit with a panel held out, but for what belongs to that panel alone.
 
     All that other panels depend on is fitted to them; then the held-out panel's own figures, see
@@ -197,9 +203,11 @@ def fit_without(setup: Setup, tables: Mapping[str, Table], panel: str) -> Setup:
     return fit(found, tables, panels=[panel], keys=own).setup
 
 
-def _recorded(setup: Setup) -> list[str]:
+def _recorded(setup: Scenario1Setup) -> list[str]:
     return [name for name, panel in setup.panels.items() if panel.file]
 
 
-def _curves(setup: Setup, tables: Mapping[str, Table], panels: Sequence[str]) -> list[Array]:
+def _curves(
+    setup: Scenario1Setup, tables: Mapping[str, ResponseTable], panels: Sequence[str]
+) -> list[Array]:
     return [predicted(setup, name, tables[setup.panels[name].board]) for name in panels]

@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from capsense._style import COLOURS, FAINT, INK, LABELS, LEGEND, TITLES, bare
-from capsense.reproduce.scenario1_setup import Array, Curves, Setup
+from capsense.reproduce.scenario1_setup import Array, PaperCurves, Scenario1Setup
 
 MEASURED, PAPER, OURS = INK, COLOURS[1], COLOURS[0]
 
 
-def plot_panels(panels: Mapping[str, tuple[Array, Curves | None]]) -> Figure:
+def plot_panels(panels: Mapping[str, tuple[Array, PaperCurves | None]]) -> Figure:
     """Fig. 9's panels with our curves: hardware and the paper's simulation where given, ours."""
     figure = Figure(figsize=(8.2, 2.4 * len(panels)), layout="constrained")
     axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
@@ -35,7 +35,7 @@ def plot_panels(panels: Mapping[str, tuple[Array, Curves | None]]) -> Figure:
 
 
 def plot_trajectories(
-    setup: Setup, curves: Mapping[tuple[str, str], tuple[Array, Array]]
+    setup: Scenario1Setup, curves: Mapping[tuple[str, str], tuple[Array, Array]]
 ) -> Figure:
     """Ways of the bar in the upper row; below, a row per board with its readings.
 
@@ -63,7 +63,7 @@ def plot_trajectories(
     return figure
 
 
-def _draw_way(ax: Axes, setup: Setup, boards: list[str], way: str) -> None:
+def _draw_way(ax: Axes, setup: Scenario1Setup, boards: list[str], way: str) -> None:
     """The middle of the bar's lower face on each distinct way, and the board, to scale."""
     distinct: dict[bytes, list[str]] = {}
     ways_of = {

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.design import Design, Role, load_design
 from capsense.errors import ScenarioError
-from capsense.scenario.schema import Table
+from capsense.scenario.schema import ScenarioTable
 from capsense.scenario.trajectory import Trajectory
 from capsense.scene import Pose
 
@@ -97,7 +97,7 @@ class Zigzag:
 
 
 @dataclass(frozen=True)
-class Setup:
+class Scenario1Setup:
     """Everything that scenario 1 depends on; SI units, tilt in degrees."""
 
     speeds: tuple[float, ...]
@@ -105,7 +105,7 @@ class Setup:
     sample_rate: float
     level: float
     """What readings without an object are normalised to where a panel has none of its own."""
-    frequency: float
+    excitation_frequency: float
     pour: str
     """Potential of the boards' pours and back planes, see :meth:`Board.sensor`."""
     size: tuple[float, float, float]
@@ -141,7 +141,7 @@ class Setup:
         name, _, own = key.rpartition(".")
         return float((self._parts(name) if name else self.__dict__)[own])
 
-    def changed(self, values: Mapping[str, float]) -> Setup:
+    def changed(self, values: Mapping[str, float]) -> Scenario1Setup:
         """The same with other figures, by the names of :meth:`value`."""
         out: dict[str, Any] = {
             "zigzag": self.zigzag, "boards": dict(self.boards), "panels": dict(self.panels)
@@ -197,7 +197,7 @@ class Setup:
         return np.arange(panel.samples) / (self.sample_rate * panel.pace)
 
 
-def load_setup() -> Setup:
+def load_setup() -> Scenario1Setup:
     """Read the packaged file.
 
     Raises:
@@ -213,34 +213,36 @@ _FRONT_END = {"stray": 1e-9, "shunt": 1e9, "full_scale": 1e3, "conversion": 10.0
 _ZIGZAG = {"depth": 1.0, "pitch": 1.0, "lift": 1.0, "start": 1.0}
 
 
-def parse_setup(data: Mapping[str, Any]) -> Setup:
+def parse_setup(data: Mapping[str, Any]) -> Scenario1Setup:
     """Read the content of such a file.
 
     Raises:
         ScenarioError: A key is missing, unknown or wrong.
     """
-    top = Table(data, FILE, "scenario 1")
+    top = ScenarioTable(data, FILE, "scenario 1")
     top.only(_TOP)
 
-    def part(name: str) -> Table:
-        return Table(top.raw(name, "a table"), FILE, name)
+    def part(name: str) -> ScenarioTable:
+        return ScenarioTable(top.raw(name, "a table"), FILE, name)
 
     path, front, bar, ways, teeth = (
         part(n) for n in ("path", "front_end", "bar", "trajectories", "zigzag")
     )
     speeds = top.series("speeds", 1e-6, 1e3, "m/s")
     a, b, c = bar.sizes("size", 3, "[x, y, z] in metres")
-    boards = [_board(Table(raw, FILE, f"board {n}")) for n, raw in enumerate(top.tables("board"))]
+    boards = [
+        _board(ScenarioTable(raw, FILE, f"board {n}")) for n, raw in enumerate(top.tables("board"))
+    ]
     panels = [
-        _panel(Table(raw, FILE, f"panel {n}"), [board.design for board in boards])
+        _panel(ScenarioTable(raw, FILE, f"panel {n}"), [board.design for board in boards])
         for n, raw in enumerate(top.tables("panel"))
     ]
-    setup = Setup(
+    setup = Scenario1Setup(
         speeds=tuple(speeds) if isinstance(speeds, list) else (speeds,),
         panel_speed=top.number("panel_speed", 1e-6, 1e3, unit="m/s"),
         sample_rate=top.number("sample_rate", 1e-3, 1e6, unit="Hz"),
         level=top.number("level", 0.0, 10.0),
-        frequency=top.number("frequency", 1.0, 1e12, unit="Hz"),
+        excitation_frequency=top.number("frequency", 1.0, 1e12, unit="Hz"),
         pour=top.choice("pour", (Role.GROUND, Role.FLOATING)),
         size=(a, b, c),
         material=bar.string("material"),
@@ -265,7 +267,7 @@ def parse_setup(data: Mapping[str, Any]) -> Setup:
     return setup
 
 
-def _board(table: Table) -> Board:
+def _board(table: ScenarioTable) -> Board:
     table.only([f.name for f in dataclasses.fields(Board)])
     pair = table.raw("pair", '["E1", "E2"]')
     if not (isinstance(pair, list) and len(pair) == 2):
@@ -279,7 +281,7 @@ def _board(table: Table) -> Board:
     )
 
 
-def _panel(table: Table, boards: list[str]) -> Panel:
+def _panel(table: ScenarioTable, boards: list[str]) -> Panel:
     table.only([f.name for f in dataclasses.fields(Panel)])
     return Panel(
         table.choice("board", boards),
@@ -292,7 +294,7 @@ def _panel(table: Table, boards: list[str]) -> Panel:
 
 
 @dataclass(frozen=True, eq=False)
-class Curves:
+class PaperCurves:
     """The two curves of a panel of the paper's Fig. 9, at samples 1 to n."""
 
     measured: Array
@@ -301,7 +303,7 @@ class Curves:
     """The paper's simulation, normalised, shape (n,)."""
 
 
-def load_curves(panel: Panel) -> Curves:
+def load_curves(panel: Panel) -> PaperCurves:
     """Read a panel; points were read off the vector figure, and are interpolated to samples."""
     text = (DATA / panel.file).read_text(encoding="utf-8")
     rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
@@ -314,4 +316,4 @@ def load_curves(panel: Panel) -> Curves:
         ]
         sample, value = np.array(points).T
         curves.append(np.interp(np.arange(1, panel.samples + 1), sample, value))
-    return Curves(*curves)
+    return PaperCurves(*curves)

@@ -10,10 +10,10 @@ from capsense.readout.channels import mutual_patterns
 from capsense.readout.converter import ShuntLaw
 from capsense.readout.front_end import ShuntFrontEnd
 from capsense.readout.noise import White
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
 from capsense.readout.wiring import Wiring
-from capsense.reproduce.scenario1_setup import Array, Board, Setup
+from capsense.reproduce.scenario1_setup import Array, Board, Scenario1Setup
 from capsense.scene import Body, Box, Pose, Scene
 from capsense.simulator import Simulator
 
@@ -21,7 +21,7 @@ CALIBRATION_SAMPLES = 100
 """Readings without an object that the base capacitance is the mean of."""
 
 
-def matrices(sim: Simulator, setup: Setup, poses: list[Pose]) -> Array:
+def matrices(sim: Simulator, setup: Scenario1Setup, poses: list[Pose]) -> Array:
     """Maxwell matrices of the simulator with the bar at poses [F], shape (n, M, M)."""
     sim.reset()
     return np.array(
@@ -38,10 +38,10 @@ def mutual(matrix: Array, names: tuple[str, ...], pair: tuple[str, str]) -> Arra
     return -matrix[..., i, j]
 
 
-def read_out(setup: Setup, board: Board, *, noise: bool, seed: int = 0) -> ReadOut:
+def readout_of(setup: Scenario1Setup, board: Board, *, noise: bool, seed: int = 0) -> Readout:
     """The radio behind the front end, reading the board's pair at the sample rate."""
-    front_end = ShuntFrontEnd(setup.frequency, setup.shunt, board.gain)
-    return ReadOut(
+    front_end = ShuntFrontEnd(setup.excitation_frequency, setup.shunt, board.gain)
+    return Readout(
         mutual_patterns(board.pair),
         board.pair,
         Schedule.simultaneous(1, setup.conversion, period=1.0 / setup.sample_rate),
@@ -53,7 +53,13 @@ def read_out(setup: Setup, board: Board, *, noise: bool, seed: int = 0) -> ReadO
 
 
 def normalised(
-    setup: Setup, board: Board, capacitance: ArrayLike, empty: float, *, noise: bool, seed: int = 0
+    setup: Scenario1Setup,
+    board: Board,
+    capacitance: ArrayLike,
+    empty: float,
+    *,
+    noise: bool,
+    seed: int = 0,
 ) -> Array:
     """What the front end makes of capacitances, over what it reads without an object.
 
@@ -68,7 +74,7 @@ def normalised(
     Returns:
         Readings over the base capacitance, shape (n,).
     """
-    chain = read_out(setup, board, noise=noise, seed=seed)
+    chain = readout_of(setup, board, noise=noise, seed=seed)
     values = [*np.full(CALIBRATION_SAMPLES, empty), *np.asarray(capacitance, dtype=float)]
     times = chain.due((len(values) - 0.5) / setup.sample_rate)
     parts = [

@@ -24,7 +24,7 @@ from capsense.reproduce.limb_worlds import PIXELS, View, opened, read_poses
 from capsense.reproduce.metrics import cross_correlation, raw_correlation
 from capsense.reproduce.paper import correlations
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Cell, Outcome, Report, Row, Table, judged
+from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
 from capsense.scene.body import Grounding
 from capsense.simulator import Method
 
@@ -68,17 +68,20 @@ AGAIN = "again"
 """The reference read by a second chip: what its noise leaves of a correlation."""
 RUNS: dict[str, Run] = {
     REFERENCE: Run("accurate, geometry, MuJoCo"),
-    DEPTH: Run("accurate, depth camera, MuJoCo", view="depth"),
+    DEPTH: Run("accurate, depth camera, MuJoCo", view="depth_camera"),
     PAPER: Run(
-        "the paper's scheme, depth camera, MuJoCo", view="depth", method="masked",
+        "the paper's scheme, depth camera, MuJoCo", view="depth_camera", method="fem_masked",
         resolution=COARSE,
     ),
     "fine": Run(
-        "the paper's scheme, mesh seven times as fine", view="depth", method="masked", rides=1
+        "the paper's scheme, mesh seven times as fine", view="depth_camera", method="fem_masked",
+        rides=1,
     ),
     "person": Run("accurate, geometry, person on 100 pF", grounding=1e-10),
     "bullet": Run("accurate, geometry, PyBullet", simulator="pybullet"),
-    "bullet_depth": Run("accurate, depth camera, PyBullet", simulator="pybullet", view="depth"),
+    "bullet_depth": Run(
+        "accurate, depth camera, PyBullet", simulator="pybullet", view="depth_camera"
+    ),
 }  # fmt: skip
 
 Changes = dict[str, Array]
@@ -156,7 +159,7 @@ def _codes(changes: Array, ways: list[Ride], person: str, run_name: str) -> Arra
     out = np.empty_like(changes)
     for number, (change, ride) in enumerate(zip(changes, ways, strict=False)):
         seed = [SEED, int(person), number, names.index(run_name)]
-        chip = cs.ReadOut.preset(
+        chip = cs.Readout.preset(
             "ad7147", sim.electrode_names, rate=CHIP_RATE,
             seed=int(np.random.SeedSequence(seed).generate_state(1)[0]),
         )  # fmt: skip
@@ -236,7 +239,7 @@ def _rows(found: Mapping[str, Changes], codes: Mapping[str, Changes]) -> list[Ro
     ]  # fmt: skip
 
 
-def _tables(found: Mapping[str, Changes], codes: Mapping[str, Changes]) -> dict[str, Table]:
+def _tables(found: Mapping[str, Changes], codes: Mapping[str, Changes]) -> dict[str, ReportTable]:
     people, electrodes = list(found[REFERENCE]), tuple(f"E{k + 1}" for k in range(6))
     tables = {}
     for name, what in ((PAPER, "paper_scheme"), (DEPTH, "depth_camera")):
@@ -256,7 +259,7 @@ def _tables(found: Mapping[str, Changes], codes: Mapping[str, Changes]) -> dict[
         lengths = (1e3 * build.length(n) for n in ("forearm", "shank"))
         numbers = (round(v, 1) for v in (1e2 * build.height, *lengths, *radii))
         sizes.append((name, build.sex, build.percentile, build.girth, *numbers))
-    tables["participants"] = Table(
+    tables["participants"] = ReportTable(
         ("participant", "sex", "percentile", "girth", "stature [cm]", "forearm [mm]",
          "lower leg [mm]", "radius of forearm [mm]", "wrist [mm]", "calf [mm]", "ankle [mm]"),
         tuple(sizes),
@@ -264,10 +267,10 @@ def _tables(found: Mapping[str, Changes], codes: Mapping[str, Changes]) -> dict[
     return tables
 
 
-def _grid(people: list[str], values: Array, electrodes: tuple[str, ...]) -> Table:
+def _grid(people: list[str], values: Array, electrodes: tuple[str, ...]) -> ReportTable:
     """Participants by electrodes, and their mean, as the paper's Table II."""
     lines = [*zip(people, values, strict=True), ("average", values.mean(axis=0))]
-    return Table(
+    return ReportTable(
         ("participant", *electrodes), tuple((p, *(f"{v:.3f}" for v in line)) for p, line in lines)
     )
 

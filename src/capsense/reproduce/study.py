@@ -69,7 +69,7 @@ def judged(
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """Columns with a heading each; written as csv, and shown in the report where it is short."""
 
     columns: tuple[str, ...]
@@ -88,7 +88,7 @@ class Outcome:
 
     title: str
     rows: tuple[Row, ...]
-    tables: Mapping[str, Table] = field(default_factory=dict)
+    tables: Mapping[str, ReportTable] = field(default_factory=dict)
     """By file name without ending."""
     plots: Mapping[str, Figure] = field(default_factory=dict)
     """By file name without ending."""

@@ -11,7 +11,7 @@ import numpy as np
 from capsense._validate import MAX_LENGTH, UNITS
 from capsense.errors import ScenarioError
 from capsense.scenario.model import MovingBody
-from capsense.scenario.schema import Table
+from capsense.scenario.schema import ScenarioTable
 from capsense.scenario.trajectory import Trajectory
 from capsense.scene import (
     Body,
@@ -42,7 +42,7 @@ MAX_GROUNDING = 1e-6
 """No body is tied to ground by more than this [F]."""
 
 
-def read_body(table: Table, name: str, folder: Path) -> MovingBody:
+def read_body(table: ScenarioTable, name: str, folder: Path) -> MovingBody:
     """Read one ``[[body]]``.
 
     Args:
@@ -67,15 +67,15 @@ def read_body(table: Table, name: str, folder: Path) -> MovingBody:
         )
     trajectory = None
     if "trajectory" in table:
-        sub = Table(table.data["trajectory"], table.source, f"{table.item}: trajectory")
+        sub = ScenarioTable(table.data["trajectory"], table.source, f"{table.item}: trajectory")
         trajectory = _read_trajectory(sub)
         pose = trajectory.pose_at(0.0)
     else:
-        pose = read_pose(Table(table.data["pose"], table.source, f"{table.item}: pose"))
+        pose = read_pose(ScenarioTable(table.data["pose"], table.source, f"{table.item}: pose"))
     return MovingBody(Body(shape, pose, material, grounding, name), trajectory)
 
 
-def _read_shape(table: Table, shape: str, folder: Path) -> Shape:
+def _read_shape(table: ScenarioTable, shape: str, folder: Path) -> Shape:
     if shape == "mesh":
         return _read_mesh(table, folder)
     if shape in ("box", "ellipsoid"):
@@ -89,7 +89,7 @@ def _read_shape(table: Table, shape: str, folder: Path) -> Shape:
     return Capsule(radius, length) if shape == "capsule" else Cylinder(radius, length)
 
 
-def _read_mesh(table: Table, folder: Path) -> TriMesh:
+def _read_mesh(table: ScenarioTable, folder: Path) -> TriMesh:
     file = table.string("file")
     scale = UNITS[table.choice("unit", list(UNITS))]
     path = folder / file
@@ -107,7 +107,7 @@ def _read_mesh(table: Table, folder: Path) -> TriMesh:
     return TriMesh(vertices * scale, faces)
 
 
-def _triangles(table: Table, path: Path) -> tuple[Any, Any]:
+def _triangles(table: ScenarioTable, path: Path) -> tuple[Any, Any]:
     """Vertices, shape (n, 3), and faces, shape (m, 3), of a file in its own unit."""
     if path.suffix.lower() not in (".stl", ".obj", ".ply", ".off"):
         raise table.error(
@@ -124,11 +124,11 @@ def _triangles(table: Table, path: Path) -> tuple[Any, Any]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def read_material(table: Table) -> Material | str:
+def read_material(table: ScenarioTable) -> Material | str:
     """The material that ``material`` names or describes."""
     value = table.raw("material", '"steel", or { eps_r = number, sigma = S/m }')
     if isinstance(value, dict):
-        sub = Table(value, table.source, f"{table.item}: material")
+        sub = ScenarioTable(value, table.source, f"{table.item}: material")
         sub.only(("name", "eps_r", "sigma"))
         return Material(
             sub.string("name", "custom"),
@@ -138,7 +138,7 @@ def read_material(table: Table) -> Material | str:
     return table.string("material")
 
 
-def read_grounding(table: Table) -> Grounding:
+def read_grounding(table: ScenarioTable) -> Grounding:
     """What ``grounding`` says; grounded by default."""
     value = table.data.get("grounding", "grounded")
     if isinstance(value, str):
@@ -157,7 +157,7 @@ def read_grounding(table: Table) -> Grounding:
     )
 
 
-def _rotations(table: Table) -> list[Pose]:
+def _rotations(table: ScenarioTable) -> list[Pose]:
     """The rotations that ``euler`` or ``quaternion`` give; none if neither is there."""
     if "euler" in table and "quaternion" in table:
         raise table.error("euler and quaternion both turn it; keep one of them")
@@ -180,7 +180,7 @@ def _rotations(table: Table) -> list[Pose]:
     return []
 
 
-def read_pose(table: Table) -> Pose:
+def read_pose(table: ScenarioTable) -> Pose:
     """The pose that a table describes by ``position`` and ``euler`` or ``quaternion``."""
     table.only(("position", "euler", "quaternion"))
     position = table.coordinates("position", (3,))
@@ -190,7 +190,7 @@ def read_pose(table: Table) -> Pose:
     return Pose(position, rotations[0].quaternion)
 
 
-def _read_trajectory(table: Table) -> Trajectory:
+def _read_trajectory(table: ScenarioTable) -> Trajectory:
     table.only(TRAJECTORY_KEYS)
     points = table.vectors("waypoints", 3, "[x, y, z] in metres")
     for number, point in enumerate(points):

@@ -11,8 +11,8 @@ from capsense.design import Design, load_design
 from capsense.errors import DesignError, MeshError, ScenarioError, SceneError
 from capsense.scenario.bodies import read_body
 from capsense.scenario.channels import Excitation
-from capsense.scenario.model import METHODS, MovingBody, Scenario
-from capsense.scenario.schema import Table
+from capsense.scenario.model import FORMER_METHODS, METHODS, MovingBody, Scenario
+from capsense.scenario.schema import ScenarioTable
 
 if TYPE_CHECKING:
     from capsense.simulator import Method
@@ -61,7 +61,7 @@ def parse_scenario(
         DesignError: Something is wrong in the design file it names.
     """
     where = folder if folder is not None else Path()
-    top = Table(data, source, "scenario")
+    top = ScenarioTable(data, source, "scenario")
     _refuse_former(top)
     top.only(TOP_KEYS)
     name = top.string("name")
@@ -83,14 +83,14 @@ def parse_scenario(
             duration=duration,
             excitation=excitation,
             pairs=pairs,
-            method=cast("Method", top.choice("method", METHODS, METHODS[0])),
+            method=_read_method(top),
             description=top.text("description"),
         )
     except ScenarioError as error:
         raise top.error(str(error)) from None
 
 
-def _refuse_former(top: Table) -> None:
+def _refuse_former(top: ScenarioTable) -> None:
     """Say what to write instead of what files of earlier versions may hold."""
     if "tolerance" in top:
         raise top.error("tolerance is gone: no method needs one any more; remove the line")
@@ -98,7 +98,15 @@ def _refuse_former(top: Table) -> None:
         raise top.error('method = "perturbation" is gone; write "surface", or remove the line')
 
 
-def read_design(top: Table, folder: Path) -> Design:
+def _read_method(top: ScenarioTable) -> Method:
+    """The simulator's method, by its name or the one that earlier versions gave it."""
+    name = top.data.get("method")
+    if isinstance(name, str) and name in FORMER_METHODS:
+        return FORMER_METHODS[name]
+    return cast("Method", top.choice("method", METHODS, METHODS[0]))
+
+
+def read_design(top: ScenarioTable, folder: Path) -> Design:
     """The design that ``design`` names: packaged, or a file relative to ``folder``.
 
     Raises:
@@ -120,7 +128,9 @@ def read_design(top: Table, folder: Path) -> Design:
         raise top.error(f"design = {value!r}: {error}") from None
 
 
-def _read_pairs(top: Table, excitation: Excitation, design: Design) -> tuple[tuple[str, str], ...]:
+def _read_pairs(
+    top: ScenarioTable, excitation: Excitation, design: Design
+) -> tuple[tuple[str, str], ...]:
     if "pairs" not in top:
         if excitation is Excitation.MUTUAL and len(design.electrodes) < 2:
             raise top.error(
@@ -155,7 +165,7 @@ def _read_pairs(top: Table, excitation: Excitation, design: Design) -> tuple[tup
     return tuple(out)
 
 
-def read_bodies(top: Table, folder: Path) -> tuple[MovingBody, ...]:
+def read_bodies(top: ScenarioTable, folder: Path) -> tuple[MovingBody, ...]:
     """Read the array of tables ``body``.
 
     Args:
@@ -170,7 +180,7 @@ def read_bodies(top: Table, folder: Path) -> tuple[MovingBody, ...]:
     for number, raw in enumerate(top.tables("body"), start=1):
         label = raw.get("name") if isinstance(raw, Mapping) else None
         tag = f'body "{label}"' if isinstance(label, str) and label else f"body {number}"
-        table = Table(raw, top.source, tag)
+        table = ScenarioTable(raw, top.source, tag)
         name = table.string("name")
         if name in names:
             raise table.error(f"two bodies are named {name!r}; names must differ")

@@ -23,8 +23,10 @@ Array = NDArray[np.float64]
 
 MAX_SAMPLES = 1_000_000
 """A scenario of more samples is refused."""
-METHODS: tuple[Method, ...] = ("surface", "masked")
+METHODS: tuple[Method, ...] = ("surface", "fem_masked")
 """The simulator's methods, the default first."""
+FORMER_METHODS: dict[str, Method] = {"masked": "fem_masked"}
+"""What earlier versions called methods in their files → the method."""
 
 
 @dataclass(frozen=True, eq=False)

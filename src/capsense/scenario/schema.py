@@ -6,7 +6,7 @@ from capsense import _validate
 from capsense.errors import ScenarioError
 
 
-class Table(_validate.Table):
+class ScenarioTable(_validate.Table):
     """One table of a scenario file; whatever is wrong raises :class:`ScenarioError`."""
 
     error_type = ScenarioError

@@ -9,7 +9,7 @@ from capsense.scene.materials import MATERIALS, Material, material
 from capsense.scene.mesh_shape import TriMesh
 from capsense.scene.point_surface import point_surface
 from capsense.scene.pose import Pose
-from capsense.scene.raster import Raster, rasterise
+from capsense.scene.raster import Raster, render_depth
 from capsense.scene.scene import PackedScene, Scene
 from capsense.scene.shape import Shape, ShapeKind
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
@@ -42,5 +42,5 @@ __all__ = [
     "encode_permittivity",
     "material",
     "point_surface",
-    "rasterise",
+    "render_depth",
 ]

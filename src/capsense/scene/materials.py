@@ -119,7 +119,7 @@ _TABLE = (
     Material("stainless steel", 1.0, 1.45e6, "grade 304, 6.9e-7 ohm m; " + _METAL),
     Material("copper", 1.0, 5.96e7, "1.68e-8 ohm m; " + _METAL),
     Material("aluminium", 1.0, 3.77e7, "2.65e-8 ohm m; " + _METAL),
-    # Insulators. Their losses are far below what capacitive read-outs resolve: sigma = 0.
+    # Insulators. Their losses are far below what capacitive readouts resolve: sigma = 0.
     Material("polycarbonate", 2.9, 0.0, _PERMITTIVITY + "2.8-3.0"),
     Material("FR4", 4.5, 0.0, _PERMITTIVITY + "4.3-5.0"),
     Material("glass", 5.0, 0.0, _PERMITTIVITY + "4-10, borosilicate 4.3-5.0"),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-class Triangles(Shape):
+class TriangleShape(Shape):
     """A shape that is given by triangles."""
 
     vertices: Array
@@ -94,7 +94,7 @@ class Triangles(Shape):
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class TriMesh(Triangles):
+class TriMesh(TriangleShape):
     """A triangle mesh, moved rigidly.
 
     It may be open, hold faces twice, cross itself, and wind any way: the solver takes the surface

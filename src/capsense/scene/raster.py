@@ -41,7 +41,7 @@ class Raster:
         return Layers(self.front, self.back, self.size)
 
 
-def rasterise(
+def render_depth(
     vertices: ArrayLike,
     faces: ArrayLike,
     size: tuple[float, float],
@@ -72,7 +72,7 @@ def rasterise(
     v, f = checked_mesh(vertices, faces)
     wide = tuple(float(s) for s in size)
     if len(wide) != 2 or not all(np.isfinite(s) and s > 0 for s in wide):
-        raise SceneError(f"rasterise: size is {size!r}; give (width, height) in metres")
+        raise SceneError(f"render_depth: size is {size!r}; give (width, height) in metres")
     rows, columns = _checked_resolution(resolution)
     sheet = _checked_thickness(thickness)
     dx, dy = wide[0] / columns, wide[1] / rows
@@ -124,7 +124,7 @@ def _checked_resolution(resolution: object) -> tuple[int, int]:
         whole, rows, columns = False, 0, 0
     if not (whole and rows > 0 and columns > 0 and rows * columns <= 4_000_000):
         raise SceneError(
-            f"rasterise: resolution is {resolution!r}; give (rows, columns), at most 4,000,000 "
+            f"render_depth: resolution is {resolution!r}; give (rows, columns), at most 4,000,000 "
             "pixels"
         )
     return rows, columns

@@ -19,7 +19,7 @@ _MANY = 0.01
 _MERGE = 1e-8
 
 
-class Surface(NamedTuple):
+class CleanSurface(NamedTuple):
     """A triangle surface brought into order."""
 
     vertices: Array
@@ -30,7 +30,7 @@ class Surface(NamedTuple):
     """Why it has no inside; empty for a closed surface."""
 
 
-def clean_surface(vertices: ArrayLike, faces: ArrayLike) -> Surface:
+def clean_surface(vertices: ArrayLike, faces: ArrayLike) -> CleanSurface:
     """Check a surface, bring it into order, and find out whether it has an inside.
 
     Coinciding vertices are merged; unused ones, faces with a repeated vertex and copies of faces
@@ -58,19 +58,19 @@ def clean_surface(vertices: ArrayLike, faces: ArrayLike) -> Surface:
             f = f if turned is None else turned
             rims = int((count == 1).sum())
             if rims:
-                return Surface(
+                return CleanSurface(
                     v, f,
                     f"the surface is not closed ({rims} of {len(count)} edges have a face on one "
                     "side only)",
                 )  # fmt: skip
             if not (count == 2).all():
-                return Surface(v, f, "more than two faces meet at some edges of the surface")
+                return CleanSurface(v, f, "more than two faces meet at some edges of the surface")
             if turned is None:
-                return Surface(v, f, "the surface is one-sided")
+                return CleanSurface(v, f, "the surface is one-sided")
     volume = enclosed_volume(v, f)
     if abs(volume) <= 1e-12 * float(np.ptp(v, axis=0).max()) ** 3:
-        return Surface(v, _without_copies(f), "the surface encloses no volume")
-    return Surface(v, f[:, ::-1].copy() if volume < 0 else f, "")
+        return CleanSurface(v, _without_copies(f), "the surface encloses no volume")
+    return CleanSurface(v, f[:, ::-1].copy() if volume < 0 else f, "")
 
 
 def enclosed_volume(vertices: Array, faces: Faces) -> float:

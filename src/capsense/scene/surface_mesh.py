@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._frozen import Frozen
 from capsense.errors import SceneError
-from capsense.scene.mesh_shape import Triangles
+from capsense.scene.mesh_shape import TriangleShape
 from capsense.scene.raster import checked_mesh, checked_vertices
 from capsense.scene.shape import ShapeKind
 from capsense.scene.surface import enclosed_volume, is_closed
@@ -64,7 +64,7 @@ class RestSurface(Frozen):
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class SurfaceMesh(Triangles):
+class SurfaceMesh(TriangleShape):
     """A surface at one instant, open or closed; an open one is a thin sheet.
 
     Args:

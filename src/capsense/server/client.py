@@ -242,7 +242,7 @@ class RemoteSensor:
         self.electrode_names: tuple[str, ...] = tuple(opened["electrodes"])
         """In matrix order."""
         self.channel_names: tuple[str, ...] = tuple(opened["channels"])
-        """Of the read-out; empty without one."""
+        """Of the readout; empty without one."""
         self.baseline: Array = np.array(opened["baseline"])
         """Maxwell matrix of the empty scene [F], shape (M, M)."""
         self.domain: Array = np.array(opened["domain"])
@@ -294,7 +294,7 @@ class RemoteSensor:
         return self.sequence - 1
 
     def reset(self) -> None:
-        """Forget the step before; the read-out and the numbers of frames begin anew."""
+        """Forget the step before; the readout and the numbers of frames begin anew."""
         self.client.ask("reset", type="reset", sensor=self.number)
         self.sequence = 0
         self.kept.clear()

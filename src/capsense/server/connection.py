@@ -29,7 +29,7 @@ IDLE_FRAMES = 100.0
 
 
 @dataclass
-class Door:
+class AdmissionControl:
     """Connections of a server, those that still shake hands included."""
 
     most: int
@@ -47,34 +47,34 @@ class Door:
         return True
 
 
-class GatedConnection(ServerConnection, asyncio.BufferedProtocol):
+class RateLimitedConnection(ServerConnection, asyncio.BufferedProtocol):
     """A connection that reads a little at a time, and is cut off when its client talks idly.
 
     Whole messages are paced by their session. Pings, pongs and fragments of a message that never
     ends do not get that far, yet would keep the event loop busy and fill the memory.
     """
 
-    def __init__(self, *args: Any, door: Door, **options: Any) -> None:
+    def __init__(self, *args: Any, admission: AdmissionControl, **options: Any) -> None:
         super().__init__(*args, **options)
         self.flooded = False
         """Whether it was cut off."""
-        self._door = door
+        self._admission = admission
         self._buffer = bytearray(READ_SIZE)
         self._idle_frames = Allowance(IDLE_FRAMES, IDLE_FRAMES)
 
     # -- called by asyncio ------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._door.open += 1
+        self._admission.open += 1
         super().connection_made(transport)
         raw = transport.get_extra_info("socket")
         if raw is not None:
             raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        if not self._door.admits():
+        if not self._admission.admits():
             cast(asyncio.Transport, transport).abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._door.open -= 1
+        self._admission.open -= 1
         super().connection_lost(exc)
 
     def get_buffer(self, sizehint: int) -> bytearray:

@@ -84,12 +84,12 @@ class ReadingMessage:
     iterations: int
     dropped: int
     """Frames of this sensor so far that newer ones replaced before they were solved."""
-    error_estimate: float
+    solver_error: float
     """[F]."""
     wall_time: float
     """Time the step took [s]."""
     conversions: NDArray[np.void]
-    """What the read-out has reported since the last reading, type :data:`CONVERSION`."""
+    """What the readout has reported since the last reading, type :data:`CONVERSION`."""
 
 
 def pack_depth(
@@ -169,7 +169,7 @@ def pack_reading(reading: ReadingMessage) -> bytes:
     """The message of a reading."""
     parts = (
         _SUMMARY.pack(
-            reading.iterations, reading.dropped & 0xFFFFFFFF, reading.error_estimate,
+            reading.iterations, reading.dropped & 0xFFFFFFFF, reading.solver_error,
             reading.wall_time,
         ),
         *(np.ascontiguousarray(a, "<f8").tobytes()

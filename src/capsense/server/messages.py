@@ -14,14 +14,14 @@ from capsense.errors import (
     DesignError,
     MeshError,
     ProtocolError,
-    ReadOutError,
+    ReadoutError,
     ScenarioError,
     SceneError,
     SolveError,
 )
 from capsense.scenario.bodies import read_grounding, read_material, read_pose
 from capsense.scenario.loader import read_bodies
-from capsense.scenario.schema import Table as ScenarioTable
+from capsense.scenario.schema import ScenarioTable
 from capsense.scene import Body, Material, Pose
 from capsense.scene.body import Grounding
 from capsense.scene.camera import OrthographicCamera
@@ -43,18 +43,18 @@ CODES = {
     "scene": "a depth frame, body, material or design is wrong",
     "watch": "this server does not let its clients watch sensors, or a client would both watch "
     "and have sensors",
-    "readout": "the read-out cannot go from the last time to this one",
+    "readout": "the readout cannot go from the last time to this one",
     "solve": "the solver found no solution",
     "internal": "a fault of the server; its log says more",
 }
 """Error codes."""
 _CODE_OF: tuple[tuple[type[CapSenseError], str], ...] = (
-    (ReadOutError, "readout"), (SolveError, "solve"), (SceneError, "scene"),
+    (ReadoutError, "readout"), (SolveError, "solve"), (SceneError, "scene"),
     (ScenarioError, "scene"), (MeshError, "scene"), (DesignError, "scene"),
 )  # fmt: skip
 
 
-class Table(_validate.Table):
+class MessageTable(_validate.Table):
     """One object of a control message; whatever is wrong raises :class:`ProtocolError`."""
 
     error_type = ProtocolError
@@ -95,7 +95,7 @@ class Watch:
 
 
 @dataclass(frozen=True)
-class Bodies:
+class BodiesMessage:
     """A scene made of shapes."""
 
     sensor: int
@@ -107,7 +107,7 @@ class Bodies:
 
 
 @dataclass(frozen=True)
-class Poses:
+class PosesMessage:
     """Bodies of the last scene have moved."""
 
     sensor: int
@@ -116,7 +116,7 @@ class Poses:
     poses: Mapping[str, Pose]
 
 
-def parse(text: str) -> Table:
+def parse(text: str) -> MessageTable:
     """The object in a control message.
 
     Raises:
@@ -132,8 +132,8 @@ def parse(text: str) -> Table:
         raise ProtocolError(f"a control message is not JSON: {str(error)[:80]}") from None
     if not isinstance(data, dict):
         raise ProtocolError('a control message must be a JSON object, like {"type": "hello"}')
-    kind = Table(data, "message", "control message").string("type")
-    return Table(data, "message", _validate.shorten(kind))
+    kind = MessageTable(data, "message", "control message").string("type")
+    return MessageTable(data, "message", _validate.shorten(kind))
 
 
 def _integer(digits: str) -> int:
@@ -146,7 +146,7 @@ def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON number")
 
 
-def read_hello(table: Table) -> Hello:
+def read_hello(table: MessageTable) -> Hello:
     """Read the first message.
 
     Raises:
@@ -164,7 +164,7 @@ def read_hello(table: Table) -> Hello:
     return Hello(table.text("token"), table.text("client")[:80])
 
 
-def read_open(table: Table) -> Open:
+def read_open(table: MessageTable) -> Open:
     """Read an ``open``.
 
     Raises:
@@ -179,7 +179,7 @@ def read_open(table: Table) -> Open:
     return Open(
         _sensor(table),
         table.text("design"),
-        _read_camera(Table(table.data.get("camera", {}), "message", "camera")),
+        _read_camera(MessageTable(table.data.get("camera", {}), "message", "camera")),
         read_material(options),
         read_grounding(options),
         back,
@@ -187,7 +187,7 @@ def read_open(table: Table) -> Open:
     )
 
 
-def read_watch(table: Table) -> Watch:
+def read_watch(table: MessageTable) -> Watch:
     """Read a ``watch``.
 
     Raises:
@@ -200,7 +200,7 @@ def read_watch(table: Table) -> Watch:
     return Watch(table.integer("client", 0, MAX_SEQUENCE), _sensor(table))
 
 
-def _read_camera(table: Table) -> OrthographicCamera:
+def _read_camera(table: MessageTable) -> OrthographicCamera:
     table.only(("width", "height", "near", "far", "rows", "columns", "pose"))
     pose = Pose()
     if "pose" in table:
@@ -216,7 +216,7 @@ def _read_camera(table: Table) -> OrthographicCamera:
     )
 
 
-def read_scene(table: Table, max_bodies: int) -> Bodies:
+def read_scene(table: MessageTable, max_bodies: int) -> BodiesMessage:
     """Read a ``scene``: bodies as in a scenario file, at rest and without files.
 
     Raises:
@@ -234,10 +234,10 @@ def read_scene(table: Table, max_bodies: int) -> Bodies:
             raise table.error("meshes and trajectories are not taken here; send depth frames, or "
                               "a new pose for every step")  # fmt: skip
     bodies = read_bodies(ScenarioTable({"body": raw}, "message", "scene"), Path())
-    return Bodies(*read_address(table), tuple(b.body for b in bodies), tuple(raw))
+    return BodiesMessage(*read_address(table), tuple(b.body for b in bodies), tuple(raw))
 
 
-def read_poses(table: Table, max_bodies: int) -> Poses:
+def read_poses(table: MessageTable, max_bodies: int) -> PosesMessage:
     """Read a ``poses``.
 
     Raises:
@@ -245,17 +245,19 @@ def read_poses(table: Table, max_bodies: int) -> Poses:
         ScenarioError: A pose is wrong.
     """
     table.only(("type", "sensor", "sequence", "time", "poses"))
-    raw = Table(table.raw("poses", '{"name": {"position": [x, y, z]}}'), "message", "poses").data
+    raw = MessageTable(
+        table.raw("poses", '{"name": {"position": [x, y, z]}}'), "message", "poses"
+    ).data
     if len(raw) > max_bodies:
         raise ProtocolError(f"{len(raw)} poses; this server takes {max_bodies}", "limit")
     poses = {
         name: read_pose(ScenarioTable(pose, "message", f"pose of {name!r}"))
         for name, pose in raw.items()
     }
-    return Poses(*read_address(table), poses)
+    return PosesMessage(*read_address(table), poses)
 
 
-def read_sensor(table: Table) -> int:
+def read_sensor(table: MessageTable) -> int:
     """Read a ``reset`` or ``close``: nothing but the sensor's number.
 
     Raises:
@@ -265,7 +267,7 @@ def read_sensor(table: Table) -> int:
     return _sensor(table)
 
 
-def read_address(table: Table) -> tuple[int, int, float]:
+def read_address(table: MessageTable) -> tuple[int, int, float]:
     """Sensor, sequence number and time [s] of a scene.
 
     Raises:
@@ -278,7 +280,7 @@ def read_address(table: Table) -> tuple[int, int, float]:
     )
 
 
-def _sensor(table: Table) -> int:
+def _sensor(table: MessageTable) -> int:
     return table.integer("sensor", 0, MAX_SENSOR)
 
 

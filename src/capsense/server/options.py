@@ -46,7 +46,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Options:
+class ServerOptions:
     """A server's options.
 
     Raises:
@@ -57,7 +57,7 @@ class Options:
     designs: tuple[str | Path, ...]
     """Packaged names or design files; the first is the default."""
     readout: str | Path | None = None
-    """A chip's name, or a read-out file; none: capacitances only."""
+    """A chip's name, or a readout file; none: capacitances only."""
     host: str = "127.0.0.1"
     port: int = 8765
     """0 for any free one."""

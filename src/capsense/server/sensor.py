@@ -11,10 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.errors import ProtocolError, ReadOutError
+from capsense.errors import ProtocolError, ReadoutError
 from capsense.reading import Reading
 from capsense.readout.counts import Counts
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.scene import Body, Scene
 from capsense.scene.depth import DepthFrame
 from capsense.server.frames import (
@@ -25,12 +25,12 @@ from capsense.server.frames import (
     pack_depth,
     pack_reading,
 )
-from capsense.server.messages import Bodies, Open, Poses
+from capsense.server.messages import BodiesMessage, Open, PosesMessage
 from capsense.simulator import Simulator
 
 MAX_CONVERSIONS = 10_000
-"""A step in time that spans more conversions of the read-out than this is refused."""
-Frame = DepthMessage | Bodies
+"""A step in time that spans more conversions of the readout than this is refused."""
+Frame = DepthMessage | BodiesMessage
 
 
 class Watcher(Protocol):
@@ -41,7 +41,7 @@ class Watcher(Protocol):
 
 
 class ServedSensor:
-    """A simulator, its read-out, and the newest frame that waits for it.
+    """A simulator, its readout, and the newest frame that waits for it.
 
     :meth:`offer`, :meth:`take`, :meth:`drop` and :meth:`restart` belong to the event loop;
     :meth:`solve` may run in any thread, one call at a time, with :attr:`lock` held.
@@ -52,7 +52,7 @@ class ServedSensor:
         readout: Of its own, or None.
     """
 
-    def __init__(self, options: Open, simulator: Simulator, readout: ReadOut | None) -> None:
+    def __init__(self, options: Open, simulator: Simulator, readout: Readout | None) -> None:
         self.options = options
         self.simulator = simulator
         self.readout = readout
@@ -74,7 +74,7 @@ class ServedSensor:
         self._tables: tuple[Mapping[str, Any], ...] = ()
         self._time: float | None = None
 
-    def offer(self, frame: Frame | Poses) -> None:
+    def offer(self, frame: Frame | PosesMessage) -> None:
         """Take a frame in; one that still waits is dropped for it.
 
         Raises:
@@ -87,9 +87,9 @@ class ServedSensor:
                 "sequence",
             )
         self._last = frame.sequence
-        if isinstance(frame, Poses):
+        if isinstance(frame, PosesMessage):
             frame = self._moved(frame)
-        if isinstance(frame, Bodies):
+        if isinstance(frame, BodiesMessage):
             self._bodies = {str(b.name): b for b in frame.bodies}
             self._tables = frame.tables
         self.frames += 1
@@ -117,7 +117,7 @@ class ServedSensor:
         Raises:
             SceneError: The frame is wrong.
             SolveError: The solver did not reach its tolerance.
-            ReadOutError: Time goes back, or leaps ahead.
+            ReadoutError: Time goes back, or leaps ahead.
         """
         self._check_time(frame.time)
         try:
@@ -126,13 +126,13 @@ class ServedSensor:
             self.simulator.reset()  # a step that failed is no starting point for the next one
             raise
         if self.readout is not None:
-            reading = replace(reading, counts=self._read_out(frame.time, reading))
+            reading = replace(reading, counts=self._sample(frame.time, reading))
         self.readings += 1
         return pack_reading(
             ReadingMessage(
                 frame.sensor, frame.sequence, frame.time, reading.capacitance, reading.delta,
                 reading.self_capacitance, reading.stats.iterations, self.dropped,
-                reading.stats.error_estimate, reading.stats.wall_time,
+                reading.stats.solver_error, reading.stats.wall_time,
                 _conversions(reading.counts),
             )
         )  # fmt: skip
@@ -140,7 +140,7 @@ class ServedSensor:
     def show(self, frame: Frame, reading: bytes) -> None:
         """Let all who watch see a frame, and the reading that answers it."""
         if self.watchers:
-            seen = scene_message(frame) if isinstance(frame, Bodies) else pack_depth(
+            seen = scene_message(frame) if isinstance(frame, BodiesMessage) else pack_depth(
                 frame.sensor, frame.sequence, frame.time, frame.depth, frame.eps_r
             )  # fmt: skip
             for watcher in self.watchers:
@@ -154,17 +154,17 @@ class ServedSensor:
             watcher.show(gone)
         self.watchers.clear()
 
-    def _moved(self, message: Poses) -> Bodies:
+    def _moved(self, message: PosesMessage) -> BodiesMessage:
         for name in message.poses:
             if name not in self._bodies:
                 known = ", ".join(self._bodies) or "none"
                 raise ProtocolError(f"the last scene has no body {name!r}; it has {known}", "scene")
         moved = {name: self._bodies[name].moved(pose) for name, pose in message.poses.items()}
         bodies = tuple({**self._bodies, **moved}.values())
-        return Bodies(message.sensor, message.sequence, message.time, bodies, self._tables)
+        return BodiesMessage(message.sensor, message.sequence, message.time, bodies, self._tables)
 
     def _world(self, frame: Frame) -> Scene | DepthFrame:
-        if isinstance(frame, Bodies):
+        if isinstance(frame, BodiesMessage):
             return Scene(frame.bodies)
         wanted = self.options
         eps_r = wanted.material if frame.eps_r is None else frame.eps_r
@@ -173,17 +173,17 @@ class ServedSensor:
         )
 
     def _check_time(self, time: float) -> None:
-        """Refuse a time that the read-out cannot go to."""
+        """Refuse a time that the readout cannot go to."""
         if self.readout is None or self._time is None:
             return
         period = self.readout.schedule.period / len(self.readout.channel_names)
         if (time - self._time) / period > MAX_CONVERSIONS:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"time leaps from {self._time:g} to {time:g} s, over more than {MAX_CONVERSIONS} "
                 "conversions; send a reset first"
             )
 
-    def _read_out(self, time: float, reading: Reading) -> Counts:
+    def _sample(self, time: float, reading: Reading) -> Counts:
         assert self.readout is not None
         if self._time is None:
             self.readout.reset(start=time)
@@ -192,7 +192,7 @@ class ServedSensor:
         return counts
 
 
-def scene_message(frame: Bodies) -> str:
+def scene_message(frame: BodiesMessage) -> str:
     """The ``scene`` that is these bodies where they stand."""
     bodies = [
         {key: value for key, value in table.items() if key != "pose"}

@@ -20,11 +20,11 @@ from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ProtocolError, ServerError
 from capsense.readout.config import choose_readout, file_content, parse_readout
-from capsense.readout.read_out import SEED_STRIDE, ReadOut
+from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene.depth import DepthFrame
 from capsense.server.frames import PROTOCOL
 from capsense.server.messages import Open, Watch
-from capsense.server.options import Options
+from capsense.server.options import ServerOptions
 from capsense.server.sensor import ServedSensor
 from capsense.simulator import Simulator
 
@@ -37,8 +37,8 @@ except ImportError as error:
         'the server needs websockets; install it with: pip install "capsense[serve]"'
     ) from error
 
-from capsense.server.connection import FLOOD, TRY_LATER, Door, GatedConnection
-from capsense.server.session import Session
+from capsense.server.connection import FLOOD, TRY_LATER, AdmissionControl, RateLimitedConnection
+from capsense.server.session import ClientSession
 
 if TYPE_CHECKING:
     from websockets.typing import Origin
@@ -63,12 +63,12 @@ class Server:
     Raises:
         DesignError: A design is wrong.
         FieldError: A field could not be built.
-        ReadOutError: There is no such read-out.
+        ReadoutError: There is no such readout.
         ServerError: Two designs have one name.
     """
 
     def __init__(
-        self, options: Options, *, progress: Progress | None = None,
+        self, options: ServerOptions, *, progress: Progress | None = None,
         logger: logging.Logger | None = None,
     ) -> None:  # fmt: skip
         self.options = options
@@ -82,7 +82,7 @@ class Server:
             self._templates[design.name] = simulator
             simulator.step(DepthFrame(np.full((8, 8), 0.1)))
             self._make_readout(simulator, 0)
-        self._sessions: dict[int, Session] = {}
+        self._sessions: dict[int, ClientSession] = {}
         self._counter = 0
         self._readings = 0
         self._started = time.monotonic()
@@ -107,7 +107,7 @@ class Server:
             OSError: The address is taken or not this machine's.
         """
         options, limits = self.options, self.options.limits
-        door = Door(2 * limits.connections + 16)
+        admission = AdmissionControl(2 * limits.connections + 16)
         listener = serve(
             self._serve, options.host, options.port,
             process_request=self._process_request,
@@ -116,7 +116,9 @@ class Server:
             open_timeout=limits.hello_timeout, close_timeout=CLOSING,
             max_size=limits.message, max_queue=4,
             logger=_quiet(self._logger),
-            create_connection=cast("type[ServerConnection]", partial(GatedConnection, door=door)),
+            create_connection=cast(
+                "type[ServerConnection]", partial(RateLimitedConnection, admission=admission)
+            ),
         )  # fmt: skip
         try:
             async with listener as server:
@@ -164,7 +166,7 @@ class Server:
             raise ProtocolError(
                 f"design {name!r} is not served; {suggest(name, self.design_names)}", "scene"
             )
-        simulator = self._templates[name].sibling()
+        simulator = self._templates[name].copy()
         return ServedSensor(wanted, simulator, self._make_readout(simulator, wanted.sensor))
 
     def find(self, wanted: Watch) -> tuple[int, ServedSensor]:
@@ -205,7 +207,7 @@ class Server:
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve one client, from its handshake to its end."""
         self._counter += 1
-        session = Session(self._counter, connection, self)
+        session = ClientSession(self._counter, connection, self)
         peer = connection.remote_address
         if len(self._sessions) >= self.options.limits.connections:
             await session.dismiss(
@@ -223,7 +225,7 @@ class Server:
             raise
         finally:
             del self._sessions[session.number]
-            if cast(GatedConnection, connection).flooded:
+            if cast(RateLimitedConnection, connection).flooded:
                 self.log("dismissed", client=session.number, code=FLOOD)
             self._readings += session.readings
             self.log("disconnected", client=session.number, readings=session.readings)
@@ -239,7 +241,7 @@ class Server:
         return None
 
     def _load_designs(self) -> list[Design]:
-        """All designs, once none of them nor the read-out is found wrong."""
+        """All designs, once none of them nor the readout is found wrong."""
         designs: dict[str, Design] = {}
         for name in self.options.designs:
             design = load_design(name)
@@ -251,8 +253,8 @@ class Server:
                 parse_readout(content, design.electrode_names, source=str(self.options.readout))
         return list(designs.values())
 
-    def _make_readout(self, simulator: Simulator, number: int) -> ReadOut | None:
-        """The read-out of a client's sensor; by their numbers, sensors have noise of their own."""
+    def _make_readout(self, simulator: Simulator, number: int) -> Readout | None:
+        """The readout of a client's sensor; by their numbers, sensors have noise of their own."""
         choice = self.options.readout
         if choice is None:
             return None

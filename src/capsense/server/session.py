@@ -15,7 +15,7 @@ from capsense.server import messages
 from capsense.server.allowance import Allowance
 from capsense.server.connection import POLICY
 from capsense.server.frames import PROTOCOL, unpack_depth
-from capsense.server.options import Options
+from capsense.server.options import ServerOptions
 from capsense.server.sensor import Frame, ServedSensor
 
 if TYPE_CHECKING:
@@ -33,10 +33,10 @@ OPENING, MISTAKE = 250.0, 100.0
 """What it takes to open a sensor, and to answer an error."""
 
 
-class Hall(Protocol):
+class SessionServer(Protocol):
     """What a session needs of its server."""
 
-    options: Options
+    options: ServerOptions
     version: str
 
     @property
@@ -56,7 +56,7 @@ class Hall(Protocol):
     def fault(self, event: str, **fields: Any) -> None: ...
 
 
-class Session:
+class ClientSession:
     """Serves one client until it leaves.
 
     The reader handles messages in their order. The solver takes the newest frames of the sensors
@@ -66,23 +66,23 @@ class Session:
     Args:
         number: Of the client, for the log.
         connection: An open connection.
-        hall: The server.
+        server: Runs it.
     """
 
-    def __init__(self, number: int, connection: ServerConnection, hall: Hall) -> None:
+    def __init__(self, number: int, connection: ServerConnection, server: SessionServer) -> None:
         self.number = number
         self.sensors: dict[int, ServedSensor] = {}
         self.readings = 0
         self._connection = connection
-        self._hall = hall
-        self._limits = hall.options.limits
+        self._server = server
+        self._limits = server.options.limits
         self._wake = asyncio.Event()
         self._left = False
         self._solver: asyncio.Task[None] | None = None
         self._watched: ServedSensor | None = None
         self._to_show: tuple[str | bytes, ...] = ()
         self._allowance = Allowance(AT_ONCE, ALLOWANCE, AT_FIRST)
-        self._handlers: dict[str, Callable[[messages.Table], Any]] = {
+        self._handlers: dict[str, Callable[[messages.MessageTable], Any]] = {
             "open": self._open, "close": self._close, "reset": self._reset,
             "scene": self._scene, "poses": self._poses, "watch": self._watch,
         }  # fmt: skip
@@ -126,7 +126,7 @@ class Session:
 
     async def dismiss(self, code: str, text: str, close_code: int = POLICY) -> None:
         """Say what is wrong, and close the connection."""
-        self._hall.log("dismissed", client=self.number, code=code, message=text[:200])
+        self._server.log("dismissed", client=self.number, code=code, message=text[:200])
         try:
             await self._send(json.dumps(messages.error_message(code, text)))
             await self._connection.close(close_code, code)
@@ -151,20 +151,20 @@ class Session:
         if isinstance(message, bytes):
             raise ProtocolError("a binary message comes before the hello; say hello first")
         hello = messages.read_hello(messages.parse(message))
-        if not self._hall.options.admits(hello.token):
+        if not self._server.options.admits(hello.token):
             raise ProtocolError("the token is missing or wrong", "token")
-        self._hall.log("hello", client=self.number, name=hello.client)
+        self._server.log("hello", client=self.number, name=hello.client)
         limits = self._limits
         await self._tell(
-            "welcome", protocol=PROTOCOL, server=f"capsense {self._hall.version}",
-            designs=self._hall.design_names,
+            "welcome", protocol=PROTOCOL, server=f"capsense {self._server.version}",
+            designs=self._server.design_names,
             limits={"sensors": limits.sensors, "pixels": limits.pixels, "bodies": limits.bodies,
                     "message": limits.message},
         )  # fmt: skip
 
     async def _pace(self, cost: float) -> None:
         """Charge some work; wait while the client has caused more than its allowance."""
-        self._allowance.rate = min(ALLOWANCE, ALL_ALLOWANCES / self._hall.clients)
+        self._allowance.rate = min(ALLOWANCE, ALL_ALLOWANCES / self._server.clients)
         left = self._allowance.spend(cost)
         if left < 0:
             await asyncio.sleep(-left / self._allowance.rate)
@@ -185,7 +185,7 @@ class Session:
         except Exception as error:
             await self._refuse(error, **messages.address_of(message))
 
-    async def _open(self, table: messages.Table) -> None:
+    async def _open(self, table: messages.MessageTable) -> None:
         wanted = messages.read_open(table)
         if self._watched is not None:
             raise ProtocolError("a client that watches opens no sensors; connect again", "watch")
@@ -196,10 +196,10 @@ class Session:
                 f"{len(self.sensors)} sensors are open, as many as allowed", "limit"
             )
         await self._pace(OPENING)
-        sensor = await self._hall.work(lambda: self._hall.make_sensor(wanted))
+        sensor = await self._server.work(lambda: self._server.make_sensor(wanted))
         self.sensors[wanted.sensor] = sensor
         simulator, readout = sensor.simulator, sensor.readout
-        self._hall.log(
+        self._server.log(
             "opened", client=self.number, sensor=wanted.sensor, design=simulator.design.name
         )
         domain = simulator.design.domain
@@ -210,31 +210,33 @@ class Session:
             channels=() if readout is None else readout.channel_names,
         )  # fmt: skip
 
-    async def _close(self, table: messages.Table) -> None:
+    async def _close(self, table: messages.MessageTable) -> None:
         sensor = self._sensor(messages.read_sensor(table))
         number = sensor.options.sensor
         async with sensor.lock:
             sensor.drop()
             del self.sensors[number]
         sensor.leave()
-        self._hall.log("closed", client=self.number, sensor=number)
+        self._server.log("closed", client=self.number, sensor=number)
         await self._tell(
             "closed", sensor=number, frames=sensor.frames, readings=sensor.readings,
             dropped=sensor.dropped,
         )  # fmt: skip
 
-    async def _watch(self, table: messages.Table) -> None:
+    async def _watch(self, table: messages.MessageTable) -> None:
         wanted = messages.read_watch(table)
         if self.sensors:
             raise ProtocolError("a client that has sensors watches none; close them", "watch")
-        client, sensor = self._hall.find(wanted)
-        design = await self._hall.work(lambda: design_to_json(sensor.simulator.design))
+        client, sensor = self._server.find(wanted)
+        design = await self._server.work(lambda: design_to_json(sensor.simulator.design))
         self._unwatch()
         await self._tell(
             "watching", client=client, sensor=sensor.options.sensor, open=sensor.options.table,
             design=json.loads(design), baseline=sensor.simulator.baseline.tolist(),
         )  # fmt: skip
-        self._hall.log("watches", client=self.number, watched=client, sensor=sensor.options.sensor)
+        self._server.log(
+            "watches", client=self.number, watched=client, sensor=sensor.options.sensor
+        )
         self._watched = sensor
         sensor.watchers.add(self)
         if sensor.left:  # meanwhile
@@ -245,19 +247,19 @@ class Session:
             self._watched.watchers.discard(self)
         self._watched, self._to_show = None, ()
 
-    async def _reset(self, table: messages.Table) -> None:
+    async def _reset(self, table: messages.MessageTable) -> None:
         sensor = self._sensor(messages.read_sensor(table))
         async with sensor.lock:
             sensor.restart()
         await self._tell("reset", sensor=sensor.options.sensor)
 
-    async def _scene(self, table: messages.Table) -> None:
-        scene = await self._hall.work(lambda: messages.read_scene(table, self._limits.bodies))
+    async def _scene(self, table: messages.MessageTable) -> None:
+        scene = await self._server.work(lambda: messages.read_scene(table, self._limits.bodies))
         self._sensor(scene.sensor).offer(scene)
         self._wake.set()
 
-    async def _poses(self, table: messages.Table) -> None:
-        poses = await self._hall.work(lambda: messages.read_poses(table, self._limits.bodies))
+    async def _poses(self, table: messages.MessageTable) -> None:
+        poses = await self._server.work(lambda: messages.read_poses(table, self._limits.bodies))
         self._sensor(poses.sensor).offer(poses)
         self._wake.set()
 
@@ -294,7 +296,7 @@ class Session:
 
     async def _solve(self, sensor: ServedSensor, frame: Frame) -> None:
         try:
-            reading = await self._hall.work(lambda: sensor.solve(frame))
+            reading = await self._server.work(lambda: sensor.solve(frame))
             await self._send(reading)
             sensor.show(frame, reading)
             self.readings += 1
@@ -312,10 +314,12 @@ class Session:
         """Answer an error; one that nobody foresaw is logged in full."""
         if isinstance(error, CapSenseError):
             code, text = messages.code_of(error), str(error)
-            self._hall.log("refused", client=self.number, code=code, message=text[:200], **address)
+            self._server.log(
+                "refused", client=self.number, code=code, message=text[:200], **address
+            )
         else:
             code, text = "internal", "a fault of the server; its log says more"
-            self._hall.fault("internal error", client=self.number, **address)
+            self._server.fault("internal error", client=self.number, **address)
         await self._send(json.dumps(messages.error_message(code, text, **address)))
         await self._pace(MISTAKE)
 
@@ -332,5 +336,5 @@ class Session:
             async with asyncio.timeout(self._limits.send_timeout):
                 await self._connection.send(message)
         except TimeoutError:
-            self._hall.log("too slow", client=self.number)
+            self._server.log("too slow", client=self.number)
             self._connection.transport.abort()

@@ -20,7 +20,7 @@ from capsense.surface.place_kernels import (
 from capsense.surface.vector_kernels import (
     doubles,
     integers,
-    multiply_lanes,
+    multiply_simd,
     point_potentials,
 )
 
@@ -167,7 +167,7 @@ def _mean_potentials(body, green, means, met, crossing, linear):
         points[:rounded], green.far, np.float32(green.floor), np.float32(FAR_LEAST), values
     )
     phi = np.empty((rounded, green.lead), np.float32)
-    multiply_lanes(values, green.score_table, phi)
+    multiply_simd(values, green.score_table, phi)
     for j in range(found):
         for i in range(green.lead):
             means[places[j], i] = inner[j] * phi[j, i]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import compiled, pasted
-from capsense._simd import LANES, at, madd, put_span, rsqrt, span, splat, vadd, vmadd
+from capsense._simd import SIMD_WIDTH, at, madd, put_span, rsqrt, span, splat, vadd, vmadd
 from capsense.surface.pair_kernels import SOFT, cluster_moments
 
 
@@ -25,7 +25,7 @@ def source_lines(points, sources, floor, out):
     zero, minus = splat(np.float32(0.0)), np.float32(-1.0)
     two = splat(np.float32(2.0) * floor)
     for i in range(points.shape[0]):
-        for s in range(0, width, LANES):
+        for s in range(0, width, SIMD_WIDTH):
             sx, sy, high = span(sources, s), span(sources, width + s), span(sources, 2 * width + s)
             low = madd(minus, high, two)
             value = fx = fy = fz = gx = gy = zero
@@ -92,7 +92,7 @@ def pair_line(shapes, i, others, weight, out, row):
     ax, ay, az = shapes[3, i], shapes[4, i], shapes[5, i]
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
     own = splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
-    for j in range(0, width, LANES):
+    for j in range(0, width, SIMD_WIDTH):
         dx = madd(minus, span(others, j), splat(x))
         dy = madd(minus, span(others, width + j), splat(y))
         dz = madd(minus, span(others, 2 * width + j), splat(z))
@@ -163,7 +163,7 @@ def near_pairs(points, others, extent, i, start, stop, n, weight, near, out, row
         near[13, count] = j
         count += 1
     width = near.shape[1]
-    for k in range(0, count, LANES):
+    for k in range(0, count, SIMD_WIDTH):
         zero, minus = splat(np.float32(0.0)), np.float32(-1.0)
         gx = gy = gz = tx = ty = tz = zero
         bound = span(near, 12 * width + k)

@@ -26,7 +26,7 @@ from capsense.surface.force_kernels import (
     wide_moments,
 )
 from capsense.surface.place_kernels import distances, near_share
-from capsense.surface.vector_kernels import WIDTH, multiply, multiply_lanes
+from capsense.surface.vector_kernels import WIDTH, multiply, multiply_simd
 
 _BLOCK = 32
 """Leaves taken at a time, whose tables stay in the cache."""
@@ -187,7 +187,7 @@ def _add_work(sums, sources, table, right, work):
     s, v = table.shape
     coefficients = np.zeros((width, lead), np.float32)
     whole = 4 * (s // 4)
-    multiply_lanes(table[:whole], right[:v], coefficients[:whole])
+    multiply_simd(table[:whole], right[:v], coefficients[:whole])
     for k in range(whole, s):
         for c in range(v):
             for i in range(lead):
@@ -210,7 +210,7 @@ def _add_contracted(sums, coefficients, work):
     """``work += sums @ coefficients``, shapes (6, lead, lead), (6, lead, s) and (s, lead)."""
     lead, width = sums.shape[1], sums.shape[2]
     part = np.empty((6 * lead, lead), np.float32)
-    multiply_lanes(sums.reshape((6 * lead, width)), coefficients, part)
+    multiply_simd(sums.reshape((6 * lead, width)), coefficients, part)
     _add(part, work.reshape((6 * lead, lead)))
 
 

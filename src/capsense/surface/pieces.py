@@ -31,7 +31,7 @@ _LEAST_AREA = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class PieceArrays:
     """Pieces of a surface as arrays, see :class:`~capsense.surface.changing.Pieces`."""
 
     centers: Array
@@ -40,7 +40,7 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class PieceLayout:
     """How the n pieces of a deforming surface lie in its triangles."""
 
     face: Ints
@@ -51,10 +51,10 @@ class Cut:
     """Clusters of all pieces, from the form that the surface had first."""
 
 
-_CUTS: WeakKeyDictionary[RestSurface, Cut] = WeakKeyDictionary()
+_CUTS: WeakKeyDictionary[RestSurface, PieceLayout] = WeakKeyDictionary()
 
 
-def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, Surface]:
+def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, PieceArrays]:
     """The triangles of a deforming surface, long and large ones cut into parts, a piece each.
 
     Returns:
@@ -66,7 +66,7 @@ def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, Surface]:
     return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)[0]
 
 
-def _cut(rest: RestSurface) -> Cut:
+def _cut(rest: RestSurface) -> PieceLayout:
     """Halve triangles at their longest edges until all edges are short; make clusters."""
     corners = rest.vertices[rest.faces]
     area = np.linalg.norm(
@@ -90,11 +90,11 @@ def _cut(rest: RestSurface) -> Cut:
     first, normals = _pieces(rest.vertices, rest.faces, face, shares)
     extent = float(np.ptp(first.centers, axis=0).max())
     features = np.concatenate([first.centers, _NORMALS * extent * normals], axis=1)
-    return Cut(face, shares, split(features, first.areas))
+    return PieceLayout(face, shares, split(features, first.areas))
 
 
-def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Surface, Array]:
-    """Pieces, see :class:`Cut`, and their normals, shape (n, 3)."""
+def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[PieceArrays, Array]:
+    """Pieces, see :class:`PieceLayout`, and their normals, shape (n, 3)."""
     corners = shares @ vertices[faces[face]]
     centers = corners.mean(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -102,10 +102,10 @@ def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Su
     normals /= np.maximum(double, 1e-300)[:, None]
     areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / 2
     arms = corners - centers[:, None]
-    return Surface(centers, areas, arms.transpose(0, 2, 1) @ arms / 12), normals
+    return PieceArrays(centers, areas, arms.transpose(0, 2, 1) @ arms / 12), normals
 
 
-def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_], float]:
+def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool_], float]:
     """The surfaces that a layered image shows, a piece a pixel.
 
     Backs count where they lie farther behind than two pixels are wide, and before 10 m; there, the
@@ -139,7 +139,7 @@ def layer_pieces(layers: Layers) -> tuple[Clusters, Surface, NDArray[np.bool_], 
     wanted = ~np.isnan(centers[..., 2])
     sheet = 0.0 if deep.any() else layers.volume / float(areas[wanted].sum())
     centers[..., 2][~wanted] = 0.0
-    pieces = Surface(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
+    pieces = PieceArrays(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
     tree = _pixel_tree(len(depth), (len(wanted) - len(depth)) // 4, *front.shape[1:], dx / dy)
     return tree, pieces, wanted.ravel(), sheet
 

@@ -98,7 +98,7 @@ class SurfaceSolver:
     Args:
         green: Green's function of the design.
         design: The design.
-        frequency: Excitation frequency [Hz].
+        excitation_frequency: Excitation frequency [Hz].
         preset: How finely scenes are resolved.
     """
 
@@ -107,10 +107,10 @@ class SurfaceSolver:
         green: GreenFunction,
         design: Design,
         *,
-        frequency: float = 250e3,
+        excitation_frequency: float = 250e3,
         preset: Preset | None = None,
     ) -> None:
-        self.frequency = frequency
+        self.excitation_frequency = excitation_frequency
         self.preset = preset or Preset()
         self.green = pack_green(green, design)
         self._function = green
@@ -163,7 +163,7 @@ class SurfaceSolver:
         low, high = packed.bounds[:, 0], packed.bounds[:, 1]
         room = self.green.room
         met = np.flatnonzero(((high > room[0]) & (low < room[1])).all(axis=1))
-        matter = matter_of([scene[k] for k in met.tolist()], self.frequency)
+        matter = matter_of([scene[k] for k in met.tolist()], self.excitation_frequency)
         return View(scene, packed, met, matter)
 
     def solution(

@@ -12,7 +12,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from capsense._jit import compiled, pasted
-from capsense._simd import at, lane_sum, madd, muladd, put_span, rsqrt, span, splat, vmadd
+from capsense._simd import at, horizontal_sum, madd, muladd, put_span, rsqrt, span, splat, vmadd
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""
@@ -138,7 +138,7 @@ def _put(out, place, a, b, c, d):
 
 
 @compiled
-def multiply_lanes(left, table, out):
+def multiply_simd(left, table, out):
     """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 8, k of 4."""
     k, s, w = left.shape[0], left.shape[1], table.shape[1]
     for j in range(0, w, 8):
@@ -177,7 +177,12 @@ def cholesky(matrix):
                     a, b = vmadd(v, span(matrix, p + k), a), vmadd(v, span(matrix, p + n + k), b)
                     c = vmadd(v, span(matrix, p + 2 * n + k), c)
                     d = vmadd(v, span(matrix, p + 3 * n + k), d)
-                s0, s1, s2, s3 = lane_sum(a), lane_sum(b), lane_sum(c), lane_sum(d)
+                s0, s1, s2, s3 = (
+                    horizontal_sum(a),
+                    horizontal_sum(b),
+                    horizontal_sum(c),
+                    horizontal_sum(d),
+                )
                 for k in range(whole, j):
                     x = at(matrix, o + k)
                     s0 = muladd(x, at(matrix, p + k), s0)

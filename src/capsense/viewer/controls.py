@@ -13,7 +13,7 @@ from capsense.viewer.player import Playback
 if TYPE_CHECKING:
     from viser import GuiApi
 
-    from capsense.viewer.source import Shot
+    from capsense.viewer.source import Frame
 
 SPEEDS = {"0.1 ×": 0.1, "0.3 ×": 0.3, "1 ×": 1.0, "3 ×": 3.0, "as fast as it goes": 0.0}
 AXES = ("x", "y", "z")
@@ -44,7 +44,7 @@ class TimeControls:
         steps.on_click(lambda _: moves[steps.value]())
         self._slider.on_update(self._scrub)
 
-    def show(self, shot: Shot) -> None:
+    def show(self, frame: Frame) -> None:
         """Follow the player."""
         label = self._names[0] if self._player.playing else self._names[1]
         if self._play.label != label:
@@ -52,8 +52,8 @@ class TimeControls:
         first, last = self._player.span
         if (self._slider.min, self._slider.max) != (first, max(last, first + 1)):
             self._slider.min, self._slider.max = first, max(last, first + 1)
-        if self._slider.value != shot.index:
-            self._slider.value = shot.index
+        if self._slider.value != frame.index:
+            self._slider.value = frame.index
 
     def _scrub(self, event: Any) -> None:
         if event.client is not None:  # moved by somebody, not by show()
@@ -146,18 +146,18 @@ def legend() -> str:
     )
 
 
-def status(player: Playback, shot: Shot, largest: float) -> str:
+def status(player: Playback, frame: Frame, largest: float) -> str:
     """What is shown, as HTML.
 
     Args:
         player: Shows it.
-        shot: Is shown.
+        frame: Is shown.
         largest: Change of an electrode that colours it fully [F].
     """
-    stats, (_, last) = shot.reading.stats, player.span
+    stats, (_, last) = frame.reading.stats, player.span
     lines = [
         f"<b>{html.escape(player.source.title)}</b>",
-        f"t = {shot.time:.3f} s, sample {shot.index} of {last}",
+        f"t = {frame.time:.3f} s, sample {frame.index} of {last}",
         f"step {1e3 * stats.wall_time:.1f} ms"
         + (f", {stats.unknowns} unknowns" if stats.unknowns else ""),
         'electrodes: <span style="background:linear-gradient(90deg,rgb(214,219,222),'

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from capsense.errors import CapSenseError
 from capsense.viewer.player import FIELD_PERIOD
-from capsense.viewer.source import Shot, Stream
+from capsense.viewer.source import Frame, Stream
 
 if TYPE_CHECKING:
     from capsense.viewer.plane import Plane
@@ -42,9 +42,9 @@ class Follower:
         self.source = source
         self.loop = False
         self.plane: Plane | None = None
-        self.with_field: Shot | None = None
+        self.with_field: Frame | None = None
         self.failure: CapSenseError | None = None
-        self._shots: list[Shot] = []
+        self._frames: list[Frame] = []
         self._first = 0
         self._shown: int | None = None
         self._times = np.empty(2 * KEPT)
@@ -65,17 +65,17 @@ class Follower:
     def span(self) -> tuple[int, int]:
         """Numbers of the first and the last sample that are kept."""
         with self._lock:
-            return self._first, self._first + max(len(self._shots) - 1, 0)
+            return self._first, self._first + max(len(self._frames) - 1, 0)
 
     @property
-    def newest(self) -> Shot | None:
+    def newest(self) -> Frame | None:
         """What is to be shown; None before there is any."""
         with self._lock:
-            if not self._shots:
+            if not self._frames:
                 return None
             if self._shown is None:
-                return self._shots[-1]
-            return self._shots[max(self._shown - self._first, 0)]
+                return self._frames[-1]
+            return self._frames[max(self._shown - self._first, 0)]
 
     def history(self, index: int) -> tuple[Array, Array]:
         """See :class:`~capsense.viewer.player.Playback`."""
@@ -119,36 +119,36 @@ class Follower:
         while not self._stopped.is_set():
             try:
                 self._take_potentials()
-                shot = self.source.next(WAIT)
-                if shot is not None:
-                    self._keep(shot)
+                frame = self.source.next(WAIT)
+                if frame is not None:
+                    self._keep(frame)
                 self.failure = None
             except CapSenseError as error:
                 self.failure = error
                 self._stopped.wait(RETRY)
 
-    def _keep(self, shot: Shot) -> None:
-        values = [c.read(shot.reading) for c in self.source.channels]
+    def _keep(self, frame: Frame) -> None:
+        values = [c.read(frame.reading) for c in self.source.channels]
         with self._lock:
-            count = len(self._shots)
+            count = len(self._frames)
             if count == 2 * KEPT:
                 count = KEPT
                 self._first += KEPT
-                del self._shots[:KEPT]
+                del self._frames[:KEPT]
                 self._times[:KEPT] = self._times[KEPT:]
                 self._changes[:KEPT] = self._changes[KEPT:]
-            self._times[count] = shot.time
+            self._times[count] = frame.time
             self._changes[count] = np.array(values) - self._levels
-            self._shots.append(shot)
+            self._frames.append(frame)
 
     def _take_potentials(self) -> None:
         """Take those of what is shown, when they are wanted and it is time."""
-        shot, plane, now = self.newest, self.plane, time.monotonic()
-        if plane is None or shot is None:
+        frame, plane, now = self.newest, self.plane, time.monotonic()
+        if plane is None or frame is None:
             return
         last = self.with_field
-        taken = last is not None and (last.index, last.plane) == (shot.index, plane)
+        taken = last is not None and (last.index, last.plane) == (frame.index, plane)
         if not taken and now - self._field_taken >= FIELD_PERIOD:
-            found = self.source.potentials(shot, plane)
-            self.with_field = replace(shot, plane=plane, potentials=found)
+            found = self.source.potentials(frame, plane)
+            self.with_field = replace(frame, plane=plane, potentials=found)
             self._field_taken = now

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import CapSenseError
-from capsense.viewer.source import Seekable, Shot, Source
+from capsense.viewer.source import Frame, Seekable, Source
 
 if TYPE_CHECKING:
     from capsense.viewer.plane import Plane
@@ -36,13 +36,13 @@ class Playback(Protocol):
     """Whether the end is followed by the beginning."""
     plane: Plane | None
     """Where potentials are wanted; None where they are not."""
-    with_field: Shot | None
+    with_field: Frame | None
     """The last one whose potentials were taken."""
     failure: CapSenseError | None
     """What stopped it; None again once it goes on."""
 
     @property
-    def newest(self) -> Shot | None:
+    def newest(self) -> Frame | None:
         """What is to be shown; None before there is any."""
 
     @property
@@ -98,8 +98,8 @@ class Player:
         self.source = source
         self.loop = True
         self.plane: Plane | None = None
-        self.newest: Shot | None = None
-        self.with_field: Shot | None = None
+        self.newest: Frame | None = None
+        self.with_field: Frame | None = None
         self.failure: CapSenseError | None = None
         self._changes: Array = np.full((len(source.times), len(source.channels)), np.nan)
         self._levels = np.array([c.read(source.empty) for c in source.channels])
@@ -182,12 +182,12 @@ class Player:
     def _take(self, index: int) -> None:
         now = time.monotonic()
         due = not self._playing or now - self._field_taken >= FIELD_PERIOD
-        shot = self.source.shot(index, self.plane if due else None)
-        values = [c.read(shot.reading) for c in self.source.channels]
+        frame = self.source.frame(index, self.plane if due else None)
+        values = [c.read(frame.reading) for c in self.source.channels]
         self._changes[index] = np.array(values) - self._levels
-        if shot.potentials is not None:
-            self.with_field, self._field_taken = shot, now
-        self.newest, self.failure = shot, None
+        if frame.potentials is not None:
+            self.with_field, self._field_taken = frame, now
+        self.newest, self.failure = frame, None
 
     def _next(self) -> int | None:
         """Wait until a sample is due; None to end."""

@@ -16,7 +16,7 @@ from capsense.reading import Reading
 from capsense.scenario.channels import Excitation, channels_of
 from capsense.scene import DepthFrame, Pose, Shape
 from capsense.viewer.follower import Follower
-from capsense.viewer.source import Shot, green_of
+from capsense.viewer.source import Frame, green_of
 
 if TYPE_CHECKING:
     from capsense.viewer.plane import Plane
@@ -28,7 +28,7 @@ class SensorStream:
     """What a sensor reads, as it is put in. A :class:`~capsense.viewer.source.Stream`.
 
     Args:
-        sensor: Potentials come from a sibling of its simulator.
+        sensor: Potentials come from a copy of its simulator.
     """
 
     def __init__(self, sensor: AttachedSensor) -> None:
@@ -36,19 +36,19 @@ class SensorStream:
         self.title, self.design = f"{simulator.design.name}, on a robot", simulator.design
         self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
         self.empty, self.green = simulator.empty, green_of(simulator)
-        self.shots: queue.Queue[Shot] = queue.Queue()
-        self._simulator = simulator.sibling()
+        self.frames: queue.Queue[Frame] = queue.Queue()
+        self._simulator = simulator.copy()
 
-    def next(self, timeout: float) -> Shot | None:
+    def next(self, timeout: float) -> Frame | None:
         """See :class:`~capsense.viewer.source.Stream`."""
         try:
-            return self.shots.get(timeout=timeout)
+            return self.frames.get(timeout=timeout)
         except queue.Empty:
             return None
 
-    def potentials(self, shot: Shot, plane: Plane) -> Array:
+    def potentials(self, frame: Frame, plane: Plane) -> Array:
         """See :class:`~capsense.viewer.source.Stream`."""
-        self._simulator.step(shot.scene)
+        self._simulator.step(frame.scene)
         return self._simulator.potentials(plane.points)
 
     def close(self) -> None:
@@ -64,9 +64,9 @@ class Show:
         self._player = Follower(self._stream)
         self._solids: tuple[int, list[Solid]] = (-1, [])
         try:
-            from capsense.viewer.view import View
+            from capsense.viewer.view import LiveView
 
-            self._view = View(self._player, host=host, port=port)
+            self._view = LiveView(self._player, host=host, port=port)
         except BaseException:
             self._player.stop()
             raise
@@ -84,7 +84,7 @@ class Show:
                 that tells none.
 
         Raises:
-            SceneError, SolveError, ReadOutError: As for the sensor.
+            SceneError, SolveError, ReadoutError: As for the sensor.
         """
         view = self._sensor.view()
         reading = self._sensor.read(time, view)
@@ -94,8 +94,8 @@ class Show:
             except SceneError:
                 time = float(self._count)
         scene = view.scene() if isinstance(view, DepthFrame) else view
-        shot = Shot(self._count, time, scene, reading, around=self._around())
-        self._stream.shots.put(shot)
+        frame = Frame(self._count, time, scene, reading, around=self._around())
+        self._stream.frames.put(frame)
         self._count += 1
         return reading
 

@@ -1,4 +1,4 @@
-"""Where the shots of a view come from: a scenario, or a recording."""
+"""Where the frames of a view come from: a scenario, or a recording."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Charges:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class Frame:
     """One instant: what stood where, and what the sensor read."""
 
     index: int
@@ -79,14 +79,14 @@ class Source(Protocol):
 class Stream(Source, Protocol):
     """Instants that come by themselves."""
 
-    def next(self, timeout: float) -> Shot | None:
+    def next(self, timeout: float) -> Frame | None:
         """The next one; None if none came within a time [s].
 
         Raises:
             CapSenseError: There will be none, or not before another call finds a new beginning.
         """
 
-    def potentials(self, shot: Shot, plane: Plane) -> Array:
+    def potentials(self, frame: Frame, plane: Plane) -> Array:
         """Potentials of an instant at a plane's points [V], shape (n, terminals).
 
         Raises:
@@ -100,7 +100,7 @@ class Seekable(Source, Protocol):
     times: Array
     """Of the instants [s], increasing, shape (N,)."""
 
-    def shot(self, index: int, plane: Plane | None = None) -> Shot:
+    def frame(self, index: int, plane: Plane | None = None) -> Frame:
         """The instant of a number.
 
         Args:
@@ -127,15 +127,15 @@ class ScenarioSource:
         self.empty = simulator.empty
         self.green = green_of(simulator)
 
-    def shot(self, index: int, plane: Plane | None = None) -> Shot:
+    def frame(self, index: int, plane: Plane | None = None) -> Frame:
         """See :class:`Seekable`."""
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
         reading = self._simulator.step(scene)
         if plane is None:
-            return Shot(index, time, scene, reading)
+            return Frame(index, time, scene, reading)
         found = self._simulator.potentials(plane.points)
-        return Shot(index, time, scene, reading, plane, found, charges_of(self._simulator))
+        return Frame(index, time, scene, reading, plane, found, charges_of(self._simulator))
 
     def close(self) -> None:
         """Nothing is held."""
@@ -169,15 +169,15 @@ class RecordingSource:
         self._simulator = session.simulator(method="surface" if gone else None, progress=progress)
         self.green = green_of(self._simulator)
 
-    def shot(self, index: int, plane: Plane | None = None) -> Shot:
+    def frame(self, index: int, plane: Plane | None = None) -> Frame:
         """See :class:`Seekable`."""
         step = self._steps[index]
-        shot = Shot(index, float(self.times[index]), step.scene, step.reading)
+        frame = Frame(index, float(self.times[index]), step.scene, step.reading)
         if plane is None:
-            return shot
+            return frame
         self._simulator.step(step.scene)
         found = self._simulator.potentials(plane.points)
-        return replace(shot, plane=plane, potentials=found, charges=charges_of(self._simulator))
+        return replace(frame, plane=plane, potentials=found, charges=charges_of(self._simulator))
 
     def close(self) -> None:
         """Nothing is held."""

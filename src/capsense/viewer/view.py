@@ -15,7 +15,7 @@ from capsense.viewer.charts import heat_map, make_charts, strip
 from capsense.viewer.controls import PlaneControls, TimeControls, status
 from capsense.viewer.export import ExportControls
 from capsense.viewer.player import Playback
-from capsense.viewer.stage import Stage
+from capsense.viewer.scene_drawing import SceneDrawing
 
 try:
     from viser import ViserServer
@@ -30,7 +30,7 @@ PERIOD = 0.05
 """The page changes no more often [s]."""
 
 
-class View:
+class LiveView:
     """Serves a page until :meth:`stop`; :meth:`run` keeps it up to date.
 
     Args:
@@ -51,7 +51,7 @@ class View:
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label("capsense")
         gui.main_panel.dock_right()
-        self._stage = Stage(self._server, source.design)
+        self._stage = SceneDrawing(self._server, source.design)
         self._status = gui.add_html("")
         self._time = TimeControls(gui, player)
         self._plane = PlaneControls(gui, player) if source.green is not None else None
@@ -81,24 +81,24 @@ class View:
 
     def refresh(self) -> None:
         """Show the newest, if it is not shown already."""
-        player, shot = self._player, self._player.newest
-        state = (shot, player.playing, player.failure)
-        if shot is not None and state != self._drawn:
+        player, frame = self._player, self._player.newest
+        state = (frame, player.playing, player.failure)
+        if frame is not None and state != self._drawn:
             self._drawn = state
             with self._server.atomic():
-                self._time.show(shot)
-                self._stage.show_bodies(Scene() if shot.around else shot.scene)
-                self._stage.show_around(shot.around)
-                times, changes = player.history(shot.index)
+                self._time.show(frame)
+                self._stage.show_bodies(Scene() if frame.around else frame.scene)
+                self._stage.show_around(frame.around)
+                times, changes = player.history(frame.index)
                 window = strip(times, changes)
                 for chart in self._charts:
                     chart.show(*window)
-                own = np.abs(np.diag(shot.reading.delta))
+                own = np.abs(np.diag(frame.reading.delta))
                 before = np.abs(changes[:, self._own]).max(initial=0.0)
                 self._loudest = max(self._loudest, float(own.max()), float(before))
-                self._status.content = status(player, shot, self._loudest)
+                self._status.content = status(player, frame, self._loudest)
                 self._stage.show_signals(own / self._loudest)
-                self._matrix.content = heat_map(shot.reading.electrode_names, shot.reading.delta)
+                self._matrix.content = heat_map(frame.reading.electrode_names, frame.reading.delta)
         self._paint()
 
     def stop(self) -> None:
@@ -110,17 +110,17 @@ class View:
         """Show the potential, where there is one and it is wanted."""
         if self._plane is None:
             return
-        plane, shot, driven = self._plane.plane, self._player.with_field, self._plane.driven
-        state = (plane, shot, driven, self._plane.charge)
+        plane, frame, driven = self._plane.plane, self._player.with_field, self._plane.driven
+        state = (plane, frame, driven, self._plane.charge)
         if state == self._painted:
             return
         self._painted = state
-        with_charge = self._plane.charge and shot is not None
-        self._stage.show_charges(shot.charges if shot and with_charge else None, driven)
+        with_charge = self._plane.charge and frame is not None
+        self._stage.show_charges(frame.charges if frame and with_charge else None, driven)
         if plane is None:
             self._stage.hide("/potential")
-        elif shot is not None and shot.plane is plane and shot.potentials is not None:
-            self._stage.show_plane(plane, shot.potentials[:, driven])
+        elif frame is not None and frame.plane is plane and frame.potentials is not None:
+            self._stage.show_plane(plane, frame.potentials[:, driven])
 
 
 class _Server(ViserServer):

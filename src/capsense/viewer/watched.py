@@ -18,9 +18,9 @@ from capsense.scenario.channels import Excitation, channels_of
 from capsense.scene import Body, DepthFrame, Scene
 from capsense.server.client import Client
 from capsense.server.frames import DepthMessage, ReadingMessage
-from capsense.server.messages import Open, Table, read_open, read_scene
+from capsense.server.messages import MessageTable, Open, read_open, read_scene
 from capsense.simulator import Simulator
-from capsense.viewer.source import Shot, green_of
+from capsense.viewer.source import Frame, green_of
 
 if TYPE_CHECKING:
     from capsense.viewer.plane import Plane
@@ -73,7 +73,7 @@ class Watched:
         self._seen: DepthMessage | dict[str, Any] | None = None
         self._scene = Scene()
 
-    def next(self, timeout: float) -> Shot | None:
+    def next(self, timeout: float) -> Frame | None:
         """See :class:`~capsense.viewer.source.Stream`."""
         try:
             if self._client is None:
@@ -83,9 +83,9 @@ class Watched:
             self.close()
             raise
 
-    def potentials(self, shot: Shot, plane: Plane) -> Array:
+    def potentials(self, frame: Frame, plane: Plane) -> Array:
         """See :class:`~capsense.viewer.source.Stream`."""
-        self._simulator.step(shot.scene)
+        self._simulator.step(frame.scene)
         return self._simulator.potentials(plane.points)
 
     def close(self) -> None:
@@ -140,7 +140,7 @@ class Watched:
         self._open, self._seen = _opened(told), None
         return client
 
-    def _receive(self, client: Client, timeout: float) -> Shot | None:
+    def _receive(self, client: Client, timeout: float) -> Frame | None:
         limit = time.monotonic() + timeout
         while True:
             try:
@@ -151,26 +151,28 @@ class Watched:
                 raise
             if isinstance(found, ReadingMessage):
                 if self._seen is not None:
-                    return self._shot(found)
+                    return self._frame(found)
             elif isinstance(found, DepthMessage) or found["type"] == "scene":
                 self._seen = found
             elif found["type"] == "unwatched":
                 raise ProtocolError("the client has closed its sensor; waiting for another")
 
-    def _shot(self, answer: ReadingMessage) -> Shot:
+    def _frame(self, answer: ReadingMessage) -> Frame:
         assert self._seen is not None
         if isinstance(self._seen, DepthMessage):
             self._scene = self._depth_scene(self._seen)
         else:
-            bodies = read_scene(Table(self._seen, "message", "scene"), len(self._seen["body"]))
+            bodies = read_scene(
+                MessageTable(self._seen, "message", "scene"), len(self._seen["body"])
+            )
             self._scene = _alike(self._scene, Scene(bodies.bodies))
         coupling = answer.self_capacitance - np.diag(answer.capacitance)
-        stats = StepStats(answer.error_estimate, answer.wall_time, iterations=answer.iterations)
+        stats = StepStats(answer.solver_error, answer.wall_time, iterations=answer.iterations)
         reading: Reading = reading_of(
             self.design, answer.capacitance, answer.delta, coupling, stats
         )
         self._count += 1
-        return Shot(self._count - 1, time.monotonic() - self._began, self._scene, reading)
+        return Frame(self._count - 1, time.monotonic() - self._began, self._scene, reading)
 
     def _depth_scene(self, seen: DepthMessage) -> Scene:
         o = self._open
@@ -179,7 +181,7 @@ class Watched:
 
 
 def _opened(told: Mapping[str, Any]) -> Open:
-    return read_open(Table(told["open"], "message", "open"))
+    return read_open(MessageTable(told["open"], "message", "open"))
 
 
 def _alike(old: Scene, new: Scene) -> Scene:

@@ -47,7 +47,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         design: Sensor design, instead of the task's own.
 
     Raises:
-        ReadOutError: There is no such chip.
+        ReadoutError: There is no such chip.
         DesignError: The design is wrong.
     """
 

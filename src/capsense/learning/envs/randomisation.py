@@ -12,7 +12,7 @@ from capsense.errors import SceneError
 from capsense.humans import Build
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.presets import chip_of
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 
 Range = tuple[float, float]
 _LOG = ("grounding", "permittivity")
@@ -43,16 +43,16 @@ class Drawn:
         sex = "female" if self.female > 0.5 else "male"
         return Build(sex, percentile=self.percentile, girth=self.girth)  # type: ignore[arg-type]
 
-    def readout(self, chip: str, electrodes: tuple[str, ...], rng: Generator) -> ReadOut:
-        """The read-out of one sensor, at the chip's highest rate, with a gain of its own.
+    def readout(self, chip: str, electrodes: tuple[str, ...], rng: Generator) -> Readout:
+        """The readout of one sensor, at the chip's highest rate, with a gain of its own.
 
         Raises:
-            ReadOutError: There is no such chip.
+            ReadoutError: There is no such chip.
         """
         rate = max(r.per_second for r in chip_of(chip).rates)
         gain = 1.0 + self.gain * rng.uniform(-1.0, 1.0)
         stage = LinearSensor(np.array(gain), np.array(0.0), np.array(0.0), 0.0)
-        return ReadOut.preset(
+        return Readout.preset(
             chip, electrodes, rate=rate, latency=self.latency, white=self.noise,
             walk=self.drift, stages=(stage,),
         )  # fmt: skip
@@ -83,7 +83,7 @@ class Randomisation:
     grounding: Range = (30e-12, 300e-12)
     """What ties the person to ground [F]."""
     gain: Range = (0.0, 0.05)
-    """Largest error of the read-out's gain."""
+    """Largest error of the readout's gain."""
     noise: Range = (0.2e-15, 1e-15)
     """Rms of the noise of one conversion [F]."""
     drift: Range = (0.0, 0.2e-15)

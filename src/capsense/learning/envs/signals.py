@@ -1,4 +1,4 @@
-"""What a policy gets of capacitive sensors: numbers of fixed size, through their read-outs."""
+"""What a policy gets of capacitive sensors: numbers of fixed size, through their readouts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from capsense.adapters.skin import AttachedSkin
 from capsense.learning.settle import settled, settling
 from capsense.reading import Reading
-from capsense.readout.read_out import SEED_STRIDE, ReadOut
+from capsense.readout.readout import SEED_STRIDE, Readout
 
 UNIT = 10e-15
 """Changes of capacitance are given in this unit [F]."""
@@ -24,11 +24,11 @@ class Signals:
     """The registers of all chips of a skin.
 
     Args:
-        skin: Sensors without read-outs of their own.
-        readouts: The read-out of each, by name.
+        skin: Sensors without readouts of their own.
+        readouts: The readout of each, by name.
     """
 
-    def __init__(self, skin: AttachedSkin, readouts: Mapping[str, ReadOut]) -> None:
+    def __init__(self, skin: AttachedSkin, readouts: Mapping[str, Readout]) -> None:
         self.skin, self.readouts = skin, dict(readouts)
         self._tare: dict[str, NDArray[np.float64]] = {}
 

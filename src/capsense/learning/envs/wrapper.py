@@ -38,13 +38,13 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         env: An environment with ``unwrapped.model`` and ``unwrapped.data`` of MuJoCo.
         sites: Sites that carry sensors; see :func:`write_model` where there are none.
         design: What :func:`capsense.adapters.mujoco.attach_skin` takes.
-        readout: Name of the chip behind every sensor, or a read-out file.
+        readout: Name of the chip behind every sensor, or a readout file.
         options: As for ``attach_skin``: ``materials``, ``grounding``, ``exclude`` and so on.
 
     Raises:
         SceneError: It is no MuJoCo environment, or has no such site.
         DesignError: The design is wrong.
-        ReadOutError: There is no such chip or file.
+        ReadoutError: There is no such chip or file.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The read-out: channels, schedule, wiring, analogue stages, converter and detector in a row."""
+"""The readout: channels, schedule, wiring, analogue stages, converter and detector in a row."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsense._validate import as_number
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern
 from capsense.readout.checks import Array, real, require, require_whole
 from capsense.readout.converter import CapDac, Conversion, Law
@@ -30,7 +30,7 @@ SEED_STRIDE = 2**32
 sensor sees in one run what another one saw in the last."""
 
 
-class Reading(Protocol):
+class ReadingLike(Protocol):
     """What a simulator's reading offers."""
 
     @property
@@ -46,7 +46,7 @@ class Reading(Protocol):
         """Diagonal with the shields driven along [F], shape (M,)."""
 
 
-class ReadOut:
+class Readout:
     """Turns capacitances into what a chip reports: late, quantised, noisy, one after another.
 
     The chain, in its order: *channels* pick one capacitance each from the Maxwell matrix;
@@ -70,21 +70,21 @@ class ReadOut:
         name: For titles.
 
     Raises:
-        ReadOutError: The parts do not fit each other.
+        ReadoutError: The parts do not fit each other.
     """
 
     def __init__(
         self, patterns: Sequence[Pattern], electrodes: Sequence[str], schedule: Schedule, law: Law,
         *, dac: CapDac | None = None, wiring: Wiring | None = None, stages: Sequence[Stage] = (),
-        detector: Detector | None = None, seed: int = 0, name: str = "read-out",
+        detector: Detector | None = None, seed: int = 0, name: str = "readout",
     ) -> None:  # fmt: skip
         self.bank = ChannelBank(patterns, electrodes)
         for kind, parts in ((Wiring, [wiring]), (Detector, [detector]), (Stage, stages)):
             for part in parts:
                 if part is not None and not isinstance(part, kind):
-                    raise ReadOutError(f"{part!r} is no {kind.__name__}; give one")
+                    raise ReadoutError(f"{part!r} is no {kind.__name__}; give one")
         if schedule.count != len(self.bank):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"the schedule samples {schedule.count} channels and there are {len(self.bank)}; "
                 "make them the same"
             )
@@ -96,19 +96,19 @@ class ReadOut:
         self.reset(seed=seed)
 
     @classmethod
-    def preset(cls, chip: str, electrodes: Sequence[str], **options: Any) -> ReadOut:
-        """A read-out with the figures of a known chip; see :func:`~capsense.readout.presets.build`.
+    def preset(cls, chip: str, electrodes: Sequence[str], **options: Any) -> Readout:
+        """A readout with the figures of a known chip; see :func:`~capsense.readout.presets.build`.
 
         Raises:
-            ReadOutError: No such chip, or an option is wrong.
+            ReadoutError: No such chip, or an option is wrong.
         """
-        from capsense.readout.presets import Options, build
+        from capsense.readout.presets import ReadoutOptions, build
 
-        return build(chip, electrodes, Options.of(options))
+        return build(chip, electrodes, ReadoutOptions.of(options))
 
     def __repr__(self) -> str:
         return (
-            f"<ReadOut {self.name!r}: {len(self.bank)} channels, each every "
+            f"<Readout {self.name!r}: {len(self.bank)} channels, each every "
             f"{1e3 * self.schedule.period:.4g} ms>"
         )
 
@@ -130,11 +130,11 @@ class ReadOut:
             seed: A new seed; by default random numbers repeat.
 
         Raises:
-            ReadOutError: ``start`` is not finite, or the seed no whole number from 0 on.
+            ReadoutError: ``start`` is not finite, or the seed no whole number from 0 on.
         """
         require("reset", "start", start, -math.inf, "s")
         if seed is not None:
-            require_whole("read-out", "seed", seed, 0)
+            require_whole("readout", "seed", seed, 0)
             self._seed = int(seed)
         seeds = np.random.SeedSequence(self._seed).spawn(len(self.stages))
         k = len(self.bank)
@@ -163,7 +163,7 @@ class ReadOut:
         last = self.schedule.samples_until(until - self._start)
         return self._start + np.unique(self.schedule.instant(np.arange(self._seen, last)))
 
-    def channel_values(self, capacitance: Reading | ArrayLike) -> Array:
+    def channel_values(self, capacitance: ReadingLike | ArrayLike) -> Array:
         """Capacitance of each channel before anything distorts it [F].
 
         Args:
@@ -174,13 +174,13 @@ class ReadOut:
             Shape (K,), or (n, K).
 
         Raises:
-            ReadOutError: The shape does not fit, or a number is not finite.
+            ReadoutError: The shape does not fit, or a number is not finite.
         """
         if _is_reading(capacitance):
-            reading = cast("Reading", capacitance)
+            reading = cast("ReadingLike", capacitance)
             if reading.electrode_names != self.bank.electrodes:
-                raise ReadOutError(
-                    f"the reading is of electrodes {reading.electrode_names}, the read-out for "
+                raise ReadoutError(
+                    f"the reading is of electrodes {reading.electrode_names}, the readout for "
                     f"{self.bank.electrodes}; make it with the simulator's electrode_names"
                 )
             matrix = reading.capacitance
@@ -193,12 +193,12 @@ class ReadOut:
     def _checked(self, values: Array) -> Array:
         k = len(self.bank)
         if values.shape[-1:] != (k,):
-            raise ReadOutError(f"channel values have shape {values.shape}; give {k} per instant")
+            raise ReadoutError(f"channel values have shape {values.shape}; give {k} per instant")
         if not np.isfinite(values).all():
-            raise ReadOutError("a channel value is not finite; mend the readings")
+            raise ReadoutError("a channel value is not finite; mend the readings")
         return values
 
-    def sample(self, time: float, capacitance: Reading | ArrayLike) -> Counts:
+    def sample(self, time: float, capacitance: ReadingLike | ArrayLike) -> Counts:
         """Tell the capacitances of an instant; get the conversions finished since the last call.
 
         Channels whose instants lie between the last call and this one see capacitances
@@ -212,16 +212,16 @@ class ReadOut:
             Conversions with time stamps up to ``time``, often none.
 
         Raises:
-            ReadOutError: Time goes back or is not finite, or the capacitances do not fit.
+            ReadoutError: Time goes back or is not finite, or the capacitances do not fit.
         """
         values = self._wired(self.channel_values(capacitance))
         if values.ndim != 1:
-            raise ReadOutError("sample takes one instant; call the read-out for a recording")
+            raise ReadoutError("sample takes one instant; call the readout for a recording")
         now = as_number(time) - self._start
         if not math.isfinite(now):
-            raise ReadOutError(f"sample at {time!r} s; give a finite time")
+            raise ReadoutError(f"sample at {time!r} s; give a finite time")
         if self._last is not None and now < self._last[0]:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"sample at {time!r} s, after one at {self._last[0] + self._start:g} s; time must "
                 "not go back: call reset() to begin anew"
             )
@@ -235,7 +235,7 @@ class ReadOut:
             self._latest = counts.last()
         return counts
 
-    def __call__(self, times: ArrayLike, capacitance: Sequence[Reading] | ArrayLike) -> Counts:
+    def __call__(self, times: ArrayLike, capacitance: Sequence[ReadingLike] | ArrayLike) -> Counts:
         """Read a whole recording, from its first time on; resets before and after.
 
         Args:
@@ -248,16 +248,16 @@ class ReadOut:
             by one gives.
 
         Raises:
-            ReadOutError: Times do not rise, or shapes do not fit.
+            ReadoutError: Times do not rise, or shapes do not fit.
         """
         t = real("times", times)
         if t.ndim != 1 or not len(t) or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-            raise ReadOutError("times must be finite numbers that rise, of shape (n,)")
+            raise ReadoutError("times must be finite numbers that rise, of shape (n,)")
         if isinstance(capacitance, Sequence) and any(map(_is_reading, capacitance)):
             capacitance = np.array([self.channel_values(c) for c in capacitance])
         array = real("capacitance", capacitance)
         if array.ndim not in (2, 3) or len(array) != len(t):
-            raise ReadOutError(
+            raise ReadoutError(
                 f"{len(t)} times for capacitances of shape {array.shape}; give (n, K) or (n, M, M)"
             )
         truth = self._checked(array) if array.ndim == 2 else self.bank.values(array)
@@ -283,7 +283,7 @@ class ReadOut:
         """Refuse a leap over more conversions than anybody wants at once."""
         plan = self.schedule
         if (now / plan.period) * plan.count - self._seen > _AT_ONCE:
-            raise ReadOutError(
+            raise ReadoutError(
                 f"{now + self._start:g} s is more than {_AT_ONCE:.0e} conversions after the last "
                 "time; take smaller steps, or begin there: reset(start=…)"
             )
@@ -353,7 +353,7 @@ class ReadOut:
         for process in self._processes:
             value = process(counts.channel, instant, value)
         if not np.isfinite(value).all():
-            raise ReadOutError("a stage made a number that is not finite; mend its figures")
+            raise ReadoutError("a stage made a number that is not finite; mend its figures")
         counts.code[:], counts.capacitance[:], counts.flags[:] = self._convert(
             counts.channel, value
         )

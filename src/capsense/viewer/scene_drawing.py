@@ -41,7 +41,7 @@ SPOTS, DOT = 6000, 1.2e-3
 _FACETED = (ShapeKind.BOX, ShapeKind.CYLINDER, ShapeKind.MESH)
 
 
-class Stage:
+class SceneDrawing:
     """Draws into a server; lengths are metres in the sensor frame.
 
     Args:

@@ -70,7 +70,7 @@ class OneAtATime:
         return OneAtATime, ()
 
 
-class Crew:
+class ThreadPool:
     """Threads that share the work of reading, the calling thread among them.
 
     The solver's kernels run beside each other; Python between them does not. No two tasks may
@@ -93,9 +93,9 @@ class Crew:
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
 
-    def __reduce__(self) -> tuple[type[Crew], tuple[int]]:
+    def __reduce__(self) -> tuple[type[ThreadPool], tuple[int]]:
         """A copy has threads of its own."""
-        return Crew, (self.threads,)
+        return ThreadPool, (self.threads,)
 
     def _helpers(self) -> ThreadPoolExecutor:
         """The other threads; a forked process inherits none, so that it starts its own."""

@@ -7,14 +7,14 @@ import time
 
 import pytest
 
-from capsense._crew import Crew, some_failed
+from capsense._thread_pool import ThreadPool, some_failed
 from capsense.errors import SceneError
 
 
 def test_tasks_run_beside_each_other() -> None:
     """Two tasks that wait for each other finish with two threads."""
     meet = threading.Barrier(2, timeout=20)
-    results, failures = Crew(2).run({"a": meet.wait, "b": meet.wait})
+    results, failures = ThreadPool(2).run({"a": meet.wait, "b": meet.wait})
     assert set(results.values()) == {0, 1}
     assert not failures
 
@@ -28,7 +28,7 @@ def test_results_and_failures_are_in_the_order_of_the_tasks(threads: int) -> Non
             raise SceneError(f"no {k}")
         return k * k
 
-    results, failures = Crew(threads).run({k: lambda k=k: task(k) for k in range(20)})
+    results, failures = ThreadPool(threads).run({k: lambda k=k: task(k) for k in range(20)})
     assert list(results.items()) == [(k, k * k) for k in range(20) if k % 3]
     assert [(k, str(e)) for k, e in failures.items()] == [(k, f"no {k}") for k in range(0, 20, 3)]
 
@@ -41,7 +41,7 @@ def test_what_it_did_not_foresee_is_passed_on(threads: int) -> None:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        Crew(threads).run({"a": broken, "b": broken})
+        ThreadPool(threads).run({"a": broken, "b": broken})
 
 
 def test_after_a_bug_nothing_more_is_begun() -> None:
@@ -56,7 +56,7 @@ def test_after_a_bug_nothing_more_is_begun() -> None:
 
     tasks = {k: first for k in range(2)} | {k: lambda k=k: done.append(k) for k in range(2, 40)}
     with pytest.raises(ZeroDivisionError):
-        Crew(2).run(tasks)
+        ThreadPool(2).run(tasks)
     assert not done
 
 
@@ -73,4 +73,4 @@ def test_a_report_names_the_first_failure_and_lists_the_others() -> None:
 def test_refused(threads: object) -> None:
     """Not a positive whole number."""
     with pytest.raises(SceneError, match=r"threads is .*give a whole number from 1"):
-        Crew(threads)  # type: ignore[arg-type]
+        ThreadPool(threads)  # type: ignore[arg-type]

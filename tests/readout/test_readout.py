@@ -1,4 +1,4 @@
-"""The read-out as a whole: instants, time stamps, interpolation, determinism."""
+"""The readout as a whole: instants, time stamps, interpolation, determinism."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from maxwell import random_maxwell
 from relative import near
 
-from capsense.errors import ReadOutError
+from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import Pattern, self_patterns
 from capsense.readout.chips import CHIPS
@@ -19,7 +19,7 @@ from capsense.readout.converter import CapDac, LinearLaw
 from capsense.readout.counts import Counts, join
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
-from capsense.readout.read_out import ReadOut
+from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
 from capsense.readout.wiring import Wiring
 
@@ -30,7 +30,7 @@ FINE = LinearLaw(1e-21, -(10**12), 10**12)
 def plain(schedule=None, **options):
     """Three self channels through a converter of very fine codes."""
     plan = schedule or Schedule.sequential(3, 2e-3, gap=1e-4)
-    return ReadOut(self_patterns(NAMES, shield=0.0), NAMES, plan, FINE, **options)
+    return Readout(self_patterns(NAMES, shield=0.0), NAMES, plan, FINE, **options)
 
 
 def full(seed=0):
@@ -136,7 +136,7 @@ def test_every_chip_step_by_step(chip):
     rng = np.random.default_rng(0)
     times = np.arange(100) * 0.01
     matrices = moving(times, rng)
-    readout = ReadOut.preset(
+    readout = Readout.preset(
         chip, NAMES, seed=5, expected=4e-12, mains=1e-15, temperature=[(0, 25), (1, 30)],
         offset_per_kelvin=1e-16,
         wiring=Wiring(crosstalk=0.02),
@@ -153,7 +153,7 @@ def test_every_chip_step_by_step(chip):
 
 
 def everything():
-    """Every part of a read-out that has a state or holds arrays."""
+    """Every part of a readout that has a state or holds arrays."""
     return plain(
         dac=CapDac(1e-12, 8, follow=True), wiring=Wiring(crosstalk=0.01),
         stages=(
@@ -242,7 +242,7 @@ def test_wiring_of_mutual_channels():
     """Analytic: leads to ground charge a self measurement only; between leads, a mutual one."""
     patterns = [Pattern("A"), Pattern("B", {"A": 1.0})]
     wiring = Wiring(trace=4e-12, cable=1e-11, shield_gain=0.5, coupling=[1e-13, 2e-13])
-    readout = ReadOut(patterns, NAMES, Schedule.simultaneous(2, 1e-3), FINE, wiring=wiring)
+    readout = Readout(patterns, NAMES, Schedule.simultaneous(2, 1e-3), FINE, wiring=wiring)
     matrix = random_maxwell(np.random.default_rng(2), 3)
     counts = readout([0.0, 0.01], [matrix, matrix])
     expected = [matrix[0, 0] + 4e-12 + 5e-12, -matrix[1, 0] + 2e-13]
@@ -264,7 +264,7 @@ def test_readings_of_a_simulator():
     coupling = np.array([-0.1, -0.2, -0.3]) * 1e-12
     reading = Reading(matrix, np.diag(matrix) + coupling)
     patterns = [Pattern("A", shield=1.0), Pattern("B", shield=0.0), Pattern("C", {"A": 1.0})]
-    readout = ReadOut(patterns, NAMES, Schedule.simultaneous(3, 1e-3), FINE)
+    readout = Readout(patterns, NAMES, Schedule.simultaneous(3, 1e-3), FINE)
     expected = [matrix[0, 0] + coupling[0], matrix[1, 1], -matrix[2, 0]]
     assert readout.channel_values(reading) == near(expected, rel=1e-12)
     assert readout.channel_values(np.array(expected)).tolist() == expected
@@ -272,11 +272,11 @@ def test_readings_of_a_simulator():
     assert readout.sample(1.0, reading).capacitance[:3] == near(expected, rel=1e-8)
     assert readout([0.0, 1.0], [reading, reading]).capacitance[:3] == near(expected, rel=1e-8)
     other = Reading(matrix, np.diag(matrix), ("A", "C", "B"))
-    with pytest.raises(ReadOutError, match="make it with the simulator's electrode_names"):
+    with pytest.raises(ReadoutError, match="make it with the simulator's electrode_names"):
         readout.sample(2.0, other)
-    with pytest.raises(ReadOutError, match="make it with the simulator's electrode_names"):
+    with pytest.raises(ReadoutError, match="make it with the simulator's electrode_names"):
         readout([0.0, 1.0], [reading, other])
-    with pytest.raises(ReadOutError, match=r"1 times for capacitances of shape \(2, 3\)"):
+    with pytest.raises(ReadoutError, match=r"1 times for capacitances of shape \(2, 3\)"):
         readout([0.0], [reading, reading])
 
 
@@ -295,19 +295,19 @@ def test_counts_by_channel_and_in_rows():
         assert (stamps[:, k] == counts.of(name).time[: len(rows)]).all()
     assert set(counts.latest()) == set(NAMES)
     assert counts.latest()["C"] == counts.of("C").capacitance[-1]
-    with pytest.raises(ReadOutError, match="no channel 'D'"):
+    with pytest.raises(ReadoutError, match="no channel 'D'"):
         counts.of("D")
-    with pytest.raises(ReadOutError, match="not whole cycles"):
+    with pytest.raises(ReadoutError, match="not whole cycles"):
         counts[counts.channel != 1].table()
-    with pytest.raises(ReadOutError, match="no 'touched'; valid are code, capacitance, flags"):
+    with pytest.raises(ReadoutError, match="no 'touched'; valid are code, capacitance, flags"):
         counts.table("touched")
-    with pytest.raises(ReadOutError, match="no counts to join"):
+    with pytest.raises(ReadoutError, match="no counts to join"):
         join([])
 
 
 def test_representations_are_short():
-    readout = ReadOut.preset("fdc1004", NAMES)
-    assert repr(readout) == "<ReadOut 'Texas Instruments FDC1004': 3 channels, each every 30 ms>"
+    readout = Readout.preset("fdc1004", NAMES)
+    assert repr(readout) == "<Readout 'Texas Instruments FDC1004': 3 channels, each every 30 ms>"
     counts = readout([0.0, 0.035], np.full((2, 3), 1e-12))
     assert repr(counts) == "<Counts: 3 conversions of 3 channels, 0.01 to 0.03 s>"
     assert repr(counts[:0]) == "<Counts: 0 conversions of 3 channels>"
@@ -326,7 +326,7 @@ def test_numbers_of_any_kind(kind):
     for readout in counts:
         readout.sample(kind(0), matrix)
     assert len(counts[0].sample(kind(1), matrix)) > 400
-    with pytest.raises(ReadOutError, match="give a finite time"):
+    with pytest.raises(ReadoutError, match="give a finite time"):
         counts[1].sample(True, matrix)
 
 
@@ -336,10 +336,10 @@ def test_leaps_are_refused():
     matrix = random_maxwell(np.random.default_rng(0), 3)
     for leap in (lambda: readout.sample(1.7e9, matrix), lambda: readout.due(1.7e9),
                  lambda: readout([0.0, 1.7e9], [matrix, matrix])):  # fmt: skip
-        with pytest.raises(ReadOutError, match=r"1.7e\+09 s is .*begin there: reset\(start=…\)"):
+        with pytest.raises(ReadoutError, match=r"1.7e\+09 s is .*begin there: reset\(start=…\)"):
             leap()
     readout.reset(start=1.7e9)
-    with pytest.raises(ReadOutError, match=r"1.8e\+09 s is more than"):
+    with pytest.raises(ReadoutError, match=r"1.8e\+09 s is more than"):
         readout.due(1.8e9)
     assert len(readout.due(1.7e9 + 1)) > 400
     readout.sample(1.7e9, matrix)
@@ -361,7 +361,7 @@ def test_leaps_are_refused():
     ],
 )
 def test_parts_that_do_not_fit_are_refused(options, words):
-    with pytest.raises(ReadOutError, match=words):
+    with pytest.raises(ReadoutError, match=words):
         plain(**options)
 
 
@@ -385,7 +385,7 @@ def test_stages_are_applied_in_their_order():
 
     shift = LinearSensor(1.0, 3e-13, 0.0, 0.0)
     for stages, expected in (((Doubled(), shift), 2300), ((shift, Doubled()), 2600)):
-        readout = ReadOut(
+        readout = Readout(
             self_patterns(NAMES), NAMES, Schedule.simultaneous(3, 0.1), Square(), stages=stages
         )
         counts = readout([0.0, 1.0], np.full((2, 3), 1e-12))
@@ -401,7 +401,7 @@ def test_a_stage_that_fails_is_noticed():
             return lambda channel, time, value: value * np.nan
 
     matrix = random_maxwell(np.random.default_rng(0), 3)
-    with pytest.raises(ReadOutError, match="a stage made a number that is not finite"):
+    with pytest.raises(ReadoutError, match="a stage made a number that is not finite"):
         plain(stages=[Broken()])([0.0, 1.0], [matrix, matrix])
 
 
@@ -409,43 +409,43 @@ def test_misuse_is_refused():
     readout = plain()
     matrix = random_maxwell(np.random.default_rng(0), 3)
     readout.sample(1.0, matrix)
-    with pytest.raises(ReadOutError, match=r"sample at 0.5 s, after one at 1 s; time must not go"):
+    with pytest.raises(ReadoutError, match=r"sample at 0.5 s, after one at 1 s; time must not go"):
         readout.sample(0.5, matrix)
-    with pytest.raises(ReadOutError, match="sample at nan s; give a finite time"):
+    with pytest.raises(ReadoutError, match="sample at nan s; give a finite time"):
         readout.sample(float("nan"), matrix)
-    with pytest.raises(ReadOutError, match="sample at 'now' s; give a finite time"):
+    with pytest.raises(ReadoutError, match="sample at 'now' s; give a finite time"):
         readout.sample("now", matrix)
-    with pytest.raises(ReadOutError, match="sample takes one instant"):
+    with pytest.raises(ReadoutError, match="sample takes one instant"):
         readout.sample(2.0, np.ones((4, 3, 3)))
-    with pytest.raises(ReadOutError, match="until is nan"):
+    with pytest.raises(ReadoutError, match="until is nan"):
         readout.due(float("nan"))
-    with pytest.raises(ReadOutError, match=r"shape \(2, 2\)"):
+    with pytest.raises(ReadoutError, match=r"shape \(2, 2\)"):
         readout.sample(2.0, np.eye(2))
-    with pytest.raises(ReadOutError, match="not finite"):
+    with pytest.raises(ReadoutError, match="not finite"):
         readout.sample(2.0, np.array([1e-12, np.nan, 1e-12]))
-    with pytest.raises(ReadOutError, match=r"channel values have shape \(4,\); give 3"):
+    with pytest.raises(ReadoutError, match=r"channel values have shape \(4,\); give 3"):
         readout.sample(2.0, np.ones(4))
-    with pytest.raises(ReadOutError, match=r"2 times for capacitances of shape \(3, 3\)"):
+    with pytest.raises(ReadoutError, match=r"2 times for capacitances of shape \(3, 3\)"):
         readout([0.0, 1.0], np.ones((3, 3)))
-    with pytest.raises(ReadOutError, match="times must be finite numbers that rise"):
+    with pytest.raises(ReadoutError, match="times must be finite numbers that rise"):
         readout([0.0, 0.0], np.ones((2, 3)))
-    with pytest.raises(ReadOutError, match="samples 4 channels and there are 3"):
+    with pytest.raises(ReadoutError, match="samples 4 channels and there are 3"):
         plain(Schedule.sequential(4, 1e-3))
-    with pytest.raises(ReadOutError, match="seed is -1"):
+    with pytest.raises(ReadoutError, match="seed is -1"):
         plain(seed=-1)
-    with pytest.raises(ReadOutError, match="start is nan"):
+    with pytest.raises(ReadoutError, match="start is nan"):
         readout.reset(start=float("nan"))
-    with pytest.raises(ReadOutError, match=r"shield_gain is 1\.5"):
+    with pytest.raises(ReadoutError, match=r"shield_gain is 1\.5"):
         plain(wiring=Wiring(shield_gain=1.5))
-    with pytest.raises(ReadOutError, match="trace is"):
+    with pytest.raises(ReadoutError, match="trace is"):
         plain(wiring=Wiring(trace=[1.0, 2.0]))
-    with pytest.raises(ReadOutError, match="crosstalk is"):
+    with pytest.raises(ReadoutError, match="crosstalk is"):
         plain(wiring=Wiring(crosstalk=[1.0, 2.0]))
 
 
 def test_held_values_are_of_fixed_size() -> None:
     """Every channel's last conversion and its age, at every call; 0 where there is none yet."""
-    chip = ReadOut.preset("fdc1004", NAMES)
+    chip = Readout.preset("fdc1004", NAMES)
     counts = chip.sample(0.0, np.zeros((3, 3)))
     held = counts.held()
     assert len(counts) == 0
