@@ -77,14 +77,10 @@ def say(message: str) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    Parameters
-    ----------
-    argv
-        Arguments after the program's name; those of the process by default.
+    Args:
+        argv: Arguments after the program's name; those of the process by default.
 
-    Returns
-    -------
-    int
+    Returns:
         The exit code, see :data:`EXIT_CODES`.
     """
     from capsense.cli.interrupt import Interrupt

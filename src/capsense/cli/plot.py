@@ -52,14 +52,10 @@ class _Family:
 def plot_run(recorder: RunWriter) -> Figure:
     """Draw a run.
 
-    Parameters
-    ----------
-    recorder
-        A run of at least one sample.
+    Args:
+        recorder: A run of at least one sample.
 
-    Returns
-    -------
-    Figure
+    Returns:
         Each family of signals relative to the empty scene and as a change in farads; beside
         them the bodies' way over the electrodes, from above and from the side.
     """

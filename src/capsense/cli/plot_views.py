@@ -26,16 +26,12 @@ Array = NDArray[np.float64]
 def draw_views(recorder: RunWriter, peak: int, colours: list[str], above: Axes, side: Axes) -> None:
     """Draw sensor, domain, bodies and their ways, in millimetres and to one scale.
 
-    Parameters
-    ----------
-    recorder
-        A run of at least one sample.
-    peak
-        The sample at which bodies are drawn solid; they are dashed at the first one.
-    colours
-        A colour for each electrode.
-    above, side
-        Square axes for the view along −z, and for that along y or x, whichever shows more.
+    Args:
+        recorder: A run of at least one sample.
+        peak: The sample at which bodies are drawn solid; they are dashed at the first one.
+        colours: A colour for each electrode.
+        above: Square axes for the view along −z.
+        side: Square axes for the view along y or x, whichever shows more.
     """
     lower, upper = _window(recorder, peak)
     across = _side_axis(recorder.positions)
