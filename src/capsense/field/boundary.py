@@ -158,9 +158,13 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
         add(facet, GROUND, Grading(0.01, largest=scale * 0.04 * room_scale(design)), 0.0)
 
     return BoundaryModel(
-        concatenate(parts), np.concatenate(owners), np.concatenate(front), np.concatenate(back), floor,
+        concatenate(parts),
+        np.concatenate(owners),
+        np.concatenate(front),
+        np.concatenate(back),
+        floor,
         len(names),
-    )  # fmt: skip
+    )
 
 
 def _grading(facet: Facet, edge: float, largest: float, scale: float) -> Grading:
