@@ -111,10 +111,11 @@ def describe(design: Design) -> str:
     from capsense.cli.tables import facts, table
 
     x, y, z = (1e3 * s for s in design.domain.size)
+    walls = "open, from" if design.domain.open else "floor"
     head = [
         ("design", design.name),
         ("", design.description),
-        ("domain", f"{x:g} × {y:g} × {z:g} mm, floor {design.domain.backplane * 1e3:g} mm below"),
+        ("domain", f"{x:g} × {y:g} × {z:g} mm, {walls} {design.domain.backplane * 1e3:g} mm below"),
         ("hash", design.content_hash()[:16]),
     ]
     blocks = [

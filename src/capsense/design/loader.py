@@ -151,7 +151,7 @@ def parse_design(
 
 
 def _read_domain(table: DesignTable) -> Domain:
-    table.only(("size", "backplane"))
+    table.only(("size", "backplane", "open"))
     sx, sy, sz = table.sizes("size", 3, "[x, y, z] in metres")
     backplane = table.length("backplane")
     if backplane >= sz:
@@ -159,7 +159,7 @@ def _read_domain(table: DesignTable) -> Domain:
             f"backplane = {backplane:g} must be smaller than the box's height, {sz:g}; it is the "
             "distance from the electrode plane z = 0 down to the box's floor"
         )
-    return Domain((sx, sy, sz), backplane)
+    return Domain((sx, sy, sz), backplane, table.boolean("open", False))
 
 
 def _read_build(table: DesignTable) -> dict[str, float]:

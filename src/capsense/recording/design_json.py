@@ -24,7 +24,11 @@ def design_to_json(design: Design) -> str:
         {
             "name": design.name,
             "description": design.description,
-            "domain": {"size": list(domain.size), "backplane": domain.backplane},
+            "domain": {
+                "size": list(domain.size),
+                "backplane": domain.backplane,
+                "open": domain.open,
+            },
             "electrodes": [
                 {"name": e.name, "surface": _surface(e.surface)} for e in design.electrodes
             ],
@@ -58,7 +62,11 @@ def design_from_json(text: str | bytes) -> Design:
         data = json.loads(text)
         design = Design(
             name=data["name"],
-            domain=Domain(tuple(data["domain"]["size"]), data["domain"]["backplane"]),
+            domain=Domain(
+                tuple(data["domain"]["size"]),
+                data["domain"]["backplane"],
+                data["domain"].get("open", False),
+            ),
             electrodes=tuple(
                 Electrode(e["name"], _read_surface(e["surface"])) for e in data["electrodes"]
             ),
