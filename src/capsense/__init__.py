@@ -43,17 +43,18 @@ if TYPE_CHECKING:
     from capsense.recording.recorder import Recorder, record
     from capsense.recording.replay import replay
     from capsense.scenario import Scenario, load_scenario
-    from capsense.scene.body import Body
     from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
-    from capsense.scene.deformable import DeformableSurface
-    from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
-    from capsense.scene.layers import Layers
+    from capsense.scene.depth import (
+        DepthFrame,
+        decode_permittivity,
+        encode_permittivity,
+        point_surface,
+    )
+    from capsense.scene.layers import Layers, render_depth
     from capsense.scene.materials import MATERIALS, Material
-    from capsense.scene.mesh_shape import TriMesh
-    from capsense.scene.point_surface import point_surface
+    from capsense.scene.mesh_shape import DeformableSurface, TriMesh
     from capsense.scene.pose import Pose
-    from capsense.scene.raster import render_depth
-    from capsense.scene.scene import Scene
+    from capsense.scene.scene import Body, Scene
     from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
     from capsense.server.client import Client
     from capsense.simulator import Simulator

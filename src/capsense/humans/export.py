@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from capsense.humans.limb import Limb, LimbPart, Segment
 from capsense.scene import Material, Pose, material
-from capsense.scene.body import Grounding, checked_grounding
+from capsense.scene.scene import Grounding, checked_grounding
 
 _BETWEEN_MASS = 1e-3
 """Mass [kg] of the shapeless links between the hinges of one joint in a URDF."""

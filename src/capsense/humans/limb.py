@@ -19,8 +19,8 @@ from capsense._validate import suggest
 from capsense.errors import SceneError
 from capsense.humans.anthropometry import Build
 from capsense.scene import Body, Capsule, Material, Pose
-from capsense.scene.body import Grounding, checked_grounding
 from capsense.scene.pose import Vec3
+from capsense.scene.scene import Grounding, checked_grounding
 
 Side = Literal["left", "right"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._style import COLOURS
-from capsense.scenario.channels import Channel
+from capsense.scenario.model import Channel
 
 MAX_LINES = 8
 """So many channels are drawn in a chart, the strongest."""

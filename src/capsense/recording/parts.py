@@ -24,7 +24,7 @@ from capsense.scene import (
     SurfaceMesh,
     TriMesh,
 )
-from capsense.scene.dispersion import ColeCole
+from capsense.scene.materials import ColeCole
 
 Fields = dict[str, Any]
 

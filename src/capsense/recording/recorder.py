@@ -23,8 +23,7 @@ from capsense.recording.mcap_file import McapFile
 from capsense.recording.messages import require
 from capsense.recording.session import DESIGN, NAME, SESSION, Session, describe
 from capsense.recording.steps import Moment, StepMessages
-from capsense.scenario.channels import Excitation
-from capsense.scenario.model import Scenario
+from capsense.scenario.model import Excitation, Scenario
 from capsense.scene import DepthFrame, Scene
 from capsense.simulator import Simulator
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from capsense.design.model import Design
 from capsense.recording.messages import PACKAGE, Messages
 from capsense.scene import Box, Capsule, Cylinder, DepthFrame, Ellipsoid, Pose, Shape, Sphere
-from capsense.scene.body import Body
+from capsense.scene.scene import Body
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float, float]

@@ -19,8 +19,7 @@ from capsense.reading import Reading, StepStats
 from capsense.readout.config import parse_readout
 from capsense.readout.readout import Readout
 from capsense.recording.versions import versions
-from capsense.scenario.channels import Channel, Excitation, channels_of
-from capsense.scenario.model import FORMER_METHODS, METHODS
+from capsense.scenario.model import FORMER_METHODS, METHODS, Channel, Excitation, channels_of
 from capsense.simulator import Method, PresetName, Simulator
 
 Array = NDArray[np.float64]

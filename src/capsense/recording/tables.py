@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.readout.counts import Counts
-from capsense.scenario.channels import Channel
+from capsense.scenario.model import Channel
 
 Array = NDArray[np.float64]
 

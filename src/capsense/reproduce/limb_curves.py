@@ -17,7 +17,7 @@ import capsense as cs
 from capsense.design.loader import parse_design
 from capsense.field.background import BuildSettings
 from capsense.reproduce.store import Store
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 
 if TYPE_CHECKING:
     from capsense.design.model import Design

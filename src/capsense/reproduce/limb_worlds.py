@@ -15,7 +15,7 @@ from capsense.adapters.attached import AttachedSensor
 from capsense.humans.export import mjcf_body
 from capsense.reproduce.limb_rides import Course
 from capsense.scene import Pose
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 
 View = Literal["geometry", "depth_camera"]
 

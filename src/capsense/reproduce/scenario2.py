@@ -25,7 +25,7 @@ from capsense.reproduce.metrics import cross_correlation, raw_correlation
 from capsense.reproduce.paper import correlations
 from capsense.reproduce.store import Store
 from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 from capsense.simulator import Method
 
 if TYPE_CHECKING:

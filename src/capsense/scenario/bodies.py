@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from capsense import _validate
 from capsense._validate import MAX_LENGTH, UNITS
 from capsense.errors import ScenarioError
-from capsense.scenario.model import MovingBody
-from capsense.scenario.schema import ScenarioTable
-from capsense.scenario.trajectory import Trajectory
+from capsense.scenario.model import MovingBody, Trajectory
 from capsense.scene import (
     Body,
     Box,
@@ -25,7 +24,14 @@ from capsense.scene import (
     Sphere,
     TriMesh,
 )
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
+
+
+class ScenarioTable(_validate.Table):
+    """One table of a scenario file; whatever is wrong raises :class:`ScenarioError`."""
+
+    error_type = ScenarioError
+
 
 SHAPE_KEYS = {
     "box": ("size",),

@@ -13,7 +13,7 @@ from capsense.adapters.attached import AttachedSensor, GeometrySensor
 from capsense.adapters.world import Solid
 from capsense.errors import SceneError
 from capsense.reading import Reading
-from capsense.scenario.channels import Excitation, channels_of
+from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import DepthFrame, Pose, Shape
 from capsense.viewer.follower import Follower
 from capsense.viewer.source import Frame, green_of

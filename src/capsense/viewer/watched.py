@@ -14,7 +14,7 @@ from capsense.errors import ProtocolError, ServerError
 from capsense.reading import Reading, StepStats
 from capsense.recording.design_json import design_from_json
 from capsense.recording.session import reading_of
-from capsense.scenario.channels import Excitation, channels_of
+from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import Body, DepthFrame, Scene
 from capsense.server.client import Client
 from capsense.server.frames import DepthMessage, ReadingMessage

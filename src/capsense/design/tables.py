@@ -1,4 +1,4 @@
-"""Where a shape sits: from the local frame of a shape to the sensor frame."""
+"""Tables of a design file: strict reading, relative permittivities of layers, placement."""
 
 from __future__ import annotations
 
@@ -12,8 +12,35 @@ from numpy.typing import NDArray
 from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
+from capsense import _validate
 from capsense.design.geometry import Facet, Surface, boundary_segments
-from capsense.design.schema import DesignTable
+from capsense.errors import DesignError
+
+
+class DesignTable(_validate.Table):
+    """One table of a design file; whatever is wrong raises :class:`DesignError`."""
+
+    error_type = DesignError
+
+
+LAYER_EPS_R: dict[str, float] = {
+    "abs": 3.0,
+    "acrylic": 3.0,
+    "air": 1.0,
+    "alumina": 9.8,
+    "borosilicate glass": 4.6,
+    "fr4": 4.5,
+    "pet": 3.2,
+    "petg": 3.0,
+    "pla": 3.0,
+    "polycarbonate": 2.9,
+    "polyimide": 3.4,
+    "ptfe": 2.1,
+    "silicone": 3.2,
+    "soda-lime glass": 7.0,
+}
+"""Relative permittivity by material name (lower case)."""
+
 
 Array = NDArray[np.float64]
 

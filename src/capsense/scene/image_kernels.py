@@ -1,9 +1,4 @@
-"""Compiled orthographic rasteriser that keeps every surface a pixel's ray meets.
-
-Rays run along z through pixel centres, which lie at whole numbers of (u, v). A pixel belongs to a
-triangle by half-open spans whose ends are computed per edge, so that triangles that share an edge
-leave neither gaps nor overlaps: a closed surface is met an even number of times everywhere.
-"""
+"""Compiled loops over pixels: layers, groups of pixels, triangles drawn into images."""
 
 from __future__ import annotations
 
@@ -16,6 +11,132 @@ from capsense._jit import compiled
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
+
+
+@compiled
+def sort_slots(front: Array, back: Array, f: Array32, b: Array32, reach: Array) -> int:
+    """Sort the intervals of every pixel, drop what is none, unite what overlaps.
+
+    Args:
+        front, back: Shape (layers, rows, columns) [m]; no interval where not front < back.
+        f, b: Receive the intervals in order of depth, then NaN, shape (layers, rows, columns).
+        reach: Receives first and one behind the last column and row that are hit, and the nearest
+            and farthest depth [m], as rows (column, row, depth), shape (2, 3).
+
+    Returns:
+        The largest number of intervals at a pixel.
+    """
+    layers, rows, columns = front.shape
+    most = 0
+    reach[0], reach[1] = math.inf, -math.inf
+    for j in range(rows):
+        for i in range(columns):
+            n = 0
+            for k in range(layers):
+                low, high = np.float32(front[k, j, i]), np.float32(back[k, j, i])
+                if not (low < high and high - low < math.inf):
+                    continue
+                at = n
+                while at > 0 and f[at - 1, j, i] > low:
+                    f[at, j, i], b[at, j, i] = f[at - 1, j, i], b[at - 1, j, i]
+                    at -= 1
+                f[at, j, i], b[at, j, i] = low, high
+                n += 1
+            last = 0
+            for k in range(1, n):
+                if f[k, j, i] <= b[last, j, i]:
+                    b[last, j, i] = max(b[last, j, i], b[k, j, i])
+                else:
+                    last += 1
+                    f[last, j, i], b[last, j, i] = f[k, j, i], b[k, j, i]
+            if n > 0:
+                n = last + 1
+                most = max(most, n)
+                reach[0, 0], reach[1, 0] = min(reach[0, 0], i), max(reach[1, 0], i + 1)
+                reach[0, 1], reach[1, 1] = min(reach[0, 1], j), max(reach[1, 1], j + 1)
+                reach[0, 2] = min(reach[0, 2], f[0, j, i])
+                reach[1, 2] = max(reach[1, 2], b[n - 1, j, i])
+            f[n:, j, i] = math.nan
+            b[n:, j, i] = math.nan
+    return most
+
+
+MAX_GROUPS = 64
+"""Different permittivities that one frame may hold."""
+
+
+@compiled
+def sort_pixels(depth: Array, eps_r: Array, near: float, far: float, conductor: float,
+                group: NDArray[np.int8], known: Array) -> int:  # fmt: skip
+    """Number the materials of a frame in order of appearance.
+
+    Args:
+        depth: Depths [m], shape (layers, rows, columns).
+        eps_r: Relative permittivities, every axis of that length or of length one.
+        near, far: Depths up to and from which nothing is seen [m].
+        conductor: Permittivity from which matter conducts; all of it counts as infinite.
+        group: Receives the number of every pixel's material, −1 for air.
+        known: Receives the permittivities, shape (MAX_GROUPS,).
+
+    Returns:
+        The number of materials; −1 if there are too many, −2 − p if that of flat pixel p is
+        neither zero (air) nor at least one.
+    """
+    layers, rows, columns = depth.shape
+    sk = 1 if eps_r.shape[0] > 1 else 0
+    sj = 1 if eps_r.shape[1] > 1 else 0
+    si = 1 if eps_r.shape[2] > 1 else 0
+    n, last = 0, -1
+    for k in range(layers):
+        for j in range(rows):
+            for i in range(columns):
+                group[k, j, i] = -1
+                d = depth[k, j, i]
+                if not (d > 0.0 and d > near and d < far):
+                    continue
+                e = eps_r[k * sk, j * sj, i * si]
+                if e == 0.0 or e == 1.0:
+                    continue
+                if not e > 1.0:
+                    return -2 - ((k * rows + j) * columns + i)
+                if e >= conductor:
+                    e = math.inf
+                if last < 0 or known[last] != e:
+                    last = 0
+                    while last < n and known[last] != e:
+                        last += 1
+                    if last == n:
+                        if n == known.shape[0]:
+                            return -1
+                        known[n] = e
+                        n += 1
+                group[k, j, i] = last
+    return n
+
+
+@compiled
+def pick(front: Array, back: Array, group: NDArray[np.int8], which: int, flip_rows: bool,
+         flip_columns: bool, f: Array, b: Array) -> bool:  # fmt: skip
+    """Copy the intervals of one material, the others as NaN, and turn the image upright.
+
+    Returns:
+        Whether there is any.
+    """
+    layers, rows, columns = front.shape
+    found = False
+    for k in range(layers):
+        for j in range(rows):
+            row = rows - 1 - j if flip_rows else j
+            for i in range(columns):
+                column = columns - 1 - i if flip_columns else i
+                if group[k, j, i] == which and front[k, j, i] < back[k, j, i]:
+                    found = True
+                    f[k, row, column], b[k, row, column] = front[k, j, i], back[k, j, i]
+                else:
+                    f[k, row, column] = b[k, row, column] = math.nan
+    return found
+
+
 Ints = NDArray[np.int64]
 
 LEAST_COSINE = 0.2
