@@ -33,15 +33,15 @@ if TYPE_CHECKING:
         SolveError,
     )
     from capsense.fleet.fleet import Fleet, FleetReading
+    from capsense.plotting.runs import plot
     from capsense.reading import Reading, StepStats
     from capsense.readout.calibration import calibrate
     from capsense.readout.chips import available_chips
     from capsense.readout.config import load_readout
     from capsense.readout.counts import Counts
     from capsense.readout.readout import Readout
-    from capsense.recording.reader import open_recording
+    from capsense.recording.reader import open_recording, replay
     from capsense.recording.recorder import Recorder, record
-    from capsense.recording.replay import replay
     from capsense.scenario import Scenario, load_scenario
     from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
     from capsense.scene.depth import (
@@ -72,8 +72,8 @@ __all__ = [
     "Simulator", "Skin", "SkinError", "SolveError", "Sphere", "StepStats", "TriMesh",
     "__version__", "assistive_gym", "available_chips", "available_designs", "calibrate",
     "coppeliasim", "decode_permittivity", "encode_permittivity", "humans", "load_design",
-    "load_readout", "load_scenario", "mujoco", "open_recording", "point_surface", "pybullet",
-    "record", "render_depth", "replay", "show",
+    "load_readout", "load_scenario", "mujoco", "open_recording", "plot", "point_surface",
+    "pybullet", "record", "render_depth", "replay", "show",
 ]  # fmt: skip
 
 ensure_place(Path(__file__).parent)

@@ -17,7 +17,6 @@ from tiny_field import SETTINGS, tiny_design
 import capsense as cs
 from capsense.errors import RecordingError
 from capsense.recording.design_json import design_from_json, design_to_json
-from capsense.recording.messages import PACKAGE, Messages
 from capsense.recording.parts import (
     body_fields,
     read_body,
@@ -25,6 +24,7 @@ from capsense.recording.parts import (
     read_shape,
     shape_fields,
 )
+from capsense.recording.ros import PACKAGE, Messages
 from capsense.recording.session import describe
 from capsense.recording.steps import StepMessages
 from capsense.scene import RestSurface, SurfaceMesh

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import ScenarioError
+from capsense.recording.session import versions
 from capsense.recording.tables import column_meanings, csv_row, reading_arrays, replacing
-from capsense.recording.versions import versions
 from capsense.scenario import Channel, Sample, Scenario
 
 if TYPE_CHECKING:

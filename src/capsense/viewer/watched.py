@@ -23,7 +23,7 @@ from capsense.simulator import Simulator
 from capsense.viewer.source import Frame, green_of
 
 if TYPE_CHECKING:
-    from capsense.viewer.plane import Plane
+    from capsense.viewer.charts import Plane
 
 Array = NDArray[np.float64]
 Address = tuple[int, int]

@@ -12,23 +12,24 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from capsense._style import FAINT, INK, LABELS, LEGEND, TIME_COLOURS, TITLES, bare
-from capsense.cli.recorder import RunWriter
 from capsense.design import Design
-from capsense.design.draw import LAYER_COLOUR, ROLE_COLOURS, outline_patch, outlines
+from capsense.plotting.designs import LAYER_COLOUR, ROLE_COLOURS, outline_patch, outlines
 from capsense.scene import Body
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from capsense.plotting.runs import Run
+
 Array = NDArray[np.float64]
 
 
-def draw_views(recorder: RunWriter, peak: int, colours: list[str], above: Axes, side: Axes) -> None:
+def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes) -> None:
     """Draw sensor, domain, bodies and their ways, in millimetres and to one scale.
 
     Parameters
     ----------
-    recorder
+    run
         A run of at least one sample.
     peak
         The sample at which bodies are drawn solid; they are dashed at the first one.
@@ -37,21 +38,21 @@ def draw_views(recorder: RunWriter, peak: int, colours: list[str], above: Axes, 
     above, side
         Square axes for the view along −z, and for that along y or x, whichever shows more.
     """
-    lower, upper = _window(recorder, peak)
-    across = _side_axis(recorder.positions)
+    lower, upper = _window(run, peak)
+    across = _side_axis(run.positions)
     span = 1.12 * float((upper - lower).max())
     middle = (lower + upper) / 2
     floor = lower[2] - 0.04 * span
     corners = {0: middle[0] - span / 2, 1: middle[1] - span / 2, 2: floor}
-    name = recorder.scenario.design.name
+    name = run.design.name
     views = ((above, (0, 1), f"{name}, from above"), (side, (across, 2), "from the side"))
     for axes, (a, b), title in views:
-        _draw_domain(recorder.scenario.design, axes, a, b)
+        _draw_domain(run.design, axes, a, b)
         if b == 1:
-            _sensor_from_above(recorder.scenario.design, colours, axes)
+            _sensor_from_above(run.design, colours, axes)
         else:
-            _sensor_from_the_side(recorder.scenario.design, colours, axes, a)
-        _draw_bodies(recorder, peak, axes, [a, b], (corners[a], corners[a] + span))
+            _sensor_from_the_side(run.design, colours, axes, a)
+        _draw_bodies(run, peak, axes, [a, b], (corners[a], corners[a] + span))
         axes.set_xlim(corners[a], corners[a] + span)
         axes.set_ylim(corners[b], corners[b] + span)
         axes.set_aspect("equal")
@@ -60,7 +61,7 @@ def draw_views(recorder: RunWriter, peak: int, colours: list[str], above: Axes, 
         axes.set_xlabel(f"{'xyz'[a]} [mm]", **LABELS)
         axes.set_ylabel(f"{'xyz'[b]} [mm]", **LABELS)
         axes.set_title(title, **TITLES)
-    if recorder.scenario.bodies and len(recorder.times) > 1:
+    if run.positions.shape[1] and len(run.times) > 1:
         handles = [Line2D([], [], ls="-", color=INK, lw=0.9, label="body at the largest change")]
         if peak:
             style: dict[str, Any] = {"marker": "o", "ls": "--", "color": INK, "mfc": "white"}
@@ -68,17 +69,15 @@ def draw_views(recorder: RunWriter, peak: int, colours: list[str], above: Axes, 
         above.figure.legend(handles=handles, loc="outside lower right", ncols=2, **LEGEND)
 
 
-def _window(recorder: RunWriter, peak: int) -> tuple[Array, Array]:
+def _window(run: Run, peak: int) -> tuple[Array, Array]:
     """Corners [mm] of what there is to see: sensor, bodies and ways inside the domain."""
-    design = recorder.scenario.design
+    design = run.design
     points = [e.surface.bounds for e in design.electrodes]
     points += [c.surface.bounds for c in design.conductors]
     points += [np.array([k.lower, k.upper]) for k in design.layers]
-    points += list(recorder.positions)
-    for moving in recorder.scenario.bodies:
-        for k in (0, peak):
-            body = moving.at(float(recorder.times[k]))
-            points.append(body.pose.apply(body.shape.to_trimesh().vertices))
+    points += [run.positions[~np.isnan(run.positions).any(axis=2)]]
+    for k in (0, peak):
+        points += [_corners(body) for body in run.scene(k)]
     cloud = np.clip(np.concatenate(points), design.domain.lower, design.domain.upper) * 1e3
     return cloud.min(axis=0), cloud.max(axis=0)
 
@@ -87,7 +86,7 @@ def _side_axis(positions: Array) -> int:
     """The horizontal axis along which the bodies move most."""
     if positions.shape[1] == 0:
         return 0
-    extent = np.ptp(positions, axis=0).max(axis=0)
+    extent = (np.nanmax(positions, axis=0) - np.nanmin(positions, axis=0)).max(axis=0)
     return 1 if extent[1] > extent[0] else 0
 
 
@@ -98,28 +97,25 @@ def _draw_domain(design: Design, axes: Axes, a: int, b: int) -> None:
 
 
 def _draw_bodies(
-    recorder: RunWriter, peak: int, axes: Axes, plane: list[int], shown: tuple[float, float]
+    run: Run, peak: int, axes: Axes, plane: list[int], shown: tuple[float, float]
 ) -> None:
-    for number, moving in enumerate(recorder.scenario.bodies):
-        track = recorder.positions[:, number][:, plane] * 1e3
-        start = [(0, "--", 0.0)] if peak else []
-        for k, dash, fill in (*start, (peak, "-", 0.12)):
-            shape = _silhouette(moving.at(float(recorder.times[k])), plane)
-            axes.add_patch(outline_patch(shape, fc=to_rgba(INK, fill), ec=INK, lw=0.9, ls=dash))
-        if np.ptp(track, axis=0).max(initial=0.0) > 0.01:
-            _draw_way(axes, track, recorder.times)
-        left, _, right, top = shape.bounds
+    """Bodies at the peak, dashed where they stood at the start, and their ways."""
+    for body in run.scene(0) if peak else ():
+        outline = _silhouette(body, plane)
+        axes.add_patch(outline_patch(outline, fc=to_rgba(INK, 0.0), ec=INK, lw=0.9, ls="--"))
+    for body in run.scene(peak):
+        outline = _silhouette(body, plane)
+        axes.add_patch(outline_patch(outline, fc=to_rgba(INK, 0.12), ec=INK, lw=0.9))
+        left, _, right, top = outline.bounds
         axes.annotate(
-            str(moving.body.name),
-            (float(np.clip((left + right) / 2, *shown)), top),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-            color=INK,
-            zorder=6,
+            body.name or "", (float(np.clip((left + right) / 2, *shown)), top), xytext=(0, 3),
+            textcoords="offset points", ha="center", fontsize=8, color=INK, zorder=6,
             annotation_clip=True,
-        )
+        )  # fmt: skip
+    for track in np.moveaxis(run.positions[:, :, plane] * 1e3, 1, 0):
+        here = ~np.isnan(track).any(axis=1)
+        if np.ptp(track[here], axis=0).max(initial=0.0) > 0.01:
+            _draw_way(axes, track[here], run.times[here])
 
 
 def _sensor_from_above(design: Design, colours: list[str], axes: Axes) -> None:
@@ -148,10 +144,14 @@ def _sensor_from_the_side(design: Design, colours: list[str], axes: Axes, axis: 
         axes.plot(*ends, color=colour, lw=width, solid_capstyle="butt", zorder=2)
 
 
+def _corners(body: Body) -> Array:
+    """Points on a body [m], shape (n, 3)."""
+    return body.pose.apply(body.shape.to_trimesh().vertices)
+
+
 def _silhouette(body: Body, plane: list[int]) -> Any:
     """Convex outline [mm] of a body seen along the third axis."""
-    points = body.pose.apply(body.shape.to_trimesh().vertices)[:, plane] * 1e3
-    return shapely.MultiPoint(points).convex_hull
+    return shapely.MultiPoint(_corners(body)[:, plane] * 1e3).convex_hull
 
 
 def _draw_way(axes: Axes, track: Array, times: Array) -> None:
