@@ -49,7 +49,6 @@ class _Family:
     """Signals that share a pair of axes."""
 
     title: str
-    symbol: str
     labels: list[str]
     styles: list[tuple[str, Any]]
     values: Array
@@ -190,7 +189,6 @@ def _families(run: Run) -> list[_Family]:
         out.append(
             _Family(
                 "diagonal of the matrix" if matrix else "self capacitance",
-                "C",
                 [channels[k].label for k in selves],
                 [style_of(channels[k].row) for k in selves],
                 run.values[:, selves],
@@ -207,7 +205,6 @@ def _families(run: Run) -> list[_Family]:
         out.append(
             _Family(
                 "mutual capacitance",
-                "C",
                 [c.label for c in shown],
                 _pair_styles(shown),
                 values[:, order],

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.codec import CHANGING, design_from_json, read_body, read_rest, read_shape
 from capsense.errors import RecordingError, SceneError
 from capsense.reading import Reading, StepStats
 from capsense.readout.counts import Counts
-from capsense.recording.design_json import design_from_json
-from capsense.recording.parts import CHANGING, read_body, read_rest, read_shape
 from capsense.recording.ros import PACKAGE, Messages, require
 from capsense.recording.session import (
     DESIGN,

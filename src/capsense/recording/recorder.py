@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from capsense.adapters.attached import AttachedSensor
+from capsense.codec import design_to_json
 from capsense.errors import ReadoutError, RecordingError
 from capsense.reading import Reading
 from capsense.readout.config import file_content, parse_readout
 from capsense.readout.readout import Readout
-from capsense.recording.design_json import design_to_json
 from capsense.recording.files import McapFile
 from capsense.recording.live import LiveTopics
 from capsense.recording.ros import require

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from websockets.exceptions import ConnectionClosed
 
+from capsense.codec import design_to_json
 from capsense.errors import CapSenseError, ProtocolError
-from capsense.recording.design_json import design_to_json
 from capsense.server import messages
 from capsense.server.frames import PROTOCOL, unpack_depth
 from capsense.server.options import POLICY, Allowance, ServerOptions

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.codec import design_from_json
 from capsense.errors import ProtocolError, ServerError
 from capsense.reading import Reading, StepStats
-from capsense.recording.design_json import design_from_json
 from capsense.recording.session import reading_of
 from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import Body, DepthFrame, Scene

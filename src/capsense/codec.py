@@ -1,13 +1,25 @@
-"""Shapes and bodies as fields of messages, and back to the last bit."""
+"""Shapes, bodies, materials and designs as plain data, and back to the last bit.
+
+Scenario files, control messages and recordings name shapes by :data:`SHAPES`. Recordings hold
+bodies as the fields of their messages, and a design as JSON: the geometry itself, and not the file
+it was read from, which may name STL files that change.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry import Polygon
 
+from capsense.design.model import Design
 from capsense.errors import RecordingError, SceneError
 from capsense.scene import (
     Body,
@@ -28,10 +40,25 @@ from capsense.scene.materials import ColeCole
 
 Fields = dict[str, Any]
 
+SHAPES: dict[str, type[Box | Sphere | Capsule | Cylinder | Ellipsoid]] = {
+    "box": Box,
+    "sphere": Sphere,
+    "capsule": Capsule,
+    "cylinder": Cylinder,
+    "ellipsoid": Ellipsoid,
+}
+"""Shapes that are a few lengths, by the names that files and messages have for them."""
 CHANGING = Layers | SurfaceMesh
 """Shapes that are new in every step, and large."""
 _OLD_LAYERS = 11
 """Numbers in the ``sizes`` of layered images as they were written once."""
+
+
+@cache
+def lengths_of(kind: str) -> dict[str, int]:
+    """Names of the lengths that a shape of :data:`SHAPES` has, each with how many it is."""
+    hints = get_type_hints(SHAPES[kind])
+    return {f.name: len(get_args(hints[f.name])) or 1 for f in fields(SHAPES[kind])}
 
 
 def shape_fields(shape: Shape | RestSurface, rest: int | None = None) -> Fields:
@@ -44,18 +71,10 @@ def shape_fields(shape: Shape | RestSurface, rest: int | None = None) -> Fields:
     Raises:
         RecordingError: A kind of shape that messages do not have.
     """
-    sizes: tuple[float, ...] = ()
+    sizes: Any = ()
     vertices, faces, values = np.empty(0), np.empty(0, np.uint32), np.empty(0, np.float32)
     kind = "rest" if isinstance(shape, RestSurface) else shape.kind.name.lower()
     match shape:
-        case Box(size):
-            sizes = size
-        case Sphere(radius):
-            sizes = (radius,)
-        case Capsule(radius, length) | Cylinder(radius, length):
-            sizes = (radius, length)
-        case Ellipsoid(radii):
-            sizes = radii
         case TriMesh() | RestSurface():
             sizes = (shape.thickness,) if isinstance(shape, RestSurface) else ()
             vertices, faces = shape.vertices.ravel(), shape.faces.ravel().astype(np.uint32)
@@ -64,6 +83,8 @@ def shape_fields(shape: Shape | RestSurface, rest: int | None = None) -> Fields:
         case Layers():
             sizes = (*shape.size, *shape.front.shape)
             values = np.concatenate([shape.front.ravel(), shape.back.ravel()])
+        case _ if type(shape) is SHAPES.get(kind):
+            sizes = np.hstack([getattr(shape, name) for name in lengths_of(kind)])
         case _:
             raise RecordingError(
                 f"shape {shape!r} cannot be recorded; use one of capsense, such as TriMesh"
@@ -85,16 +106,8 @@ def read_shape(message: Any, rests: Mapping[int, RestSurface] | None = None) -> 
     s = message.sizes.tolist()
     try:
         match message.kind:
-            case "box":
-                return Box(tuple(s))
-            case "sphere":
-                return Sphere(*s)
-            case "capsule":
-                return Capsule(*s)
-            case "cylinder":
-                return Cylinder(*s)
-            case "ellipsoid":
-                return Ellipsoid(tuple(s))
+            case kind if kind in SHAPES:
+                return SHAPES[kind](*((tuple(s),) if 3 in lengths_of(kind).values() else s))
             case "mesh":  # once, its size held the spacing of a grid
                 return TriMesh(*_triangles(message))
             case "surface":
@@ -184,3 +197,57 @@ def read_body(message: Any, shapes: Mapping[int, Shape]) -> Body:
         return Body(shapes[message.shape], Pose(), matter, grounding, message.name or None)
     except (SceneError, TypeError, ValueError) as error:
         raise RecordingError(f"body {message.id} is damaged: {error}") from None
+
+
+def design_to_json(design: Design) -> str:
+    """Write a design down. Python prints floats so that they are read back exactly."""
+    return json.dumps({**_plain(design), "content_hash": design.content_hash()})
+
+
+def design_from_json(text: str | bytes) -> Design:
+    """The design that was written down.
+
+    Raises:
+        RecordingError: The text is damaged.
+    """
+    try:
+        data = json.loads(text)
+        design: Design = _read(Design, data)
+        whole = design.content_hash() == data["content_hash"]
+    except (KeyError, TypeError, ValueError, RecursionError, shapely.errors.ShapelyError) as error:
+        raise RecordingError(f"the recorded design is damaged: {error!r}") from None
+    if not whole:
+        raise RecordingError("the recorded design is damaged: its content hash differs")
+    return design
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses, arrays and polygons as JSON has them; a polygon is its ``rings``."""
+    if is_dataclass(value):
+        named = {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+        return {("rings" if key == "polygon" else key): item for key, item in named.items()}
+    if isinstance(value, Polygon):
+        rings = (value.exterior, *value.interiors)
+        return [shapely.get_coordinates(ring).tolist() for ring in rings]
+    if isinstance(value, np.ndarray | Enum):
+        return value.tolist() if isinstance(value, np.ndarray) else value.value
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return dict(value) if isinstance(value, Mapping) else value
+
+
+def _read(kind: Any, data: Any) -> Any:
+    """What :func:`_plain` made of an object of a type."""
+    if isinstance(kind, type) and is_dataclass(kind):
+        types = get_type_hints(kind)
+        keys = {name: "rings" if name == "polygon" else name for name in types}
+        return kind(**{name: _read(types[name], data[key]) for name, key in keys.items()})
+    if kind is Polygon:
+        return Polygon(data[0], data[1:])
+    if get_origin(kind) is tuple:
+        of = get_args(kind)[0]
+        return tuple(_read(of, item) for item in data)
+    if get_origin(kind) is np.ndarray:
+        array = np.array(data)
+        return array if array.size else array.reshape(-1, 2, 3)  # a surface without rims
+    return kind(data) if isinstance(kind, type) and issubclass(kind, Enum) else data
