@@ -167,14 +167,12 @@ def play_samples(
 
 
 def _write(recorder: RunWriter, summary: dict[str, Any]) -> None:
-    from capsense.plotting.runs import plot_run, run_of_scenario
+    from capsense.plotting.runs import plot_run
 
     recorder.write_arrays()
     recorder.write_summary(summary)
     if recorder.count:
-        r = recorder
-        run = run_of_scenario(r.scenario, r.times, r.values, r.levels, r.positions)
-        plot_run(run).savefig(r.folder / "plot.png", dpi=150)
+        plot_run(recorder.run).savefig(recorder.folder / "plot.png", dpi=150)
 
 
 def _run_report(summary: dict[str, Any], folder: Path) -> str:

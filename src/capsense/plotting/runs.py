@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -27,8 +27,10 @@ from capsense.errors import CapSenseError
 from capsense.plotting.designs import draw_design
 from capsense.plotting.views import draw_views
 from capsense.reading import Reading
+from capsense.recording.export import run_of
 from capsense.recording.reader import Recording
-from capsense.scenario import Channel, Excitation, Scenario
+from capsense.recording.tables import Run
+from capsense.scenario import Channel, Excitation
 from capsense.scenario.model import channels_of
 from capsense.scene import Scene
 
@@ -55,43 +57,6 @@ class _Family:
     """Capacitance [F], shape (n, k)."""
     levels: Array
     """The same with nothing in front of the sensor [F], shape (k,)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """What a picture of a run shows: n samples, at least one, of K channels and B bodies."""
-
-    title: str
-    design: Design
-    channels: tuple[Channel, ...]
-    times: Array
-    """[s], shape (n,)."""
-    values: Array
-    """Capacitance of each channel [F], shape (n, K)."""
-    levels: Array
-    """The same with nothing in front of the sensor [F], shape (K,)."""
-    positions: Array
-    """Origins of the bodies [m], shape (n, B, 3); NaN where one is absent."""
-    scene: Callable[[int], Scene]
-    """The bodies as they stood at a sample."""
-
-    @classmethod
-    def of(
-        cls, title: str, design: Design, channels: tuple[Channel, ...], empty: Reading,
-        times: Sequence[float], readings: Sequence[Reading], scenes: Sequence[Scene],
-    ) -> Run:  # fmt: skip
-        """The run of readings and the scenes they were taken of; bodies are told by name."""
-        found = [{b.name or str(k): b.pose.position for k, b in enumerate(s)} for s in scenes]
-        names = list(dict.fromkeys(name for bodies in found for name in bodies))
-        absent = (np.nan,) * 3
-        positions = [[bodies.get(name, absent) for name in names] for bodies in found]
-        return cls(
-            title, design, channels, np.array(times, dtype=float),
-            np.array([[c.read(r) for c in channels] for r in readings]),
-            np.array([c.read(empty) for c in channels]),
-            np.reshape(np.array(positions, dtype=float), (len(scenes), len(names), 3)),
-            lambda k: scenes[k],
-        )  # fmt: skip
 
 
 def plot(
@@ -122,13 +87,7 @@ def plot(
     if isinstance(what, Design):
         return cast(Figure, draw_design(what).figure)
     if isinstance(what, Recording):
-        s = what.session
-        steps = list(what.steps())
-        name = s.title or s.name
-        run = Run.of(
-            name, s.design, s.channels, s.empty, [step.clock for step in steps],
-            [step.reading for step in steps], [step.scene for step in steps],
-        )  # fmt: skip
+        run = run_of(what, list(what.steps()))
     else:
         if simulator is None:
             raise CapSenseError("readings are drawn with their simulator; give plot(readings, sim)")
@@ -141,20 +100,13 @@ def plot(
                 "many of each"
             )
         channels = channels_of(Excitation(excitation), design.electrode_names)
-        run = Run.of(design.name, design, channels, simulator.empty, moments.tolist(), what, seen)
-    if not len(run.times):
+        run = Run(
+            design.name, design, channels, simulator.empty, (), moments.tolist(), list(what),
+            list(seen),
+        )  # fmt: skip
+    if not run.times:
         raise CapSenseError("there is no reading to draw; take a step first")
     return plot_run(run)
-
-
-def run_of_scenario(
-    scenario: Scenario, times: Array, values: Array, levels: Array, positions: Array
-) -> Run:
-    """The run of a scenario, of which only channels and positions were kept."""
-    return Run(
-        scenario.name, scenario.design, scenario.channels, times, values, levels, positions,
-        lambda k: scenario.scene_at(float(times[k])),
-    )  # fmt: skip
 
 
 def plot_run(run: Run) -> Figure:
@@ -169,7 +121,7 @@ def plot_run(run: Run) -> Figure:
         upper = figure.add_subplot(grid[0, column], sharex=shared)
         shared = shared or upper
         lower = figure.add_subplot(grid[1, column], sharex=shared)
-        _draw_family(family, run.times, peak, upper, lower)
+        _draw_family(family, np.array(run.times), peak, upper, lower)
     colours = [style_of(k)[0] for k in range(len(run.design.electrodes))]
     if run.channels[0].excitation is Excitation.MUTUAL:
         colours = [PLAIN_ELECTRODE] * len(colours)

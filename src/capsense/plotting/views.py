@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,12 +15,12 @@ from numpy.typing import NDArray
 from capsense._style import FAINT, INK, LABELS, LEGEND, TIME_COLOURS, TITLES, bare
 from capsense.design import Design
 from capsense.plotting.designs import LAYER_COLOUR, ROLE_COLOURS, outline_patch, outlines
-from capsense.scene import Body
+from capsense.scene import Body, Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from capsense.plotting.runs import Run
+    from capsense.recording.tables import Run
 
 Array = NDArray[np.float64]
 
@@ -38,8 +39,9 @@ def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes)
     above, side
         Square axes for the view along −z, and for that along y or x, whichever shows more.
     """
-    lower, upper = _window(run, peak)
-    across = _side_axis(run.positions)
+    _, positions, _ = run.poses()
+    lower, upper = _window(run, positions, peak)
+    across = _side_axis(positions)
     span = 1.12 * float((upper - lower).max())
     middle = (lower + upper) / 2
     floor = lower[2] - 0.04 * span
@@ -52,7 +54,11 @@ def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes)
             _sensor_from_above(run.design, colours, axes)
         else:
             _sensor_from_the_side(run.design, colours, axes, a)
-        _draw_bodies(run, peak, axes, [a, b], (corners[a], corners[a] + span))
+        _draw_bodies(run.scenes, peak, axes, [a, b], (corners[a], corners[a] + span))
+        for track in np.moveaxis(positions[:, :, [a, b]] * 1e3, 1, 0):
+            here = ~np.isnan(track).any(axis=1)
+            if np.ptp(track[here], axis=0).max(initial=0.0) > 0.01:
+                _draw_way(axes, track[here], np.array(run.times)[here])
         axes.set_xlim(corners[a], corners[a] + span)
         axes.set_ylim(corners[b], corners[b] + span)
         axes.set_aspect("equal")
@@ -61,7 +67,7 @@ def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes)
         axes.set_xlabel(f"{'xyz'[a]} [mm]", **LABELS)
         axes.set_ylabel(f"{'xyz'[b]} [mm]", **LABELS)
         axes.set_title(title, **TITLES)
-    if run.positions.shape[1] and len(run.times) > 1:
+    if positions.shape[1] and len(run.times) > 1:
         handles = [Line2D([], [], ls="-", color=INK, lw=0.9, label="body at the largest change")]
         if peak:
             style: dict[str, Any] = {"marker": "o", "ls": "--", "color": INK, "mfc": "white"}
@@ -69,15 +75,15 @@ def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes)
         above.figure.legend(handles=handles, loc="outside lower right", ncols=2, **LEGEND)
 
 
-def _window(run: Run, peak: int) -> tuple[Array, Array]:
+def _window(run: Run, positions: Array, peak: int) -> tuple[Array, Array]:
     """Corners [mm] of what there is to see: sensor, bodies and ways inside the domain."""
     design = run.design
     points = [e.surface.bounds for e in design.electrodes]
     points += [c.surface.bounds for c in design.conductors]
     points += [np.array([k.lower, k.upper]) for k in design.layers]
-    points += [run.positions[~np.isnan(run.positions).any(axis=2)]]
+    points += [positions[~np.isnan(positions).any(axis=2)]]
     for k in (0, peak):
-        points += [_corners(body) for body in run.scene(k)]
+        points += [_corners(body) for body in run.scenes[k]]
     cloud = np.clip(np.concatenate(points), design.domain.lower, design.domain.upper) * 1e3
     return cloud.min(axis=0), cloud.max(axis=0)
 
@@ -97,13 +103,13 @@ def _draw_domain(design: Design, axes: Axes, a: int, b: int) -> None:
 
 
 def _draw_bodies(
-    run: Run, peak: int, axes: Axes, plane: list[int], shown: tuple[float, float]
+    scenes: Sequence[Scene], peak: int, axes: Axes, plane: list[int], shown: tuple[float, float]
 ) -> None:
-    """Bodies at the peak, dashed where they stood at the start, and their ways."""
-    for body in run.scene(0) if peak else ():
+    """Bodies at the peak, dashed where they stood at the start."""
+    for body in scenes[0] if peak else ():
         outline = _silhouette(body, plane)
         axes.add_patch(outline_patch(outline, fc=to_rgba(INK, 0.0), ec=INK, lw=0.9, ls="--"))
-    for body in run.scene(peak):
+    for body in scenes[peak]:
         outline = _silhouette(body, plane)
         axes.add_patch(outline_patch(outline, fc=to_rgba(INK, 0.12), ec=INK, lw=0.9))
         left, _, right, top = outline.bounds
@@ -112,10 +118,6 @@ def _draw_bodies(
             textcoords="offset points", ha="center", fontsize=8, color=INK, zorder=6,
             annotation_clip=True,
         )  # fmt: skip
-    for track in np.moveaxis(run.positions[:, :, plane] * 1e3, 1, 0):
-        here = ~np.isnan(track).any(axis=1)
-        if np.ptp(track[here], axis=0).max(initial=0.0) > 0.01:
-            _draw_way(axes, track[here], run.times[here])
 
 
 def _sensor_from_above(design: Design, colours: list[str], axes: Axes) -> None:

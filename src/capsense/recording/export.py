@@ -18,9 +18,9 @@ from capsense.readout.counts import Counts, join
 from capsense.recording.reader import Recording, Step
 from capsense.recording.session import Session
 from capsense.recording.tables import (
+    Run,
     column_meanings,
     csv_row,
-    reading_arrays,
     replacing,
     write_counts,
 )
@@ -190,31 +190,20 @@ def _parquet(recording: Recording, path: Path) -> int:
     return n
 
 
+def run_of(recording: Recording, steps: list[Step]) -> Run:
+    """Steps of a recording as a run, by the recording's clock."""
+    s = recording.session
+    return Run(
+        s.title or s.name, s.design, s.channels, s.empty, (), [k.clock for k in steps],
+        [k.reading for k in steps], [k.scene for k in steps],
+    )  # fmt: skip
+
+
 def _npz(recording: Recording, path: Path) -> int:
-    session = recording.session
     steps = list(recording.steps())
     if not steps:
         raise RecordingError(f"{recording.path} holds no steps; there is nothing to export")
-    names = _body_names(steps)
-    positions = np.full((len(steps), len(names), 3), np.nan)
-    quaternions = np.full((len(steps), len(names), 4), np.nan)
-    for k, step in enumerate(steps):
-        for i, body in enumerate(step.scene):
-            b = names[body.name or f"body{i}"]
-            positions[k, b], quaternions[k, b] = body.pose.position, body.pose.quaternion
-    stats = [s.reading.stats for s in steps]
-    arrays = reading_arrays(
-        time=np.array([s.clock for s in steps]),
-        capacitance=np.array([s.reading.capacitance for s in steps]),
-        delta=np.array([s.reading.delta for s in steps]),
-        baseline=session.empty.capacitance,
-        self_capacitance=np.array([s.reading.self_capacitance for s in steps]),
-        self_baseline=session.empty.self_capacitance, electrodes=session.design.electrode_names,
-        channels=session.channels, values=np.array([_values(session, s) for s in steps]),
-        levels=_levels(session), bodies=list(names), positions=positions, quaternions=quaternions,
-        iterations=[s.iterations for s in stats],
-        error_estimate=[s.solver_error for s in stats], step_time=[s.wall_time for s in stats],
-    )  # fmt: skip
+    arrays = run_of(recording, steps).arrays()
     arrays["episode"] = np.array([s.episode for s in steps])
     counts = [c for c in (s.reading.counts for s in steps) if c is not None]
     if counts:
@@ -222,14 +211,6 @@ def _npz(recording: Recording, path: Path) -> int:
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     return len(steps)
-
-
-def _body_names(steps: list[Step]) -> dict[str, int]:
-    """Names of all bodies in the order of their appearance, numbered."""
-    found = dict.fromkeys(
-        body.name or f"body{i}" for step in steps for i, body in enumerate(step.scene)
-    )
-    return {name: k for k, name in enumerate(found)}
 
 
 def _all_counts(recording: Recording) -> Counts:
