@@ -25,7 +25,7 @@ from capsense.field.terminals import Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
-from capsense.scene.shape import as_points
+from capsense.scene.shapes import as_points
 
 if TYPE_CHECKING:
     from capsense.masked import MeshSensor

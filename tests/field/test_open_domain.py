@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import capsense as cs
+from capsense import codec
 from capsense.constants import EPS0
 from capsense.design.loader import parse_design
-from capsense.recording.design_json import design_from_json, design_to_json
 
 RADIUS = 0.010
 
@@ -67,7 +67,7 @@ def test_open_is_part_of_a_design(tmp_path):
     opened, closed = disc(open=True), disc()
     assert opened.content_hash() != closed.content_hash()
     assert disc(open=False).content_hash() == closed.content_hash()
-    back = design_from_json(design_to_json(opened))
+    back = codec.design_from_json(codec.design_to_json(opened))
     assert back.domain.open
     assert back.content_hash() == opened.content_hash()
 

@@ -10,15 +10,19 @@ from typing import Any
 import numpy as np
 
 from capsense._validate import nearest, read_toml, suggest
-from capsense.design.checks import check_design, snap_to_layers
-from capsense.design.clearance import cut_clearance
-from capsense.design.curved import bend_sheet, cylinder_surface, is_level, read_bend
+from capsense.design.checks import check_design, cut_clearance, snap_to_layers
 from capsense.design.geometry import Surface
-from capsense.design.materials import LAYER_EPS_R
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
-from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import DesignTable
-from capsense.design.shapes import SHAPES, box_surface, planar_surface
+from capsense.design.shapes import (
+    SHAPES,
+    bend_sheet,
+    box_surface,
+    cylinder_surface,
+    is_level,
+    planar_surface,
+    read_bend,
+)
+from capsense.design.tables import LAYER_EPS_R, PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
 STL_KEYS = ("file", "unit", "scale", "part", "closed")
