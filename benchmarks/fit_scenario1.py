@@ -22,12 +22,14 @@ from capsense.reproduce.scenario1_fit import (
     ResponseTable,
     fit,
     fit_without,
+    matrices,
+    mutual,
+    normalised,
     own_figures,
     predicted,
     tabulate,
 )
 from capsense.reproduce.scenario1_setup import Array, Scenario1Setup, load_curves, load_setup
-from capsense.reproduce.scenario1_signal import matrices, mutual, normalised
 from capsense.simulator import Simulator
 
 BOARDS = ("stripe", "patch")

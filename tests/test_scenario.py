@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 import capsense as cs
 from capsense.errors import CapSenseError, DesignError, ScenarioError
 from capsense.scenario import Excitation, Trajectory, load_scenario, parse_scenario
-from capsense.scenario.channels import channels_of
-from capsense.scenario.trajectory import slerp
+from capsense.scenario.model import channels_of, slerp
 from capsense.scene import Pose
 
 ROOT = Path(__file__).parents[1]

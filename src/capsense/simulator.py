@@ -25,7 +25,7 @@ from capsense.field.terminals import Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
-from capsense.scene.shape import as_points
+from capsense.scene.shapes import as_points
 
 if TYPE_CHECKING:
     from capsense.masked import MeshSensor
@@ -113,6 +113,11 @@ class Simulator:
         """The mesh that was given in place of a design, or None."""
         given = self.mesh.design if self.mesh is not None else cast("Design | str | Path", design)
         self.design = given if isinstance(given, Design) else load_design(given)
+        if self.method == "fem_masked" and self.design.domain.open:
+            raise ValueError(
+                f"design {self.design.name!r} has an open domain, which method 'fem_masked' cannot "
+                "mesh; use method 'surface', or leave out open = true"
+            )
         self.settings = settings or default_settings(self.design)
         """Numerical settings of the background field."""
         self.steps = 0

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from capsense.design import available_designs, load_design
-from capsense.design.draw import draw_design
+from capsense.plotting.designs import draw_design
 
 pytest.importorskip("matplotlib")
 

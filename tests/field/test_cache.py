@@ -28,7 +28,7 @@ from capsense.field.boundary import BoundarySolution
 from capsense.field.cache import cache_key, default_cache_dir, default_settings, load_or_build
 from capsense.field.lock import exclusive
 from capsense.field.store import read_arrays, write_arrays
-from capsense.mesh.settings import MeshSettings
+from capsense.mesh.lattice import MeshSettings
 
 DENSE = "boundary elements: factorising"
 FIT = "response to charges: fit"

@@ -19,12 +19,12 @@ from capsense.reproduce import scenario1
 from capsense.reproduce.scenario1_fit import (
     fit,
     fit_without,
+    normalised,
     own_figures,
     predicted,
     tabulate,
 )
 from capsense.reproduce.scenario1_setup import DATA, FILE, load_curves, load_setup, parse_setup
-from capsense.reproduce.scenario1_signal import normalised
 
 SETUP = load_setup()
 STRIPE = SETUP.boards["stripe"]

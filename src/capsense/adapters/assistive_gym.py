@@ -18,7 +18,7 @@ from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Material, Pose, Scene
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 from capsense.simulator import Simulator
 
 __all__ = ["AssistiveGymSensor", "attach", "limbs"]

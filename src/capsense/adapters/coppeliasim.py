@@ -22,7 +22,7 @@ from capsense.design.model import Design
 from capsense.errors import AdapterError, MissingDependencyError, SceneError
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
-from capsense.scene.body import Grounding, checked_grounding
+from capsense.scene.scene import Grounding, checked_grounding
 from capsense.simulator import Simulator, make_readout
 
 __all__ = ["CoppeliaSensor", "attach", "connect", "running"]

@@ -14,9 +14,9 @@ from capsense.adapters.coppeliasim_calls import Remote
 from capsense.adapters.rules import Rules
 from capsense.errors import AdapterError, SceneError
 from capsense.scene import Material, Pose
-from capsense.scene.body import Grounding
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
+from capsense.scene.scene import Grounding
 from capsense.simulator import Simulator
 
 NEAR = 1e-4

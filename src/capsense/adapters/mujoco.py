@@ -20,7 +20,7 @@ from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.readout.readout import Readout
 from capsense.scene import Material
-from capsense.scene.body import Grounding, checked_grounding
+from capsense.scene.scene import Grounding, checked_grounding
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import DepthSensor, refuse_missing
 from capsense.errors import SceneError
 from capsense.scene import Material, Pose
-from capsense.scene.body import Grounding
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
+from capsense.scene.scene import Grounding
 from capsense.simulator import Simulator
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from capsense.adapters.rules import Rules
 from capsense.design.model import Design
 from capsense.fleet import FleetReading
 from capsense.scene import Body, Material, Pose, Shape
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 
 if TYPE_CHECKING:
     import mujoco

@@ -34,7 +34,7 @@ from capsense.scene import (
     Shape,
     Sphere,
 )
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 
 
 class SensorCapacitance(ParallelSensors):

@@ -26,7 +26,7 @@ from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 

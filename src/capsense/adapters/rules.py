@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from capsense._validate import suggest
 from capsense.errors import SceneError
 from capsense.scene import Material, material
-from capsense.scene.body import Grounding, checked_grounding
+from capsense.scene.scene import Grounding, checked_grounding
 
 Names = tuple[str, ...]
 """The names that one solid answers to, such as those of its geom and of its body."""

@@ -10,15 +10,19 @@ from typing import Any
 import numpy as np
 
 from capsense._validate import nearest, read_toml, suggest
-from capsense.design.checks import check_design, snap_to_layers
-from capsense.design.clearance import cut_clearance
-from capsense.design.curved import bend_sheet, cylinder_surface, is_level, read_bend
+from capsense.design.checks import check_design, cut_clearance, snap_to_layers
 from capsense.design.geometry import Surface
-from capsense.design.materials import LAYER_EPS_R
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
-from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import DesignTable
-from capsense.design.shapes import SHAPES, box_surface, planar_surface
+from capsense.design.shapes import (
+    SHAPES,
+    bend_sheet,
+    box_surface,
+    cylinder_surface,
+    is_level,
+    planar_surface,
+    read_bend,
+)
+from capsense.design.tables import LAYER_EPS_R, PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
 STL_KEYS = ("file", "unit", "scale", "part", "closed")
@@ -140,7 +144,7 @@ def parse_design(
 
 
 def _read_domain(table: DesignTable) -> Domain:
-    table.only(("size", "backplane"))
+    table.only(("size", "backplane", "open"))
     sx, sy, sz = table.sizes("size", 3, "[x, y, z] in metres")
     backplane = table.length("backplane")
     if backplane >= sz:
@@ -148,7 +152,7 @@ def _read_domain(table: DesignTable) -> Domain:
             f"backplane = {backplane:g} must be smaller than the box's height, {sz:g}; it is the "
             "distance from the electrode plane z = 0 down to the box's floor"
         )
-    return Domain((sx, sy, sz), backplane)
+    return Domain((sx, sy, sz), backplane, table.boolean("open", False))
 
 
 def _read_build(table: DesignTable) -> dict[str, float]:

@@ -11,9 +11,8 @@ from shapely.affinity import translate
 from capsense._validate import UNITS
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Domain, Electrode
-from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import DesignTable
 from capsense.design.stl import SheetMesh, read_stl, sheet_surface, weld
+from capsense.design.tables import PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
 Array = NDArray[np.float64]

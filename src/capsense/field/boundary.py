@@ -34,7 +34,7 @@ _FEW_FACETS = 64
 """Sheets of more facets than this are curved; their facets are not searched for narrow gaps."""
 _FAR_PLANE = 0.01
 """Parallel sheets farther apart than this [m] need no panels of their distance."""
-_FEW, _MANY = 4_500, 9_000
+_FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
 _FINEST, _COARSEST = 0.5, 8.0
 """The finest, and where the search begins, as multiples of the default sizes."""
@@ -121,7 +121,7 @@ def _fitted(design: Design) -> float:
 
 def _cut(design: Design, scale: float) -> BoundaryModel:
     """Cut a design into panels of the default sizes times ``scale``."""
-    floor = float(design.domain.lower[2])
+    floor = design.domain.floor
     names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
     flat: list[bool] = []
@@ -277,7 +277,7 @@ def _interfaces(design: Design, sheets: list[tuple[Facet, int]]) -> list[tuple[F
                 np.abs((face.origin - lower) @ face.axes[2]),
                 np.abs((face.origin - upper) @ face.axes[2]),
             )
-            if on_wall < _PLANE_TOL:
+            if on_wall < _PLANE_TOL and not design.domain.open:
                 continue
             region = face.polygon
             for facet, _ in sheets:
@@ -295,7 +295,9 @@ def _interfaces(design: Design, sheets: list[tuple[Facet, int]]) -> list[tuple[F
 
 
 def _walls(design: Design) -> list[Facet]:
-    """Ceiling and side walls of the box; the floor is met by images."""
+    """Ceiling and side walls of the box; the floor is met by images. An open domain has none."""
+    if design.domain.open:
+        return []
     box = Layer("box", "", 1.0, design.domain.lower, design.domain.upper)
     return [f for f in _box_faces(box) if f.axes[2, 2] > -0.5]
 

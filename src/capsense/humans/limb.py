@@ -19,8 +19,8 @@ from capsense._validate import suggest
 from capsense.errors import SceneError
 from capsense.humans.anthropometry import Build
 from capsense.scene import Body, Capsule, Material, Pose
-from capsense.scene.body import Grounding, checked_grounding
 from capsense.scene.pose import Vec3
+from capsense.scene.scene import Grounding, checked_grounding
 
 Side = Literal["left", "right"]
 
@@ -152,14 +152,14 @@ class Limb:
         return [(f"{self.name}_{segment.name}_{k}", p) for k, p in enumerate(segment.parts, 1)]
 
     def mjcf(self, pose: Pose = Pose(), **options: object) -> str:  # noqa: B008
-        """A MuJoCo model of the limb; see :func:`capsense.humans.export.to_mjcf`."""
-        from capsense.humans.export import to_mjcf
+        """A MuJoCo model of the limb; see :func:`capsense.humans.formats.to_mjcf`."""
+        from capsense.humans.formats import to_mjcf
 
         return to_mjcf(self, pose, **options)  # type: ignore[arg-type]
 
     def urdf(self) -> str:
-        """A URDF of the limb; see :func:`capsense.humans.export.to_urdf`."""
-        from capsense.humans.export import to_urdf
+        """A URDF of the limb; see :func:`capsense.humans.formats.to_urdf`."""
+        from capsense.humans.formats import to_urdf
 
         return to_urdf(self)
 

@@ -8,7 +8,10 @@ all three are given here.
 
 from __future__ import annotations
 
+import json
 import math
+from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,3 +56,14 @@ def _pair(one: ArrayLike, other: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     if a.shape != b.shape or not a.size:
         raise ValueError(f"curves have shapes {a.shape} and {b.shape}; make them the same")
     return a, b
+
+
+def correlations(table: int) -> dict[str, Any]:
+    """Eq. 12 of the paper's simulation against its hardware.
+
+    Args:
+        table: 1, by speed [m/s, as text] and board; or 2, a list over electrodes by participant.
+    """
+    path = files("capsense.reproduce") / "data" / f"table_{table}.json"
+    found: dict[str, Any] = json.loads(path.read_text("utf-8"))["normalised cross-correlation"]
+    return found

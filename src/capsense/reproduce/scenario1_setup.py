@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.design import Design, Role, load_design
 from capsense.errors import ScenarioError
-from capsense.scenario.schema import ScenarioTable
-from capsense.scenario.trajectory import Trajectory
+from capsense.scenario.bodies import ScenarioTable
+from capsense.scenario.model import Trajectory
 from capsense.scene import Pose
 
 Array = NDArray[np.float64]

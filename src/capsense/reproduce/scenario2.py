@@ -18,14 +18,23 @@ from numpy.typing import NDArray
 import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.field.background import BuildSettings
-from capsense.mesh.settings import MeshSettings
-from capsense.reproduce.limb_rides import PARTICIPANTS, RIDES, SEED, Ride, course, rides
-from capsense.reproduce.limb_worlds import PIXELS, View, opened, read_poses
-from capsense.reproduce.metrics import cross_correlation, raw_correlation
-from capsense.reproduce.paper import correlations
+from capsense.mesh.lattice import MeshSettings
+from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
+from capsense.reproduce.limb_worlds import (
+    PARTICIPANTS,
+    PIXELS,
+    RIDES,
+    SEED,
+    Ride,
+    View,
+    course,
+    opened,
+    read_poses,
+    rides,
+)
+from capsense.reproduce.metrics import correlations, cross_correlation, raw_correlation
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 from capsense.simulator import Method
 
 if TYPE_CHECKING:
@@ -89,7 +98,7 @@ Changes = dict[str, Array]
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
-    """Carry the study out; see :class:`capsense.reproduce.study.Study`."""
+    """Carry the study out; see :class:`capsense.reproduce.harness.Study`."""
     store = Store(folder)
     people = list(PARTICIPANTS)[: 2 if reduced else None]
     count = 2 if reduced else RIDES

@@ -103,7 +103,7 @@ def _plain(value: object) -> Any:
     raise TypeError(f"a part's input is a {type(value).__name__}; give numbers, texts or arrays")
 
 
-ABOVE = ("cli", "reproduce", "viewer")
+ABOVE = ("cli", "plotting", "reproduce", "viewer")
 """Packages that a part does not depend on, but for the module that computes it."""
 
 

@@ -8,34 +8,28 @@ from typing import Any
 
 import numpy as np
 
+from capsense import _validate
 from capsense._validate import MAX_LENGTH, UNITS
+from capsense.codec import SHAPES, lengths_of
 from capsense.errors import ScenarioError
-from capsense.scenario.model import MovingBody
-from capsense.scenario.schema import ScenarioTable
-from capsense.scenario.trajectory import Trajectory
+from capsense.scenario.model import MovingBody, Trajectory
 from capsense.scene import (
     Body,
-    Box,
-    Capsule,
-    Cylinder,
-    Ellipsoid,
     Material,
     Pose,
     Shape,
-    Sphere,
     TriMesh,
 )
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 
-SHAPE_KEYS = {
-    "box": ("size",),
-    "sphere": ("radius",),
-    "capsule": ("radius", "length"),
-    "cylinder": ("radius", "length"),
-    "ellipsoid": ("radii",),
-    "mesh": ("file", "unit"),
-}
-"""Shapes, and the keys of each."""
+
+class ScenarioTable(_validate.Table):
+    """One table of a scenario file; whatever is wrong raises :class:`ScenarioError`."""
+
+    error_type = ScenarioError
+
+
+MESH_KEYS = ("file", "unit")
 BODY_KEYS = ("name", "shape", "material", "grounding", "pose", "trajectory")
 TRAJECTORY_KEYS = ("waypoints", "speed", "dwell", "euler", "quaternion", "closed")
 MAX_GROUNDING = 1e-6
@@ -54,8 +48,9 @@ def read_body(table: ScenarioTable, name: str, folder: Path) -> MovingBody:
         ScenarioError: A key, type or number is wrong.
         SceneError: A shape or material is wrong.
     """
-    shape_name = table.choice("shape", list(SHAPE_KEYS))
-    table.only((*BODY_KEYS, *SHAPE_KEYS[shape_name]))
+    shape_name = table.choice("shape", [*SHAPES, "mesh"])
+    lengths = MESH_KEYS if shape_name == "mesh" else tuple(lengths_of(shape_name))
+    table.only((*BODY_KEYS, *lengths))
     shape = _read_shape(table, shape_name, folder)
     material = read_material(table)
     grounding = read_grounding(table)
@@ -78,15 +73,11 @@ def read_body(table: ScenarioTable, name: str, folder: Path) -> MovingBody:
 def _read_shape(table: ScenarioTable, shape: str, folder: Path) -> Shape:
     if shape == "mesh":
         return _read_mesh(table, folder)
-    if shape in ("box", "ellipsoid"):
-        key = SHAPE_KEYS[shape][0]
-        a, b, c = table.sizes(key, 3, "[x, y, z] in metres")
-        return Box((a, b, c)) if shape == "box" else Ellipsoid((a, b, c))
-    radius = table.length("radius")
-    if shape == "sphere":
-        return Sphere(radius)
-    length = table.length("length")
-    return Capsule(radius, length) if shape == "capsule" else Cylinder(radius, length)
+    lengths: list[Any] = [
+        table.length(key) if count == 1 else table.sizes(key, count, "[x, y, z] in metres")
+        for key, count in lengths_of(shape).items()
+    ]
+    return SHAPES[shape](*lengths)
 
 
 def _read_mesh(table: ScenarioTable, folder: Path) -> TriMesh:

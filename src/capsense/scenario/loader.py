@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 from capsense._validate import read_toml, suggest
 from capsense.design import Design, load_design
 from capsense.errors import DesignError, MeshError, ScenarioError, SceneError
-from capsense.scenario.bodies import read_body
-from capsense.scenario.channels import Excitation
-from capsense.scenario.model import FORMER_METHODS, METHODS, MovingBody, Scenario
-from capsense.scenario.schema import ScenarioTable
+from capsense.scenario.bodies import ScenarioTable, read_body
+from capsense.scenario.model import FORMER_METHODS, METHODS, Excitation, MovingBody, Scenario
 
 if TYPE_CHECKING:
     from capsense.simulator import Method

@@ -10,10 +10,8 @@ from typing import Any, cast
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import Frame, Opcode
 
-from capsense.server.allowance import Allowance
+from capsense.server.options import POLICY, Allowance
 
-POLICY, TRY_LATER = 1008, 1013
-"""Codes with which connections are closed on errors, and when there are too many."""
 FLOOD = "flood"
 """Reason with which a client that talks idly is cut off."""
 READ_SIZE = 16384

@@ -1,15 +1,42 @@
-"""What a server serves, to whom, and how much."""
+"""What a server serves, to whom, and how much somebody may do."""
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
+import time
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from capsense.errors import ServerError
 from capsense.server.frames import HEADER
 from capsense.server.messages import MAX_TEXT
+
+POLICY, TRY_LATER = 1008, 1013
+"""Codes with which connections are closed on errors, and when there are too many."""
+
+
+class Allowance:
+    """A token bucket that can be overdrawn.
+
+    Args:
+        most: What can be spent at once, after a rest.
+        rate: What comes back a second.
+        first: What can be spent at the start; by default ``most``.
+    """
+
+    def __init__(self, most: float, rate: float, first: float | None = None) -> None:
+        self.most, self.rate = most, rate
+        self._left = most if first is None else first
+        self._counted = time.monotonic()
+
+    def spend(self, cost: float) -> float:
+        """Spend some, and return what is left: below zero, more was spent than there was."""
+        now = time.monotonic()
+        regained = (now - self._counted) * self.rate
+        self._counted = now
+        self._left = min(self.most, self._left + regained) - cost
+        return self._left
 
 
 @dataclass(frozen=True)

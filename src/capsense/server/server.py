@@ -24,7 +24,7 @@ from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene.depth import DepthFrame
 from capsense.server.frames import PROTOCOL
 from capsense.server.messages import Open, Watch
-from capsense.server.options import ServerOptions
+from capsense.server.options import TRY_LATER, ServerOptions
 from capsense.server.sensor import ServedSensor
 from capsense.simulator import Simulator
 
@@ -37,7 +37,7 @@ except ImportError as error:
         'the server needs websockets; install it with: pip install "capsense[serve]"'
     ) from error
 
-from capsense.server.connection import FLOOD, TRY_LATER, AdmissionControl, RateLimitedConnection
+from capsense.server.connection import FLOOD, AdmissionControl, RateLimitedConnection
 from capsense.server.session import ClientSession
 
 if TYPE_CHECKING:

@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from websockets.exceptions import ConnectionClosed
 
+from capsense.codec import design_to_json
 from capsense.errors import CapSenseError, ProtocolError
-from capsense.recording.design_json import design_to_json
 from capsense.server import messages
-from capsense.server.allowance import Allowance
-from capsense.server.connection import POLICY
 from capsense.server.frames import PROTOCOL, unpack_depth
-from capsense.server.options import ServerOptions
+from capsense.server.options import POLICY, Allowance, ServerOptions
 from capsense.server.sensor import Frame, ServedSensor
 
 if TYPE_CHECKING:

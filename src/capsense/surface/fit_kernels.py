@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import kernel
-from capsense.scene.distance_kernels import triangle_distance2
+from capsense.scene.geometry_kernels import triangle_distance2
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from capsense.field.change import Change
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.scene import PackedScene
-from capsense.scene.shape import Shape, ShapeKind
+from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.changing import ChangingBody
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
 from capsense.surface.pieces import layer_pieces, mesh_pieces

@@ -20,7 +20,7 @@ from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir
 from capsense.field.store import read_arrays, write_arrays
 from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
-from capsense.scene.shape import ShapeKind
+from capsense.scene.shapes import ShapeKind
 from capsense.surface.panels import panels_of, polygon_panels
 from capsense.surface.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.surface.standing import standing

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.scene import Box, Capsule, Cylinder
-from capsense.scene.shape import Shape
+from capsense.scene.shapes import Shape
 
 Array = NDArray[np.float64]
 

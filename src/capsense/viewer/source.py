@@ -22,7 +22,7 @@ from capsense.surface.solver import SurfaceSolver
 if TYPE_CHECKING:
     from capsense.field.green import GreenFunction
     from capsense.recording.reader import Recording
-    from capsense.viewer.plane import Plane
+    from capsense.viewer.charts import Plane
 
 Array = NDArray[np.float64]
 

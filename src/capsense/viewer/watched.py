@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.codec import design_from_json
 from capsense.errors import ProtocolError, ServerError
 from capsense.reading import Reading, StepStats
-from capsense.recording.design_json import design_from_json
 from capsense.recording.session import reading_of
-from capsense.scenario.channels import Excitation, channels_of
+from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import Body, DepthFrame, Scene
 from capsense.server.client import Client
 from capsense.server.frames import DepthMessage, ReadingMessage
@@ -23,7 +23,7 @@ from capsense.simulator import Simulator
 from capsense.viewer.source import Frame, green_of
 
 if TYPE_CHECKING:
-    from capsense.viewer.plane import Plane
+    from capsense.viewer.charts import Plane
 
 Array = NDArray[np.float64]
 Address = tuple[int, int]
