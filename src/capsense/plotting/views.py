@@ -28,16 +28,12 @@ Array = NDArray[np.float64]
 def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes) -> None:
     """Draw sensor, domain, bodies and their ways, in millimetres and to one scale.
 
-    Parameters
-    ----------
-    run
-        A run of at least one sample.
-    peak
-        The sample at which bodies are drawn solid; they are dashed at the first one.
-    colours
-        A colour for each electrode.
-    above, side
-        Square axes for the view along −z, and for that along y or x, whichever shows more.
+    Args:
+        run: A run of at least one sample.
+        peak: The sample at which bodies are drawn solid; they are dashed at the first one.
+        colours: A colour for each electrode.
+        above: Square axes for the view along −z.
+        side: Square axes for the view along y or x, whichever shows more.
     """
     _, positions, _ = run.poses()
     lower, upper = _window(run, positions, peak)
