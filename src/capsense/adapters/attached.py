@@ -5,7 +5,8 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.placement import nothing_seen, placement, turned_round
+from capsense.adapters.rules import DEFAULTS, Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import SceneError
+from capsense.errors import MissingDependencyError, SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
@@ -202,7 +204,9 @@ class DepthSensor(AttachedSensor):
 class WorldSource(ABC):
     """The solids of a simulator's model, taken over once for all sensors that ride in it."""
 
-    def __init__(self) -> None:
+    def __init__(self, rules: Rules) -> None:
+        self.rules = rules
+        """What is seen, and what it is made of."""
         self.version = 0
         """Goes up whenever the solids are taken over again."""
         self.refresh()
@@ -325,47 +329,74 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
 
 
 def check_perception(
-    perception: object, only_geometry: Mapping[str, object], only_depth: Mapping[str, object]
+    perception: object, options: Mapping[str, object], only: Mapping[str, Sequence[str]]
 ) -> None:
     """Refuse an unknown kind of perception, and options that belong to the other kind.
 
     Args:
         perception: What was asked for.
-        only_geometry: Options that only geometry has; those that are false were not given.
-        only_depth: Options that only a depth camera has.
+        options: The options that were given.
+        only: Names of the options that only ``"geometry"`` has, or only ``"depth_camera"``.
 
     Raises:
         SceneError: The first thing that is wrong.
     """
     if perception not in ("geometry", "depth_camera"):
         raise SceneError(f'perception is {perception!r}; choose "geometry" or "depth_camera"')
-    other, options = "geometry", only_geometry
-    if perception == "geometry":
-        other, options = "depth_camera", only_depth
-    for name, value in options.items():
-        if value is not None and value is not False and value != () and value != {}:
+    other = "geometry" if perception == "depth_camera" else "depth_camera"
+    for name in only[other]:
+        usual = DEFAULTS.get(name)
+        if options.get(name, usual) not in (usual, None, (), [], {}):
             raise SceneError(
                 f'{name} goes with perception="{other}"; leave it out of perception="{perception}"'
             )
 
 
-def check_image(size: Any, resolution: Any, domain_width: float) -> tuple[float, int]:
-    """Size [m] and pixels of a square image; the width of the domain by default.
+@dataclass(frozen=True)
+class Image:
+    """The square depth image of a sensor, checked.
 
     Raises:
-        SceneError: Not a positive length, or not a number of pixels from 4 to 2000.
+        SceneError: ``size`` is not a positive length, or ``resolution`` not a number of pixels
+            from 4 to 2000.
     """
-    if size is None:
-        size = domain_width
-    if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
-        raise SceneError(f"size is {size!r}; give the width of the image in metres")
-    if (
-        isinstance(resolution, bool)
-        or not isinstance(resolution, int)
-        or not 4 <= resolution <= 2000
-    ):
-        raise SceneError(f"resolution is {resolution!r}; give a whole number from 4 to 2000")
-    return float(size), resolution
+
+    size: float
+    """Width and height [m]."""
+    resolution: int = 64
+    """Pixels along each side."""
+    back: str | float = "fill"
+    """Where what is seen ends, as of a depth frame."""
+
+    def __post_init__(self) -> None:
+        size, pixels = self.size, self.resolution
+        if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
+            raise SceneError(f"size is {size!r}; give the width of the image in metres")
+        if isinstance(pixels, bool) or not isinstance(pixels, int) or not 4 <= pixels <= 2000:
+            raise SceneError(f"resolution is {pixels!r}; give a whole number from 4 to 2000")
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any], design: Design) -> Image:
+        """The image that ``ImageOptions`` ask for; without a size, as wide as the domain."""
+        size, pixels = options.get("size"), options.get("resolution")
+        return cls(
+            float(max(design.domain.size[:2])) if size is None else size,
+            64 if pixels is None else pixels, options.get("back", "fill"),
+        )  # fmt: skip
+
+
+def require(module: str, title: str, extra: str) -> None:
+    """Refuse to go on without an optional package.
+
+    Raises:
+        MissingDependencyError: It is not installed.
+    """
+    try:
+        import_module(module)
+    except ImportError:
+        raise MissingDependencyError(
+            f"{title} is not installed; pip install 'capsense[{extra}]'"
+        ) from None
 
 
 def refuse_missing(what: str, name: str, known: Sequence[str]) -> SceneError:

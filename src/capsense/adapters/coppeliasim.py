@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-from capsense.adapters.attached import check_image, make_simulator
+from capsense.adapters.attached import Image, make_simulator
 from capsense.adapters.coppeliasim_calls import Remote, translated
 from capsense.adapters.coppeliasim_vision import (
     CoppeliaSensor,
@@ -17,12 +17,17 @@ from capsense.adapters.coppeliasim_vision import (
     find_vision_sensor,
     make_vision_sensor,
 )
-from capsense.adapters.rules import Rules, as_material
+from capsense.adapters.rules import (
+    DEFAULTS,
+    ImageOptions,
+    SeenOptions,
+    as_material,
+    split_rules,
+)
 from capsense.design.model import Design
 from capsense.errors import AdapterError, MissingDependencyError, SceneError
 from capsense.readout.readout import Readout
-from capsense.scene import Material, Pose
-from capsense.scene.body import Grounding, checked_grounding
+from capsense.scene import Pose
 from capsense.simulator import Simulator, make_readout
 
 __all__ = ["CoppeliaSensor", "attach", "connect", "running"]
@@ -125,21 +130,18 @@ def _start(remote: Remote) -> None:
     raise AdapterError("the simulation does not start; look for messages in CoppeliaSim")
 
 
+class CoppeliaOptions(SeenOptions, ImageOptions, total=False):
+    """Keywords of :func:`attach`."""
+
+
 def attach(
     sim: Any,
     object: int | str,
     design: Design | str | Path | Simulator = "six_patch",
     *,
     pose_in_object: Pose | None = None,
-    materials: Mapping[str, Material | str] | None = None,
-    default_material: Material | str | None = None,
-    default_grounding: Grounding = "grounded",
-    exclude: Sequence[str] = (),
-    exclude_own: bool = True,
-    size: float | None = None,
-    resolution: int | None = None,
-    back: str | float = "fill",
     readout: Readout | str | Path | None = None,
+    **options: Unpack[CoppeliaOptions],
 ) -> CoppeliaSensor:
     """Attach a sensor to an object; call ``read()`` after every step.
 
@@ -148,11 +150,13 @@ def attach(
 
     Where the object neither is a vision sensor nor carries one as its child, one is made, in the
     render mode "auxiliary channels", which knows no light, and what materials say is written into
-    the auxiliary colours of all shapes in the scene. Patterns are shell patterns, tried on a
-    shape's name and on its path, such as ``/Person/arm``. Permittivities of dielectrics are
-    rounded to whole numbers. Shapes added later want :meth:`CoppeliaSensor.refresh`.
+    the auxiliary colours of all shapes in the scene. Name patterns are tried on a shape's name and
+    on its path, such as ``/Person/arm``. Permittivities of dielectrics are rounded to whole
+    numbers. Shapes added later want :meth:`CoppeliaSensor.refresh`.
 
-    A vision sensor of the scene's own is taken as it is, and so is the red channel of its image.
+    A vision sensor of the scene's own is taken as it is, and so is the red channel of its image;
+    ``default_material`` is then that of everything seen, instead of what the red channel says.
+    ``default_grounding`` is that of all conductors, which are one body.
 
     Args:
         sim: What :func:`connect` or ``client.require("sim")`` returned.
@@ -161,19 +165,11 @@ def attach(
         pose_in_object: The sensor frame in the object's frame, by default that frame itself:
             origin at the centre of the electrode plane, z out of the sensor. A vision sensor of
             the scene's own is itself the sensor frame.
-        materials: Name pattern → material; the first that fits decides.
-        default_material: Material of everything else, steel by default. With a vision sensor of
-            the scene's own: of everything seen, instead of what the red channel says.
-        default_grounding: Grounding of all conductors, which are one body.
-        exclude: Name patterns of shapes that the sensor does not see.
-        exclude_own: Leave out the shape that the object is or stands on, which the design itself
-            describes.
-        size: Width and height of the image [m]; by default the width of the domain.
-        resolution: Pixels along each side of the image, 64 by default.
-        back: Where what is seen ends: ``"fill"``, at the end of the domain, or after an assumed
-            thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+        options: What is seen and what it is made of: ``materials``, ``exclude`` and the others of
+            :class:`~capsense.adapters.rules.SeenOptions`; ``size``, ``resolution`` and ``back`` of
+            :class:`~capsense.adapters.rules.ImageOptions`.
 
     Raises:
         SceneError: There is no such object, a pattern fits nothing, its vision sensor is in
@@ -187,45 +183,38 @@ def attach(
     remote = Remote(sim)
     handle = remote.find(object)
     vision_sensor = find_vision_sensor(remote, handle)
-    grounding = checked_grounding(default_grounding)
+    rules, other = split_rules(options, CoppeliaOptions)
     if vision_sensor is not None:
-        made_only = {
-            "materials": materials is not None, "exclude": len(exclude) > 0,
-            "pose_in_object": pose_in_object is not None, "size": size is not None,
-            "exclude_own=False": not exclude_own,
-        }  # fmt: skip
-        _check_own(vision_sensor, made_only, resolution)
-    material = None if default_material is None else as_material(default_material)
-    rules = Rules(materials or {}, {}, material or "steel", exclude=exclude)
+        _check_own(vision_sensor, {**options, "pose_in_object": pose_in_object})
     simulator = make_simulator(design)
-    domain = simulator.design.domain
-    pixels = 64 if resolution is None else resolution
-    size, pixels = check_image(size, pixels, max(domain.size[:2]))
+    image = Image.of(other, simulator.design)
     chip = make_readout(readout, simulator)
+    material = as_material(rules.default_material) if "default_material" in options else None
     paint = None
     if vision_sensor is None:  # all is checked: only now the scene is changed
-        paint = Paint(remote, rules, carrier(remote, handle) if exclude_own else None)
-        pose, far = pose_in_object or Pose(), float(domain.upper[2])
+        paint = Paint(remote, rules, carrier(remote, handle) if rules.exclude_own else None)
+        far = float(simulator.design.domain.upper[2])
         vision_sensor = make_vision_sensor(
-            remote, handle, pose, size, far, pixels, paint.collection
+            remote, handle, pose_in_object or Pose(), image, far, paint.collection
         )
         material = None  # the colours say it
-    sensor = CoppeliaSensor(remote, vision_sensor, simulator, grounding, back, paint, material)
+    sensor = CoppeliaSensor(
+        remote, vision_sensor, simulator, rules.default_grounding, image.back, paint, material
+    )
     sensor.use_readout(sensor.readout if readout is None else chip)
     return sensor
 
 
-def _check_own(
-    vision_sensor: VisionSensor, made_only: Mapping[str, bool], resolution: int | None
-) -> None:
+def _check_own(vision_sensor: VisionSensor, options: Mapping[str, Any]) -> None:
     """Refuse what does not go with a vision sensor of the scene's own."""
-    for name, given in made_only.items():
-        if given:
+    for name in ("materials", "exclude", "pose_in_object", "size", "exclude_own"):
+        usual = DEFAULTS.get(name)
+        if options.get(name, usual) not in (usual, None, (), []):
             raise SceneError(
                 f"{name} goes with a vision sensor that attach makes, but {vision_sensor.path!r} "
                 "is there; leave one of them out"
             )
-    rows, columns = vision_sensor.resolution
+    (rows, columns), resolution = vision_sensor.resolution, options.get("resolution")
     if resolution is not None and (rows, columns) != (resolution, resolution):
         raise SceneError(
             f"vision sensor {vision_sensor.path!r} has {columns} x {rows} pixels, not "

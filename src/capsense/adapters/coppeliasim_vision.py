@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import DepthSensor
+from capsense.adapters.attached import DepthSensor, Image
 from capsense.adapters.coppeliasim_calls import Remote
 from capsense.adapters.rules import Rules
 from capsense.errors import AdapterError, SceneError
@@ -242,7 +242,7 @@ def find_vision_sensor(remote: Remote, handle: int) -> VisionSensor | None:
 
 
 def make_vision_sensor(
-    remote: Remote, handle: int, pose: Pose, size: float, far: float, resolution: int, seen: int
+    remote: Remote, handle: int, pose: Pose, image: Image, far: float, seen: int
 ) -> VisionSensor:
     """An orthographic vision sensor on an object, in the place of one made there earlier.
 
@@ -250,18 +250,16 @@ def make_vision_sensor(
         remote: The simulator.
         handle: The object.
         pose: The sensor frame in the object's frame.
-        size: Width and height of the image [m].
+        image: Size and pixels of its image.
         far: Depth up to which it sees [m].
-        resolution: Pixels along each side.
         seen: Handle of the collection of what it sees.
     """
     for old, name in _children(remote, handle).items():
         if name == _ALIAS:
             _remove_vision_sensor(remote, old)
-    sizes = [NEAR, far, size, 0.01] + [0.0] * 7
-    vision_sensor = int(
-        remote.call("createVisionSensor", _OPTIONS, [resolution] * 2 + [0, 0], sizes)
-    )
+    sizes = [NEAR, far, image.size, 0.01] + [0.0] * 7
+    pixels = [image.resolution, image.resolution, 0, 0]
+    vision_sensor = int(remote.call("createVisionSensor", _OPTIONS, pixels, sizes))
     remote.call("setObjectAlias", vision_sensor, _ALIAS)
     remote.call("setObjectParent", vision_sensor, handle, False)
     remote.call("setObjectPose", vision_sensor, [*pose.position, *pose.quaternion], handle)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.adapters.meshes import Terrain
 from capsense.adapters.rules import Tie
-from capsense.adapters.terrain import Terrain
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
