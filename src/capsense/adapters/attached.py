@@ -278,7 +278,7 @@ class GeometrySensor(AttachedSensor):
         if len(self.world.scene(frames)):
             return super().check()
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
-        behind = self.world.scene(replace(frames, sensor_quaternion=np.array(turn.quaternion)))
+        behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
         return [turned_round([str(b.name) for b in behind])] if len(behind) else super().check()
 
     def refresh(self) -> None:

@@ -15,9 +15,9 @@ from capsense.adapters.parallel import (
     ParallelSensors,
     WorldShape,
     as_numbers,
+    from_matrices,
     warn_left_out,
 )
-from capsense.adapters.parallel_kernels import from_matrices
 from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
 from capsense.fleet import FleetReading

@@ -16,10 +16,10 @@ from capsense.adapters.parallel import (
     ParallelSensors,
     WorldShape,
     as_numbers,
+    compose,
     matching,
     warn_left_out,
 )
-from capsense.adapters.parallel_kernels import compose
 from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
 from capsense.errors import SceneError

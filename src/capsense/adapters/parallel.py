@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -132,3 +132,29 @@ def matching(known: Sequence[str], patterns: str | Sequence[str], what: str) -> 
 def as_numbers(values: Any, device: Any) -> Any:
     """Whole numbers as an array of Warp."""
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False)
+def compose(
+    parents: wp.array2d(dtype=wp.transform), number: wp.array2d(dtype=wp.int32),
+    local: wp.array2d(dtype=wp.transform), out: wp.array2d(dtype=wp.transform),
+) -> None:  # fmt: skip
+    """Poses in the world of what is fixed to some of its bodies, -1 for the world itself."""
+    w, k = wp.tid()
+    at = local[w, k]
+    if number[w, k] >= 0:
+        at = wp.transform_multiply(parents[w, number[w, k]], at)
+    out[w, k] = at
+
+
+@no_type_check
+@wp.kernel(enable_backward=False)
+def from_matrices(
+    position: wp.array2d(dtype=wp.vec3), matrix: wp.array2d(dtype=wp.mat33),
+    number: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.transform),
+) -> None:  # fmt: skip
+    """Poses of some of what a simulator gives by positions and rotation matrices."""
+    w, k = wp.tid()
+    n = number[k]
+    out[w, k] = wp.transform(position[w, n], wp.quat_from_matrix(matrix[w, n]))
