@@ -7,33 +7,44 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Unpack
 
-from capsense.adapters.attached import Image, make_simulator
-from capsense.adapters.coppeliasim_calls import Remote, translated
-from capsense.adapters.coppeliasim_vision import (
-    CoppeliaSensor,
-    Paint,
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.adapters.attached import DepthSensor, make_simulator, require
+from capsense.adapters.coppeliasim_remote import (
+    Remote,
     VisionSensor,
     carrier,
+    draws,
     find_vision_sensor,
     make_vision_sensor,
+    remove_vision_sensor,
+    show,
+    translated,
 )
 from capsense.adapters.rules import (
     DEFAULTS,
+    Image,
     ImageOptions,
+    Rules,
     SeenOptions,
     as_material,
     split_rules,
 )
 from capsense.design.model import Design
-from capsense.errors import AdapterError, MissingDependencyError, SceneError
+from capsense.errors import AdapterError, SceneError
 from capsense.readout.readout import Readout
-from capsense.scene import Pose
+from capsense.scene import Material, Pose
+from capsense.scene.body import Grounding
+from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
 from capsense.simulator import Simulator, make_readout
 
-__all__ = ["CoppeliaSensor", "attach", "connect", "running"]
+__all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]
 
 _TRIES = 10
 """Steps after which a started simulation must be running."""
+_REMOVED = 1
+"""Option of ``sim.addItemToCollection``."""
 
 
 def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -> Any:
@@ -54,13 +65,10 @@ def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -
         MissingDependencyError: The client is not installed.
         AdapterError: Nobody answers there, or in another version of the protocol.
     """
-    try:
-        import zmq
-        from coppeliasim_zmqremoteapi_client import RemoteAPIClient
-    except ImportError:
-        raise MissingDependencyError(
-            "CoppeliaSim's client is not installed; pip install 'capsense[coppelia]'"
-        ) from None
+    require("coppeliasim_zmqremoteapi_client", "CoppeliaSim's client", "coppelia")
+    import zmq
+    from coppeliasim_zmqremoteapi_client import RemoteAPIClient
+
     if not timeout > 0:
         raise AdapterError(f"timeout is {timeout!r}; give seconds above zero")
     client = RemoteAPIClient(host, port)
@@ -220,3 +228,176 @@ def _check_own(vision_sensor: VisionSensor, options: Mapping[str, Any]) -> None:
             f"vision sensor {vision_sensor.path!r} has {columns} x {rows} pixels, not "
             f"{resolution} x {resolution}; leave resolution out, or set it there"
         )
+
+
+class CoppeliaSensor(DepthSensor):
+    """A sensor on an object in CoppeliaSim; made by :func:`attach`.
+
+    Args:
+        remote: The simulator.
+        vision_sensor: What it sees with.
+        simulator: The sensor itself.
+        grounding: Of all conductors.
+        back: Where what is seen ends.
+        paint: What colours the world's shapes, if it was to be coloured.
+        material: What everything is made of; None to tell by the red channel.
+    """
+
+    def __init__(
+        self,
+        remote: Remote,
+        vision_sensor: VisionSensor,
+        simulator: Simulator,
+        grounding: Grounding,
+        back: str | float,
+        paint: Paint | None,
+        material: Material | None,
+    ) -> None:
+        super().__init__(simulator)
+        self.vision_sensor = vision_sensor
+        """The vision sensor it sees with."""
+        self._remote, self._paint = remote, paint
+        self._grounding, self._back, self._material = grounding, back, material
+
+    def _time(self) -> float:
+        return float(self._remote.call("getSimulationTime"))
+
+    @property
+    def pose(self) -> Pose:
+        world = self._remote.constant("handle_world")
+        numbers = self._remote.call("getObjectPose", self.vision_sensor.handle, world)
+        return Pose(numbers[:3], numbers[3:])
+
+    def frame(self) -> DepthFrame:
+        """The depth image of the present state.
+
+        Raises:
+            SceneError: The simulation is not running, or the vision sensor was changed.
+            AdapterError: CoppeliaSim does not answer, or draws nothing.
+        """
+        remote, handle = self._remote, self.vision_sensor.handle
+        if remote.is_stopped():
+            raise SceneError(
+                "the simulation is not running; call sim.startSimulation() and sim.step(), or "
+                "step in capsense.coppeliasim.running(sim)"
+            )
+        if self._paint is None:
+            remote.call("handleVisionSensor", handle)
+        elif not draws(remote, handle):
+            self._paint.collect(handle)  # CoppeliaSim drops collections of scripts that end
+            if not draws(remote, handle):
+                raise AdapterError(
+                    f"CoppeliaSim draws nothing for vision sensor {self.vision_sensor.path!r}; "
+                    "builds and machines without OpenGL do not, nor does it while vision sensors "
+                    "are disabled: start the usual build, on a machine without a display under "
+                    "xvfb-run"
+                )
+        depth = self._image("getVisionSensorDepth", np.dtype("<f4"), 1, 1)
+        seen: Any = self._material
+        if seen is None:
+            seen = self._image("getVisionSensorImg", np.dtype("u1"), 3)
+        return DepthFrame(
+            depth, seen, self.vision_sensor.camera, grounding=self._grounding, back=self._back
+        )
+
+    def refresh(self) -> None:
+        """Colour the world's shapes again, and collect anew which are seen, after some were added.
+
+        Raises:
+            SceneError: A name pattern fits nothing.
+            AdapterError: CoppeliaSim does not answer.
+        """
+        if self._paint is not None:
+            self._paint.collect(self.vision_sensor.handle)
+
+    def remove(self) -> None:
+        """Take the vision sensor that was made for this one out of the scene again.
+
+        Raises:
+            AdapterError: CoppeliaSim does not answer, or it is gone already.
+        """
+        if self._paint is not None:
+            remove_vision_sensor(self._remote, self.vision_sensor.handle)
+
+    def _image(
+        self, name: str, kind: np.dtype[Any], channels: int, *options: int
+    ) -> NDArray[np.generic]:
+        data, (columns, rows) = self._remote.call(name, self.vision_sensor.handle, *options)
+        known = self.vision_sensor.resolution
+        if (rows, columns) != known:
+            raise SceneError(
+                f"vision sensor {self.vision_sensor.path!r} now has {columns} x {rows} pixels, not "
+                f"{known[1]} x {known[0]}; attach again"
+            )
+        if len(data) != rows * columns * channels * kind.itemsize:
+            raise AdapterError(
+                f"sim.{name} gave {len(data)} bytes for {columns} x {rows} pixels of "
+                f"{channels * kind.itemsize} bytes"
+            )
+        image = np.frombuffer(data, kind)
+        return image.reshape((rows, columns, channels)[: 3 if channels > 1 else 2])
+
+
+class Paint:
+    """Writes into the auxiliary colours of all shapes what they are made of.
+
+    The red channel holds :func:`~capsense.scene.depth.encode_permittivity`.
+
+    Raises:
+        SceneError: A name pattern fits nothing, or there is no code for a permittivity.
+
+    Args:
+        remote: The simulator.
+        rules: What shapes are made of, and which are not seen; patterns are tried on a shape's
+            name and on its path.
+        own: A shape that is not seen, if any.
+    """
+
+    def __init__(self, remote: Remote, rules: Rules, own: int | None) -> None:
+        self._remote, self._rules = remote, rules
+        self._own = own
+        self.collection = self._paint(self._shapes())
+        """Handle of the collection of what is seen."""
+
+    def collect(self, vision_sensor: int) -> None:
+        """Colour the shapes that there are now, and show them to a vision sensor.
+
+        Raises:
+            SceneError: A name pattern fits nothing.
+        """
+        shapes = self._shapes()  # refuses wrong patterns before the scene is changed
+        with suppress(AdapterError):  # it may be gone already
+            self._remote.call("destroyCollection", self.collection)
+        self.collection = self._paint(shapes)
+        show(self._remote, vision_sensor, self.collection)
+
+    def _shapes(self) -> dict[int, tuple[tuple[str, str], float]]:
+        """Names and code, from 0 to 1, of every shape in the scene.
+
+        Raises:
+            SceneError: A name pattern fits nothing, or there is no code for a permittivity.
+        """
+        remote, rules = self._remote, self._rules
+        scene, kind = remote.constant("handle_scene"), remote.constant("sceneobject_shape")
+        shapes = remote.call("getObjectsInTree", scene, kind)
+        called = {int(h): (str(remote.call("getObjectAlias", h)), remote.path(h)) for h in shapes}
+        rules.check(list(called.values()))
+        out = {}
+        for handle, names in called.items():
+            matter = rules.material_of(names)
+            code = encode_permittivity(np.inf if matter.is_conductor() else matter.eps_r)
+            out[handle] = names, int(code) / CONDUCTOR_CODE
+        return out
+
+    def _paint(self, shapes: dict[int, tuple[tuple[str, str], float]]) -> int:
+        """Colour shapes; returns a new collection of those that are seen."""
+        remote = self._remote
+        component = remote.constant("colorcomponent_auxiliary")
+        single, every = remote.constant("handle_single"), remote.constant("handle_all")
+        collection = int(remote.call("createCollection", 0))
+        remote.call("addItemToCollection", collection, every, -1, 0)
+        for handle, (names, red) in shapes.items():
+            if handle == self._own or self._rules.excludes(names):
+                remote.call("addItemToCollection", collection, single, handle, _REMOVED)
+            remote.call("setShapeColor", handle, None, component, [red, 0.0, 0.0])
+        return collection

@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from capsense.adapters.attached import (
     GeometrySensor,
-    Image,
-    check_perception,
     make_simulator,
     refuse_missing,
     require,
 )
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
-from capsense.adapters.rules import AttachOptions, split_rules
+from capsense.adapters.rules import AttachOptions, Image, check_perception, split_rules
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from capsense.adapters.attached import (
     GeometrySensor,
-    Image,
-    check_perception,
     make_simulator,
     refuse_missing,
     require,
@@ -20,7 +18,13 @@ from capsense.adapters.attached import (
 from capsense.adapters.pybullet_bodies import Mount, body_numbers, links_of
 from capsense.adapters.pybullet_depth import PybulletDepthSensor
 from capsense.adapters.pybullet_model import ClientSource
-from capsense.adapters.rules import AttachOptions, ImageOptions, split_rules
+from capsense.adapters.rules import (
+    AttachOptions,
+    Image,
+    ImageOptions,
+    check_perception,
+    split_rules,
+)
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design

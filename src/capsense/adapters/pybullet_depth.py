@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import DepthSensor, Image
+from capsense.adapters.attached import DepthSensor
 from capsense.adapters.pybullet_bodies import (
     BodyWatch,
     Link,
@@ -15,7 +15,7 @@ from capsense.adapters.pybullet_bodies import (
     links_of,
     matter_of,
 )
-from capsense.adapters.rules import Rules
+from capsense.adapters.rules import Image, Rules
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame

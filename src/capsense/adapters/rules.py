@@ -7,7 +7,10 @@ from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
 from typing import Any, TypedDict
 
+import numpy as np
+
 from capsense._validate import suggest
+from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Material, material
 from capsense.scene.body import Grounding, checked_grounding
@@ -146,6 +149,63 @@ class Rules:
     def takes_hull(self, names: Names) -> bool:
         """Whether a mesh of these names is taken as its convex hull."""
         return any(matches(p, names) for p in self.hull)
+
+
+def check_perception(
+    perception: object, options: Mapping[str, object], only: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuse an unknown kind of perception, and options that belong to the other kind.
+
+    Args:
+        perception: What was asked for.
+        options: The options that were given.
+        only: Names of the options that only ``"geometry"`` has, or only ``"depth_camera"``.
+
+    Raises:
+        SceneError: The first thing that is wrong.
+    """
+    if perception not in ("geometry", "depth_camera"):
+        raise SceneError(f'perception is {perception!r}; choose "geometry" or "depth_camera"')
+    other = "geometry" if perception == "depth_camera" else "depth_camera"
+    for name in only[other]:
+        usual = DEFAULTS.get(name)
+        if options.get(name, usual) not in (usual, None, (), [], {}):
+            raise SceneError(
+                f'{name} goes with perception="{other}"; leave it out of perception="{perception}"'
+            )
+
+
+@dataclass(frozen=True)
+class Image:
+    """The square depth image of a sensor, checked.
+
+    Raises:
+        SceneError: ``size`` is not a positive length, or ``resolution`` not a number of pixels
+            from 4 to 2000.
+    """
+
+    size: float
+    """Width and height [m]."""
+    resolution: int = 64
+    """Pixels along each side."""
+    back: str | float = "fill"
+    """Where what is seen ends, as of a depth frame."""
+
+    def __post_init__(self) -> None:
+        size, pixels = self.size, self.resolution
+        if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
+            raise SceneError(f"size is {size!r}; give the width of the image in metres")
+        if isinstance(pixels, bool) or not isinstance(pixels, int) or not 4 <= pixels <= 2000:
+            raise SceneError(f"resolution is {pixels!r}; give a whole number from 4 to 2000")
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any], design: Design) -> Image:
+        """The image that ``ImageOptions`` ask for; without a size, as wide as the domain."""
+        size, pixels = options.get("size"), options.get("resolution")
+        return cls(
+            float(max(design.domain.size[:2])) if size is None else size,
+            64 if pixels is None else pixels, options.get("back", "fill"),
+        )  # fmt: skip
 
 
 def split_rules(options: Mapping[str, Any], known: type) -> tuple[Rules, dict[str, Any]]:
