@@ -37,7 +37,8 @@ SPEC = Path(__file__).with_name("servoing.toml")
 COARSE = 0.43
 """Refinement of the mesh of the paper's scheme, some 30,000 tetrahedra as its authors used."""
 NOISE, GAIN = 0.4e-15, 0.05
-"""Of the samples that networks are trained on: rms after the low-pass filter [F], largest error."""
+"""Of the samples that networks are trained on: rms after the low-pass filter [F]; largest error of
+the gain, which a chip's channels share."""
 
 
 def belief(gap: float) -> Belief:
@@ -115,7 +116,7 @@ def paper_scheme() -> cs.Simulator:
 def network(values: Array, poses: Array, seed: int = 0) -> PoseNetwork:
     """A network trained on readings with gain errors and noise."""
     rng = np.random.default_rng(seed)
-    gain = 1 + GAIN * rng.uniform(-1, 1, values.shape)
+    gain = 1 + GAIN * rng.uniform(-1, 1, (len(values), 1))
     return PoseNetwork.fit(
         gain * values + NOISE * rng.standard_normal(values.shape), poses, seed=seed
     )

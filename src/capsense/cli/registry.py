@@ -19,6 +19,7 @@ COMMANDS = (
     "capsense.cli.design",
     "capsense.cli.readout",
     "capsense.cli.dataset",
+    "capsense.cli.optimise",
     "capsense.cli.bench",
     "capsense.cli.reproduce",
     "capsense.cli.serve",

@@ -261,7 +261,7 @@ class PoseEstimator:
         out[np.ix_(free, free)] = np.linalg.inv(rows.T @ rows) * np.outer(spread, spread)
         return out[:4, :4]
 
-    def _linearised(self, measured: Array | None) -> tuple[Array, Array, Array, Array]:
+    def _linearised(self, measured: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:
         """Which unknowns there are; rows of the least-squares problem in units of their spread, the
         standard deviations of what is measured [F], and the model at the state [F]."""
         values, slopes = self.model(LimbPose(*self._state[:4]), math.exp(self._state[4]))
