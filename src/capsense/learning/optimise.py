@@ -179,12 +179,12 @@ def search(
         judge(share)
     best = min(tried, key=lambda pair: pair[1].cost)[0]
     left = task.evaluations - len(tried)
-    if left > len(low):
+    if left > 0:  # of the simplex, one corner is known
         origin = (best - low) / width
         corners = origin + np.where(origin > 0.5, -0.15, 0.15)[:, None] * np.eye(len(low))
         minimize(
             judge, origin, method="Nelder-Mead", bounds=[(0.0, 1.0)] * len(low),
-            options={"maxfev": left, "initial_simplex": np.vstack([origin, corners]),
+            options={"maxfev": left + 1, "initial_simplex": np.vstack([origin, corners]),
                      "xatol": 1e-3, "fatol": 1e-4},
         )  # fmt: skip
     return min(tried, key=lambda pair: pair[1].cost)
