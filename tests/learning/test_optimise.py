@@ -90,6 +90,14 @@ def test_example_starts_from_the_packaged_design() -> None:
     assert tomllib.loads(to_toml(nested)) == nested
 
 
+def test_the_page_s_task(tmp_path: Path) -> None:
+    page = (EXAMPLE.parents[2] / "docs" / "optimise.md").read_text(encoding="utf-8")
+    (tmp_path / "task.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    task = load_task(tmp_path / "task.toml")
+    assert len(task.poses) == 4
+    assert task.start == pytest.approx([0.02])
+
+
 def quadratic(best: np.ndarray, calls: list[np.ndarray]) -> Any:
     def bound(self: DesignTask, values: np.ndarray, *_: Any) -> Bound:
         calls.append(values)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -171,7 +170,7 @@ def test_refusals(sim: cs.Simulator) -> None:
 def test_network(tmp_path: Path) -> None:
     """It learns a smooth function, the same by seed, and survives a file."""
     rng = np.random.default_rng(1)
-    poses = rng.uniform(-1, 1, (2000, 4)) * (0.05, 0.03, 0.2, 0.3) + (0, 0.06, 0, 0)
+    poses = rng.uniform(-1, 1, (600, 4)) * (0.05, 0.03, 0.2, 0.3) + (0, 0.06, 0, 0)
     mixed = np.array([[1, 2, 0, 1], [1, -2, 1, 0], [0, 1, 1, 1], [2, 0, -1, 1], [1, 1, 1, -1]])
     readings = 1e-14 * np.exp((poses / poses.std(axis=0)) @ mixed.T / 4)
     net = PoseNetwork.fit(readings, poses, iterations=200)
@@ -192,9 +191,33 @@ def test_network(tmp_path: Path) -> None:
         PoseNetwork.fit(readings * np.nan, poses)
 
 
+@pytest.fixture
+def benchmarks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+
+
+@pytest.mark.usefixtures("benchmarks")
+def test_distance_model() -> None:
+    """By hand: ε₀ A / d of a ball, from the middle of a square; in an environment, of the arm."""
+    import policy
+    from distance_model import DistanceModel
+
+    plates = DistanceModel(cs.load_design("six_patch_bare"), scale=2.0)
+    ball = cs.Body(cs.Sphere(0.02), cs.Pose((0.038, 0.025, 0.07)))
+    assert plates.read([ball])[5] == pytest.approx(2 * 8.8541878e-12 * 9e-4 / 0.05)
+    assert plates.read([]) == pytest.approx(np.zeros(6))
+    env = policy.DistanceFollow()
+    env.reset(seed=1)
+    felt, solved = env.signals.skin.read()["pad"], env.signals.skin.skin.read()["pad"]
+    assert np.diag(felt.delta) == pytest.approx(np.diag(solved.delta), rel=1.0)
+    assert felt.delta[0, 1] == 0.0
+    observation, *_ = env.step(np.zeros(5, np.float32))
+    assert observation in env.observation_space
+
+
+@pytest.mark.usefixtures("benchmarks")
 def test_ride_along_an_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmark, briefly: along a swaying arm, on the field, through a chip."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     import servoing_world as world
 
     from capsense.learning.envs.randomisation import Randomisation
@@ -209,4 +232,3 @@ def test_ride_along_an_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.abs(found.estimated)[:, :2].max() < 0.015
     again = world.ride(env, PoseEstimator(sim, Belief(taper=0.06), noise=0.4e-15), 1)
     np.testing.assert_array_equal(found.kept, again.kept)
-    sys.modules.pop("servoing_world")
