@@ -28,7 +28,7 @@ FIRST = 0.03
 """The ride begins so far above the wrist or ankle [m]."""
 SMOOTHING = 0.1
 """Time constant of the low-pass filter that all estimators read the chip through [s]."""
-CLOSE = 0.03
+CLOSE = 0.02
 """A ride has succeeded if no error of place was larger than this [m], and nothing was touched."""
 SEGMENTS = {"arm": ("forearm", "upper_arm", "elbow_flexion"),
             "leg": ("shank", "thigh", "knee_flexion")}  # fmt: skip

@@ -146,8 +146,8 @@ def test_follows_in_a_few_steps(sim: cs.Simulator) -> None:
 
 def test_motion_by_hand() -> None:
     """Towards a limb to the left that is too far, and turned to it."""
-    motion = follow(LimbPose(0.01, 0.07, 0.1, 0.2), gap=0.05, gain=2.0)
-    assert motion == pytest.approx([0, 0.02, 0.04, 0, -0.2, 0.4])
+    motion = follow(LimbPose(0.01, 0.07, 0.1, 0.2), gap=0.05, gain=2.0, turning=3.0)
+    assert motion == pytest.approx([0, 0.02, 0.04, 0, -0.3, 0.6])
     assert follow(LimbPose(), speed=0.1) == pytest.approx([0.1, 0, 0, 0, 0, 0])
 
 

@@ -272,18 +272,21 @@ class PoseEstimator:
         return free, np.concatenate([rows, np.eye(len(free))]), scale, values
 
 
-def follow(pose: LimbPose, gap: float = 0.05, speed: float = 0.0, gain: float = 3.0) -> Array:
+def follow(
+    pose: LimbPose, gap: float = 0.05, speed: float = 0.0, gain: float = 8.0, turning: float = 3.0
+) -> Array:
     """The motion by which a sensor keeps over a limb and goes along it, shape (6,).
 
     Args:
         pose: Where the limb is.
         gap: The gap to be kept [m].
         speed: Along the limb, towards +x [m/s].
-        gain: Errors decay at this rate [1/s].
+        gain: Errors of place decay at this rate [1/s].
+        turning: Errors of angles, which are noisier, decay at this one [1/s].
 
     Returns:
         Velocity of the sensor [m/s] and its angular velocity [rad/s], in the sensor frame.
     """
     keep = gain * np.array([0.0, pose.lateral, pose.vertical - gap])
-    turn = gain * np.array([0.0, -pose.pitch, pose.yaw])
+    turn = turning * np.array([0.0, -pose.pitch, pose.yaw])
     return np.concatenate([keep + speed * pose.direction, turn])
