@@ -78,14 +78,10 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    Parameters
-    ----------
-    argv
-        Arguments after the program's name; those of the process by default.
+    Args:
+        argv: Arguments after the program's name; those of the process by default.
 
-    Returns
-    -------
-    int
+    Returns:
         The exit code, see :data:`EXIT_CODES`.
     """
     args = build_parser().parse_args(argv)

@@ -27,17 +27,13 @@ FILES = ("readings.csv", "readings.npz", "summary.json", "plot.png")
 def prepare_folder(folder: Path, *, force: bool) -> None:
     """Make the output folder, and see that it can be written to.
 
-    Parameters
-    ----------
-    folder
-        Where results go; made with its parents if it is not there.
-    force
-        Take a folder that holds something, and remove earlier results from it.
+    Args:
+        folder: Where results go; made with its parents if it is not there.
+        force: Take a folder that holds something, and remove earlier results from it.
 
-    Raises
-    ------
-    ScenarioError
-        If it is a file, holds something and ``force`` is not set, or cannot be written to.
+    Raises:
+        ScenarioError: If it is a file, holds something and ``force`` is not set, or cannot be
+            written to.
     """
     if folder.exists() and not folder.is_dir():
         raise ScenarioError(f"output {folder} is a file; give a folder")
@@ -62,14 +58,10 @@ def prepare_folder(folder: Path, *, force: bool) -> None:
 class RunWriter:
     """Takes samples, writes ``readings.csv`` row by row, and the other files at the end.
 
-    Parameters
-    ----------
-    folder
-        An output folder made by :func:`prepare_folder`.
-    scenario
-        The scenario that is run.
-    empty
-        The sensor's reading with nothing in front of it.
+    Args:
+        folder: An output folder made by :func:`prepare_folder`.
+        scenario: The scenario that is run.
+        empty: The sensor's reading with nothing in front of it.
     """
 
     def __init__(self, folder: Path, scenario: Scenario, empty: Reading) -> None:

@@ -31,12 +31,11 @@ Array = NDArray[np.float64]
 def check_design(design: Design, *, source: str = "design") -> None:
     """Refuse a design that could not be built, or that the field solver could not treat.
 
-    Raises
-    ------
-    DesignError
-        If there is no electrode; if a name is used twice; if an electrode touches another, or a
-        conductor; if anything leaves the domain; if layers overlap; if a sheet crosses a layer's
-        surface. The message names ``source``, the item, the value and the mend.
+    Raises:
+        DesignError: If there is no electrode; if a name is used twice; if an electrode touches
+            another, or a conductor; if anything leaves the domain; if layers overlap; if a sheet
+            crosses a layer's surface. The message names ``source``, the item, the value and the
+            mend.
     """
     if not design.electrodes:
         raise DesignError(f"{source}: design has no electrode; add an [[electrode]] table")

@@ -50,22 +50,17 @@ def available_designs() -> tuple[str, ...]:
 def load_design(name_or_path: str | Path) -> Design:
     """Load a sensor design.
 
-    Parameters
-    ----------
-    name_or_path
-        Name of a packaged design, see :func:`available_designs`, or path to a design ``.toml``.
+    Args:
+        name_or_path: Name of a packaged design, see :func:`available_designs`, or path to a design
+            ``.toml``.
 
-    Returns
-    -------
-    Design
+    Returns:
         The checked design; lengths in metres, in the sensor frame (origin at the centre of the
         electrode plane, z out of the sensor).
 
-    Raises
-    ------
-    DesignError
-        If there is no such design, or if anything in its file is wrong; the message names the
-        file, the item, the value and the mend.
+    Raises:
+        DesignError: If there is no such design, or if anything in its file is wrong; the message
+            names the file, the item, the value and the mend.
     """
     text = str(name_or_path)
     if isinstance(name_or_path, str) and not text.endswith(".toml") and not set("/\\") & set(text):
@@ -93,19 +88,13 @@ def parse_design(
 ) -> Design:
     """Build a checked design from the content of a design file, given as nested dicts.
 
-    Parameters
-    ----------
-    data
-        What ``tomllib`` makes of a design file.
-    source
-        Name of the file, for messages.
-    folder
-        Folder that STL files are relative to; the current one by default.
+    Args:
+        data: What ``tomllib`` makes of a design file.
+        source: Name of the file, for messages.
+        folder: Folder that STL files are relative to; the current one by default.
 
-    Raises
-    ------
-    DesignError
-        If anything is wrong; the message names the item, the value and the mend.
+    Raises:
+        DesignError: If anything is wrong; the message names the item, the value and the mend.
     """
     top = DesignTable(data, source, "design")
     top.only(TOP_KEYS)

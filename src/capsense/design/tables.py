@@ -99,10 +99,8 @@ def read_placement(table: DesignTable) -> Placement:
     sensor's x, y and z axes, in that order; both in degrees. ``quaternion`` (x, y, z, w) replaces
     both.
 
-    Raises
-    ------
-    DesignError
-        If a number is missing or wrong, or if keys contradict each other.
+    Raises:
+        DesignError: If a number is missing or wrong, or if keys contradict each other.
     """
     center = table.coordinates("center", (2, 3), default=(0.0, 0.0))
     if len(center) == 3 and "z" in table:

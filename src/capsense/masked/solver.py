@@ -84,36 +84,24 @@ class MaskedSolver:
     ) -> None:
         """Assemble the empty domain.
 
-        Parameters
-        ----------
-        mesh
-            The fixed mesh.
-        electrode_groups
-            Node groups of the electrodes in matrix order, shape (M,).
-        ground_groups
-            Node groups held at 0 V.
-        eps_background
-            Relative permittivity of the empty domain: one number, or one per tetrahedron, (k,).
-        solver
-            "cg" or "lu".
-        tolerance
-            Relative residual that ends CG.
-        max_iterations
-            CG iterations after which a step fails.
-        warm_start
-            Whether CG starts from the potentials of the step before, or from zero.
-        profiles
-            Potential [V] of each node of an electrode that is driven with 1 V, by its group, each
-            of shape (g,); 1 where none is given.
+        Args:
+            mesh: The fixed mesh.
+            electrode_groups: Node groups of the electrodes in matrix order, shape (M,).
+            ground_groups: Node groups held at 0 V.
+            eps_background: Relative permittivity of the empty domain: one number, or one per
+                tetrahedron, (k,).
+            solver: "cg" or "lu".
+            tolerance: Relative residual that ends CG.
+            max_iterations: CG iterations after which a step fails.
+            warm_start: Whether CG starts from the potentials of the step before, or from zero.
+            profiles: Potential [V] of each node of an electrode that is driven with 1 V, by its
+                group, each of shape (g,); 1 where none is given.
 
-        Raises
-        ------
-        MeshError
-            If a group is unknown or empty, electrodes share nodes, or a profile does not fit.
-        FieldError
-            If `eps_background` does not fit the mesh.
-        SolveError
-            If a setting is out of range.
+        Raises:
+            MeshError: If a group is unknown or empty, electrodes share nodes, or a profile does not
+                fit.
+            FieldError: If `eps_background` does not fit the mesh.
+            SolveError: If a setting is out of range.
         """
         if solver not in ("cg", "lu"):
             raise SolveError(f"unknown solver {solver!r}; known: cg, lu")
@@ -156,22 +144,16 @@ class MaskedSolver:
     def step(self, inside: ArrayLike, body_eps_r: Sequence[float]) -> Array:
         """Capacitances with objects in the domain.
 
-        Parameters
-        ----------
-        inside
-            Index of the body that holds each tetrahedron's centroid, −1 for none, shape (k,).
-        body_eps_r
-            Relative permittivity of each body, or `GROUNDED`, shape (B,).
+        Args:
+            inside: Index of the body that holds each tetrahedron's centroid, −1 for none, shape
+                (k,).
+            body_eps_r: Relative permittivity of each body, or `GROUNDED`, shape (B,).
 
-        Returns
-        -------
-        ndarray
+        Returns:
             Maxwell capacitance matrix [F], shape (M, M), symmetric.
 
-        Raises
-        ------
-        SolveError
-            If the arrays do not fit, or CG does not reach its tolerance.
+        Raises:
+            SolveError: If the arrays do not fit, or CG does not reach its tolerance.
         """
         bodies = np.asarray(inside)
         if bodies.shape != (self.mesh.n_tets,) or not np.issubdtype(bodies.dtype, np.integer):
@@ -189,25 +171,17 @@ class MaskedSolver:
     def step_cells(self, eps_r: ArrayLike, grounded: ArrayLike | None = None) -> Array:
         """Capacitances for given permittivities of all tetrahedra.
 
-        Parameters
-        ----------
-        eps_r
-            Relative permittivities, objects included, shape (k,).
-        grounded
-            Tetrahedra that belong to conductors at 0 V, booleans of shape (k,). Electrode nodes
-            in them keep the electrode's potential.
+        Args:
+            eps_r: Relative permittivities, objects included, shape (k,).
+            grounded: Tetrahedra that belong to conductors at 0 V, booleans of shape (k,). Electrode
+                nodes in them keep the electrode's potential.
 
-        Returns
-        -------
-        ndarray
+        Returns:
             Maxwell capacitance matrix [F], shape (M, M), symmetric.
 
-        Raises
-        ------
-        FieldError
-            If `eps_r` does not fit the mesh.
-        SolveError
-            If `grounded` does not fit, or CG does not reach its tolerance.
+        Raises:
+            FieldError: If `eps_r` does not fit the mesh.
+            SolveError: If `grounded` does not fit, or CG does not reach its tolerance.
         """
         started = time.perf_counter()
         changed = self._update(check_eps_r(self.mesh, eps_r))
@@ -286,19 +260,13 @@ def conjugate_gradients(
 
     Ends when sqrt(rᵀ D⁻¹ r) ≤ tolerance · sqrt(bᵀ D⁻¹ b) with r = b − K x.
 
-    Returns
-    -------
-    solution
-        x, shape (n,).
-    iterations
-        Iterations made.
-    residual
-        sqrt(rᵀ D⁻¹ r / bᵀ D⁻¹ b) at the end.
+    Returns:
+        solution: x, shape (n,).
+        iterations: Iterations made.
+        residual: sqrt(rᵀ D⁻¹ r / bᵀ D⁻¹ b) at the end.
 
-    Raises
-    ------
-    SolveError
-        If the tolerance is not reached in `max_iterations`.
+    Raises:
+        SolveError: If the tolerance is not reached in `max_iterations`.
     """
     scale = math.sqrt(_dot(load, inverse_diagonal * load))
     if scale == 0.0:

@@ -78,34 +78,23 @@ def mesh_design(
     and grows by `growth` metres per metre of distance up to `size_far`. Inside a layer it stays
     below the layer's thickness divided by `layers_across`.
 
-    Parameters
-    ----------
-    design
-        The sensor. Curved conductors are meshed as the facets they come in.
-    size_at_edges
-        Element size [m] at conductor rims.
-    size_far
-        Largest element size [m].
-    growth
-        Increase of the element size per unit distance from the rims.
-    layers_across
-        Elements wanted across the thickness of a layer; below 1, that much flatter elements
-        are accepted.
+    Args:
+        design: The sensor. Curved conductors are meshed as the facets they come in.
+        size_at_edges: Element size [m] at conductor rims.
+        size_far: Largest element size [m].
+        growth: Increase of the element size per unit distance from the rims.
+        layers_across: Elements wanted across the thickness of a layer; below 1, that much flatter
+            elements are accepted.
 
-    Returns
-    -------
-    TetMesh
+    Returns:
         Node groups: one for each electrode and conductor under its name, and "ground" for the
         outer box. Cell groups: one for each layer; where layers overlap the last one owns the
         cell. Nodes [m] in the sensor frame.
 
-    Raises
-    ------
-    MeshError
-        If a size is not positive, there are more than `MAX_FACETS` facets, an electrode
-        touches the box or another conductor, names are used twice, or Gmsh fails.
-    MissingDependencyError
-        If Gmsh or a shared library that it needs is not installed.
+    Raises:
+        MeshError: If a size is not positive, there are more than `MAX_FACETS` facets, an electrode
+            touches the box or another conductor, names are used twice, or Gmsh fails.
+        MissingDependencyError: If Gmsh or a shared library that it needs is not installed.
     """
     sizes = {
         "size_at_edges": size_at_edges,
@@ -141,10 +130,9 @@ def mesh_design(
 def import_gmsh() -> ModuleType:
     """Import the Gmsh module.
 
-    Raises
-    ------
-    MissingDependencyError
-        If the package or a shared library is missing; the message gives the install command.
+    Raises:
+        MissingDependencyError: If the package or a shared library is missing; the message gives the
+            install command.
     """
     try:
         return importlib.import_module("gmsh")

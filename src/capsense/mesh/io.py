@@ -109,24 +109,18 @@ _NODE_PREFIX, _CELL_PREFIX = "node_group:", "cell_group:"
 def load_mesh(path: str | Path, unit: Unit | None = None) -> TetMesh:
     """Read a mesh from a `.msh`, `.vtu` or `.mat` file.
 
-    Parameters
-    ----------
-    path
-        The file. Physical groups of a `.msh` become groups of the mesh: those of volumes cell
-        groups, those of surfaces, curves and points node groups; a group without a name is
-        called ``physical_<dimension>_<number>``. Nodes outside every tetrahedron are dropped,
-        and only the corners of quadratic tetrahedra are kept.
-    unit
-        Unit of length of the file: "m" (the default for `.msh` and `.vtu`), "mm" or "cm" (the
-        default for `.mat`).
+    Args:
+        path: The file. Physical groups of a `.msh` become groups of the mesh: those of volumes cell
+            groups, those of surfaces, curves and points node groups; a group without a name is
+            called ``physical_<dimension>_<number>``. Nodes outside every tetrahedron are dropped,
+            and only the corners of quadratic tetrahedra are kept.
+        unit: Unit of length of the file: "m" (the default for `.msh` and `.vtu`), "mm" or "cm" (the
+            default for `.mat`).
 
-    Raises
-    ------
-    MeshError
-        If the suffix is not one of `SUFFIXES`, or the file is missing, unreadable, inconsistent,
-        holds no tetrahedra or holds other solids.
-    MissingDependencyError
-        If the file is a `.vtu` and meshio is not installed.
+    Raises:
+        MeshError: If the suffix is not one of `SUFFIXES`, or the file is missing, unreadable,
+            inconsistent, holds no tetrahedra or holds other solids.
+        MissingDependencyError: If the file is a `.vtu` and meshio is not installed.
     """
     path = Path(path)
     suffix = _suffix(path)
@@ -155,26 +149,19 @@ def save_mesh(
 ) -> None:
     """Write a mesh to a `.msh` (metres), `.vtu` (metres) or `.mat` (centimetres) file.
 
-    Parameters
-    ----------
-    mesh
-        The mesh, groups included. In `.mat` files the group "ground" joins the electrodes in
-        the list of Dirichlet nodes, every other node group is an electrode, and neither names
-        nor cell groups are kept.
-    path
-        The file to write.
-    point_data, cell_data
-        Only for `.vtu`: named arrays of shape (n, …) or (k, …) stored with the mesh.
-    msh_version
-        Only for `.msh`: format "4.1" or "2.2", both as text.
+    Args:
+        mesh: The mesh, groups included. In `.mat` files the group "ground" joins the electrodes in
+            the list of Dirichlet nodes, every other node group is an electrode, and neither names
+            nor cell groups are kept.
+        path: The file to write.
+        point_data: Only for `.vtu`: named arrays of shape (n, …), stored with the mesh.
+        cell_data: Only for `.vtu`: named arrays of shape (k, …), stored with the mesh.
+        msh_version: Only for `.msh`: format "4.1" or "2.2", both as text.
 
-    Raises
-    ------
-    MeshError
-        If the suffix is not one of `SUFFIXES`, data does not fit the mesh or the file type, or
-        the file cannot be written.
-    MissingDependencyError
-        If the file is a `.vtu` and meshio is not installed.
+    Raises:
+        MeshError: If the suffix is not one of `SUFFIXES`, data does not fit the mesh or the file
+            type, or the file cannot be written.
+        MissingDependencyError: If the file is a `.vtu` and meshio is not installed.
     """
     path = Path(path)
     suffix = _suffix(path)

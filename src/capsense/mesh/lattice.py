@@ -51,23 +51,18 @@ def kuhn_tets(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> TetMesh:
     this is the 7-point difference stencil; on a graded one the weight of an axis link averages
     the cross-sections of the four cells around it as (2, 1, 1, 2)/6.
 
-    Parameters
-    ----------
-    x, y, z
-        Strictly increasing coordinates [m] of the lattice planes, shapes (nx,), (ny,), (nz,),
-        two at least of each.
+    Args:
+        x: Strictly increasing coordinates [m] of the lattice planes, at least two, shape (nx,).
+        y: The same, shape (ny,).
+        z: The same, shape (nz,).
 
-    Returns
-    -------
-    TetMesh
+    Returns:
         Node (i, j, k) has number ``(i * ny + j) * nz + k``; cell (i, j, k) owns the tetrahedra
         ``6 * ((i * (ny - 1) + j) * (nz - 1) + k) + (0…5)``. Node group "ground" holds the six
         outer faces.
 
-    Raises
-    ------
-    MeshError
-        If coordinates are not finite, one-dimensional and strictly increasing.
+    Raises:
+        MeshError: If coordinates are not finite, one-dimensional and strictly increasing.
     """
     axes = [_coordinates(values, name) for values, name in ((x, "x"), (y, "y"), (z, "z"))]
     shape = tuple(len(axis) for axis in axes)

@@ -91,11 +91,9 @@ class _Numbers:
 def parse_msh(content: bytes) -> MshData:
     """Parse the bytes of a .msh file.
 
-    Raises
-    ------
-    MeshError
-        If the file is not of version 2.2 or 4.1, is partitioned or damaged, or holds solids
-        other than tetrahedra.
+    Raises:
+        MeshError: If the file is not of version 2.2 or 4.1, is partitioned or damaged, or holds
+            solids other than tetrahedra.
     """
     head = re.match(rb"\$MeshFormat\s+([\d.]+)\s+([01])\s+(\d+)[^\n]*\n", content)
     if head is None:

@@ -33,11 +33,9 @@ class TetMesh:
     Indices count from 0. Tetrahedra given with negative volume are reoriented. The arrays are
     copied and made read-only.
 
-    Raises
-    ------
-    MeshError
-        If a coordinate is not finite, an index is out of range, a tetrahedron is degenerate,
-        two cell groups share a cell, or an array has the wrong shape.
+    Raises:
+        MeshError: If a coordinate is not finite, an index is out of range, a tetrahedron is
+            degenerate, two cell groups share a cell, or an array has the wrong shape.
     """
 
     points: Array
@@ -146,10 +144,8 @@ class TetMesh:
     def group_nodes(self, names: Iterable[str]) -> IntArray:
         """The sorted union of node groups, shape (g,).
 
-        Raises
-        ------
-        MeshError
-            If a name is not a node group of this mesh.
+        Raises:
+            MeshError: If a name is not a node group of this mesh.
         """
         names = tuple(names)
         for name in names:
@@ -162,10 +158,8 @@ class TetMesh:
     def cell_values(self, values: Mapping[str, float], default: float = 1.0) -> Array:
         """One number per tetrahedron, shape (k,): `values` of its cell group, else `default`.
 
-        Raises
-        ------
-        MeshError
-            If a name is not a cell group of this mesh.
+        Raises:
+            MeshError: If a name is not a cell group of this mesh.
         """
         out = np.full(self.n_tets, default, dtype=np.float64)
         for name, value in values.items():

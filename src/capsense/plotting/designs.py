@@ -31,16 +31,11 @@ def draw_design(design: Design, ax: Axes | None = None) -> Axes:
     Without ``ax`` a figure is made with a side view under the top view, its heights stretched
     and not to scale unless electrodes are curved; with ``ax`` only the top view is drawn into it.
 
-    Parameters
-    ----------
-    design
-        The design to draw.
-    ax
-        Matplotlib axes to draw into; by default those of a new figure.
+    Args:
+        design: The design to draw.
+        ax: Matplotlib axes to draw into; by default those of a new figure.
 
-    Returns
-    -------
-    Axes
+    Returns:
         The axes of the top view; ``axes.figure`` is the figure.
     """
     side: Axes | None = None
