@@ -10,14 +10,13 @@ from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.channels import Pattern, mutual_patterns
-from capsense.readout.chip import Status
-from capsense.readout.chips import CHIPS
+from capsense.readout.chips import CHIPS, Status
 from capsense.readout.converter import Range
+from capsense.readout.front_end import Wiring
 from capsense.readout.noise import allan_deviation
 from capsense.readout.presets import ReadoutOptions, charge_for, schedule_of
 from capsense.readout.presets import build as build_chip
 from capsense.readout.readout import Readout
-from capsense.readout.wiring import Wiring
 
 COUNT = 12
 NAMES = tuple(f"E{k}" for k in range(COUNT))

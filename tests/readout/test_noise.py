@@ -15,6 +15,7 @@ from relative import near
 from capsense.errors import ReadoutError
 from capsense.readout.noise import (
     ClimateDrift,
+    Context,
     Flicker,
     Mains,
     Profile,
@@ -22,7 +23,6 @@ from capsense.readout.noise import (
     White,
     allan_deviation,
 )
-from capsense.readout.stage import Context
 
 PERIOD = 0.01
 

@@ -18,10 +18,10 @@ from capsense.readout.chips import CHIPS
 from capsense.readout.converter import CapDac, LinearLaw
 from capsense.readout.counts import Counts, join
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
+from capsense.readout.front_end import Wiring
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
-from capsense.readout.wiring import Wiring
 
 NAMES = ("A", "B", "C")
 FINE = LinearLaw(1e-21, -(10**12), 10**12)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Unpack
 
 from capsense.adapters import pybullet
 from capsense.adapters.attached import AttachedSensor, make_simulator, refuse_missing
@@ -17,8 +17,7 @@ from capsense.adapters.pybullet_bodies import BODY_NAME, LINK_NAME
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.readout.readout import Readout
-from capsense.scene import DepthFrame, Material, Pose, Scene
-from capsense.scene.scene import Grounding
+from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Simulator
 
 __all__ = ["AssistiveGymSensor", "attach", "limbs"]
@@ -47,10 +46,9 @@ def attach(
     pose_in_link: Pose = Pose(),  # noqa: B008, it is immutable
     design: Design | str | Path | Simulator = "six_patch",
     *,
-    materials: Mapping[str, Material | str] | None = None,
-    grounding: Mapping[str, Grounding] | None = None,
+    perception: Literal["geometry", "depth_camera"] = "geometry",
     readout: Readout | str | Path | None = None,
-    **options: Any,
+    **options: Unpack[pybullet.PybulletOptions],
 ) -> AssistiveGymSensor:
     """Attach a sensor to an agent of an environment that was reset; call ``read()`` after a step.
 
@@ -70,12 +68,11 @@ def attach(
         pose_in_link: The sensor frame in the link's frame (the URDF frame): origin at the centre
             of the electrode plane, z out of the sensor.
         design: A design, a packaged name, a design file, or a ready simulator.
-        materials: Name pattern → material; the first that fits decides.
-        grounding: Name pattern → grounding; the first that fits decides. Geometry only.
+        perception: As for :func:`capsense.adapters.pybullet.attach`.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
-        options: As for :func:`capsense.adapters.pybullet.attach`: ``perception``, ``shapes``,
-            ``exclude`` and so on.
+        options: As for :func:`capsense.adapters.pybullet.attach`: those of
+            :class:`~capsense.adapters.pybullet.PybulletOptions`.
 
     Raises:
         SceneError: The environment was not reset, has no such agent or link, or as for
@@ -96,15 +93,14 @@ def attach(
             raise refuse_missing("agent with a body", agent, list(agents))
         number = _link(env, agent, link)
         _name(env, agents)
-        matter, ties = materials, grounding
+        known = options.copy()
         if "human" in agents:
-            matter = _and_person(materials, "human")
-            if options.get("perception") != "depth_camera":
-                ties = _and_person(grounding, PERSON)
+            known["materials"] = _and_person(options.get("materials"), "human")
+            if perception == "geometry":
+                known["grounding"] = _and_person(options.get("grounding"), PERSON)
         return pybullet.attach(
-            env.id, agents[agent], number, pose_in_link, simulator,
-            materials=matter, grounding=ties, **options,
-        )  # fmt: skip
+            env.id, agents[agent], number, pose_in_link, simulator, perception=perception, **known
+        )
 
     sensor = AssistiveGymSensor(env, simulator, attach_now)
     sensor.use_readout(sensor.readout if readout is None else readout)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.placement import nothing_seen, placement, turned_round
+from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import SceneError
+from capsense.errors import MissingDependencyError, SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
@@ -202,7 +203,9 @@ class DepthSensor(AttachedSensor):
 class WorldSource(ABC):
     """The solids of a simulator's model, taken over once for all sensors that ride in it."""
 
-    def __init__(self) -> None:
+    def __init__(self, rules: Rules) -> None:
+        self.rules = rules
+        """What is seen, and what it is made of."""
         self.version = 0
         """Goes up whenever the solids are taken over again."""
         self.refresh()
@@ -274,7 +277,7 @@ class GeometrySensor(AttachedSensor):
         if len(self.world.scene(frames)):
             return super().check()
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
-        behind = self.world.scene(replace(frames, sensor_quaternion=np.array(turn.quaternion)))
+        behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
         return [turned_round([str(b.name) for b in behind])] if len(behind) else super().check()
 
     def refresh(self) -> None:
@@ -324,48 +327,18 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
     return design if isinstance(design, Simulator) else Simulator(design)
 
 
-def check_perception(
-    perception: object, only_geometry: Mapping[str, object], only_depth: Mapping[str, object]
-) -> None:
-    """Refuse an unknown kind of perception, and options that belong to the other kind.
-
-    Args:
-        perception: What was asked for.
-        only_geometry: Options that only geometry has; those that are false were not given.
-        only_depth: Options that only a depth camera has.
+def require(module: str, title: str, extra: str) -> None:
+    """Refuse to go on without an optional package.
 
     Raises:
-        SceneError: The first thing that is wrong.
+        MissingDependencyError: It is not installed.
     """
-    if perception not in ("geometry", "depth_camera"):
-        raise SceneError(f'perception is {perception!r}; choose "geometry" or "depth_camera"')
-    other, options = "geometry", only_geometry
-    if perception == "geometry":
-        other, options = "depth_camera", only_depth
-    for name, value in options.items():
-        if value is not None and value is not False and value != () and value != {}:
-            raise SceneError(
-                f'{name} goes with perception="{other}"; leave it out of perception="{perception}"'
-            )
-
-
-def check_image(size: Any, resolution: Any, domain_width: float) -> tuple[float, int]:
-    """Size [m] and pixels of a square image; the width of the domain by default.
-
-    Raises:
-        SceneError: Not a positive length, or not a number of pixels from 4 to 2000.
-    """
-    if size is None:
-        size = domain_width
-    if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
-        raise SceneError(f"size is {size!r}; give the width of the image in metres")
-    if (
-        isinstance(resolution, bool)
-        or not isinstance(resolution, int)
-        or not 4 <= resolution <= 2000
-    ):
-        raise SceneError(f"resolution is {resolution!r}; give a whole number from 4 to 2000")
-    return float(size), resolution
+    try:
+        import_module(module)
+    except ImportError:
+        raise MissingDependencyError(
+            f"{title} is not installed; pip install 'capsense[{extra}]'"
+        ) from None
 
 
 def refuse_missing(what: str, name: str, known: Sequence[str]) -> SceneError:

@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-from capsense.adapters.attached import check_image, make_simulator
-from capsense.adapters.coppeliasim_calls import Remote, translated
-from capsense.adapters.coppeliasim_vision import (
-    CoppeliaSensor,
-    Paint,
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.adapters.attached import DepthSensor, make_simulator, require
+from capsense.adapters.coppeliasim_remote import (
+    Remote,
     VisionSensor,
     carrier,
+    draws,
     find_vision_sensor,
     make_vision_sensor,
+    remove_vision_sensor,
+    show,
+    translated,
 )
-from capsense.adapters.rules import Rules, as_material
+from capsense.adapters.rules import (
+    DEFAULTS,
+    Image,
+    ImageOptions,
+    Rules,
+    SeenOptions,
+    as_material,
+    split_rules,
+)
 from capsense.design.model import Design
-from capsense.errors import AdapterError, MissingDependencyError, SceneError
+from capsense.errors import AdapterError, SceneError
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
-from capsense.scene.scene import Grounding, checked_grounding
+from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
+from capsense.scene.scene import Grounding
 from capsense.simulator import Simulator, make_readout
 
-__all__ = ["CoppeliaSensor", "attach", "connect", "running"]
+__all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]
 
 _TRIES = 10
 """Steps after which a started simulation must be running."""
+_REMOVED = 1
+"""Option of ``sim.addItemToCollection``."""
 
 
 def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -> Any:
@@ -49,13 +65,10 @@ def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -
         MissingDependencyError: The client is not installed.
         AdapterError: Nobody answers there, or in another version of the protocol.
     """
-    try:
-        import zmq
-        from coppeliasim_zmqremoteapi_client import RemoteAPIClient
-    except ImportError:
-        raise MissingDependencyError(
-            "CoppeliaSim's client is not installed; pip install 'capsense[coppelia]'"
-        ) from None
+    require("coppeliasim_zmqremoteapi_client", "CoppeliaSim's client", "coppelia")
+    import zmq
+    from coppeliasim_zmqremoteapi_client import RemoteAPIClient
+
     if not timeout > 0:
         raise AdapterError(f"timeout is {timeout!r}; give seconds above zero")
     client = RemoteAPIClient(host, port)
@@ -125,21 +138,18 @@ def _start(remote: Remote) -> None:
     raise AdapterError("the simulation does not start; look for messages in CoppeliaSim")
 
 
+class CoppeliaOptions(SeenOptions, ImageOptions, total=False):
+    """Keywords of :func:`attach`."""
+
+
 def attach(
     sim: Any,
     object: int | str,
     design: Design | str | Path | Simulator = "six_patch",
     *,
     pose_in_object: Pose | None = None,
-    materials: Mapping[str, Material | str] | None = None,
-    default_material: Material | str | None = None,
-    default_grounding: Grounding = "grounded",
-    exclude: Sequence[str] = (),
-    exclude_own: bool = True,
-    size: float | None = None,
-    resolution: int | None = None,
-    back: str | float = "fill",
     readout: Readout | str | Path | None = None,
+    **options: Unpack[CoppeliaOptions],
 ) -> CoppeliaSensor:
     """Attach a sensor to an object; call ``read()`` after every step.
 
@@ -148,11 +158,13 @@ def attach(
 
     Where the object neither is a vision sensor nor carries one as its child, one is made, in the
     render mode "auxiliary channels", which knows no light, and what materials say is written into
-    the auxiliary colours of all shapes in the scene. Patterns are shell patterns, tried on a
-    shape's name and on its path, such as ``/Person/arm``. Permittivities of dielectrics are
-    rounded to whole numbers. Shapes added later want :meth:`CoppeliaSensor.refresh`.
+    the auxiliary colours of all shapes in the scene. Name patterns are tried on a shape's name and
+    on its path, such as ``/Person/arm``. Permittivities of dielectrics are rounded to whole
+    numbers. Shapes added later want :meth:`CoppeliaSensor.refresh`.
 
-    A vision sensor of the scene's own is taken as it is, and so is the red channel of its image.
+    A vision sensor of the scene's own is taken as it is, and so is the red channel of its image;
+    ``default_material`` is then that of everything seen, instead of what the red channel says.
+    ``default_grounding`` is that of all conductors, which are one body.
 
     Args:
         sim: What :func:`connect` or ``client.require("sim")`` returned.
@@ -161,19 +173,11 @@ def attach(
         pose_in_object: The sensor frame in the object's frame, by default that frame itself:
             origin at the centre of the electrode plane, z out of the sensor. A vision sensor of
             the scene's own is itself the sensor frame.
-        materials: Name pattern → material; the first that fits decides.
-        default_material: Material of everything else, steel by default. With a vision sensor of
-            the scene's own: of everything seen, instead of what the red channel says.
-        default_grounding: Grounding of all conductors, which are one body.
-        exclude: Name patterns of shapes that the sensor does not see.
-        exclude_own: Leave out the shape that the object is or stands on, which the design itself
-            describes.
-        size: Width and height of the image [m]; by default the width of the domain.
-        resolution: Pixels along each side of the image, 64 by default.
-        back: Where what is seen ends: ``"fill"``, at the end of the domain, or after an assumed
-            thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+        options: What is seen and what it is made of: ``materials``, ``exclude`` and the others of
+            :class:`~capsense.adapters.rules.SeenOptions`; ``size``, ``resolution`` and ``back`` of
+            :class:`~capsense.adapters.rules.ImageOptions`.
 
     Raises:
         SceneError: There is no such object, a pattern fits nothing, its vision sensor is in
@@ -187,47 +191,213 @@ def attach(
     remote = Remote(sim)
     handle = remote.find(object)
     vision_sensor = find_vision_sensor(remote, handle)
-    grounding = checked_grounding(default_grounding)
+    rules, other = split_rules(options, CoppeliaOptions)
     if vision_sensor is not None:
-        made_only = {
-            "materials": materials is not None, "exclude": len(exclude) > 0,
-            "pose_in_object": pose_in_object is not None, "size": size is not None,
-            "exclude_own=False": not exclude_own,
-        }  # fmt: skip
-        _check_own(vision_sensor, made_only, resolution)
-    material = None if default_material is None else as_material(default_material)
-    rules = Rules(materials or {}, {}, material or "steel", exclude=exclude)
+        _check_own(vision_sensor, {**options, "pose_in_object": pose_in_object})
     simulator = make_simulator(design)
-    domain = simulator.design.domain
-    pixels = 64 if resolution is None else resolution
-    size, pixels = check_image(size, pixels, max(domain.size[:2]))
+    image = Image.of(other, simulator.design)
     chip = make_readout(readout, simulator)
+    material = as_material(rules.default_material) if "default_material" in options else None
     paint = None
     if vision_sensor is None:  # all is checked: only now the scene is changed
-        paint = Paint(remote, rules, carrier(remote, handle) if exclude_own else None)
-        pose, far = pose_in_object or Pose(), float(domain.upper[2])
+        paint = Paint(remote, rules, carrier(remote, handle) if rules.exclude_own else None)
+        far = float(simulator.design.domain.upper[2])
         vision_sensor = make_vision_sensor(
-            remote, handle, pose, size, far, pixels, paint.collection
+            remote, handle, pose_in_object or Pose(), image, far, paint.collection
         )
         material = None  # the colours say it
-    sensor = CoppeliaSensor(remote, vision_sensor, simulator, grounding, back, paint, material)
+    sensor = CoppeliaSensor(
+        remote, vision_sensor, simulator, rules.default_grounding, image.back, paint, material
+    )
     sensor.use_readout(sensor.readout if readout is None else chip)
     return sensor
 
 
-def _check_own(
-    vision_sensor: VisionSensor, made_only: Mapping[str, bool], resolution: int | None
-) -> None:
+def _check_own(vision_sensor: VisionSensor, options: Mapping[str, Any]) -> None:
     """Refuse what does not go with a vision sensor of the scene's own."""
-    for name, given in made_only.items():
-        if given:
+    for name in ("materials", "exclude", "pose_in_object", "size", "exclude_own"):
+        usual = DEFAULTS.get(name)
+        if options.get(name, usual) not in (usual, None, (), []):
             raise SceneError(
                 f"{name} goes with a vision sensor that attach makes, but {vision_sensor.path!r} "
                 "is there; leave one of them out"
             )
-    rows, columns = vision_sensor.resolution
+    (rows, columns), resolution = vision_sensor.resolution, options.get("resolution")
     if resolution is not None and (rows, columns) != (resolution, resolution):
         raise SceneError(
             f"vision sensor {vision_sensor.path!r} has {columns} x {rows} pixels, not "
             f"{resolution} x {resolution}; leave resolution out, or set it there"
         )
+
+
+class CoppeliaSensor(DepthSensor):
+    """A sensor on an object in CoppeliaSim; made by :func:`attach`.
+
+    Args:
+        remote: The simulator.
+        vision_sensor: What it sees with.
+        simulator: The sensor itself.
+        grounding: Of all conductors.
+        back: Where what is seen ends.
+        paint: What colours the world's shapes, if it was to be coloured.
+        material: What everything is made of; None to tell by the red channel.
+    """
+
+    def __init__(
+        self,
+        remote: Remote,
+        vision_sensor: VisionSensor,
+        simulator: Simulator,
+        grounding: Grounding,
+        back: str | float,
+        paint: Paint | None,
+        material: Material | None,
+    ) -> None:
+        super().__init__(simulator)
+        self.vision_sensor = vision_sensor
+        """The vision sensor it sees with."""
+        self._remote, self._paint = remote, paint
+        self._grounding, self._back, self._material = grounding, back, material
+
+    def _time(self) -> float:
+        return float(self._remote.call("getSimulationTime"))
+
+    @property
+    def pose(self) -> Pose:
+        world = self._remote.constant("handle_world")
+        numbers = self._remote.call("getObjectPose", self.vision_sensor.handle, world)
+        return Pose(numbers[:3], numbers[3:])
+
+    def frame(self) -> DepthFrame:
+        """The depth image of the present state.
+
+        Raises:
+            SceneError: The simulation is not running, or the vision sensor was changed.
+            AdapterError: CoppeliaSim does not answer, or draws nothing.
+        """
+        remote, handle = self._remote, self.vision_sensor.handle
+        if remote.is_stopped():
+            raise SceneError(
+                "the simulation is not running; call sim.startSimulation() and sim.step(), or "
+                "step in capsense.coppeliasim.running(sim)"
+            )
+        if self._paint is None:
+            remote.call("handleVisionSensor", handle)
+        elif not draws(remote, handle):
+            self._paint.collect(handle)  # CoppeliaSim drops collections of scripts that end
+            if not draws(remote, handle):
+                raise AdapterError(
+                    f"CoppeliaSim draws nothing for vision sensor {self.vision_sensor.path!r}; "
+                    "builds and machines without OpenGL do not, nor does it while vision sensors "
+                    "are disabled: start the usual build, on a machine without a display under "
+                    "xvfb-run"
+                )
+        depth = self._image("getVisionSensorDepth", np.dtype("<f4"), 1, 1)
+        seen: Any = self._material
+        if seen is None:
+            seen = self._image("getVisionSensorImg", np.dtype("u1"), 3)
+        return DepthFrame(
+            depth, seen, self.vision_sensor.camera, grounding=self._grounding, back=self._back
+        )
+
+    def refresh(self) -> None:
+        """Colour the world's shapes again, and collect anew which are seen, after some were added.
+
+        Raises:
+            SceneError: A name pattern fits nothing.
+            AdapterError: CoppeliaSim does not answer.
+        """
+        if self._paint is not None:
+            self._paint.collect(self.vision_sensor.handle)
+
+    def remove(self) -> None:
+        """Take the vision sensor that was made for this one out of the scene again.
+
+        Raises:
+            AdapterError: CoppeliaSim does not answer, or it is gone already.
+        """
+        if self._paint is not None:
+            remove_vision_sensor(self._remote, self.vision_sensor.handle)
+
+    def _image(
+        self, name: str, kind: np.dtype[Any], channels: int, *options: int
+    ) -> NDArray[np.generic]:
+        data, (columns, rows) = self._remote.call(name, self.vision_sensor.handle, *options)
+        known = self.vision_sensor.resolution
+        if (rows, columns) != known:
+            raise SceneError(
+                f"vision sensor {self.vision_sensor.path!r} now has {columns} x {rows} pixels, not "
+                f"{known[1]} x {known[0]}; attach again"
+            )
+        if len(data) != rows * columns * channels * kind.itemsize:
+            raise AdapterError(
+                f"sim.{name} gave {len(data)} bytes for {columns} x {rows} pixels of "
+                f"{channels * kind.itemsize} bytes"
+            )
+        image = np.frombuffer(data, kind)
+        return image.reshape((rows, columns, channels)[: 3 if channels > 1 else 2])
+
+
+class Paint:
+    """Writes into the auxiliary colours of all shapes what they are made of.
+
+    The red channel holds :func:`~capsense.scene.depth.encode_permittivity`.
+
+    Raises:
+        SceneError: A name pattern fits nothing, or there is no code for a permittivity.
+
+    Args:
+        remote: The simulator.
+        rules: What shapes are made of, and which are not seen; patterns are tried on a shape's
+            name and on its path.
+        own: A shape that is not seen, if any.
+    """
+
+    def __init__(self, remote: Remote, rules: Rules, own: int | None) -> None:
+        self._remote, self._rules = remote, rules
+        self._own = own
+        self.collection = self._paint(self._shapes())
+        """Handle of the collection of what is seen."""
+
+    def collect(self, vision_sensor: int) -> None:
+        """Colour the shapes that there are now, and show them to a vision sensor.
+
+        Raises:
+            SceneError: A name pattern fits nothing.
+        """
+        shapes = self._shapes()  # refuses wrong patterns before the scene is changed
+        with suppress(AdapterError):  # it may be gone already
+            self._remote.call("destroyCollection", self.collection)
+        self.collection = self._paint(shapes)
+        show(self._remote, vision_sensor, self.collection)
+
+    def _shapes(self) -> dict[int, tuple[tuple[str, str], float]]:
+        """Names and code, from 0 to 1, of every shape in the scene.
+
+        Raises:
+            SceneError: A name pattern fits nothing, or there is no code for a permittivity.
+        """
+        remote, rules = self._remote, self._rules
+        scene, kind = remote.constant("handle_scene"), remote.constant("sceneobject_shape")
+        shapes = remote.call("getObjectsInTree", scene, kind)
+        called = {int(h): (str(remote.call("getObjectAlias", h)), remote.path(h)) for h in shapes}
+        rules.check(list(called.values()))
+        out = {}
+        for handle, names in called.items():
+            matter = rules.material_of(names)
+            code = encode_permittivity(np.inf if matter.is_conductor() else matter.eps_r)
+            out[handle] = names, int(code) / CONDUCTOR_CODE
+        return out
+
+    def _paint(self, shapes: dict[int, tuple[tuple[str, str], float]]) -> int:
+        """Colour shapes; returns a new collection of those that are seen."""
+        remote = self._remote
+        component = remote.constant("colorcomponent_auxiliary")
+        single, every = remote.constant("handle_single"), remote.constant("handle_all")
+        collection = int(remote.call("createCollection", 0))
+        remote.call("addItemToCollection", collection, every, -1, 0)
+        for handle, (names, red) in shapes.items():
+            if handle == self._own or self._rules.excludes(names):
+                remote.call("addItemToCollection", collection, single, handle, _REMOVED)
+            remote.call("setShapeColor", handle, None, component, [red, 0.0, 0.0])
+        return collection

@@ -1,21 +1,46 @@
-"""Triangle meshes of simulators, made into solids."""
+"""Primitives, triangle meshes and terrains of simulators, made into solids."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
-from capsense.scene import Cylinder, TriMesh
+from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
 
 Array = NDArray[np.float64]
+
+_TILE = 0.6
+"""Tiles are about so wide [m], or a cell of the terrain if that is wider."""
 
 
 class UnusableShape(SceneError):
     """A shape of a model that can be left out: it has no volume, or its file cannot be read."""
+
+
+def primitive(kind: str, sizes: Sequence[float]) -> Shape | None:
+    """The primitive of a simulator, or None for other kinds.
+
+    Args:
+        kind: ``"SPHERE"``, ``"CAPSULE"``, ``"CYLINDER"``, ``"ELLIPSOID"`` or ``"BOX"``.
+        sizes: Three numbers [m] as MuJoCo and Newton give them: half edges or semi-axes; for a
+            round shape its radius and its half length along z.
+    """
+    a, b, c = sizes
+    if kind == "SPHERE" or (kind == "CAPSULE" and b <= 0):
+        return Sphere(a)
+    if kind == "CAPSULE":
+        return Capsule(a, 2 * b)
+    if kind == "CYLINDER":
+        return Cylinder(a, 2 * b)
+    if kind == "ELLIPSOID":
+        return Ellipsoid((a, b, c))
+    return Box((2 * a, 2 * b, 2 * c)) if kind == "BOX" else None
 
 
 def solid_mesh(vertices: ArrayLike, faces: ArrayLike, label: str, *, hull: bool = False) -> TriMesh:
@@ -107,6 +132,61 @@ def height_field(heights: ArrayLike, size: ArrayLike, base: float) -> tuple[Arra
         [np.stack([rim, rim + n, ahead], axis=1), np.stack([ahead, rim + n, ahead + n], axis=1)]
     )
     return vertices, np.concatenate([top, top[:, ::-1] + n, walls])
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """A height field, given out in tiles."""
+
+    heights: Array
+    """Heights [m] over z = 0 of its frame, rows along y and columns along x, (rows, columns)."""
+    half: tuple[float, float]
+    """Half extents along x and y [m]."""
+    base: float
+    """Depth of its floor below z = 0 [m]."""
+    solid: bool
+    """Whether tiles have walls and a floor, as matter that does not conduct must have."""
+    label: str
+    """What it is called, for messages."""
+    _tiles: dict[tuple[int, int], TriMesh] = field(default_factory=dict, repr=False)
+
+    def bounds(self) -> Array:
+        """Lower and upper corner of the bounding box [m] in its frame, shape (2, 3)."""
+        x, y = self.half
+        low, high = float(self.heights.min()), float(self.heights.max())
+        return np.array([[-x, -y, min(low, -self.base)], [x, y, high]])
+
+    def near(self, centre: Array, reach: float) -> list[TriMesh]:
+        """The tiles within a distance [m] along x and y of a point in its frame, shape (3,)."""
+        along = [self._range(axis, centre[axis], reach) for axis in (0, 1)]
+        return [self._tile(row, column) for row in along[1] for column in along[0]]
+
+    def _cells(self, axis: int) -> tuple[int, int, float]:
+        """Cells along x (0) or y (1), those of a tile, and the width of a cell [m]."""
+        cells = self.heights.shape[1 - axis] - 1
+        width = 2 * self.half[axis] / cells
+        return cells, max(1, round(_TILE / width)), width
+
+    def _range(self, axis: int, at: float, reach: float) -> range:
+        cells, many, width = self._cells(axis)
+        low, high = ((at + side * reach + self.half[axis]) / (many * width) for side in (-1, 1))
+        last = -(-cells // many)
+        return range(max(0, int(np.floor(low))), min(last, int(np.floor(high)) + 1))
+
+    def _tile(self, row: int, column: int) -> TriMesh:
+        if (row, column) not in self._tiles:
+            (nx, mx, dx), (ny, my, dy) = self._cells(0), self._cells(1)
+            rows = slice(row * my, min((row + 1) * my, ny) + 1)
+            columns = slice(column * mx, min((column + 1) * mx, nx) + 1)
+            part = self.heights[rows, columns]
+            half = 0.5 * dx * (part.shape[1] - 1), 0.5 * dy * (part.shape[0] - 1)
+            vertices, faces = height_field(part, half, self.base)
+            vertices[:, 0] += columns.start * dx - self.half[0] + half[0]
+            vertices[:, 1] += rows.start * dy - self.half[1] + half[1]
+            if not self.solid:
+                faces = faces[: 2 * (part.shape[0] - 1) * (part.shape[1] - 1)]
+            self._tiles[row, column] = solid_mesh(vertices, faces, self.label)
+        return self._tiles[row, column]
 
 
 def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Array, Array]:

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import GeometrySensor, check_perception, make_simulator
+from capsense.adapters.attached import (
+    GeometrySensor,
+    make_simulator,
+    refuse_missing,
+    require,
+)
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
-from capsense.adapters.mujoco_spec import add_sensor
-from capsense.adapters.rules import Rules
+from capsense.adapters.rules import AttachOptions, Image, check_perception, split_rules
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
-from capsense.errors import MissingDependencyError, SceneError
+from capsense.errors import SceneError
 from capsense.readout.readout import Readout
-from capsense.scene import Material
-from capsense.scene.scene import Grounding, checked_grounding
+from capsense.scene import Pose
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 
@@ -30,10 +33,33 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 __all__ = [
-    "AttachedSkin", "MujocoDepthSensor", "MujocoSensor", "add_sensor", "attach", "attach_skin",
+    "AttachedSkin", "MujocoDepthSensor", "MujocoOptions", "MujocoSensor", "add_sensor", "attach",
+    "attach_skin",
 ]  # fmt: skip
 
 _SCALAR_LAST = [1, 2, 3, 0]
+_TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
+"""MuJoCo's cameras look along -z: half a turn about x."""
+_ONLY = {
+    "geometry": ("materials", "grounding", "exclude", "hull", "groups", "exclude_own"),
+    "depth_camera": ("camera", "back"),
+}
+
+
+class MujocoSkinOptions(AttachOptions, total=False):
+    """Keywords of :func:`attach_skin`."""
+
+    groups: Collection[int] | None
+    """See only geoms of these groups (MuJoCo's 0 to 5); default all."""
+
+
+class MujocoOptions(MujocoSkinOptions, total=False):
+    """Keywords of :func:`attach`; with a depth camera only the defaults and the two below."""
+
+    camera: str | None
+    """Name of the camera; by default that of the site. Depth only."""
+    back: str | float
+    """Where what the camera sees ends, as of :class:`ImageOptions`. Depth only."""
 
 
 def attach(
@@ -43,17 +69,8 @@ def attach(
     design: Design | str | Path | Simulator = "six_patch",
     *,
     perception: Literal["geometry", "depth_camera"] = "geometry",
-    materials: Mapping[str, Material | str] | None = None,
-    grounding: Mapping[str, Grounding] | None = None,
-    default_material: Material | str = "steel",
-    default_grounding: Grounding = "grounded",
-    exclude: Sequence[str] = (),
-    exclude_own: bool = True,
-    hull: Sequence[str] = (),
-    groups: Collection[int] | None = None,
-    camera: str | None = None,
-    back: str | float = "fill",
     readout: Readout | str | Path | None = None,
+    **options: Unpack[MujocoOptions],
 ) -> MujocoSensor | MujocoDepthSensor:
     """Attach a sensor to a site of a model; call ``read()`` after every ``mj_step``.
 
@@ -61,7 +78,7 @@ def attach(
     the sensor. With ``perception="geometry"`` geoms become solids once, at this call, and only
     their poses and the vertices of flexes are taken at a reading.
 
-    Patterns are shell patterns. They are tried on a geom's name (``geom3`` for the unnamed
+    Name patterns are tried on a geom's name (``geom3`` for the unnamed
     third, say), on its body's name, and on ``body/geom``; on a flex's name. The model can say the
     same in its ``<custom>`` section: ``<text name="capsense.material:arm*" data="human"/>`` and
     ``<text name="capsense.grounding:arm*" data="100e-12"/>``. What is given here comes first,
@@ -85,20 +102,10 @@ def attach(
         design: A design, a packaged name, a design file, or a ready simulator.
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, the image of a
             camera.
-        materials: Name pattern → material; the first that fits decides. Geometry only.
-        grounding: Name pattern → grounding; the first that fits decides. Geometry only.
-        default_material: Material of everything else.
-        default_grounding: Grounding of everything else.
-        exclude: Name patterns of geoms that the sensor does not see. Geometry only.
-        exclude_own: Leave out the geoms of the body that carries the site, which the design
-            itself describes. The world's own geoms are never left out by this. Geometry only.
-        hull: Name patterns of mesh geoms that are taken as their convex hulls. Geometry only.
-        groups: See only geoms of these groups (MuJoCo's 0 to 5); default all. Geometry only.
-        camera: Name of the camera; by default that of the site. Depth only.
-        back: Where what the camera sees ends: ``"fill"``, at the end of the domain, or after an
-            assumed thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+        options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
+            the others of :class:`MujocoOptions`.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -108,28 +115,20 @@ def attach(
         DesignError: The design is wrong.
         ReadoutError: There is no such chip.
     """
-    _require()
+    require("mujoco", "MuJoCo", "mujoco")
     _check_pair(model, data)
-    only_geometry = {
-        "materials": materials, "grounding": grounding, "exclude": exclude, "hull": hull,
-        "groups": groups, "exclude_own=False": not exclude_own,
-    }  # fmt: skip
-    check_perception(perception, only_geometry, {"camera": camera, "back": back != "fill"})
+    check_perception(perception, options, _ONLY)
+    rules, other = split_rules(options, MujocoOptions)
     number = find_site(model, site)
+    sensor: MujocoSensor | MujocoDepthSensor
     if perception == "depth_camera":
-        depth_camera = find_camera(model, site if camera is None else camera)
-        sensor: MujocoSensor | MujocoDepthSensor = MujocoDepthSensor(
-            model, data, number, depth_camera, make_simulator(design), default_material,
-            checked_grounding(default_grounding), back,
-        )  # fmt: skip
-        sensor.use_readout(sensor.readout if readout is None else readout)
-        sensor.warn()
-        return sensor
-    rules = Rules(
-        materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
-    )
-    source = ModelSource(model, data, rules, groups)
-    sensor = MujocoSensor(source, number, make_simulator(design), exclude_own=exclude_own)
+        name = other.get("camera")
+        camera = find_camera(model, site if name is None else name)
+        back = other.get("back", "fill")
+        sensor = MujocoDepthSensor(model, data, number, camera, make_simulator(design), rules, back)
+    else:
+        source = ModelSource(model, data, rules, other.get("groups"))
+        sensor = MujocoSensor(source, number, make_simulator(design))
     sensor.use_readout(sensor.readout if readout is None else readout)
     sensor.warn()
     return sensor
@@ -141,16 +140,9 @@ def attach_skin(
     sites: Sequence[str],
     design: AnyDesign | Mapping[str, AnyDesign] = "arm_segment",
     *,
-    materials: Mapping[str, Material | str] | None = None,
-    grounding: Mapping[str, Grounding] | None = None,
-    default_material: Material | str = "steel",
-    default_grounding: Grounding = "grounded",
-    exclude: Sequence[str] = (),
-    exclude_own: bool = True,
-    hull: Sequence[str] = (),
-    groups: Collection[int] | None = None,
     readout: str | Path | None = None,
     threads: int | None = None,
+    **options: Unpack[MujocoSkinOptions],
 ) -> AttachedSkin:
     """Attach a sensor to each of several sites; one ``read()`` reads them all, in parallel.
 
@@ -163,16 +155,9 @@ def attach_skin(
         sites: Names of the sites, which are also those of the readings.
         design: What :func:`attach` takes, for all sites, or site → design. A simulator that is
             given for several sites stands for its own design.
-        materials: As for :func:`attach`, like all that follow up to ``groups``.
-        grounding: Name pattern → grounding.
-        default_material: Material of everything else.
-        default_grounding: Grounding of everything else.
-        exclude: Name patterns of geoms that no sensor sees.
-        exclude_own: Leave out the geoms of the body that carries a sensor, for that sensor.
-        hull: Name patterns of mesh geoms that are taken as their convex hulls.
-        groups: See only geoms of these groups; default all.
         readout: Name of the chip behind every sensor, or the path of a readout file.
         threads: How many threads read; by default as many as the process may use processors.
+        options: As for :func:`attach`: those of :class:`MujocoSkinOptions`.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -181,20 +166,15 @@ def attach_skin(
         DesignError: A design is wrong.
         ReadoutError: There is no such chip.
     """
-    _require()
+    require("mujoco", "MuJoCo", "mujoco")
     _check_pair(model, data)
+    rules, other = split_rules(options, MujocoSkinOptions)
     if isinstance(sites, str):
         raise SceneError(f"sites is {sites!r}; give a list of names, like [{sites!r}]")
     numbers = {site: find_site(model, site) for site in sites}
-    rules = Rules(
-        materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
-    )
-    source = ModelSource(model, data, rules, groups)
+    source = ModelSource(model, data, rules, other.get("groups"))
     simulators = simulators_of(sites, design)
-    sensors = {
-        site: MujocoSensor(source, number, simulators[site], exclude_own=exclude_own)
-        for site, number in numbers.items()
-    }
+    sensors = {site: MujocoSensor(source, k, simulators[site]) for site, k in numbers.items()}
     skin = AttachedSkin(sensors, readout, threads)
     skin.warn()
     return skin
@@ -205,16 +185,13 @@ class MujocoSensor(GeometrySensor):
 
     source: ModelSource
 
-    def __init__(
-        self, source: ModelSource, site: int, simulator: Simulator, *, exclude_own: bool
-    ) -> None:
+    def __init__(self, source: ModelSource, site: int, simulator: Simulator) -> None:
         self.model = source.model
         """The model."""
         self.data = source.data
         """The state that readings are taken of."""
         self._site = site
         self._body = int(self.model.site_bodyid[site])
-        self._exclude_own = exclude_own
         self._turn = np.empty(4)
         super().__init__(simulator, source)
 
@@ -222,7 +199,7 @@ class MujocoSensor(GeometrySensor):
         return float(self.data.time)
 
     def _own_frame(self) -> int | None:
-        return self._body if self._exclude_own and self._body else None
+        return self._body if self.source.rules.exclude_own and self._body else None
 
     def _frames(self, position: Array, quaternion: Array) -> Frames:
         import mujoco
@@ -233,13 +210,71 @@ class MujocoSensor(GeometrySensor):
         return Frames(position, quaternion, data.site_xpos[self._site], self._turn[_SCALAR_LAST])
 
 
-def _require() -> None:
-    try:
-        import mujoco  # noqa: F401
-    except ImportError:
-        raise MissingDependencyError(
-            "MuJoCo is not installed; pip install 'capsense[mujoco]'"
-        ) from None
+def add_sensor(
+    spec: mujoco.MjSpec,
+    body: str,
+    pose: Pose,
+    name: str = "pad",
+    *,
+    camera: float | None = None,
+    resolution: int = 64,
+) -> str:
+    """Add the site of a sensor to a body of a model, and on request the camera it sees through.
+
+    Args:
+        spec: A model before ``spec.compile()``, such as ``mujoco.MjSpec.from_file(path)``.
+        body: Name of the body that carries the sensor; ``"world"`` for the world itself.
+        pose: The sensor frame in the body's frame: origin at the centre of the electrode plane,
+            z out of the sensor.
+        name: Of the site, and of the camera.
+        camera: Width and height [m] of the image of an orthographic camera with a rangefinder,
+            for ``attach(…, perception="depth_camera")``; by default there is none.
+        resolution: Pixels along each side of the image.
+
+    Returns:
+        ``name``, as :func:`attach` takes it.
+
+    Raises:
+        SceneError: There is no such body, the name is taken, or something is of the wrong kind
+            or out of range.
+    """
+    import mujoco
+
+    if not isinstance(spec, mujoco.MjSpec):
+        raise SceneError(
+            f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, such as "
+            "mujoco.MjSpec.from_file(path)"
+        )
+    if not isinstance(pose, Pose):
+        raise SceneError(f"pose is {pose!r}; give a Pose(position, quaternion)")
+    if not isinstance(name, str) or not name:
+        raise SceneError(f"name is {name!r}; give the new site a name, like 'pad'")
+    carrier = spec.body(body) if isinstance(body, str) else None
+    if carrier is None:
+        raise refuse_missing("body", str(body), [b.name for b in spec.bodies if b.name])
+    taken = {"site": spec.sites, "camera": spec.cameras if camera is not None else []}
+    for kind, things in taken.items():
+        if name in [thing.name for thing in things]:
+            raise SceneError(f"the model has a {kind} named {name!r} already; give another name")
+    image = Image(1.0 if camera is None else camera, resolution)
+    carrier.add_site(name=name, pos=pose.position, quat=_scalar_first(pose))
+    if camera is None:
+        return name
+    carrier.add_camera(
+        name=name, pos=pose.position, quat=_scalar_first(pose @ _TO_CAMERA), fovy=image.size,
+        proj=mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC, resolution=[resolution, resolution],
+    )  # fmt: skip
+    depth = 1 << int(mujoco.mjtRayDataField.mjRAYDATA_DEPTH)
+    spec.add_sensor(
+        type=mujoco.mjtSensor.mjSENS_RANGEFINDER, objtype=mujoco.mjtObj.mjOBJ_CAMERA,
+        objname=name, intprm=[depth, 0, 0],
+    )  # fmt: skip
+    return name
+
+
+def _scalar_first(pose: Pose) -> list[float]:
+    x, y, z, w = pose.quaternion
+    return [w, x, y, z]
 
 
 def _check_pair(model: Any, data: Any) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters.attached import DepthSensor, refuse_missing
+from capsense.adapters.rules import Rules
 from capsense.errors import SceneError
-from capsense.scene import Material, Pose
+from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
-from capsense.scene.scene import Grounding
 from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -48,8 +48,7 @@ class MujocoDepthSensor(DepthSensor):
         site: int,
         camera: DepthCamera,
         simulator: Simulator,
-        material: Material | str,
-        grounding: Grounding,
+        rules: Rules,
         back: str | float,
     ) -> None:
         super().__init__(simulator)
@@ -58,13 +57,14 @@ class MujocoDepthSensor(DepthSensor):
         self.data = data
         """The state that readings are taken of."""
         self._site, self._depth_camera = site, camera
-        self._material, self._grounding, self._back = material, grounding, back
+        self._material, self._grounding = rules.default_material, rules.default_grounding
+        self._back = back
         width = camera.height * camera.columns / camera.rows
         far = float(simulator.design.domain.upper[2])
         self._camera = OrthographicCamera.opengl(width, camera.height, Pose(), far=far)
         self._same_body = model.site_bodyid[site] == model.cam_bodyid[camera.number]
         self._placed: OrthographicCamera | None = None
-        DepthFrame(np.zeros((1, 1)), material, grounding=grounding, back=back)  # checks them
+        DepthFrame(np.zeros((1, 1)), self._material, back=back)  # checks them
 
     def frame(self) -> DepthFrame:
         """The depth image of the present state.

@@ -10,22 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters.attached import WorldSource
-from capsense.adapters.meshes import height_field, solid_mesh
+from capsense.adapters.meshes import Terrain, height_field, primitive, solid_mesh
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
-from capsense.adapters.terrain import Terrain
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
-from capsense.scene import (
-    Box,
-    Capsule,
-    Cylinder,
-    Ellipsoid,
-    Material,
-    Pose,
-    Shape,
-    Sphere,
-    TriMesh,
-)
+from capsense.scene import Material, Pose, Shape, TriMesh
 
 if TYPE_CHECKING:
     import mujoco
@@ -177,19 +166,12 @@ class ModelReader:
 
         kinds = mujoco.mjtGeom
         kind = int(self.model.geom_type[geom])
-        a, b, c = self.model.geom_size[geom].tolist()
+        name = kinds(kind).name.removeprefix("mjGEOM_")
         if kind == int(kinds.mjGEOM_PLANE):
             return HalfSpace()
-        if kind == int(kinds.mjGEOM_SPHERE):
-            return Sphere(a)
-        if kind == int(kinds.mjGEOM_CAPSULE):
-            return Capsule(a, 2 * b) if b > 0 else Sphere(a)
-        if kind == int(kinds.mjGEOM_CYLINDER):
-            return Cylinder(a, 2 * b)
-        if kind == int(kinds.mjGEOM_ELLIPSOID):
-            return Ellipsoid((a, b, c))
-        if kind == int(kinds.mjGEOM_BOX):
-            return Box((2 * a, 2 * b, 2 * c))
+        shape = primitive(name, self.model.geom_size[geom].tolist())
+        if shape is not None:
+            return shape
         if kind in (int(kinds.mjGEOM_MESH), int(kinds.mjGEOM_SDF)):
             return self._mesh(int(self.model.geom_dataid[geom]), names)
         if kind == int(kinds.mjGEOM_HFIELD):
@@ -257,7 +239,6 @@ class ModelSource(WorldSource):
 
         self.model = model
         self.data = data
-        self._rules = rules
         _check_groups(groups)
         kinds = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
         self._warnings = [int(getattr(mujoco.mjtWarning, kind)) for kind in kinds]
@@ -270,11 +251,11 @@ class ModelSource(WorldSource):
         self._geoms = [
             i for i in range(model.ngeom) if groups is None or int(model.geom_group[i]) in groups
         ]
-        super().__init__()
+        super().__init__(rules)
 
     def refresh(self) -> None:
         super().refresh()
-        self._reader = ModelReader(self.model, self._rules)
+        self._reader = ModelReader(self.model, self.rules)
         self._made: dict[int, Solid | None] = {}
         self._known = [a.copy() for a in self._sizes()]
         self._set_back = self._bad_numbers()

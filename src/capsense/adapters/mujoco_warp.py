@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import warp as wp
 
 from capsense.adapters.mujoco_depth import find_site
 from capsense.adapters.mujoco_model import ModelReader
 from capsense.adapters.parallel import (
-    ParallelOptions,
+    FleetOptions,
     ParallelSensors,
     WorldShape,
     as_numbers,
+    from_matrices,
     warn_left_out,
 )
-from capsense.adapters.parallel_kernels import from_matrices
-from capsense.adapters.rules import Rules
+from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
 from capsense.fleet import FleetReading
-from capsense.scene import Body, Material, Pose, Shape
-from capsense.scene.scene import Grounding
+from capsense.scene import Body, Pose, Shape
 
 if TYPE_CHECKING:
     import mujoco
+
+
+class WarpOptions(FleetOptions, total=False):
+    """Keywords of :class:`CapacitiveSensors`."""
+
+    groups: Collection[int] | None
+    """See only geoms of these groups; default all."""
 
 
 class CapacitiveSensors(ParallelSensors):
@@ -39,17 +45,8 @@ class CapacitiveSensors(ParallelSensors):
         data: ``mujoco_warp.Data`` of some worlds.
         sites: Names of the sites.
         design: A design, its name, or the path of its file, for all sites.
-        materials: Name pattern → material, as for :func:`capsense.mujoco.attach`, like all that
-            follow up to ``groups``.
-        grounding: Name pattern → grounding.
-        default_material: Material of everything else.
-        default_grounding: Grounding of everything else.
-        exclude: Name patterns of geoms that no sensor sees.
-        exclude_own: Leave out the geoms of the body that carries a sensor, for that sensor.
-        hull: Name patterns of mesh geoms that are taken as their convex hulls.
-        groups: See only geoms of these groups; default all.
-        options: Further keywords of :class:`~capsense.adapters.parallel.ParallelOptions`:
-            ``device``, ``preset``, ``budget``.
+        options: What is seen and what it is made of, as for :func:`capsense.mujoco.attach`; and
+            ``device``, ``preset``, ``budget``. All are those of :class:`WarpOptions`.
 
     Raises:
         SceneError: There is no such site, a pattern fits nothing, or nothing can be seen.
@@ -62,20 +59,10 @@ class CapacitiveSensors(ParallelSensors):
         data: Any,
         sites: Sequence[str],
         design: Design | str | Path = "six_patch",
-        *,
-        materials: Mapping[str, Material | str] | None = None,
-        grounding: Mapping[str, Grounding] | None = None,
-        default_material: Material | str = "steel",
-        default_grounding: Grounding = "grounded",
-        exclude: Sequence[str] = (),
-        exclude_own: bool = True,
-        hull: Sequence[str] = (),
-        groups: Collection[int] | None = None,
-        **options: Any,
+        **options: Unpack[WarpOptions],
     ) -> None:
-        rules = Rules(
-            materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
-        )
+        rules, other = split_rules(options, WarpOptions)
+        groups = other.pop("groups", None)
         reader = ModelReader(model, rules)
         geoms: list[int] = []
         parts: list[WorldShape] = []
@@ -100,8 +87,8 @@ class CapacitiveSensors(ParallelSensors):
         ]
         device = data.geom_xpos.device
         super().__init__(
-            parts, carriers, data.geom_xpos.shape[0],
-            ParallelOptions(design, Rules(), exclude_own, **options), device,
+            parts, carriers, data.geom_xpos.shape[0], design, Rules(exclude_own=rules.exclude_own),
+            device, other,
         )  # fmt: skip
         self._geoms = as_numbers(geoms, device)
         self._numbers = as_numbers(numbers, device)

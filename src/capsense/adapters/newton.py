@@ -2,39 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from capsense.adapters.meshes import solid_mesh
+from capsense.adapters.meshes import primitive, solid_mesh
 from capsense.adapters.parallel import (
-    ParallelOptions,
+    FleetOptions,
     ParallelSensors,
     WorldShape,
     as_numbers,
+    compose,
     matching,
     warn_left_out,
 )
-from capsense.adapters.parallel_kernels import compose
-from capsense.adapters.rules import Rules
+from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.scene import (
-    Body,
-    Box,
-    Capsule,
-    Cylinder,
-    Ellipsoid,
-    Material,
-    Pose,
-    Shape,
-    Sphere,
-)
-from capsense.scene.scene import Grounding
+from capsense.scene import Body, Pose, Shape
 
 
 class SensorCapacitance(ParallelSensors):
@@ -49,15 +38,9 @@ class SensorCapacitance(ParallelSensors):
         model: The model, after ``ModelBuilder.finalize``.
         sites: Label patterns of the sites; those of the first world decide.
         design: A design, its name, or the path of its file, for all sites.
-        materials: Label pattern → material; the first that fits decides.
-        grounding: Label pattern → grounding; the first that fits decides.
-        default_material: Material of everything else.
-        default_grounding: Grounding of everything else.
-        exclude: Label patterns of shapes that no sensor sees.
-        exclude_own: Leave out the shapes of the body that carries a sensor, for that sensor.
-        hull: Label patterns of meshes that are taken as their convex hulls.
-        options: Further keywords of :class:`~capsense.adapters.parallel.ParallelOptions`:
-            ``device``, ``preset``, ``budget``.
+        options: What is seen and what it is made of, by the labels of shapes; and ``device``,
+            ``preset``, ``budget``. All are those of
+            :class:`~capsense.adapters.parallel.FleetOptions`.
 
     Raises:
         SceneError: There is no such site, a pattern fits nothing, nothing can be seen, or worlds
@@ -70,21 +53,11 @@ class SensorCapacitance(ParallelSensors):
         model: Any,
         sites: str | Sequence[str],
         design: Design | str | Path = "six_patch",
-        *,
-        materials: Mapping[str, Material | str] | None = None,
-        grounding: Mapping[str, Grounding] | None = None,
-        default_material: Material | str = "steel",
-        default_grounding: Grounding = "grounded",
-        exclude: Sequence[str] = (),
-        exclude_own: bool = True,
-        hull: Sequence[str] = (),
-        **options: Any,
+        **options: Unpack[FleetOptions],
     ) -> None:
         from newton import ShapeFlags
 
-        rules = Rules(
-            materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
-        )
+        rules, other = split_rules(options, FleetOptions)
         table = _by_world(model)
         site = (model.shape_flags.numpy()[table[0]] & int(ShapeFlags.SITE)) != 0
         labels = [model.shape_label[k] for k in table[0].tolist()]
@@ -106,13 +79,7 @@ class SensorCapacitance(ParallelSensors):
         chosen = known[matching(names, sites, "site")]
         carriers = [(labels[k], int(carrier[table[0, k]])) for k in chosen.tolist()]
         device = model.shape_transform.device
-        super().__init__(
-            parts,
-            carriers,
-            len(table),
-            ParallelOptions(design, rules, exclude_own, **options),
-            device,
-        )
+        super().__init__(parts, carriers, len(table), design, rules, device, other)
         local = model.shape_transform.numpy()
         seen = np.array([columns[k] for k in self.chosen])
         self._fixed = [
@@ -200,17 +167,9 @@ class _Reader:
         return self._made[key]
 
     def _shape(self, shape: int, kind: int, size: tuple[float, ...], label: str) -> Shape:
-        kinds, (a, b, c) = self._kinds, size
-        if kind == int(kinds.SPHERE):
-            return Sphere(a)
-        if kind == int(kinds.CAPSULE):
-            return Capsule(a, 2 * b) if b > 0 else Sphere(a)
-        if kind == int(kinds.CYLINDER):
-            return Cylinder(a, 2 * b)
-        if kind == int(kinds.ELLIPSOID):
-            return Ellipsoid((a, b, c))
-        if kind == int(kinds.BOX):
-            return Box((2 * a, 2 * b, 2 * c))
+        made = primitive(self._kinds(kind).name, size)
+        if made is not None:
+            return made
         mesh = self._source[shape]
         vertices = np.asarray(mesh.vertices, float) * np.array(size)
         faces = np.asarray(mesh.indices).reshape(-1, 3)

@@ -3,38 +3,32 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
 
-from capsense.adapters.rules import Names, Rules
+from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.fleet import Fleet, FleetReading
+from capsense.fleet.fleet import Preset
 from capsense.scene import Body
 
 _SHOWN = 6
 """Names that are listed in a message."""
 
 
-@dataclass(frozen=True)
-class ParallelOptions:
-    """What a sensor in many worlds is, and how it is solved."""
+class FleetOptions(AttachOptions, total=False):
+    """Keywords of sensors in many worlds."""
 
-    design: Design | str | Path = "six_patch"
-    """As :class:`~capsense.fleet.Fleet` takes it."""
-    rules: Rules = field(default_factory=Rules)
-    """What is seen, and what it is made of."""
-    exclude_own: bool = True
-    """Leave out, for each sensor, the shapes of the body that carries it."""
-    device: str | None = None
-    """As of a fleet; by default that of the simulator's arrays."""
-    preset: str = "learning"
-    budget: int = 64
+    device: str | None
+    """As of a :class:`~capsense.fleet.Fleet`; by default that of the simulator's arrays."""
+    preset: Preset
+    budget: int
     """Accuracy on the CPU and on Warp, as of a fleet."""
 
 
@@ -57,8 +51,10 @@ class ParallelSensors:
         parts: Shapes of a world.
         sites: Names of the sites, and the bodies that carry them.
         worlds: How many worlds.
-        options: The sensors.
+        design: As of a fleet.
+        rules: What is seen.
         device: Warp's device of the simulator's arrays.
+        options: Those of :class:`FleetOptions` that are none of the rules.
 
     Raises:
         SceneError: Nothing can be seen, or the rules leave everything out.
@@ -69,21 +65,22 @@ class ParallelSensors:
         parts: Sequence[WorldShape],
         sites: Sequence[tuple[str, int]],
         worlds: int,
-        options: ParallelOptions,
+        design: Design | str | Path,
+        rules: Rules,
         device: Any,
+        options: Mapping[str, Any],
     ) -> None:
-        options.rules.check([part.names for part in parts])
-        self.chosen = [k for k, part in enumerate(parts) if not options.rules.excludes(part.names)]
+        rules.check([part.names for part in parts])
+        self.chosen = [k for k, part in enumerate(parts) if not rules.excludes(part.names)]
         """Which of the parts are seen."""
         if not self.chosen:
             raise SceneError("there is nothing to see: all shapes are left out")
         seen = [parts[k] for k in self.chosen]
         first = [p.bodies if isinstance(p.bodies, Body) else p.bodies[0] for p in seen]
-        where = options.device or ("cpu" if device.is_cpu else str(device))
+        where = options.get("device") or ("cpu" if device.is_cpu else str(device))
         self.fleet = Fleet(
-            options.design, first, worlds, sensors=len(sites), device=where,
-            preset=options.preset, budget=options.budget,  # type: ignore[arg-type]
-        )  # fmt: skip
+            design, first, worlds, sensors=len(sites), **{**options, "device": where}
+        )
         """The fleet: its places are the shapes, its sensors the sites."""
         self.names = tuple(part.names[-1] for part in seen)
         self.sites = tuple(name for name, _ in sites)
@@ -91,7 +88,7 @@ class ParallelSensors:
         for place, part in enumerate(seen):
             if not isinstance(part.bodies, Body):
                 self.fleet.change(place, part.bodies)
-        if options.exclude_own:
+        if rules.exclude_own:
             for sensor, (_, own) in enumerate(sites):
                 mine = [k for k, part in enumerate(seen) if part.body == own >= 0]
                 self.fleet.hide(sensor, mine)
@@ -135,3 +132,29 @@ def matching(known: Sequence[str], patterns: str | Sequence[str], what: str) -> 
 def as_numbers(values: Any, device: Any) -> Any:
     """Whole numbers as an array of Warp."""
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False)
+def compose(
+    parents: wp.array2d(dtype=wp.transform), number: wp.array2d(dtype=wp.int32),
+    local: wp.array2d(dtype=wp.transform), out: wp.array2d(dtype=wp.transform),
+) -> None:  # fmt: skip
+    """Poses in the world of what is fixed to some of its bodies, -1 for the world itself."""
+    w, k = wp.tid()
+    at = local[w, k]
+    if number[w, k] >= 0:
+        at = wp.transform_multiply(parents[w, number[w, k]], at)
+    out[w, k] = at
+
+
+@no_type_check
+@wp.kernel(enable_backward=False)
+def from_matrices(
+    position: wp.array2d(dtype=wp.vec3), matrix: wp.array2d(dtype=wp.mat33),
+    number: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.transform),
+) -> None:  # fmt: skip
+    """Poses of some of what a simulator gives by positions and rotation matrices."""
+    w, k = wp.tid()
+    n = number[k]
+    out[w, k] = wp.transform(position[w, n], wp.quat_from_matrix(matrix[w, n]))

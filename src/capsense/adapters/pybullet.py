@@ -2,40 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters.attached import (
     GeometrySensor,
-    check_image,
-    check_perception,
     make_simulator,
     refuse_missing,
+    require,
 )
-from capsense.adapters.pybullet_bodies import body_numbers, links_of
+from capsense.adapters.pybullet_bodies import Mount, body_numbers, links_of
 from capsense.adapters.pybullet_depth import PybulletDepthSensor
 from capsense.adapters.pybullet_model import ClientSource
-from capsense.adapters.rules import Rules
+from capsense.adapters.rules import (
+    AttachOptions,
+    Image,
+    ImageOptions,
+    check_perception,
+    split_rules,
+)
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
-from capsense.errors import MissingDependencyError, SceneError
+from capsense.errors import SceneError
 from capsense.readout.readout import Readout
-from capsense.scene import Material, Pose
-from capsense.scene.scene import Grounding
+from capsense.scene import Pose
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 
 Array = NDArray[np.float64]
 Shapes = Literal["collision", "visual"]
 
-__all__ = ["AttachedSkin", "PybulletDepthSensor", "PybulletSensor", "attach", "attach_skin"]
+__all__ = [
+    "AttachedSkin", "PybulletDepthSensor", "PybulletOptions", "PybulletSensor", "attach",
+    "attach_skin",
+]  # fmt: skip
 
 _NO_POSE = Pose()
+_ONLY = {
+    "geometry": ("grounding", "hull", "shapes"),
+    "depth_camera": ("size", "resolution", "back"),
+}
+
+
+class PybulletSkinOptions(AttachOptions, total=False):
+    """Keywords of :func:`attach_skin`."""
+
+    shapes: Shapes
+    """``"collision"``, the default: what Bullet collides with, where a mesh is the convex hull of
+    each of its connected parts; or ``"visual"``: what it draws, meshes as they are."""
+
+
+class PybulletOptions(PybulletSkinOptions, ImageOptions, total=False):
+    """Keywords of :func:`attach`; ``grounding``, ``hull`` and ``shapes`` are for geometry only,
+    ``size``, ``resolution`` and ``back`` for depth cameras only."""
 
 
 def attach(
@@ -46,25 +70,15 @@ def attach(
     design: Design | str | Path | Simulator = "six_patch",
     *,
     perception: Literal["geometry", "depth_camera"] = "geometry",
-    shapes: Shapes = "collision",
-    materials: Mapping[str, Material | str] | None = None,
-    grounding: Mapping[str, Grounding] | None = None,
-    default_material: Material | str = "steel",
-    default_grounding: Grounding = "grounded",
-    exclude: Sequence[str] = (),
-    exclude_own: bool = True,
-    hull: Sequence[str] = (),
-    size: float | None = None,
-    resolution: int = 64,
-    back: str | float = "fill",
     readout: Readout | str | Path | None = None,
+    **options: Unpack[PybulletOptions],
 ) -> PybulletSensor | PybulletDepthSensor:
     """Attach a sensor to a link; call ``read()`` after every ``stepSimulation``.
 
     With ``perception="geometry"`` shapes become solids once, at this call, and again when bodies
     were added or removed; only poses and the vertices of soft bodies are taken at a reading.
 
-    Patterns are shell patterns. They are tried on a link's name, on its body's name, and on
+    Name patterns are tried on a link's name, on its body's name, and on
     ``body/link``; bodies without a name are called ``body3``, say. A body can say the same in its
     user data: ``addUserData(body, "capsense.material", "human", linkIndex=2)`` and the key
     ``"capsense.grounding"``. What is given here comes first, then user data, then the defaults.
@@ -82,24 +96,10 @@ def attach(
             mass): origin at the centre of the electrode plane, z out of the sensor.
         design: A design, a packaged name, a design file, or a ready simulator.
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, a rendered image.
-        shapes: ``"collision"``: what Bullet collides with, where a mesh is the convex hull of
-            each of its connected parts; or ``"visual"``: what it draws, meshes as they are.
-            Geometry only.
-        materials: Name pattern → material; the first that fits decides.
-        grounding: Name pattern → grounding; the first that fits decides. Geometry only.
-        default_material: Material of everything else.
-        default_grounding: Grounding of everything else.
-        exclude: Name patterns of links that the sensor does not see.
-        exclude_own: Leave out the link that carries the sensor, which the design itself
-            describes.
-        hull: Name patterns of links whose visual meshes are taken as their convex hulls.
-            Geometry only.
-        size: Width and height of the image [m]; by default the width of the domain. Depth only.
-        resolution: Pixels along each side of the image. Depth only.
-        back: Where what is drawn ends: ``"fill"``, at the end of the domain, or after an assumed
-            thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`. Depth only.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
             :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+        options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
+            the others of :class:`PybulletOptions`.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
@@ -108,32 +108,21 @@ def attach(
         DesignError: The design is wrong.
         ReadoutError: There is no such chip.
     """
-    _require()
-    _check_shapes(shapes)
-    only_geometry = {
-        "grounding": grounding, "hull": hull, 'shapes="visual"': shapes == "visual",
-    }  # fmt: skip
-    only_depth = {"size": size, "resolution": resolution != 64, "back": back != "fill"}
-    check_perception(perception, only_geometry, only_depth)
+    require("pybullet", "PyBullet", "pybullet")
+    check_perception(perception, options, _ONLY)
+    rules, other = split_rules(options, PybulletOptions)
+    shapes = _checked_shapes(other.pop("shapes", "collision"))
     if not isinstance(pose_in_link, Pose):
         raise SceneError(f"pose_in_link is {pose_in_link!r}; give a Pose(position, quaternion)")
-    rules = Rules(
-        materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
-    )
     number = _client_number(client)
-    index = _find_link(number, body, link)
+    mount = Mount(body, _find_link(number, body, link), pose_in_link)
     simulator = make_simulator(design)
+    sensor: PybulletSensor | PybulletDepthSensor
     if perception == "depth_camera":
-        size, resolution = check_image(size, resolution, max(simulator.design.domain.size[:2]))
-        sensor: PybulletSensor | PybulletDepthSensor = PybulletDepthSensor(
-            number, body, index, pose_in_link, simulator, rules,
-            exclude_own=exclude_own, size=size, resolution=resolution, back=back,
-        )  # fmt: skip
-        sensor.use_readout(sensor.readout if readout is None else readout)
-        sensor.warn()
-        return sensor
-    source = ClientSource(number, rules, shapes)
-    sensor = PybulletSensor(source, body, index, pose_in_link, simulator, exclude_own=exclude_own)
+        image = Image.of(other, simulator.design)
+        sensor = PybulletDepthSensor(number, mount, simulator, rules, image)
+    else:
+        sensor = PybulletSensor(ClientSource(number, rules, shapes), mount, simulator)
     sensor.use_readout(sensor.readout if readout is None else readout)
     sensor.warn()
     return sensor
@@ -145,16 +134,9 @@ def attach_skin(
     mounts: Mapping[str, tuple[int | str, Pose]],
     design: AnyDesign | Mapping[str, AnyDesign] = "arm_segment",
     *,
-    shapes: Shapes = "collision",
-    materials: Mapping[str, Material | str] | None = None,
-    grounding: Mapping[str, Grounding] | None = None,
-    default_material: Material | str = "steel",
-    default_grounding: Grounding = "grounded",
-    exclude: Sequence[str] = (),
-    exclude_own: bool = True,
-    hull: Sequence[str] = (),
     readout: str | Path | None = None,
     threads: int | None = None,
+    **options: Unpack[PybulletSkinOptions],
 ) -> AttachedSkin:
     """Attach several sensors to a robot's links; one ``read()`` reads them all, in parallel.
 
@@ -167,16 +149,9 @@ def attach_skin(
         mounts: Name → link, by index or name, and the sensor frame in the link's frame.
         design: What :func:`attach` takes, for all sensors, or name → design. A simulator that is
             given for several sensors stands for its own design.
-        shapes: As for :func:`attach`, like all that follow up to ``hull``.
-        materials: Name pattern → material.
-        grounding: Name pattern → grounding.
-        default_material: Material of everything else.
-        default_grounding: Grounding of everything else.
-        exclude: Name patterns of links that no sensor sees.
-        exclude_own: Leave out the link that carries a sensor, for that sensor.
-        hull: Name patterns of links whose visual meshes are taken as their convex hulls.
         readout: Name of the chip behind every sensor, or the path of a readout file.
         threads: How many threads read; by default as many as the process may use processors.
+        options: As for :func:`attach`: those of :class:`PybulletSkinOptions`.
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
@@ -185,23 +160,18 @@ def attach_skin(
         DesignError: A design is wrong.
         ReadoutError: There is no such chip.
     """
-    _require()
-    _check_shapes(shapes)
+    require("pybullet", "PyBullet", "pybullet")
+    rules, other = split_rules(options, PybulletSkinOptions)
+    shapes = _checked_shapes(other.get("shapes", "collision"))
     number = _client_number(client)
-    links: dict[str, tuple[int, Pose]] = {}
+    places: dict[str, Mount] = {}
     for name, mount in mounts.items():
         if not (isinstance(mount, tuple) and len(mount) == 2 and isinstance(mount[1], Pose)):
             raise SceneError(f"mount {name!r} is {mount!r}; give a pair (link, Pose(…))")
-        links[name] = _find_link(number, body, mount[0]), mount[1]
-    rules = Rules(
-        materials or {}, grounding or {}, default_material, default_grounding, exclude, hull
-    )
+        places[name] = Mount(body, _find_link(number, body, mount[0]), mount[1])
     source = ClientSource(number, rules, shapes)
-    simulators = simulators_of(links, design)
-    sensors = {
-        name: PybulletSensor(source, body, *mount, simulators[name], exclude_own=exclude_own)
-        for name, mount in links.items()
-    }
+    simulators = simulators_of(places, design)
+    sensors = {k: PybulletSensor(source, mount, simulators[k]) for k, mount in places.items()}
     skin = AttachedSkin(sensors, readout, threads)
     skin.warn()
     return skin
@@ -212,24 +182,12 @@ class PybulletSensor(GeometrySensor):
 
     source: ClientSource
 
-    def __init__(
-        self,
-        source: ClientSource,
-        body: int,
-        link: int,
-        pose_in_link: Pose,
-        simulator: Simulator,
-        *,
-        exclude_own: bool,
-    ) -> None:
+    def __init__(self, source: ClientSource, mount: Mount, simulator: Simulator) -> None:
         self.client = source.client
         """Number of the physics client."""
-        self.body = body
-        """The body that carries the sensor."""
-        self.link = link
-        """Its link, -1 for the base."""
-        self._in_link = pose_in_link
-        self._exclude_own = exclude_own
+        self.body, self.link = mount.body, mount.link
+        """The body that carries the sensor, and its link, -1 for the base."""
+        self._in_link = mount.pose_in_link
         super().__init__(simulator, source)
 
     def _take_over(self) -> None:
@@ -241,25 +199,17 @@ class PybulletSensor(GeometrySensor):
         super()._take_over()
 
     def _own_frame(self) -> int | None:
-        return self._carrier if self._exclude_own else None
+        return self._carrier if self.source.rules.exclude_own else None
 
     def _frames(self, position: Array, quaternion: Array) -> Frames:
         sensor = Pose(position[self._carrier], quaternion[self._carrier]) @ self._in_frame
         return Frames(position, quaternion, np.array(sensor.position), np.array(sensor.quaternion))
 
 
-def _require() -> None:
-    try:
-        import pybullet  # noqa: F401
-    except ImportError:
-        raise MissingDependencyError(
-            "PyBullet is not installed; pip install 'capsense[pybullet]'"
-        ) from None
-
-
-def _check_shapes(shapes: object) -> None:
+def _checked_shapes(shapes: str) -> str:
     if shapes not in ("collision", "visual"):
         raise SceneError(f'shapes is {shapes!r}; choose "collision" or "visual"')
+    return shapes
 
 
 def _client_number(client: Any) -> int:

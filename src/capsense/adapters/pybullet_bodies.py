@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from capsense.adapters.rules import Names, Rules, Tie, read_grounding, read_material
 from capsense.errors import SceneError
-from capsense.scene import Material
+from capsense.scene import Material, Pose
 
 _WATCHES = itertools.count()
 _SOFT_BODY = 3
@@ -26,6 +27,16 @@ class Link:
     """-1 is the base."""
     name: str
     names: Names
+
+
+class Mount(NamedTuple):
+    """Where a sensor sits."""
+
+    body: int
+    link: int
+    """-1 is the base."""
+    pose_in_link: Pose
+    """The sensor frame in the link's frame."""
 
 
 def body_numbers(client: int) -> list[int]:

@@ -9,12 +9,13 @@ from capsense.adapters.attached import DepthSensor
 from capsense.adapters.pybullet_bodies import (
     BodyWatch,
     Link,
+    Mount,
     check_patterns,
     gone,
     links_of,
     matter_of,
 )
-from capsense.adapters.rules import Rules
+from capsense.adapters.rules import Image, Rules
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
@@ -35,34 +36,18 @@ class PybulletDepthSensor(DepthSensor):
     """A sensor that sees a depth image; made by :func:`capsense.adapters.pybullet.attach`."""
 
     def __init__(
-        self,
-        client: int,
-        body: int,
-        link: int,
-        pose_in_link: Pose,
-        simulator: Simulator,
-        rules: Rules,
-        *,
-        exclude_own: bool,
-        size: float,
-        resolution: int,
-        back: str | float,
+        self, client: int, mount: Mount, simulator: Simulator, rules: Rules, image: Image
     ) -> None:
         super().__init__(simulator)
         self.client = client
         """Number of the physics client."""
-        self.body = body
-        """The body that carries the sensor."""
-        self.link = link
-        """Its link, -1 for the base."""
-        self._in_link, self._rules = pose_in_link, rules
-        self._back = back
-        self._exclude_own = exclude_own
-        self._resolution = resolution
+        self.body, self.link = mount.body, mount.link
+        """The body that carries the sensor, and its link, -1 for the base."""
+        self._in_link, self._rules, self._image = mount.pose_in_link, rules, image
         far = float(simulator.design.domain.upper[2])
         self._near, self._far = _WITHDRAWN + _NEAR, _WITHDRAWN + far
-        self._camera = OrthographicCamera(size, size, Pose(), near=_NEAR, far=far)
-        self._projection = _projection(size, self._near, self._far, resolution)
+        self._camera = OrthographicCamera(image.size, image.size, Pose(), near=_NEAR, far=far)
+        self._projection = _projection(image.size, self._near, self._far, image.resolution)
         self._watch = BodyWatch(client)
         self._eps_r: dict[int, float] = {}
         check_patterns(rules, self._read_materials())
@@ -75,7 +60,7 @@ class PybulletDepthSensor(DepthSensor):
             links = self._read_materials()
             if (self.body, self.link) not in [(k.body, k.link) for k in links]:
                 raise gone(self.body)
-        n = self._resolution
+        n = self._image.resolution
         view = (self.pose @ _CAMERA).inverse().matrix.T.ravel().tolist()
         image = p.getCameraImage(
             n, n, view, self._projection, renderer=p.ER_TINY_RENDERER,
@@ -89,8 +74,9 @@ class PybulletDepthSensor(DepthSensor):
         for code in np.unique(seen[seen >= 0]).tolist():
             eps_r[seen == code] = self._eps_r.get(code, 0.0)
         return DepthFrame(
-            depth, eps_r, self._camera, grounding=self._rules.default_grounding, back=self._back
-        )
+            depth, eps_r, self._camera, grounding=self._rules.default_grounding,
+            back=self._image.back,
+        )  # fmt: skip
 
     @property
     def pose(self) -> Pose:
@@ -112,7 +98,7 @@ class PybulletDepthSensor(DepthSensor):
         for link in links:
             own = (link.body, link.link) == (self.body, self.link)
             code = link.body + ((link.link + 1) << 24)
-            if (own and self._exclude_own) or self._rules.excludes(link.names):
+            if (own and self._rules.exclude_own) or self._rules.excludes(link.names):
                 self._eps_r[code] = 0.0
                 continue
             matter, _ = matter_of(self.client, link, self._rules)

@@ -15,6 +15,7 @@ from capsense.adapters.meshes import (
     is_flat,
     joined_hulls,
     load_triangles,
+    primitive,
     round_cylinder,
     solid_mesh,
 )
@@ -30,7 +31,7 @@ from capsense.adapters.pybullet_bodies import (
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
-from capsense.scene import Box, Capsule, Cylinder, Pose, Shape, Sphere
+from capsense.scene import Pose, Shape
 
 Array = NDArray[np.float64]
 
@@ -262,9 +263,9 @@ class ClientSource(WorldSource):
 
     def __init__(self, client: int, rules: Rules, shapes: str) -> None:
         self.client = client
-        self._rules, self._shapes = rules, shapes
+        self._shapes = shapes
         self._watch = BodyWatch(client)
-        super().__init__()
+        super().__init__(rules)
         check_patterns(rules, self._links)
 
     def refresh(self) -> None:
@@ -275,7 +276,7 @@ class ClientSource(WorldSource):
             (body, [k.link for k in self._links if k.body == body and k.link >= 0])
             for body in bodies
         ]
-        self._reader = WorldReader(self.client, self._links, self._rules, self._shapes)
+        self._reader = WorldReader(self.client, self._links, self.rules, self._shapes)
         self._made: dict[int, list[Solid]] = {}
 
     def index(self, body: int, link: int) -> int:
@@ -326,16 +327,12 @@ def _primitive(kind: int, sizes: tuple[float, float, float]) -> Shape | None:
     """The shape that one of Bullet's types and its sizes [m] stand for."""
     import pybullet as p
 
-    a, b, c = sizes
-    if kind == p.GEOM_BOX:
-        return Box((a, b, c))
-    if kind == p.GEOM_SPHERE:
-        return Sphere(a)
-    if kind == p.GEOM_CAPSULE:
-        return Capsule(b, a) if a > 0 else Sphere(b)
-    if kind == p.GEOM_CYLINDER:
-        return Cylinder(b, a)
-    return None
+    a, b, c = (0.5 * size for size in sizes)
+    known = {
+        p.GEOM_BOX: ("BOX", (a, b, c)), p.GEOM_SPHERE: ("SPHERE", (2 * a, 0, 0)),
+        p.GEOM_CAPSULE: ("CAPSULE", (2 * b, a, 0)), p.GEOM_CYLINDER: ("CYLINDER", (2 * b, a, 0)),
+    }  # fmt: skip
+    return primitive(*known[kind]) if kind in known else None
 
 
 def _turned_to(normal: Sequence[float]) -> Pose:

@@ -1,12 +1,16 @@
-"""What the things of a simulator are made of, and what ties them to ground: rules by name."""
+"""The options of all ``attach`` functions, and the rules by name that they stand for."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
+from typing import Any, TypedDict
+
+import numpy as np
 
 from capsense._validate import suggest
+from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Material, material
 from capsense.scene.scene import Grounding, checked_grounding
@@ -30,37 +34,78 @@ def matches(pattern: str, names: Names) -> bool:
     return any(fnmatchcase(name, pattern) for name in names)
 
 
+class SeenOptions(TypedDict, total=False):
+    """What a sensor sees, and what that is made of: keywords of every ``attach``.
+
+    Patterns are shell patterns of names (``*``, ``?``, ``[…]``; case matters); which names an
+    object answers to is said at the ``attach`` of each simulator. Where several patterns of one
+    kind fit, the first decides.
+    """
+
+    materials: Mapping[str, Material | str] | None
+    """Name pattern → material."""
+    default_material: Material | str
+    """The material where no pattern fits and the model itself does not say; steel by default."""
+    default_grounding: Grounding
+    """The grounding where no pattern fits and the model itself does not say: ``"grounded"``, which
+    is the default, ``"floating"``, or a capacitance to ground [F]."""
+    exclude: Sequence[str]
+    """Name patterns of what the sensor does not see."""
+    exclude_own: bool
+    """Leave out the body that carries the sensor, which the design itself describes; True by
+    default."""
+
+
+class AttachOptions(SeenOptions, total=False):
+    """Keywords of every ``attach`` that sees the shapes of a model themselves."""
+
+    grounding: Mapping[str, Grounding] | None
+    """Name pattern → grounding; a capacitance is that of all that the pattern fits together."""
+    hull: Sequence[str]
+    """Name patterns of meshes that are taken as their convex hulls."""
+
+
+class ImageOptions(TypedDict, total=False):
+    """Keywords of every ``attach`` that renders a depth image."""
+
+    size: float | None
+    """Width and height of the image [m]; by default the width of the design's domain."""
+    resolution: int | None
+    """Pixels along each side of the image, 64 by default."""
+    back: str | float
+    """Where what is seen ends: ``"fill"``, at the end of the domain, which is the default, or
+    after an assumed thickness [m]; see :class:`~capsense.scene.depth.DepthFrame`."""
+
+
+DEFAULTS: Mapping[str, object] = {
+    "exclude_own": True, "back": "fill", "resolution": 64, "shapes": "collision",
+}  # fmt: skip
+"""Options whose default is not None, empty or False."""
+
+
 @dataclass(frozen=True)
 class Rules:
-    """What a sensor sees of a model, and what that is made of, by name patterns.
-
-    Where several patterns of one kind fit, the first decides.
+    """The values of :class:`AttachOptions`, checked.
 
     Raises:
         SceneError: An unknown material or a wrong grounding.
     """
 
-    materials: Mapping[str, Material | str] = field(default_factory=dict)
-    """Name pattern → material."""
-    grounding: Mapping[str, Grounding] = field(default_factory=dict)
-    """Name pattern → grounding; a capacitance is that of all it fits together."""
+    materials: Mapping[str, Material | str] | None = None
+    grounding: Mapping[str, Grounding] | None = None
     default_material: Material | str = "steel"
-    """The material where neither a pattern fits nor the model itself says."""
     default_grounding: Grounding = "grounded"
-    """The grounding where neither a pattern fits nor the model itself says."""
     exclude: Sequence[str] = ()
-    """Name patterns of what is left out."""
+    exclude_own: bool = True
     hull: Sequence[str] = ()
-    """Name patterns of the meshes that are taken as their convex hulls."""
 
     def __post_init__(self) -> None:
-        for what in ("materials", "grounding"):
-            value = getattr(self, what)
-            if not isinstance(value, Mapping):
-                raise SceneError(f"{what} is {value!r}; give a dict of name patterns")
         put = object.__setattr__
-        put(self, "materials", {k: as_material(v) for k, v in self.materials.items()})
-        put(self, "grounding", {k: checked_grounding(v) for k, v in self.grounding.items()})
+        for key, checked in (("materials", as_material), ("grounding", checked_grounding)):
+            value = getattr(self, key) or {}
+            if not isinstance(value, Mapping):
+                raise SceneError(f"{key} is {value!r}; give a dict of name patterns")
+            put(self, key, {pattern: checked(v) for pattern, v in value.items()})
         put(self, "default_material", as_material(self.default_material))
         put(self, "default_grounding", checked_grounding(self.default_grounding))
         put(self, "exclude", _patterns("exclude", self.exclude))
@@ -85,14 +130,14 @@ class Rules:
 
     def material_of(self, names: Names, own: Material | None = None) -> Material:
         """The material of something; ``own`` is what the model says of it."""
-        for pattern, value in self.materials.items():
+        for pattern, value in (self.materials or {}).items():
             if matches(pattern, names):
                 return as_material(value)
         return as_material(self.default_material) if own is None else own
 
     def tie_of(self, names: Names, own: Tie | None = None) -> Tie:
         """What ties something to ground; ``own`` is what the model says of it."""
-        for pattern, value in self.grounding.items():
+        for pattern, value in (self.grounding or {}).items():
             if matches(pattern, names):
                 return Tie(value, f"pattern {pattern}")
         return Tie(self.default_grounding, "default") if own is None else own
@@ -104,6 +149,83 @@ class Rules:
     def takes_hull(self, names: Names) -> bool:
         """Whether a mesh of these names is taken as its convex hull."""
         return any(matches(p, names) for p in self.hull)
+
+
+def check_perception(
+    perception: object, options: Mapping[str, object], only: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuse an unknown kind of perception, and options that belong to the other kind.
+
+    Args:
+        perception: What was asked for.
+        options: The options that were given.
+        only: Names of the options that only ``"geometry"`` has, or only ``"depth_camera"``.
+
+    Raises:
+        SceneError: The first thing that is wrong.
+    """
+    if perception not in ("geometry", "depth_camera"):
+        raise SceneError(f'perception is {perception!r}; choose "geometry" or "depth_camera"')
+    other = "geometry" if perception == "depth_camera" else "depth_camera"
+    for name in only[other]:
+        usual = DEFAULTS.get(name)
+        if options.get(name, usual) not in (usual, None, (), [], {}):
+            raise SceneError(
+                f'{name} goes with perception="{other}"; leave it out of perception="{perception}"'
+            )
+
+
+@dataclass(frozen=True)
+class Image:
+    """The square depth image of a sensor, checked.
+
+    Raises:
+        SceneError: ``size`` is not a positive length, or ``resolution`` not a number of pixels
+            from 4 to 2000.
+    """
+
+    size: float
+    """Width and height [m]."""
+    resolution: int = 64
+    """Pixels along each side."""
+    back: str | float = "fill"
+    """Where what is seen ends, as of a depth frame."""
+
+    def __post_init__(self) -> None:
+        size, pixels = self.size, self.resolution
+        if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
+            raise SceneError(f"size is {size!r}; give the width of the image in metres")
+        if isinstance(pixels, bool) or not isinstance(pixels, int) or not 4 <= pixels <= 2000:
+            raise SceneError(f"resolution is {pixels!r}; give a whole number from 4 to 2000")
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any], design: Design) -> Image:
+        """The image that ``ImageOptions`` ask for; without a size, as wide as the domain."""
+        size, pixels = options.get("size"), options.get("resolution")
+        return cls(
+            float(max(design.domain.size[:2])) if size is None else size,
+            64 if pixels is None else pixels, options.get("back", "fill"),
+        )  # fmt: skip
+
+
+def split_rules(options: Mapping[str, Any], known: type) -> tuple[Rules, dict[str, Any]]:
+    """The rules among the keywords of an ``attach``, and the other keywords.
+
+    Args:
+        options: The keywords.
+        known: The TypedDict of those that there are.
+
+    Raises:
+        TypeError: There is no such keyword.
+        SceneError: An unknown material or a wrong grounding.
+    """
+    names = known.__annotations__
+    for name in options:
+        if name not in names:
+            raise TypeError(f"attach has no option {name!r}; {suggest(name, names)}")
+    ruled = {f.name for f in fields(Rules)}
+    rules = Rules(**{name: value for name, value in options.items() if name in ruled})
+    return rules, {name: value for name, value in options.items() if name not in ruled}
 
 
 def _patterns(what: str, patterns: object) -> tuple[str, ...]:

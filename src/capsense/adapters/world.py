@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._jit import compiled
+from capsense.adapters.meshes import Terrain
 from capsense.adapters.rules import Tie
-from capsense.adapters.terrain import Terrain
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
@@ -64,8 +65,7 @@ class SoftSolid:
     """That of a sheet [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Frames:
+class Frames(NamedTuple):
     """Where the moving frames of a simulator, and the sensor, are at one instant."""
 
     position: Array
@@ -76,6 +76,35 @@ class Frames:
     """Origin of the sensor frame [m], shape (3,)."""
     sensor_quaternion: Array
     """Unit quaternion of the sensor frame, shape (4,)."""
+
+
+class Layout(NamedTuple):
+    """Where n solids stand in the frames that carry them, and how far they reach."""
+
+    frame: NDArray[np.int64]
+    """Frame of each solid, shape (n,)."""
+    position: Array
+    """Origins of the solids [m] in their frames, shape (n, 3)."""
+    quaternion: Array
+    """Their unit quaternions (x, y, z, w), shape (n, 4)."""
+    centre: Array
+    """Centres of the solids' own bounding boxes [m], shape (n, 3)."""
+    half: Array
+    """Half edge lengths of those boxes [m], shape (n, 3)."""
+    depth: Array
+    """Zero for a solid; for a half space below its local plane z = 0, the thickness [m] of the
+    plate that stands for it, shape (n,)."""
+
+
+class Placed(NamedTuple):
+    """Where n solids stand in the sensor frame."""
+
+    position: Array
+    """Origins [m], shape (n, 3)."""
+    quaternion: Array
+    """Unit quaternions, shape (n, 4)."""
+    seen: NDArray[np.bool_]
+    """Whether the bounding box reaches into the domain, shape (n,)."""
 
 
 @dataclass(eq=False, repr=False)
@@ -96,10 +125,6 @@ class World:
     def __post_init__(self) -> None:
         n = len(self.solids)
         edge = self._reach = float(np.linalg.norm(self.domain.size))
-        self._frame = np.array([s.frame for s in self.solids], dtype=np.int64)
-        self._local_position = np.array([s.pose.position for s in self.solids]).reshape(n, 3)
-        self._local_quaternion = np.array([s.pose.quaternion for s in self.solids]).reshape(n, 4)
-        self._depth = np.array([edge * _thickness(s) for s in self.solids])
         self._bodies = []
         boxes = np.zeros((n, 2, 3))
         taken: dict[str, int] = {}
@@ -120,12 +145,15 @@ class World:
         )
         self._surfaces: list[DeformableSurface | None] = [None] * len(self.soft)
         self._tied: dict[tuple[int, int], Body] = {}
-        self._centre = boxes.mean(axis=1)
-        self._half = 0.5 * (boxes[:, 1] - boxes[:, 0])
+        self._layout = Layout(
+            np.array([s.frame for s in self.solids], dtype=np.int64),
+            np.array([s.pose.position for s in self.solids]).reshape(n, 3),
+            np.array([s.pose.quaternion for s in self.solids]).reshape(n, 4),
+            boxes.mean(axis=1), 0.5 * (boxes[:, 1] - boxes[:, 0]),
+            np.array([edge * _thickness(s) for s in self.solids]),
+        )  # fmt: skip
         self._lower, self._upper = self.domain.lower, self.domain.upper
-        self._position = np.empty((n, 3))
-        self._quaternion = np.empty((n, 4))
-        self._seen = np.zeros(n, dtype=np.bool_)
+        self._placed = Placed(np.empty((n, 3)), np.empty((n, 4)), np.zeros(n, dtype=np.bool_))
 
     def scene(self, frames: Frames) -> Scene:
         """The solids that reach into the domain, in the sensor frame.
@@ -133,33 +161,27 @@ class World:
         Raises:
             SceneError: A frame stands at no finite place.
         """
-        from capsense.adapters.kernels import place_solids
-
-        place_solids(
-            frames.position, frames.quaternion, self._frame, self._local_position,
-            self._local_quaternion, self._centre, self._half, self._depth,
-            frames.sensor_position, frames.sensor_quaternion, self._lower, self._upper,
-            self._position, self._quaternion, self._seen,
-        )  # fmt: skip
+        placed = self._placed
+        place_solids(frames, self._layout, self._lower, self._upper, placed)
         if not np.isfinite(frames.sensor_position.sum() + frames.sensor_quaternion.sum()):
             raise _diverged("the sensor's link")
-        if not np.isfinite(self._position.sum() + self._quaternion.sum()):
-            bad = ~np.isfinite(self._position.sum(axis=1) + self._quaternion.sum(axis=1))
+        if not np.isfinite(placed.position.sum() + placed.quaternion.sum()):
+            bad = ~np.isfinite(placed.position.sum(axis=1) + placed.quaternion.sum(axis=1))
             raise _diverged(repr(self.solids[int(np.flatnonzero(bad)[0])].label))
-        seen = np.flatnonzero(self._seen)
+        seen = np.flatnonzero(placed.seen)
         sharing = self._sharing[seen]
         bodies = [self._bodies[i] for i in seen.tolist()]
         if sharing.max(initial=-1) >= 0:
             count = np.bincount(sharing + 1)[sharing + 1]
             for k in np.flatnonzero(sharing >= 0).tolist():
                 bodies[k] = self._share(int(seen[k]), int(count[k]))
-        poses = zip(self._position[seen].tolist(), self._quaternion[seen].tolist(), strict=True)
-        placed = [
+        poses = zip(placed.position[seen].tolist(), placed.quaternion[seen].tolist(), strict=True)
+        parts = [
             part
             for i, b, p in zip(seen.tolist(), bodies, poses, strict=True)
             for part in self._parts(i, b.moved(Pose(*p)))
         ]
-        return Scene(placed + self._soft_bodies(frames) if self.soft else placed)
+        return Scene(parts + self._soft_bodies(frames) if self.soft else parts)
 
     def _parts(self, index: int, body: Body) -> list[Body]:
         """A body that is placed; of a terrain, the tiles that reach into the domain."""
@@ -227,3 +249,81 @@ def _diverged(what: str) -> SceneError:
         f"the simulation has diverged: {what} stands at a place that is not finite; set the "
         "simulation back, and take a smaller time step or gentler controls"
     )
+
+
+@compiled
+def _multiply(a: Array, b: Array, out: Array) -> None:
+    """Quaternion product a b, (x, y, z, w)."""
+    x1, y1, z1, w1 = a[0], a[1], a[2], a[3]
+    x2, y2, z2, w2 = b[0], b[1], b[2], b[3]
+    out[0] = w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2
+    out[1] = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2
+    out[2] = w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2
+    out[3] = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
+
+
+@compiled
+def _rotate(q: Array, v: Array, out: Array) -> None:
+    """Turn v by the unit quaternion q: v + 2 u × (u × v + w v), with q = (u, w)."""
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    vx, vy, vz = v[0], v[1], v[2]
+    cx = y * vz - z * vy + w * vx
+    cy = z * vx - x * vz + w * vy
+    cz = x * vy - y * vx + w * vz
+    out[0] = vx + 2.0 * (y * cz - z * cy)
+    out[1] = vy + 2.0 * (z * cx - x * cz)
+    out[2] = vz + 2.0 * (x * cy - y * cx)
+
+
+@compiled
+def place_solids(
+    frames: Frames, layout: Layout, lower: Array, upper: Array, placed: Placed
+) -> None:
+    """Find where solids stand in the sensor frame, and which of them reach into its domain.
+
+    Args:
+        frames: Where the moving frames and the sensor are.
+        layout: The solids in their frames.
+        lower: Lower corner of the domain [m] in the sensor frame, shape (3,).
+        upper: Upper corner, shape (3,).
+        placed: Receives the result.
+    """
+    position, quaternion, seen = placed.position, placed.quaternion, placed.seen
+    depth = layout.depth
+    inverse = frames.sensor_quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
+    turn, arm, axis = np.empty(4), np.empty(3), np.empty(3)
+    middle, reach = np.empty(3), np.empty(3)
+    for i in range(layout.frame.shape[0]):
+        f = layout.frame[i]
+        _multiply(frames.quaternion[f], layout.quaternion[i], turn)
+        _rotate(frames.quaternion[f], layout.position[i], arm)
+        for k in range(3):
+            arm[k] += frames.position[f, k] - frames.sensor_position[k]
+        _multiply(inverse, turn, quaternion[i])
+        _rotate(inverse, arm, position[i])
+        if depth[i] > 0.0:
+            axis[:] = 0.0
+            axis[2] = 1.0
+            _rotate(quaternion[i], axis, arm)
+            above, extent = 0.0, 0.0
+            for k in range(3):
+                above += arm[k] * (0.5 * (lower[k] + upper[k]) - position[i, k])
+                extent += abs(arm[k]) * 0.5 * (upper[k] - lower[k])
+            for k in range(3):
+                foot = 0.5 * (lower[k] + upper[k]) - above * arm[k]
+                position[i, k] = foot - 0.5 * depth[i] * arm[k]
+            seen[i] = above < extent
+            continue
+        _rotate(quaternion[i], layout.centre[i], middle)
+        reach[:] = 0.0
+        for j in range(3):
+            axis[:] = 0.0
+            axis[j] = layout.half[i, j]
+            _rotate(quaternion[i], axis, arm)
+            for k in range(3):
+                reach[k] += abs(arm[k])
+        seen[i] = True
+        for k in range(3):
+            at = position[i, k] + middle[k]
+            if at - reach[k] >= upper[k] or at + reach[k] <= lower[k]:
+                seen[i] = False

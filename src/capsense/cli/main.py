@@ -10,13 +10,13 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from capsense.cli import design, recordings, run, serve, studies
+from capsense.cli import design, optimise, recordings, run, serve, studies
 from capsense.cli.console import BAD_INPUT, FAILED, INTERRUPTED, OK, Interrupt, say
 from capsense.errors import CapSenseError, FieldError, SolveError
 
 COMMANDS = (
     run.RUN, run.RECORD, recordings.REPLAY, recordings.EXPORT, design.DESIGN, recordings.READOUT,
-    studies.DATASET, studies.BENCH, studies.REPRODUCE, serve.SERVE, serve.VIEW,
+    studies.DATASET, optimise.OPTIMISE, studies.BENCH, studies.REPRODUCE, serve.SERVE, serve.VIEW,
 )  # fmt: skip
 """The subcommands, in the order of ``--help``. A new one is written as a
 :class:`~capsense.cli.console.Command` and listed here."""

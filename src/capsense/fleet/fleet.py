@@ -23,15 +23,14 @@ from capsense.errors import (
 )
 from capsense.field.cache import default_settings, load_or_build
 from capsense.field.terminals import Terminals
-from capsense.fleet.step_kernels import Bodies, Found, Poses, Sensor, step_rows
+from capsense.fleet.bodies import BodyTable
+from capsense.fleet.step_kernels import Found, Poses, Sensor, step_rows
 from capsense.readout.counts import Held
 from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
-from capsense.surface.matter import UNIT, matter_of
-from capsense.surface.place_kernels import BODY
-from capsense.surface.rigid import RigidShape
+from capsense.surface.matter import UNIT
 from capsense.surface.solver import DOUBTFUL, PRESETS, SurfaceSolver
 
 if TYPE_CHECKING:
@@ -149,23 +148,14 @@ class Fleet:
         if device != "cpu":
             chosen_preset = replace(chosen_preset, panels=_PANELS * budget)
         self._solver = SurfaceSolver(
-            field.green,
-            self.design,
-            excitation_frequency=excitation_frequency,
+            field.green, self.design, excitation_frequency=excitation_frequency,
             preset=chosen_preset,
-        )
+        )  # fmt: skip
         self._terminals = Terminals(self.design, field.capacitance)
         n = self._terminals.electrodes
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
-        self._kinds: dict[tuple[int, bool], int] = {}
-        self._held: list[RigidShape] = []  # records point to their arrays
-        shape = count, self.places
-        self._bodies = Bodies(
-            np.zeros(0, BODY), np.zeros(0), np.full(shape, -1), np.ones(shape), np.zeros(shape),
-            np.zeros(shape), np.zeros(shape, np.int64), np.zeros((sensors, len(bodies)), np.bool_),
-        )  # fmt: skip
-        self._given = np.full(shape, None, object)
+        self._table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: SideBySide | None = None
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
@@ -216,27 +206,8 @@ class Fleet:
             SceneError: There is no such place or environment, the numbers do not match, or a body
                 is of matter with losses or of a shape that is not rigid.
         """
-        if isinstance(place, bool) or not isinstance(place, int) or not 0 <= place < self.places:
-            raise SceneError(f"place is {place!r}; there are places 0 to {self.places - 1}")
-        rows = np.arange(self.count) if environments is None else np.asarray(environments).ravel()
-        if rows.dtype.kind not in "iu" or (len(rows) and not (
-            rows.min() >= 0 and rows.max() < self.count
-        )):  # fmt: skip
-            raise SceneError(
-                f"environments is {environments!r}; give numbers from 0 to {self.count - 1}"
-            )
-        each = [bodies] * len(rows) if isinstance(bodies, Body) or bodies is None else list(bodies)
-        if len(each) != len(rows):
-            raise SceneError(f"{len(each)} bodies are given for {len(rows)} environments")
-        alike = {id(body): body for body in each}
-        known = {key: self._row(body) for key, body in alike.items()}
-        table = self._bodies
-        values = [known[id(body)] for body in each]
-        for column, part in zip(table[2:-1], zip(*values, strict=True), strict=True):
-            column[rows, place] = part
-        self._given[rows, place] = each
-        if self._warp is not None:
-            self._warp.take(table, self._held)
+        self._table.change(place, bodies, environments)
+        self._take_over()
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """Leave places out of what a sensor sees, such as the link that carries it.
@@ -248,54 +219,12 @@ class Fleet:
         Raises:
             SceneError: There is no such sensor or place.
         """
-        for what, known, given in (
-            ("sensors", self.sensors, [sensor]), ("places", self.places, places),
-        ):  # fmt: skip
-            for number in given:
-                if number not in range(known):
-                    raise SceneError(f"hide: {number!r} is none of the {what} 0 to {known - 1}")
-        self._bodies.hidden[sensor] = np.isin(np.arange(self.places), places)
+        self._table.hide(sensor, places)
+        self._take_over()
+
+    def _take_over(self) -> None:
         if self._warp is not None:
-            self._warp.take(self._bodies, self._held)
-
-    def _row(self, body: Body | None) -> tuple[int, float, float, float, int]:
-        """Shape, scale, softness, tie and neutrality of a body."""
-        if body is None:
-            return -1, 1.0, 0.0, 0.0, 1
-        if not isinstance(body, Body):
-            raise SceneError(f"{body!r} is not a Body")
-        matter = matter_of([body], self._solver.excitation_frequency)
-        if matter.lossy:
-            hertz = self._solver.excitation_frequency
-            raise SceneError(
-                f"{body.material.name!r} has losses at {hertz:g} Hz, which a "
-                "fleet does not know; give the body a conductor's or a lossless material"
-            )
-        shape, size = self._solver.functions_of(body.shape)
-        if not isinstance(shape, RigidShape):
-            raise SceneError(
-                f"{type(body.shape).__name__} is not rigid; a fleet takes primitives and TriMesh"
-            )
-        tie = complex(matter.ties(np.array([size * shape.capacitance]))[0]).real
-        neutral = int(np.isinf(tie))
-        soft = float(matter.softness[0].real)
-        number = self._number(shape, soft != 0.0)
-        return number, size, soft, 0.0 if neutral else tie, neutral
-
-    def _number(self, shape: RigidShape, soft: bool) -> int:
-        """The number of a shape in the table, which it joins if it is new."""
-        found = self._kinds.setdefault((id(shape), soft), len(self._kinds))
-        if found == len(self._held):
-            record = np.array([shape.record], BODY)
-            if soft:
-                record["impedance"] = shape.impedance.ctypes.data
-            radius = float(np.linalg.norm(shape.panels.corners, axis=2).max())
-            self._held.append(shape)
-            self._bodies = self._bodies._replace(
-                shapes=np.concatenate([self._bodies.shapes, record]),
-                radius=np.append(self._bodies.radius, radius),
-            )
-        return found
+            self._warp.take(self._table.bodies, self._table.shapes)
 
     def use_readout(self, readout: Readout | str | None, *, seed: int = 0) -> None:
         """Read every sensor through a chip of its own from now on.
@@ -368,22 +297,19 @@ class Fleet:
         e, s, b = self.count, self.sensors, self.places
         if sensors is None:
             sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7))
+        wanted = (("poses", poses, (e, b, 7)), ("sensors", sensors, (e, s, 7)))
         if self._warp is None:
-            return self._step(
-                Poses(_checked("poses", poses, (e, b, 7)), _checked("sensors", sensors, (e, s, 7))),
-                jacobian,
-            )
+            return self._step(Poses(*(_checked(*each) for each in wanted)), jacobian)
         if jacobian:
             raise ValueError('a Jacobian is worked out on device "cpu" only')
         self._warp.solve(
             *(
-                values if hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
-                else _checked(what, values, shape)
-                for what, values, shape in (
-                    ("poses", poses, (e, b, 7)), ("sensors", sensors, (e, s, 7)),
-                )
+                each[1]
+                if hasattr(each[1], "__dlpack__") and not isinstance(each[1], np.ndarray)
+                else _checked(*each)
+                for each in wanted
             )
-        )  # fmt: skip
+        )
         return FleetReading(self._warp.capacitance, self._warp.delta)
 
     def _step(self, where: Poses, jacobian: bool) -> FleetReading:
@@ -395,7 +321,7 @@ class Fleet:
         found = Found(np.zeros((e, s, m, m)), np.zeros((e, s)), slope)
         sensor = Sensor(solver.green, solver.preset.threshold, solver.preset.width, DOUBTFUL)
         with first_use():
-            in_parts(step_rows, e, self._bodies, where, sensor, found)
+            in_parts(step_rows, e, self._table.bodies, where, sensor, found)
         failed = np.flatnonzero(~np.isfinite(found.delta).all(axis=(1, 2, 3)))
         if len(failed):
             raise SolveError(
@@ -434,20 +360,18 @@ class Fleet:
         e, s, b = self.count, self.sensors, self.places
         where = _checked("poses", poses, (e, b, 7))
         at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
-        found = np.asarray(
-            self.solved(where, at).delta
-            if self._warp is None else self.solved(where, at).delta.numpy()
-        )  # fmt: skip
+        delta = self.solved(where, at).delta
+        found = delta if self._warp is None else delta.numpy()
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
         simulator = Simulator(self.design, excitation_frequency=self._solver.excitation_frequency)
         errors = np.empty((len(drawn), s, *self.baseline.shape))
         for row, k in enumerate(drawn.tolist()):
             for j in range(s):
                 frame = Pose() if at is None else Pose(at[k, j, :3], at[k, j, 3:])
-                hidden = self._bodies.hidden[j]
+                hidden = self._table.bodies.hidden[j]
                 scene = Scene(
                     body.moved(frame.inverse() @ Pose(pose[:3], pose[3:]))
-                    for body, pose, out in zip(self._given[k], where[k], hidden, strict=True)
+                    for body, pose, out in zip(self._table.given[k], where[k], hidden, strict=True)
                     if body is not None and not out
                 )
                 truth = simulator.step(scene).delta

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Bools, Ints, finite, per_channel, require
-from capsense.readout.noise import Flicker
-from capsense.readout.stage import Context, Process
+from capsense.readout.noise import Context, Flicker, Process
 
 _EXCESS = 2.0
 """Residuals that are so many times what noise explains are in doubt; of few samples, more."""

@@ -12,13 +12,12 @@ from capsense._validate import read_toml, suggest
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
-from capsense.readout.chip import Chip
-from capsense.readout.chips import CHIPS
+from capsense.readout.chips import CHIPS, Chip
 from capsense.readout.converter import Law, ResonanceLaw, ShuntLaw
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
+from capsense.readout.front_end import Wiring
 from capsense.readout.presets import ReadoutOptions, build, chip_of, expected_of
 from capsense.readout.readout import ReadingLike, Readout
-from capsense.readout.wiring import Wiring
 
 TOP_KEYS = (
     "chip", "rate", "period", "latency", "seed", "random", "expected", "capdac", "mode", "pairs",

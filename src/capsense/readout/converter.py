@@ -14,7 +14,7 @@ from capsense._validate import as_number
 from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Ints, require, require_whole
 from capsense.readout.front_end import ShuntFrontEnd
-from capsense.readout.stage import rounds
+from capsense.readout.schedule import rounds
 
 Flags = NDArray[np.uint8]
 

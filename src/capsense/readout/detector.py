@@ -16,7 +16,7 @@ import numpy as np
 from capsense._validate import as_number
 from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Bools, Ints, require, require_whole
-from capsense.readout.stage import rounds
+from capsense.readout.schedule import rounds
 
 
 class TrackerProcess(Protocol):

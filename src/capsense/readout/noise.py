@@ -1,4 +1,11 @@
-"""Noise and drift, added to the capacitance that a conversion sees.
+"""The analogue stages of a readout: noise and drift, added to what a conversion sees.
+
+A stage is a small frozen description. When a readout starts it makes a *process* of it, which
+holds what changes: random numbers, filters' memories. Stages are applied in their order; each takes
+the capacitances of a batch of samples and returns new ones. A batch is a run of successive samples
+of the schedule, of any length; a process with a memory for each channel goes through it in
+:func:`~capsense.readout.schedule.rounds`. It gives the same numbers, to the last bit, however
+samples are dealt into batches.
 
 Levels are stated the way data sheets and Allan plots state them. With conversions back to back and
 averaged over a time τ, the Allan deviation is
@@ -16,6 +23,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.random import Generator
@@ -23,9 +31,47 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Ints, finite, require, require_whole
-from capsense.readout.stage import Context, Process
 
 _POLES_PER_DECADE = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What a stage is told when a readout starts."""
+
+    channels: int
+    """Number of channels K."""
+    conversion: float
+    """Length of a conversion's window [s]."""
+    period: float
+    """Time from one sample of a channel to its next [s]."""
+    rng: np.random.Generator
+    """Random numbers of this stage alone."""
+
+
+class Process(Protocol):
+    """A stage at work.
+
+    A copy of a readout copies its processes: keep what changes in objects that can be copied, as
+    the arguments of a ``functools.partial``, and not in the variables of an enclosing function.
+    """
+
+    def __call__(self, channel: Ints, time: Array, value: Array) -> Array:
+        """Return the new capacitances of a batch [F], shape (n,).
+
+        Args:
+            channel: Channel numbers; any K in a row are all different; shape (n,).
+            time: Instants [s], not falling, shape (n,).
+            value: Capacitances [F], shape (n,).
+        """
+
+
+@runtime_checkable
+class Stage(Protocol):
+    """One link of the analogue chain."""
+
+    def start(self, context: Context) -> Process:
+        """Return the stage's process, in its initial state."""
 
 
 @dataclass(frozen=True)

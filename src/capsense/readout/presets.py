@@ -13,15 +13,13 @@ from capsense._validate import suggest
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
 from capsense.readout.checks import Array, require
-from capsense.readout.chip import Chip
-from capsense.readout.chips import CHIPS, MPR121_CURRENTS, MPR121_SUPPLY, MPR121_TIMES
+from capsense.readout.chips import CHIPS, Chip
 from capsense.readout.converter import CapDac, Law, LinearLaw, ReciprocalLaw, ShuntLaw
 from capsense.readout.detector import Detector
-from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
+from capsense.readout.front_end import Wiring
+from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, Stage, White
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule, idle_of
-from capsense.readout.stage import Stage
-from capsense.readout.wiring import Wiring
 
 EXPECTED = 10e-12
 """Capacitance that chips which adapt to it are set up for by default [F]."""
@@ -225,11 +223,10 @@ def charge_for(capacitance: float) -> ReciprocalLaw:
     Raises:
         ReadoutError: No setting brings it into the range.
     """
-    laws = [
-        ReciprocalLaw(current, time, MPR121_SUPPLY)
-        for time in MPR121_TIMES
-        for current in MPR121_CURRENTS
-    ]
+    usual = CHIPS["mpr121"].law
+    assert isinstance(usual, ReciprocalLaw)
+    settings = [(k * 1e-6, 0.5e-6 * 2**power) for power in range(7) for k in range(1, 64)]
+    laws = [dataclasses.replace(usual, current=current, time=time) for current, time in settings]
     wanted = np.array(capacitance)
     fitting = [law for law in laws if law.low <= float(law.level(wanted)) <= law.high]
     if not fitting:

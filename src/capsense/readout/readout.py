@@ -17,9 +17,9 @@ from capsense.readout.checks import Array, real, require, require_whole
 from capsense.readout.converter import CapDac, Conversion, Law
 from capsense.readout.counts import Counts
 from capsense.readout.detector import Detector
+from capsense.readout.front_end import Wiring
+from capsense.readout.noise import Context, Process, Stage
 from capsense.readout.schedule import Schedule
-from capsense.readout.stage import Context, Process, Stage
-from capsense.readout.wiring import Wiring
 
 _BATCH = 4096
 """Samples processed at a time."""

@@ -9,6 +9,7 @@ neglected term is T²/24 times the second derivative of the capacitance, T being
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -155,3 +156,9 @@ def idle_of(period: float | None, busy: float) -> float:
             f"{busy:g} s"
         )
     return max(period - busy, 0.0)
+
+
+def rounds(samples: int, channels: int) -> Iterator[slice]:
+    """Cut a batch into parts that hold each of the channels once at most."""
+    for first in range(0, samples, channels):
+        yield slice(first, first + channels)

@@ -17,11 +17,10 @@ from scipy.optimize import least_squares
 from capsense.readout.calibration import base_capacitance, relative_to
 from capsense.readout.channels import mutual_patterns
 from capsense.readout.converter import ShuntLaw
-from capsense.readout.front_end import ShuntFrontEnd
+from capsense.readout.front_end import ShuntFrontEnd, Wiring
 from capsense.readout.noise import White
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
-from capsense.readout.wiring import Wiring
 from capsense.reproduce.scenario1_setup import Array, Board, Scenario1Setup, load_curves
 from capsense.scene import Body, Box, Pose, Scene
 from capsense.simulator import Simulator

@@ -1,0 +1,262 @@
+"""CoppeliaSim as a sensor needs it: calls to its remote API, and orthographic vision sensors."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from capsense.adapters.attached import refuse_missing
+from capsense.adapters.rules import Image
+from capsense.errors import AdapterError, SceneError
+from capsense.scene import Pose
+from capsense.scene.camera import OrthographicCamera
+
+_FUNCTIONS = (
+    "addItemToCollection", "createCollection", "createVisionSensor", "destroyCollection",
+    "getObject", "getObjectAlias", "getObjectFloatParam", "getObjectInt32Param",
+    "getObjectParent", "getObjectPose", "getObjectType", "getObjectsInTree",
+    "getSimulationState", "getSimulationTime", "getVisionSensorDepth", "getVisionSensorImg",
+    "handleVisionSensor", "isHandle", "removeObjects", "setObjectAlias", "setObjectInt32Param",
+    "setObjectParent", "setObjectPose", "setShapeColor", "setStepping", "startSimulation",
+    "step", "stopSimulation",
+)  # fmt: skip
+_CONSTANTS = (
+    "colorcomponent_auxiliary", "handle_all", "handle_scene", "handle_single", "handle_world",
+    "sceneobject_shape", "sceneobject_visionsensor", "simulation_stopped",
+    "visionfloatparam_far_clipping", "visionfloatparam_near_clipping",
+    "visionfloatparam_ortho_size", "visionintparam_entity_to_render",
+    "visionintparam_perspective_operation",
+    "visionintparam_render_mode", "visionintparam_resolution_x", "visionintparam_resolution_y",
+)  # fmt: skip
+OLDEST = "4.6"
+"""The first CoppeliaSim that speaks the second version of the remote API's protocol."""
+_FULL_PATH = 1
+"""Option of ``sim.getObjectAlias``."""
+NEAR = 1e-4
+"""Near clipping plane of the sensors made here [m], the least that CoppeliaSim takes."""
+_SLACK = 1e-5
+"""What is not this much nearer than the far clipping plane, relative to that, is background: the
+depth buffer and single precision round."""
+_OPTIONS = 1 + 4 + 64 + 128
+"""Of ``sim.createVisionSensor``: handled explicitly, frustum not shown, no fog, own background."""
+_AUXILIARY_CHANNELS = 1
+"""Render mode that draws the auxiliary colours of shapes as they are, without light."""
+_CHILDREN = 1 + 2
+"""Options of ``sim.getObjectsInTree``: not the object itself, and its own children alone."""
+_ALIAS = "capsense"
+"""Name of the vision sensors made here."""
+
+
+class Remote:
+    """CoppeliaSim's ``sim``, as far as a sensor needs it.
+
+    Args:
+        sim: What ``client.require("sim")`` returned.
+
+    Raises:
+        AdapterError: It lacks something that a sensor needs.
+    """
+
+    def __init__(self, sim: Any) -> None:
+        missing = [n for n in (*_FUNCTIONS, *_CONSTANTS) if not hasattr(sim, n)]
+        if "getObject" in missing or "getSimulationTime" in missing:
+            raise AdapterError(
+                f"sim is {sim!r}; give what capsense.coppeliasim.connect() or "
+                'client.require("sim") returned'
+            )
+        if missing:
+            raise AdapterError(
+                f"this CoppeliaSim has no sim.{missing[0]}, which the sensor needs; it takes "
+                f"CoppeliaSim {OLDEST} or later"
+            )
+        self.sim = sim
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Call a function of ``sim``.
+
+        Raises:
+            AdapterError: It does not answer, or refuses.
+        """
+        try:
+            return getattr(self.sim, name)(*arguments)
+        except Exception as error:  # the client raises nothing finer for what the server refuses
+            raise translated(f"sim.{name}", error) from error
+
+    def constant(self, name: str) -> int:
+        """A number that ``sim`` knows by name."""
+        return int(getattr(self.sim, name))
+
+    def path(self, handle: int) -> str:
+        """The path of an object in the scene, such as ``/Robot/link/pad``."""
+        return str(self.call("getObjectAlias", handle, _FULL_PATH))
+
+    def find(self, thing: object) -> int:
+        """The handle of an object, from its path or the handle itself.
+
+        Raises:
+            SceneError: There is no such object.
+        """
+        if isinstance(thing, str):
+            handle = self.call("getObject", thing, {"noError": True})
+            if handle < 0:
+                every = self.call("getObjectsInTree", self.constant("handle_scene"))
+                raise refuse_missing("object", thing, [self.path(h) for h in every])
+            return int(handle)
+        if isinstance(thing, bool) or not isinstance(thing, int):
+            raise SceneError(f"object is {thing!r}; give a path such as '/Robot/link/pad'")
+        if not self.call("isHandle", thing):
+            raise SceneError(f"there is no object of handle {thing}; give a path or a handle")
+        return thing
+
+    def is_stopped(self) -> bool:
+        """Whether the simulation is stopped."""
+        return bool(self.call("getSimulationState") == self.constant("simulation_stopped"))
+
+
+def translated(what: str, error: Exception) -> AdapterError:
+    """What the client raised at a call, as an error that names the mend."""
+    import zmq
+
+    if isinstance(error, zmq.Again):
+        return AdapterError(
+            f"CoppeliaSim did not answer {what} in time; is it still running? Connect again"
+        )
+    if isinstance(error, zmq.ZMQError):
+        return AdapterError(
+            f"the connection to CoppeliaSim is broken since a call failed ({what}: {error}); "
+            "connect and attach again"
+        )
+    if isinstance(error, KeyError):  # the client misses the fields of its own protocol
+        return AdapterError(
+            f"CoppeliaSim answered {what} in another version of the remote API; it takes "
+            f"CoppeliaSim {OLDEST} or later"
+        )
+    return AdapterError(f"{what}: {str(error).replace('_=NL=_', ' ').replace('_=TB=_', ' ')}")
+
+
+@dataclass(frozen=True)
+class VisionSensor:
+    """A vision sensor. Its frame is the sensor frame: z out of the sensor."""
+
+    handle: int
+    path: str
+    camera: OrthographicCamera
+    resolution: tuple[int, int]
+    """Rows and columns."""
+
+
+def find_vision_sensor(remote: Remote, handle: int) -> VisionSensor | None:
+    """The vision sensor that an object is, or carries; None where it has none.
+
+    Those that :func:`make_vision_sensor` made for it earlier do not count.
+
+    Raises:
+        SceneError: It has several, or the one is in perspective.
+    """
+    if remote.call("getObjectType", handle) == remote.constant("sceneobject_visionsensor"):
+        return _read_vision_sensor(remote, handle)
+    found = [
+        vision_sensor for vision_sensor, name in _children(remote, handle).items() if name != _ALIAS
+    ]
+    if len(found) > 1:
+        paths = ", ".join(repr(remote.path(h)) for h in found)
+        raise SceneError(
+            f"{remote.path(handle)!r} carries {len(found)} vision sensors ({paths}); name one"
+        )
+    return _read_vision_sensor(remote, found[0]) if found else None
+
+
+def make_vision_sensor(
+    remote: Remote, handle: int, pose: Pose, image: Image, far: float, seen: int
+) -> VisionSensor:
+    """An orthographic vision sensor on an object, in the place of one made there earlier.
+
+    Args:
+        remote: The simulator.
+        handle: The object.
+        pose: The sensor frame in the object's frame.
+        image: Size and pixels of its image.
+        far: Depth up to which it sees [m].
+        seen: Handle of the collection of what it sees.
+    """
+    for old, name in _children(remote, handle).items():
+        if name == _ALIAS:
+            remove_vision_sensor(remote, old)
+    sizes = [NEAR, far, image.size, 0.01] + [0.0] * 7
+    pixels = [image.resolution, image.resolution, 0, 0]
+    vision_sensor = int(remote.call("createVisionSensor", _OPTIONS, pixels, sizes))
+    remote.call("setObjectAlias", vision_sensor, _ALIAS)
+    remote.call("setObjectParent", vision_sensor, handle, False)
+    remote.call("setObjectPose", vision_sensor, [*pose.position, *pose.quaternion], handle)
+    mode = remote.constant("visionintparam_render_mode")
+    remote.call("setObjectInt32Param", vision_sensor, mode, _AUXILIARY_CHANNELS)
+    show(remote, vision_sensor, seen)
+    return _read_vision_sensor(remote, vision_sensor)
+
+
+def show(remote: Remote, vision_sensor: int, collection: int) -> None:
+    """Let a vision sensor see what is in a collection."""
+    entity = remote.constant("visionintparam_entity_to_render")
+    remote.call("setObjectInt32Param", vision_sensor, entity, collection)
+
+
+def draws(remote: Remote, vision_sensor: int) -> bool:
+    """Let a vision sensor look; whether anything was drawn, be it the background alone.
+
+    A vision sensor that drew returns figures of its image, fifteen numbers; one that could not,
+    for want of OpenGL or of its collection, returns none.
+    """
+    found = remote.call("handleVisionSensor", vision_sensor)
+    return not isinstance(found, list | tuple) or len(found) < 2 or len(found[1]) > 0
+
+
+def carrier(remote: Remote, handle: int) -> int | None:
+    """The shape that an object is or stands on, if any."""
+    shape = remote.constant("sceneobject_shape")
+    while handle >= 0 and remote.call("getObjectType", handle) != shape:
+        handle = int(remote.call("getObjectParent", handle))
+    return handle if handle >= 0 else None
+
+
+def remove_vision_sensor(remote: Remote, vision_sensor: int) -> None:
+    """Remove a vision sensor made here, and the collection of what it sees."""
+    entity = remote.constant("visionintparam_entity_to_render")
+    with suppress(AdapterError):  # CoppeliaSim drops collections of scripts that end
+        remote.call("destroyCollection", remote.call("getObjectInt32Param", vision_sensor, entity))
+    remote.call("removeObjects", [vision_sensor])
+
+
+def _children(remote: Remote, handle: int) -> dict[int, str]:
+    """The vision sensors that an object carries, and their names."""
+    kind = remote.constant("sceneobject_visionsensor")
+    found = remote.call("getObjectsInTree", handle, kind, _CHILDREN)
+    return {
+        int(vision_sensor): str(remote.call("getObjectAlias", vision_sensor))
+        for vision_sensor in found
+    }
+
+
+def _read_vision_sensor(remote: Remote, handle: int) -> VisionSensor:
+    def number(name: str) -> float:
+        get = "getObjectInt32Param" if name.startswith("visionint") else "getObjectFloatParam"
+        return float(remote.call(get, handle, remote.constant(name)))
+
+    path = remote.path(handle)
+    if number("visionintparam_perspective_operation"):
+        raise SceneError(
+            f"vision sensor {path!r} is in perspective; depth must come from parallel rays, so "
+            "clear its perspective mode"
+        )
+    columns = int(number("visionintparam_resolution_x"))
+    rows = int(number("visionintparam_resolution_y"))
+    pixel = number("visionfloatparam_ortho_size") / max(columns, rows)
+    # CoppeliaSim's camera looks along its frame's z, with y up and x to the left: its view matrix
+    # is the frame's inverse turned half round about y. Rows are read from the bottom.
+    camera = OrthographicCamera(
+        columns * pixel, rows * pixel, Pose(),
+        near=number("visionfloatparam_near_clipping"),
+        far=number("visionfloatparam_far_clipping") * (1 - _SLACK),
+        rows="+y", columns="-x",
+    )  # fmt: skip
+    return VisionSensor(handle, path, camera, (rows, columns))
