@@ -20,8 +20,7 @@ from capsense.errors import BatchError, FieldError, ReadoutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.change import Change
-from capsense.field.terminals import Terminals
+from capsense.field.change import Change, Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
