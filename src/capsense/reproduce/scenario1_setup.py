@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.design import Design, Role, load_design
 from capsense.errors import ScenarioError
-from capsense.scenario.bodies import ScenarioTable
+from capsense.scenario.loader import ScenarioTable
 from capsense.scenario.model import Trajectory
 from capsense.scene import Pose
 

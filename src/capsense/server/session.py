@@ -12,8 +12,8 @@ from websockets.exceptions import ConnectionClosed
 from capsense.codec import design_to_json
 from capsense.errors import CapSenseError, ProtocolError
 from capsense.server import messages
+from capsense.server.connection import POLICY, Allowance, ServerOptions
 from capsense.server.frames import PROTOCOL, unpack_depth
-from capsense.server.options import POLICY, Allowance, ServerOptions
 from capsense.server.sensor import Frame, ServedSensor
 
 if TYPE_CHECKING:
