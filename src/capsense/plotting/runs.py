@@ -17,6 +17,7 @@ from capsense._style import (
     FAINT,
     INK,
     LABELS,
+    LEGEND,
     TIME_COLOURS,
     bare,
     style_of,
@@ -30,7 +31,7 @@ from capsense.reading import Reading
 from capsense.recording.export import run_of
 from capsense.recording.reader import Recording
 from capsense.recording.tables import Run
-from capsense.scenario import Channel, Excitation
+from capsense.scenario import Excitation
 from capsense.scenario.model import channels_of
 from capsense.scene import Scene
 
@@ -138,15 +139,11 @@ def _families(run: Run) -> list[_Family]:
     out = []
     if selves:
         matrix = channels[selves[0]].excitation is Excitation.MATRIX
-        out.append(
-            _Family(
-                "diagonal of the matrix" if matrix else "self capacitance",
-                [channels[k].label for k in selves],
-                [style_of(channels[k].row) for k in selves],
-                run.values[:, selves],
-                run.levels[selves],
-            )
-        )
+        shown = [channels[k] for k in selves]
+        title = "diagonal of the matrix" if matrix else "self capacitance"
+        styles = [style_of(c.row) for c in shown]
+        labels = [c.label for c in shown]
+        out.append(_Family(title, labels, styles, run.values[:, selves], run.levels[selves]))
     if pairs:
         # A pair's capacitance is positive, whatever the sign of its entry in the matrix.
         sign = -1.0 if channels[pairs[0]].excitation is Excitation.MATRIX else 1.0
@@ -154,23 +151,12 @@ def _families(run: Run) -> list[_Family]:
         rank = np.argsort(-np.abs(values - levels).max(axis=0), kind="stable")
         order = [*sorted(rank[:MAX_LINES].tolist()), *rank[MAX_LINES:].tolist()]
         shown = [channels[pairs[k]] for k in order]
-        out.append(
-            _Family(
-                "mutual capacitance",
-                [c.label for c in shown],
-                _pair_styles(shown),
-                values[:, order],
-                levels[order],
-            )
-        )
+        # Colours for the strongest pairs, dashed in turns so that neighbours differ twice.
+        styles = [(COLOURS[k], DASHES[k % 2]) for k in range(min(len(shown), MAX_LINES))]
+        styles += [(FAINT, "-")] * (len(shown) - len(styles))
+        labels = [c.label for c in shown]
+        out.append(_Family("mutual capacitance", labels, styles, values[:, order], levels[order]))
     return out
-
-
-def _pair_styles(channels: list[Channel]) -> list[tuple[str, Any]]:
-    """Colours for the strongest pairs, dashed in turns so that neighbours differ twice."""
-    return [
-        (COLOURS[k], DASHES[k % 2]) if k < MAX_LINES else (FAINT, "-") for k in range(len(channels))
-    ]
 
 
 def _strongest(run: Run) -> int:
@@ -196,15 +182,9 @@ def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: A
             colour, dash = family.styles[k]
             strong = k < MAX_LINES or colour != FAINT
             axes.plot(
-                times,
-                signals[:, k],
-                color=colour,
-                ls=dash,
-                marker=marker,
-                lw=1.6 if strong else 0.8,
-                zorder=3 if strong else 2,
-                label=family.labels[k],
-            )
+                times, signals[:, k], color=colour, ls=dash, marker=marker,
+                lw=1.6 if strong else 0.8, zorder=3 if strong else 2, label=family.labels[k],
+            )  # fmt: skip
         if len(times) > 1:
             axes.axvline(times[peak], color=INK, lw=0.7, ls=":", zorder=1)
         bare(axes)
@@ -219,18 +199,10 @@ def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: A
     if rest:
         entries.append((lines[-1], f"{rest} others"))
     upper.legend(
-        *zip(*entries, strict=True),
-        loc="lower left",
-        bbox_to_anchor=(-0.02, 1.0),
-        ncols=5 if len(entries) > 6 else 6,
-        fontsize=8,
-        frameon=False,
-        handlelength=1.4,
-        columnspacing=0.8,
-        title=family.title,
-        alignment="left",
-        title_fontproperties={"size": 10, "weight": "bold"},
-    )
+        *zip(*entries, strict=True), loc="lower left", bbox_to_anchor=(-0.02, 1.0),
+        ncols=5 if len(entries) > 6 else 6, handlelength=1.4, columnspacing=0.8, title=family.title,
+        alignment="left", title_fontproperties={"size": 10, "weight": "bold"}, **LEGEND,
+    )  # fmt: skip
     upper.set_ylabel("relative to the empty scene", **LABELS)
     upper.tick_params(labelbottom=False)
     lower.set_ylabel(f"change from the empty scene [{unit}]", **LABELS)
@@ -243,11 +215,7 @@ def _time_strip(axes: Axes, times: Array) -> None:
     """Colours of time along the bottom, as they are used for the way."""
     low, high = axes.get_ylim()
     height = 0.025 * (high - low)
-    axes.imshow(
-        np.linspace(0, 1, 256)[None],
-        cmap=TIME_COLOURS,
-        aspect="auto",
-        extent=(times[0], times[-1], low - height, low),
-        zorder=0,
-    )
+    place = (times[0], times[-1], low - height, low)
+    colours = np.linspace(0, 1, 256)[None]
+    axes.imshow(colours, cmap=TIME_COLOURS, aspect="auto", extent=place, zorder=0)
     axes.set_ylim(low - height, high)

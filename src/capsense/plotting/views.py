@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from capsense._style import FAINT, INK, LABELS, LEGEND, TIME_COLOURS, TITLES, bare
 from capsense.design import Design
-from capsense.plotting.designs import LAYER_COLOUR, ROLE_COLOURS, outline_patch, outlines
+from capsense.plotting.designs import LAYER_COLOUR, ROLE_COLOURS, add_surface, outline_patch
 from capsense.scene import Body, Scene
 
 if TYPE_CHECKING:
@@ -126,11 +126,9 @@ def _sensor_from_above(design: Design, colours: list[str], axes: Axes) -> None:
         plate = shapely.geometry.box(*low, *high)
         axes.add_patch(outline_patch(plate, fc=LAYER_COLOUR, ec=FAINT, lw=0.6))
     for conductor in design.conductors:
-        for shape in outlines(conductor.surface):
-            axes.add_patch(outline_patch(shape, fc="#d5dade", ec="none"))
+        add_surface(axes, conductor.surface, fc="#d5dade", ec="none")
     for electrode, colour in zip(design.electrodes, colours, strict=True):
-        for shape in outlines(electrode.surface):
-            axes.add_patch(outline_patch(shape, fc=colour, ec="white", lw=0.3, zorder=2))
+        add_surface(axes, electrode.surface, fc=colour, ec="white", lw=0.3, zorder=2)
 
 
 def _sensor_from_the_side(design: Design, colours: list[str], axes: Axes, axis: int) -> None:
