@@ -15,7 +15,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from capsense.reproduce.metrics import cross_correlation, rmse
+from capsense.readout.calibration import cross_correlation
 from capsense.reproduce.scenario1_fit import (
     Fit,
     Grid,
@@ -30,6 +30,7 @@ from capsense.reproduce.scenario1_fit import (
     tabulate,
 )
 from capsense.reproduce.scenario1_setup import Array, Scenario1Setup, load_curves, load_setup
+from capsense.reproduce.store import rmse
 from capsense.simulator import Simulator
 
 BOARDS = ("stripe", "patch")

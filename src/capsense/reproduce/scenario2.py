@@ -19,6 +19,7 @@ import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.field.background import BuildSettings
 from capsense.mesh.lattice import MeshSettings
+from capsense.readout.calibration import cross_correlation
 from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
 from capsense.reproduce.limb_worlds import (
     PARTICIPANTS,
@@ -32,8 +33,7 @@ from capsense.reproduce.limb_worlds import (
     read_poses,
     rides,
 )
-from capsense.reproduce.metrics import correlations, cross_correlation, raw_correlation
-from capsense.reproduce.store import Store
+from capsense.reproduce.store import Store, correlations, raw_correlation
 from capsense.scene.scene import Grounding
 from capsense.simulator import Method
 
