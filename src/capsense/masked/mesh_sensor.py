@@ -321,7 +321,7 @@ class MaskedScenes:
         Raises:
             ValueError: Always.
         """
-        raise ValueError('method "masked" gives no potentials; use "surface"')
+        raise ValueError('method "fem_masked" gives no potentials; use "surface"')
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
         """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
