@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from capsense._style import COLOURS, FAINT, INK, LABELS, LEGEND, TITLES, bare
 from capsense.readout.calibration import cross_correlation
 from capsense.reproduce.harness import Outcome, Report, ReportTable, Row, judged
-from capsense.reproduce.scenario1_fit import matrices, mutual, normalised
 from capsense.reproduce.scenario1_setup import (
     TRIANGLE,
     ZIGZAG,
@@ -27,6 +26,9 @@ from capsense.reproduce.scenario1_setup import (
     Scenario1Setup,
     load_curves,
     load_setup,
+    matrices,
+    mutual,
+    normalised,
 )
 from capsense.reproduce.store import (
     Store,
