@@ -262,11 +262,12 @@ def plot(
 
 def plot_run(run: Run) -> Figure:
     """Draw a run; see :func:`plot`."""
-    families = _families(run)
+    values = run.values
+    families = _families(run, values)
     columns = len(families)
     figure = Figure(figsize=(4.4 * columns + 4.4, 7.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
     grid = figure.add_gridspec(2, columns + 1, width_ratios=[1.0] * columns + [0.95])
-    peak = _strongest(run)
+    peak = _strongest(values, run.levels)
     shared: Axes | None = None
     for column, family in enumerate(families):
         upper = figure.add_subplot(grid[0, column], sharex=shared)
@@ -282,7 +283,7 @@ def plot_run(run: Run) -> Figure:
     return figure
 
 
-def _families(run: Run) -> list[_Family]:
+def _families(run: Run, values: Array) -> list[_Family]:
     channels = run.channels
     selves = [k for k, c in enumerate(channels) if c.row == c.column]
     pairs = [k for k, c in enumerate(channels) if c.row != c.column]
@@ -293,11 +294,11 @@ def _families(run: Run) -> list[_Family]:
         title = "diagonal of the matrix" if matrix else "self capacitance"
         styles = [style_of(c.row) for c in shown]
         labels = [c.label for c in shown]
-        out.append(_Family(title, labels, styles, run.values[:, selves], run.levels[selves]))
+        out.append(_Family(title, labels, styles, values[:, selves], run.levels[selves]))
     if pairs:
         # A pair's capacitance is positive, whatever the sign of its entry in the matrix.
         sign = -1.0 if channels[pairs[0]].excitation is Excitation.MATRIX else 1.0
-        values, levels = sign * run.values[:, pairs], sign * run.levels[pairs]
+        values, levels = sign * values[:, pairs], sign * run.levels[pairs]
         rank = np.argsort(-np.abs(values - levels).max(axis=0), kind="stable")
         order = [*sorted(rank[:MAX_LINES].tolist()), *rank[MAX_LINES:].tolist()]
         shown = [channels[pairs[k]] for k in order]
@@ -309,10 +310,10 @@ def _families(run: Run) -> list[_Family]:
     return out
 
 
-def _strongest(run: Run) -> int:
+def _strongest(values: Array, levels: Array) -> int:
     """The sample with the largest relative change; the middle one where it stays that large."""
-    scale = np.maximum(np.abs(run.levels), 1e-18)
-    change = (np.abs(run.values - run.levels) / scale).max(axis=1)
+    scale = np.maximum(np.abs(levels), 1e-18)
+    change = (np.abs(values - levels) / scale).max(axis=1)
     first = int(np.argmax(change))
     below = np.flatnonzero(change[first:] < 0.995 * change[first])
     last = first + int(below[0]) - 1 if len(below) else len(change) - 1
