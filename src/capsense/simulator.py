@@ -155,8 +155,7 @@ class Simulator:
     def _make_solver(self) -> tuple[_Solver, Array]:
         """The solver, and the matrix of all terminals in the empty domain [F]."""
         if self.method == "fem_masked":
-            from capsense.masked.mesh_sensor import lattice_sensor
-            from capsense.masked.scenes import MaskedScenes
+            from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor
 
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)
