@@ -1,0 +1,61 @@
+"""The public names, and where they are from; see ``docs/conventions.md``."""
+
+from capsense import humans
+from capsense.adapters import assistive_gym, coppeliasim, mujoco, pybullet
+from capsense.adapters.attached import AttachedSensor
+from capsense.design.loader import available_designs, load_design
+from capsense.design.model import Design
+from capsense.errors import (
+    AdapterError,
+    BatchError,
+    CapSenseError,
+    DesignError,
+    ProtocolError,
+    RecordingError,
+    ScenarioError,
+    SceneError,
+    SkinError,
+    SolveError,
+)
+from capsense.fleet.fleet import Fleet, FleetReading
+from capsense.reading import Reading, StepStats
+from capsense.readout.calibration import calibrate
+from capsense.readout.chips import available_chips
+from capsense.readout.config import load_readout
+from capsense.readout.counts import Counts
+from capsense.readout.readout import Readout
+from capsense.recording.reader import open_recording
+from capsense.recording.recorder import Recorder, record
+from capsense.recording.replay import replay
+from capsense.scenario import Scenario, load_scenario
+from capsense.scene.body import Body
+from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
+from capsense.scene.deformable import DeformableSurface
+from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
+from capsense.scene.layers import Layers
+from capsense.scene.materials import MATERIALS, Material
+from capsense.scene.mesh_shape import TriMesh
+from capsense.scene.point_surface import point_surface
+from capsense.scene.pose import Pose
+from capsense.scene.raster import render_depth
+from capsense.scene.scene import Scene
+from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
+from capsense.server.client import Client
+from capsense.simulator import Simulator
+from capsense.skin import Skin
+from capsense.viewer.show import show
+
+__version__: str
+
+__all__ = [
+    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "Body", "Box", "CapSenseError",
+    "Capsule", "Client", "Counts", "Cylinder", "DeformableSurface", "DepthFrame", "Design",
+    "DesignError", "Ellipsoid", "Fleet", "FleetReading", "Layers", "Material",
+    "OrthographicCamera", "PerspectiveCamera", "Pose", "ProtocolError", "Reading", "Readout",
+    "Recorder", "RecordingError", "Scenario", "ScenarioError", "Scene", "SceneError",
+    "Simulator", "Skin", "SkinError", "SolveError", "Sphere", "StepStats", "TriMesh",
+    "__version__", "assistive_gym", "available_chips", "available_designs", "calibrate",
+    "coppeliasim", "decode_permittivity", "encode_permittivity", "humans", "load_design",
+    "load_readout", "load_scenario", "mujoco", "open_recording", "point_surface", "pybullet",
+    "record", "render_depth", "replay", "show",
+]  # fmt: skip
