@@ -13,7 +13,6 @@ from capsense.adapters.attached import (
     GeometrySensor,
     make_simulator,
     refuse_missing,
-    require,
 )
 from capsense.adapters.pybullet_bodies import Mount, body_numbers, links_of
 from capsense.adapters.pybullet_depth import PybulletDepthSensor
@@ -28,7 +27,7 @@ from capsense.adapters.rules import (
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
-from capsense.errors import SceneError
+from capsense.errors import SceneError, require_package
 from capsense.readout.readout import Readout
 from capsense.scene import Pose
 from capsense.simulator import Simulator
@@ -108,7 +107,7 @@ def attach(
         DesignError: The design is wrong.
         ReadoutError: There is no such chip.
     """
-    require("pybullet", "PyBullet", "pybullet")
+    require_package("pybullet", "PyBullet", "pybullet")
     check_perception(perception, options, _ONLY)
     rules, other = split_rules(options, PybulletOptions)
     shapes = _checked_shapes(other.pop("shapes", "collision"))
@@ -160,7 +159,7 @@ def attach_skin(
         DesignError: A design is wrong.
         ReadoutError: There is no such chip.
     """
-    require("pybullet", "PyBullet", "pybullet")
+    require_package("pybullet", "PyBullet", "pybullet")
     rules, other = split_rules(options, PybulletSkinOptions)
     shapes = _checked_shapes(other.get("shapes", "collision"))
     number = _client_number(client)
