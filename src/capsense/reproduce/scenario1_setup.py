@@ -17,13 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from capsense.design import Design, Role, load_design
 from capsense.errors import ScenarioError
 from capsense.readout.calibration import base_capacitance, relative_to
-from capsense.readout.channels import mutual_patterns
+from capsense.readout.channels import ChannelBank, mutual_patterns
 from capsense.readout.converter import ShuntLaw
-from capsense.readout.front_end import ShuntFrontEnd
+from capsense.readout.front_end import ShuntFrontEnd, Wiring
 from capsense.readout.noise import White
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
-from capsense.readout.wiring import Wiring
 from capsense.scenario.loader import ScenarioTable
 from capsense.scenario.model import Trajectory
 from capsense.scene import Body, Box, Pose, Scene
@@ -353,8 +352,7 @@ def readout_of(setup: Scenario1Setup, board: Board, *, noise: bool, seed: int = 
     """The radio behind the front end, reading the board's pair at the sample rate."""
     front_end = ShuntFrontEnd(setup.excitation_frequency, setup.shunt, board.gain)
     return Readout(
-        mutual_patterns(board.pair),
-        board.pair,
+        ChannelBank(mutual_patterns(board.pair), board.pair),
         Schedule.simultaneous(1, setup.conversion, period=1.0 / setup.sample_rate),
         ShuntLaw(front_end, setup.full_scale),
         wiring=Wiring(coupling=setup.stray),
