@@ -14,22 +14,28 @@ from dataclasses import replace
 from itertools import combinations, product
 
 import numpy as np
-
-from capsense.reproduce.metrics import cross_correlation, rmse
-from capsense.reproduce.scenario1_fit import (
+from scenario1_fit import (
     Fit,
     Grid,
     ResponseTable,
     fit,
     fit_without,
-    matrices,
-    mutual,
-    normalised,
     own_figures,
     predicted,
     tabulate,
 )
-from capsense.reproduce.scenario1_setup import Array, Scenario1Setup, load_curves, load_setup
+
+from capsense.readout.calibration import cross_correlation
+from capsense.reproduce.scenario1_setup import (
+    Array,
+    Scenario1Setup,
+    load_curves,
+    load_setup,
+    matrices,
+    mutual,
+    normalised,
+)
+from capsense.reproduce.store import rmse
 from capsense.simulator import Simulator
 
 BOARDS = ("stripe", "patch")

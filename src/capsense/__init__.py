@@ -1,8 +1,8 @@
 """CapSense: real-time simulation of capacitive proximity sensors for robots.
 
 The public names are listed in ``docs/conventions.md``. They are imported at first use, so that
-``import capsense`` itself is light: the imports below are seen by type checkers only, and
-:func:`__getattr__` looks up there where a name is from.
+``import capsense`` itself is light: ``__init__.pyi`` says where each is from, to type checkers and
+to :func:`__getattr__`.
 """
 
 from __future__ import annotations
@@ -10,88 +10,20 @@ from __future__ import annotations
 import ast
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from capsense._kernel_cache import ensure_place
 
-if TYPE_CHECKING:
-    from capsense import humans
-    from capsense.adapters import assistive_gym, coppeliasim, mujoco, pybullet
-    from capsense.adapters.attached import AttachedSensor
-    from capsense.design.loader import available_designs, load_design
-    from capsense.design.model import Design
-    from capsense.errors import (
-        AdapterError,
-        BatchError,
-        CapSenseError,
-        DesignError,
-        ProtocolError,
-        RecordingError,
-        ScenarioError,
-        SceneError,
-        SkinError,
-        SolveError,
-    )
-    from capsense.fleet.fleet import Fleet, FleetReading
-    from capsense.plotting.runs import plot
-    from capsense.reading import Reading, StepStats
-    from capsense.readout.calibration import calibrate
-    from capsense.readout.chips import available_chips
-    from capsense.readout.config import load_readout
-    from capsense.readout.counts import Counts
-    from capsense.readout.readout import Readout
-    from capsense.recording.reader import open_recording, replay
-    from capsense.recording.recorder import Recorder, record
-    from capsense.scenario import Scenario, load_scenario
-    from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
-    from capsense.scene.depth import (
-        DepthFrame,
-        decode_permittivity,
-        encode_permittivity,
-        point_surface,
-    )
-    from capsense.scene.layers import Layers, render_depth
-    from capsense.scene.materials import MATERIALS, Material
-    from capsense.scene.mesh_shape import DeformableSurface, TriMesh
-    from capsense.scene.pose import Pose
-    from capsense.scene.scene import Body, Scene
-    from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
-    from capsense.server.client import Client
-    from capsense.simulator import Simulator
-    from capsense.skin import Skin
-    from capsense.viewer.show import show
-
-    __version__: str
-
-__all__ = [
-    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "Body", "Box", "CapSenseError",
-    "Capsule", "Client", "Counts", "Cylinder", "DeformableSurface", "DepthFrame", "Design",
-    "DesignError", "Ellipsoid", "Fleet", "FleetReading", "Layers", "Material",
-    "OrthographicCamera", "PerspectiveCamera", "Pose", "ProtocolError", "Reading", "Readout",
-    "Recorder", "RecordingError", "Scenario", "ScenarioError", "Scene", "SceneError",
-    "Simulator", "Skin", "SkinError", "SolveError", "Sphere", "StepStats", "TriMesh",
-    "__version__", "assistive_gym", "available_chips", "available_designs", "calibrate",
-    "coppeliasim", "decode_permittivity", "encode_permittivity", "humans", "load_design",
-    "load_readout", "load_scenario", "mujoco", "open_recording", "plot", "point_surface",
-    "pybullet", "record", "render_depth", "replay", "show",
-]  # fmt: skip
-
 ensure_place(Path(__file__).parent)
 
-
-def _homes() -> dict[str, str]:
-    """The module of each public name, by the imports above."""
-    source = ast.parse(Path(__file__).read_text(encoding="utf-8"))
-    seen = next(node for node in source.body if isinstance(node, ast.If))
-    return {
-        name.name: str(node.module)
-        for node in seen.body
-        if isinstance(node, ast.ImportFrom)
-        for name in node.names
-    }
-
-
-_HOMES = _homes()
+_HOMES = {
+    name.name: str(node.module)
+    for node in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body
+    if isinstance(node, ast.ImportFrom)
+    for name in node.names
+}
+"""The module of each public name."""
+__all__ = ["__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:

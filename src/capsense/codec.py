@@ -83,7 +83,7 @@ def shape_fields(shape: Shape | RestSurface, rest: int | None = None) -> Fields:
         case Layers():
             sizes = (*shape.size, *shape.front.shape)
             values = np.concatenate([shape.front.ravel(), shape.back.ravel()])
-        case _ if type(shape) is SHAPES.get(kind):
+        case _ if isinstance(shape, SHAPES.get(kind, ())):
             sizes = np.hstack([getattr(shape, name) for name in lengths_of(kind)])
         case _:
             raise RecordingError(

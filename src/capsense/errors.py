@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 _LONGEST, _HEAD, _TAIL = 1000, 600, 300
@@ -94,3 +95,22 @@ class ProtocolError(CapSenseError, ValueError):
         super().__init__(message)
         self.code = code
         """What is wrong, one of :data:`capsense.server.messages.CODES`."""
+
+
+def require_package(module: str, title: str, extra: str) -> None:
+    """Refuse to go on without an optional package.
+
+    Args:
+        module: What is imported.
+        title: What people call it.
+        extra: The extra of CapSense that installs it.
+
+    Raises:
+        MissingDependencyError: It is not installed.
+    """
+    try:
+        import_module(module)
+    except ImportError:
+        raise MissingDependencyError(
+            f"{title} is not installed; pip install 'capsense[{extra}]'"
+        ) from None

@@ -20,8 +20,7 @@ from capsense.errors import BatchError, FieldError, ReadoutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.change import Change
-from capsense.field.terminals import Terminals
+from capsense.field.change import Change, Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
@@ -156,8 +155,7 @@ class Simulator:
     def _make_solver(self) -> tuple[_Solver, Array]:
         """The solver, and the matrix of all terminals in the empty domain [F]."""
         if self.method == "fem_masked":
-            from capsense.masked.mesh_sensor import lattice_sensor
-            from capsense.masked.scenes import MaskedScenes
+            from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor
 
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)

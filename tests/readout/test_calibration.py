@@ -19,7 +19,7 @@ from capsense.readout.calibration import (
     tare,
     unit_range,
 )
-from capsense.readout.channels import self_patterns
+from capsense.readout.channels import ChannelBank, self_patterns
 from capsense.readout.converter import LinearLaw
 from capsense.readout.noise import Flicker, White
 from capsense.readout.readout import Readout
@@ -91,7 +91,7 @@ def saturated(top, random=0.0, seed=0):
     time = np.arange(0, 60, 0.05)
     true = (2 + 2 * np.exp(-(((time - 30) / 8) ** 2)))[:, None] * [1e-12, 0.9e-12]
     readout = Readout(
-        self_patterns(("A", "B"), shield=0.0), ("A", "B"), Schedule.simultaneous(2, 0.1),
+        ChannelBank(self_patterns("AB", shield=0.0), tuple("AB")), Schedule.simultaneous(2, 0.1),
         LinearLaw(1e-18, 0, round(top / 1e-18)), seed=seed,
         stages=(LinearSensor(1.03, 2e-13, 0.0, 0.0), White(1e-15)),
     )  # fmt: skip
@@ -176,7 +176,11 @@ def test_intervals_cover_with_flicker():
     for seed in range(trials):
         noise = (Flicker(5e-16), White(1e-15))
         readout = Readout(
-            bank, names, plan, LinearLaw(1e-21, -(10**12), 10**12), stages=noise, seed=seed
+            ChannelBank(bank, names),
+            plan,
+            LinearLaw(1e-21, -(10**12), 10**12),
+            stages=noise,
+            seed=seed,
         )
         stamps, rows = readout(time, truth[0] * true + truth[1]).table()
         instants = stamps[:, 0] - 0.01
@@ -213,7 +217,7 @@ def test_a_calibrated_model_measures_like_the_sensor():
     true, measured, time = recording(np.random.default_rng(3))
     sensor = calibrate(true, measured, time)
     readout = Readout(
-        self_patterns(("A", "B"), shield=0.0), ("A", "B"), Schedule.simultaneous(2, 0.1),
+        ChannelBank(self_patterns("AB", shield=0.0), tuple("AB")), Schedule.simultaneous(2, 0.1),
         LinearLaw(1e-21, -(10**12), 10**12), stages=(sensor, White(1e-16)),
     )  # fmt: skip
     counts = readout(time, true)
@@ -226,8 +230,10 @@ def test_a_calibrated_model_measures_like_the_sensor():
     assert again.offset == pytest.approx(OFFSET + drift_between, abs=5e-17)
     assert again.drift == near(DRIFT, rel=0.05)
     with pytest.raises(ReadoutError, match="list of 3, one per channel"):
-        Readout(self_patterns(("A", "B", "C")), ("A", "B", "C"), Schedule.simultaneous(3, 0.1),
-                LinearLaw(1e-15, 0, 9), stages=(sensor,))  # fmt: skip
+        Readout(
+            ChannelBank(self_patterns("ABC"), tuple("ABC")), Schedule.simultaneous(3, 0.1),
+            LinearLaw(1e-15, 0, 9), stages=(sensor,),
+        )  # fmt: skip
 
 
 def test_normalisations():

@@ -13,7 +13,7 @@ from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
-from capsense.readout.channels import Pattern, self_patterns
+from capsense.readout.channels import ChannelBank, Pattern, self_patterns
 from capsense.readout.chips import CHIPS
 from capsense.readout.converter import CapDac, LinearLaw
 from capsense.readout.counts import Counts, join
@@ -30,7 +30,7 @@ FINE = LinearLaw(1e-21, -(10**12), 10**12)
 def plain(schedule=None, **options):
     """Three self channels through a converter of very fine codes."""
     plan = schedule or Schedule.sequential(3, 2e-3, gap=1e-4)
-    return Readout(self_patterns(NAMES, shield=0.0), NAMES, plan, FINE, **options)
+    return Readout(ChannelBank(self_patterns(NAMES, shield=0.0), NAMES), plan, FINE, **options)
 
 
 def full(seed=0):
@@ -242,7 +242,9 @@ def test_wiring_of_mutual_channels():
     """Analytic: leads to ground charge a self measurement only; between leads, a mutual one."""
     patterns = [Pattern("A"), Pattern("B", {"A": 1.0})]
     wiring = Wiring(trace=4e-12, cable=1e-11, shield_gain=0.5, coupling=[1e-13, 2e-13])
-    readout = Readout(patterns, NAMES, Schedule.simultaneous(2, 1e-3), FINE, wiring=wiring)
+    readout = Readout(
+        ChannelBank(patterns, NAMES), Schedule.simultaneous(2, 1e-3), FINE, wiring=wiring
+    )
     matrix = random_maxwell(np.random.default_rng(2), 3)
     counts = readout([0.0, 0.01], [matrix, matrix])
     expected = [matrix[0, 0] + 4e-12 + 5e-12, -matrix[1, 0] + 2e-13]
@@ -264,7 +266,7 @@ def test_readings_of_a_simulator():
     coupling = np.array([-0.1, -0.2, -0.3]) * 1e-12
     reading = Reading(matrix, np.diag(matrix) + coupling)
     patterns = [Pattern("A", shield=1.0), Pattern("B", shield=0.0), Pattern("C", {"A": 1.0})]
-    readout = Readout(patterns, NAMES, Schedule.simultaneous(3, 1e-3), FINE)
+    readout = Readout(ChannelBank(patterns, NAMES), Schedule.simultaneous(3, 1e-3), FINE)
     expected = [matrix[0, 0] + coupling[0], matrix[1, 1], -matrix[2, 0]]
     assert readout.channel_values(reading) == near(expected, rel=1e-12)
     assert readout.channel_values(np.array(expected)).tolist() == expected
@@ -386,7 +388,10 @@ def test_stages_are_applied_in_their_order():
     shift = LinearSensor(1.0, 3e-13, 0.0, 0.0)
     for stages, expected in (((Doubled(), shift), 2300), ((shift, Doubled()), 2600)):
         readout = Readout(
-            self_patterns(NAMES), NAMES, Schedule.simultaneous(3, 0.1), Square(), stages=stages
+            ChannelBank(self_patterns(NAMES), NAMES),
+            Schedule.simultaneous(3, 0.1),
+            Square(),
+            stages=stages,
         )
         counts = readout([0.0, 1.0], np.full((2, 3), 1e-12))
         assert (counts.code == expected**2).all()

@@ -6,7 +6,6 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from capsense.adapters.placement import nothing_seen, placement, turned_round
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import MissingDependencyError, SceneError
+from capsense.errors import SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
@@ -325,20 +324,6 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
         FieldError: The background field could not be built.
     """
     return design if isinstance(design, Simulator) else Simulator(design)
-
-
-def require(module: str, title: str, extra: str) -> None:
-    """Refuse to go on without an optional package.
-
-    Raises:
-        MissingDependencyError: It is not installed.
-    """
-    try:
-        import_module(module)
-    except ImportError:
-        raise MissingDependencyError(
-            f"{title} is not installed; pip install 'capsense[{extra}]'"
-        ) from None
 
 
 def refuse_missing(what: str, name: str, known: Sequence[str]) -> SceneError:

@@ -10,7 +10,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import DepthSensor, make_simulator, require
+from capsense.adapters.attached import DepthSensor, make_simulator
 from capsense.adapters.coppeliasim_remote import (
     Remote,
     VisionSensor,
@@ -32,7 +32,7 @@ from capsense.adapters.rules import (
     split_rules,
 )
 from capsense.design.model import Design
-from capsense.errors import AdapterError, SceneError
+from capsense.errors import AdapterError, SceneError, require_package
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
@@ -65,7 +65,7 @@ def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -
         MissingDependencyError: The client is not installed.
         AdapterError: Nobody answers there, or in another version of the protocol.
     """
-    require("coppeliasim_zmqremoteapi_client", "CoppeliaSim's client", "coppelia")
+    require_package("coppeliasim_zmqremoteapi_client", "CoppeliaSim's client", "coppelia")
     import zmq
     from coppeliasim_zmqremoteapi_client import RemoteAPIClient
 

@@ -13,7 +13,6 @@ from capsense.adapters.attached import (
     GeometrySensor,
     make_simulator,
     refuse_missing,
-    require,
 )
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
@@ -21,7 +20,7 @@ from capsense.adapters.rules import AttachOptions, Image, check_perception, spli
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
-from capsense.errors import SceneError
+from capsense.errors import SceneError, require_package
 from capsense.readout.readout import Readout
 from capsense.scene import Pose
 from capsense.simulator import Simulator
@@ -115,7 +114,7 @@ def attach(
         DesignError: The design is wrong.
         ReadoutError: There is no such chip.
     """
-    require("mujoco", "MuJoCo", "mujoco")
+    require_package("mujoco", "MuJoCo", "mujoco")
     _check_pair(model, data)
     check_perception(perception, options, _ONLY)
     rules, other = split_rules(options, MujocoOptions)
@@ -166,7 +165,7 @@ def attach_skin(
         DesignError: A design is wrong.
         ReadoutError: There is no such chip.
     """
-    require("mujoco", "MuJoCo", "mujoco")
+    require_package("mujoco", "MuJoCo", "mujoco")
     _check_pair(model, data)
     rules, other = split_rules(options, MujocoSkinOptions)
     if isinstance(sites, str):

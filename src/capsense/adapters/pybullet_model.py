@@ -92,33 +92,90 @@ class SoftMesh:
         return np.array(vertices)
 
 
-class WorldReader:
-    """Reads the shapes of all links of a world.
+class ClientSource(WorldSource):
+    """The solids of a PyBullet world; frames are its links' centres of mass.
+
+    They are taken over again when bodies were added or removed, or the world was reset. A pattern
+    must fit something at first; what it fits may leave.
 
     Args:
         client: Number of the physics client.
-        links: The links; their order is that of the frames.
         rules: What is seen, and what it is made of.
         shapes: ``"collision"`` or ``"visual"``.
 
+    Raises:
+        SceneError: A pattern fits nothing.
     """
 
-    def __init__(self, client: int, links: Sequence[Link], rules: Rules, shapes: str) -> None:
+    def __init__(self, client: int, rules: Rules, shapes: str) -> None:
         self.client = client
-        self.links = links
-        self.rules = rules
-        self.shapes = shapes
-        self.notes: list[str] = []
-        """What was left out or replaced, and why."""
-        self._meshes: dict[tuple[object, ...], Shape] = {}
+        self._shapes = shapes
+        self._watch = BodyWatch(client)
+        super().__init__(rules)
+        check_patterns(rules, self._links)
 
-    def solids(self, index: int) -> Iterator[Solid]:
+    def refresh(self) -> None:
+        super().refresh()
+        bodies = self._watch.bodies()
+        self._links = [link for body in bodies for link in links_of(self.client, body)]
+        self._groups = [
+            (body, [k.link for k in self._links if k.body == body and k.link >= 0])
+            for body in bodies
+        ]
+        self._meshes: dict[tuple[object, ...], Shape] = {}
+        self._notes: list[str] = []  # what was left out or replaced, and why
+        self._made: dict[int, list[Solid]] = {}
+
+    def index(self, body: int, link: int) -> int:
+        """Number of a link's frame.
+
+        Raises:
+            SceneError: The link has left the world.
+        """
+        for number, known in enumerate(self._links):
+            if (known.body, known.link) == (body, link):
+                return number
+        raise gone(body)
+
+    def solids(self, own: int | None) -> list[Solid]:
+        out = []
+        for i, link in enumerate(self._links):
+            if i == own or is_soft(self.client, link):
+                continue
+            if i not in self._made:
+                self._made[i] = list(self._solids_of(i))
+            out += self._made[i]
+        notes, self._notes = self._notes, []
+        if notes:
+            warnings.warn("sensor: " + ";\n".join(dict.fromkeys(notes)), stacklevel=2)
+        return out
+
+    def soft(self, own: int | None) -> list[SoftSolid]:
+        numbers = [i for i, k in enumerate(self._links) if i != own and is_soft(self.client, k)]
+        return [soft for i in numbers for soft in self._soft_of(i)]
+
+    def links(self) -> tuple[Array, Array]:
+        import pybullet as p
+
+        if self._watch.changed():
+            self.refresh()
+        poses: list[Any] = []
+        for body, links in self._groups:
+            poses.append(p.getBasePositionAndOrientation(body, physicsClientId=self.client))
+            if links:
+                states = p.getLinkStates(
+                    body, links, computeForwardKinematics=1, physicsClientId=self.client
+                )
+                poses += [s[:2] for s in states]
+        return np.array([pose[0] for pose in poses]), np.array([pose[1] for pose in poses])
+
+    def _solids_of(self, index: int) -> Iterator[Solid]:
         """The solids of one link.
 
         Raises:
             SceneError: A shape is not supported.
         """
-        link = self.links[index]
+        link = self._links[index]
         if self.rules.excludes(link.names):
             return
         material, tie = matter_of(self.client, link, self.rules)
@@ -132,13 +189,13 @@ class WorldReader:
                 tie=tie,
             )
 
-    def soft_solids(self, index: int) -> list[SoftSolid]:
+    def _soft_of(self, index: int) -> list[SoftSolid]:
         """A soft body as a deformable; none where the rules leave it out.
 
         Raises:
             SceneError: Its mesh is not made of triangles.
         """
-        link = self.links[index]
+        link = self._links[index]
         if self.rules.excludes(link.names):
             return []
         mesh = SoftMesh(self.client, link)
@@ -154,7 +211,7 @@ class WorldReader:
         drawn = [entry for entry in drawn if entry[1] == link.link]
         if any(entry[2] == _HEIGHT_FIELD for entry in drawn):
             raise _refuse(link, "is a height field, of which PyBullet tells nothing but its bounds")
-        if self.shapes == "visual":
+        if self._shapes == "visual":
             to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
             flat = lost = False
             for entry in drawn:
@@ -163,7 +220,7 @@ class WorldReader:
                 try:
                     shape = self._visual(link, entry)
                 except UnusableShape as error:
-                    self.notes.append(f"{error} (its link's collision shapes are taken)")
+                    self._notes.append(f"{error} (its link's collision shapes are taken)")
                     lost = True
                     continue
                 flat = flat or shape is None
@@ -173,7 +230,7 @@ class WorldReader:
                 return
         # entries 0 and 1 are sound in the first record of a link only
         data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
-        if self.shapes == "visual" and not data and flat:
+        if self._shapes == "visual" and not data and flat:
             raise _refuse(link, "has a flat visual mesh, without an inside, and no collision shape")
         for number, entry in enumerate(data):
             if self._is_nothing(link, entry):
@@ -181,7 +238,7 @@ class WorldReader:
             try:
                 yield self._collision(link, number, entry)
             except UnusableShape as error:
-                self.notes.append(f"{error} (left out)")
+                self._notes.append(f"{error} (left out)")
 
     def _is_nothing(self, link: Link, entry: Any) -> bool:
         """Whether a shape has no volume, as the empty boxes that some URDFs hold."""
@@ -194,7 +251,9 @@ class WorldReader:
         }.get(kind, 1.0)  # fmt: skip
         if least > 0:
             return False
-        self.notes.append(f"{link.names[-1]!r} has a shape of sizes {a:g}, {b:g}, {c:g} (left out)")
+        self._notes.append(
+            f"{link.names[-1]!r} has a shape of sizes {a:g}, {b:g}, {c:g} (left out)"
+        )
         return True
 
     def _visual(self, link: Link, entry: Any) -> Shape | None:
@@ -244,83 +303,6 @@ class WorldReader:
             raise _refuse(link, "has a concave collision mesh that PyBullet does not give out")
         corners = pose.inverse().apply(vertices)  # given in the frame of the centre of mass
         return round_cylinder(corners) or solid_mesh(corners, (), label, hull=True), pose
-
-
-class ClientSource(WorldSource):
-    """The solids of a PyBullet world; frames are its links' centres of mass.
-
-    They are taken over again when bodies were added or removed, or the world was reset. A pattern
-    must fit something at first; what it fits may leave.
-
-    Args:
-        client: Number of the physics client.
-        rules: What is seen, and what it is made of.
-        shapes: ``"collision"`` or ``"visual"``.
-
-    Raises:
-        SceneError: A pattern fits nothing.
-    """
-
-    def __init__(self, client: int, rules: Rules, shapes: str) -> None:
-        self.client = client
-        self._shapes = shapes
-        self._watch = BodyWatch(client)
-        super().__init__(rules)
-        check_patterns(rules, self._links)
-
-    def refresh(self) -> None:
-        super().refresh()
-        bodies = self._watch.bodies()
-        self._links = [link for body in bodies for link in links_of(self.client, body)]
-        self._groups = [
-            (body, [k.link for k in self._links if k.body == body and k.link >= 0])
-            for body in bodies
-        ]
-        self._reader = WorldReader(self.client, self._links, self.rules, self._shapes)
-        self._made: dict[int, list[Solid]] = {}
-
-    def index(self, body: int, link: int) -> int:
-        """Number of a link's frame.
-
-        Raises:
-            SceneError: The link has left the world.
-        """
-        for number, known in enumerate(self._links):
-            if (known.body, known.link) == (body, link):
-                return number
-        raise gone(body)
-
-    def solids(self, own: int | None) -> list[Solid]:
-        out = []
-        for i, link in enumerate(self._links):
-            if i == own or is_soft(self.client, link):
-                continue
-            if i not in self._made:
-                self._made[i] = list(self._reader.solids(i))
-            out += self._made[i]
-        notes, self._reader.notes = self._reader.notes, []
-        if notes:
-            warnings.warn("sensor: " + ";\n".join(dict.fromkeys(notes)), stacklevel=2)
-        return out
-
-    def soft(self, own: int | None) -> list[SoftSolid]:
-        numbers = [i for i, k in enumerate(self._links) if i != own and is_soft(self.client, k)]
-        return [soft for i in numbers for soft in self._reader.soft_solids(i)]
-
-    def links(self) -> tuple[Array, Array]:
-        import pybullet as p
-
-        if self._watch.changed():
-            self.refresh()
-        poses: list[Any] = []
-        for body, links in self._groups:
-            poses.append(p.getBasePositionAndOrientation(body, physicsClientId=self.client))
-            if links:
-                states = p.getLinkStates(
-                    body, links, computeForwardKinematics=1, physicsClientId=self.client
-                )
-                poses += [s[:2] for s in states]
-        return np.array([pose[0] for pose in poses]), np.array([pose[1] for pose in poses])
 
 
 def _primitive(kind: int, sizes: tuple[float, float, float]) -> Shape | None:

@@ -24,7 +24,7 @@ from capsense.cli.console import (
 from capsense.cli.run import build_simulator, chosen_scenario
 
 if TYPE_CHECKING:
-    from capsense.server.options import Limits
+    from capsense.server.connection import Limits
     from capsense.server.server import Server
     from capsense.viewer.player import Playback
     from capsense.viewer.view import LiveView
@@ -72,7 +72,7 @@ def _serve(args: argparse.Namespace) -> int:
     """Serve until told to stop, and return the exit code."""
     import asyncio
 
-    from capsense.server.options import ServerOptions
+    from capsense.server.connection import ServerOptions
     from capsense.server.server import Server
 
     options = ServerOptions(
@@ -88,7 +88,7 @@ def _serve(args: argparse.Namespace) -> int:
 
 
 def _limits(args: argparse.Namespace) -> Limits:
-    from capsense.server.options import Limits
+    from capsense.server.connection import Limits
 
     values = {name: getattr(args, f"max_{name}") for name in _LIMITS}
     return Limits(**{name: value for name, value in values.items() if value is not None})
@@ -260,7 +260,7 @@ def _player(args: argparse.Namespace) -> Playback:
     with BuildProgress(shown=progress_shown(args.quiet)) as progress:
         if args.connect is not None:
             from capsense.viewer.show import Follower
-            from capsense.viewer.watched import Watched
+            from capsense.viewer.source import Watched
 
             token = read_token(args.token_file) or ""
             return Follower(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -92,36 +92,30 @@ def _at(point: Array) -> str:
     return "(" + ", ".join(f"{x:.6g}" for x in np.round(point, 9) + 0.0) + ") m"
 
 
+def _beyond(bounds: Array, domain: Domain, margin: float) -> Iterator[tuple[str, str]]:
+    """What bounds, shape (2, 3), do that are not ``margin`` inside, and where, in words."""
+    walls = np.array([domain.lower, domain.upper])
+    room = (bounds - walls) * [[1.0], [-1.0]]
+    for axis, side in zip(*np.nonzero(margin > room.T), strict=True):
+        name, value, wall = "xyz"[axis], bounds[side, axis], walls[side, axis]
+        verb = "touches" if abs(value - wall) < TOUCH else "leaves"
+        yield verb, f"it reaches {name} = {value:.6g} m and the wall is at {name} = {wall:.6g} m"
+
+
 def _inside_domain(sheet: Electrode | Conductor, domain: Domain, source: str) -> None:
-    for axis, name in enumerate("xyz"):
-        low, high = sheet.surface.bounds[:, axis]
-        wall_low, wall_high = float(domain.lower[axis]), float(domain.upper[axis])
-        for value, wall, out in (
-            (low, wall_low, low - wall_low < TOUCH),
-            (high, wall_high, wall_high - high < TOUCH),
-        ):
-            if out:
-                kind = "touches" if abs(value - wall) < TOUCH else "leaves"
-                raise DesignError(
-                    f"{source}: {_label(sheet)}: {kind} the grounded box: it reaches "
-                    f"{name} = {value:.6g} m and the wall is at {name} = {wall:.6g} m; move it "
-                    "inside (center, z, size) or enlarge domain size or backplane; "
-                    "lengths are metres"
-                )
+    for verb, where in _beyond(sheet.surface.bounds, domain, TOUCH):
+        raise DesignError(
+            f"{source}: {_label(sheet)}: {verb} the grounded box: {where}; move it inside (center, "
+            "z, size) or enlarge domain size or backplane; lengths are metres"
+        )
 
 
 def _layer_inside_domain(layer: Layer, domain: Domain, source: str) -> None:
-    for axis, name in enumerate("xyz"):
-        for value, wall, out in (
-            (layer.lower[axis], domain.lower[axis], layer.lower[axis] < domain.lower[axis] - TOUCH),
-            (layer.upper[axis], domain.upper[axis], layer.upper[axis] > domain.upper[axis] + TOUCH),
-        ):
-            if out:
-                raise DesignError(
-                    f"{source}: {_label(layer)}: leaves the domain: it reaches {name} = "
-                    f"{value:.6g} m and the wall is at {name} = {wall:.6g} m; reduce its size or "
-                    "z, or enlarge domain size or backplane; lengths are metres"
-                )
+    for _, where in _beyond(np.array([layer.lower, layer.upper]), domain, -TOUCH):
+        raise DesignError(
+            f"{source}: {_label(layer)}: leaves the domain: {where}; reduce its size or z, or "
+            "enlarge domain size or backplane; lengths are metres"
+        )
 
 
 def _apart(one: Layer, other: Layer, source: str) -> None:

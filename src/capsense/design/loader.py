@@ -112,9 +112,13 @@ def parse_design(
             out.append(DesignTable(raw, source, tag, limit))
         return out
 
-    electrodes = [_read_electrode(t, where, domain) for t in items("electrode")]
+    electrodes = [
+        Electrode(t.string("name"), _read_surface(t, where, domain, ())) for t in items("electrode")
+    ]
     for table in items("electrodes_from_stl"):
-        electrodes += _read_stl_group(table, where, domain)
+        from capsense.design.stl_shape import read_imprint_group
+
+        electrodes += read_imprint_group(table, where, domain)
     layers = [_read_layer(t) for t in items("layer")]
     stack = tuple(layers)
     electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack)) for e in electrodes]
@@ -188,16 +192,6 @@ def _bent(sheet: Electrode | Conductor, radius: float, source: str) -> Surface:
         return sheet.surface
     item = f'{source}: {type(sheet).__name__.lower()} "{sheet.name}"'
     return bend_sheet(item, sheet.surface, radius)
-
-
-def _read_electrode(table: DesignTable, folder: Path, domain: Domain) -> Electrode:
-    return Electrode(table.string("name"), _read_surface(table, folder, domain, ()))
-
-
-def _read_stl_group(table: DesignTable, folder: Path, domain: Domain) -> list[Electrode]:
-    from capsense.design.stl_shape import read_imprint_group
-
-    return read_imprint_group(table, folder, domain)
 
 
 def _read_conductor(

@@ -1,4 +1,12 @@
-"""Electrode and conductor shapes: planar outlines, boxes, cylinders and bent sheets."""
+"""Parametric shapes of electrodes and other conductors, flat and round.
+
+Each planar shape is a function from a design table to polygons [m] in the shape's own plane,
+centred on its own origin; :data:`SHAPES` lists them with the keys that they read.
+
+Sheets bent onto a cylinder, and closed cylinders, are made of flat strips. A strip is as wide as
+the arc that it stands for, so that areas are exact; its edges lie a little outside the round
+surface, and its middle a little inside.
+"""
 
 from __future__ import annotations
 

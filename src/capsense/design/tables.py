@@ -1,4 +1,8 @@
-"""Tables of a design file: strict reading, relative permittivities of layers, placement."""
+"""Tables of a design file: strict reading, relative permittivities of layers, placement.
+
+Permittivities are those that vendors' tables and handbooks give between 100 kHz and 10 MHz; the
+middle of the published range where there is one. A design may state ``eps_r`` instead of a name.
+"""
 
 from __future__ import annotations
 

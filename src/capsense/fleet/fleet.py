@@ -22,7 +22,7 @@ from capsense.errors import (
     SolveError,
 )
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.terminals import Terminals
+from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.step_kernels import Found, Poses, Sensor, step_rows
 from capsense.readout.counts import Held

@@ -75,16 +75,15 @@ def step_rows(start, stop, bodies, poses, sensor, found):
     green, slopes = sensor.green, found.slope.shape[0] > 0
     m = green.terminals
     seen, place = np.empty(places, bodies.shapes.dtype), np.empty(places, np.int64)
-    turn, own = np.empty((3, 3)), np.empty((3, 3))
+    turns = np.empty((3, 3)), np.empty((3, 3))
     for e in range(start, stop):
         for s in range(sensors):
-            _matrix(poses.sensors[e, s], turn)
+            _matrix(poses.sensors[e, s], turns[0])
             count = 0
             for b in range(places):
                 if bodies.choice[e, b] >= 0 and not bodies.hidden[s, b]:
-                    _matrix(poses.bodies[e, b], own)
                     record = seen[count : count + 1]
-                    if _placed(bodies, e, b, poses, s, turn, own, green.room, record):
+                    if _placed(bodies, e, b, poses, s, turns, green.room, record):
                         seen[count].group = count
                         place[count] = b
                         count += 1
@@ -114,8 +113,13 @@ def _matrix(pose, out):
 
 
 @compiled
-def _placed(bodies, e, b, poses, s, turn, own, room, record):
-    """Fill the record of a body in a sensor's frame; False where it is out of its sight."""
+def _placed(bodies, e, b, poses, s, turns, room, record):
+    """Fill the record of a body in a sensor's frame; False where it is out of its sight.
+
+    ``turns`` are the sensor's rotation matrix, and room for that of the body.
+    """
+    turn, own = turns
+    _matrix(poses.bodies[e, b], own)
     u, scale = bodies.choice[e, b], bodies.scale[e, b]
     reach = scale * bodies.radius[u]
     record[0] = bodies.shapes[u]

@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from capsense.errors import SceneError
+from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
 from capsense.fleet.step_kernels import Bodies
 from capsense.surface.matter import UNIT
@@ -44,7 +45,7 @@ class WarpCore:
         def room(*shape: int, dtype: Any = wp.float32) -> Any:
             return wp.zeros(shape, dtype=dtype, device=self.device)
 
-        cut = kernels.WarpCut()
+        cut = warp_cut.WarpCut()
         cut.pose = room(places, views, dtype=wp.transform)
         for name in ("node", "split", "number"):
             setattr(cut, name, room(n, views, dtype=wp.int32))
@@ -53,13 +54,13 @@ class WarpCore:
         cut.points = room(n, 4, views, dtype=wp.vec3)
         self.cut = cut
         passes = self.green.near_table.shape[1]
-        self.rows, self.matrix = room(n, passes * kernels.WIDTH, views), room(n, n, views)
+        self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
         self.capacitance, self.delta = (room(environments, sensors, m, m) for _ in range(2))
         self.dropped = room(environments, sensors, dtype=wp.int32)
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
         """Take over what stands where."""
-        places = kernels.Places()
+        places = warp_cut.Places()
         for name in ("choice", "neutral", "hidden"):
             setattr(places, name, self._array(getattr(bodies, name), wp.int32))
         for name in ("scale", "softness", "tie"):
@@ -88,9 +89,9 @@ class WarpCore:
         green, cut, at = self.green, self.cut, (self.shapes, self.places)
         width = self.rows.shape[1]
         for kernel, dim, arguments in (
-            (kernels.choose, (places, views), [*at, green, bodies, sensors, k, cut]),
-            (kernels.place, (n, views), [*at, green, count, k, cut]),
-            (kernels.rows, (n, width // kernels.WIDTH, views), [green, cut, self.rows]),
+            (warp_cut.choose, (places, views), [*at, green, bodies, sensors, k, cut]),
+            (warp_cut.place, (n, views), [*at, green, count, k, cut]),
+            (kernels.rows, (n, width // warp_cut.WIDTH, views), [green, cut, self.rows]),
             (kernels.pairs, (n, n, views), [green, cut, k, self.matrix]),
             (kernels.to_functions, (places, width, views), [cut, k, self.rows]),
             (kernels.to_functions, (places, n, views), [cut, k, self.matrix]),
@@ -151,13 +152,13 @@ def as_transforms(poses: Any, shape: tuple[int, ...], device: Any) -> Any:
 
 
 def _response(green: Green, empty: Array, screened: Array, device: Any) -> Any:
-    out = kernels.Response()
+    out = warp_cut.Response()
     for name in ("near", "far"):
         sources = np.ascontiguousarray(getattr(green, name).T, np.float32)
         table = getattr(green, f"{name}_table")
-        parts = np.ascontiguousarray(table.reshape(len(table), -1, kernels.WIDTH))
+        parts = np.ascontiguousarray(table.reshape(len(table), -1, warp_cut.WIDTH))
         setattr(out, name, wp.array(sources, dtype=wp.vec3, device=device))
-        setattr(out, f"{name}_table", wp.array(parts, dtype=kernels.row, device=device))
+        setattr(out, f"{name}_table", wp.array(parts, dtype=warp_cut.row, device=device))
     out.lead, out.terminals, out.unit = green.lead, len(empty), UNIT
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blend.tolist()
@@ -184,7 +185,7 @@ def _shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any:
     def joined(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(tree, name) for tree in trees])
 
-    out = kernels.Shapes()
+    out = warp_cut.Shapes()
     out.first = array(np.concatenate([[0], np.cumsum(2 * sizes - 1)[:-1]]), wp.int32)
     out.functions = array(sizes, wp.int32)
     out.block = array(np.concatenate([[0], np.cumsum(sizes**2)[:-1]]), wp.int64)

@@ -1,4 +1,8 @@
-"""Human bodies in other formats: SMPL models in, MJCF and URDF out."""
+"""Human bodies in other formats: SMPL models in, MJCF and URDF out.
+
+Model files of the SMPL family are the user's: they are licensed by their makers and are not part of
+CapSense, see smpl-x.is.tue.mpg.de.
+"""
 
 from __future__ import annotations
 

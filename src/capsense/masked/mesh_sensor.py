@@ -1,4 +1,8 @@
-"""A sensor that is given as a tetrahedral mesh, and the mesh of a design."""
+"""Sensors given as tetrahedral meshes, meshes of designs, and the scheme on scenes.
+
+The planes of a design's mesh follow the edges and faces of its sheets and layers, and spread out
+with distance from them. Tetrahedra whose centroid lies in a body take its material.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +21,12 @@ from capsense.design.model import Design, Domain, Electrode
 from capsense.design.stl import sheet_surface, weld
 from capsense.errors import DesignError, MeshError, SceneError
 from capsense.field.boundary import terminals
+from capsense.field.change import Change
+from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh, kuhn_tets
 from capsense.mesh.lattice import MeshSettings
 from capsense.mesh.tetmesh import GROUND
+from capsense.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -279,3 +286,74 @@ def lattice_sensor(design: Design, terminals: Sequence[str], settings: MeshSetti
         inside = (mesh.centroids > layer.lower) & (mesh.centroids < layer.upper)
         eps[inside.all(axis=1)] = layer.eps_r
     return MeshSensor(mesh, tuple(terminals), (GROUND,), eps)
+
+
+class MaskedScenes:
+    """Masks the tetrahedra of a mesh with a scene's bodies and solves in full.
+
+    Floating conductors are met by a large permittivity, as a scheme that knows only permittivity
+    must; impedances to ground cannot be represented and are refused. Each scene is solved from the
+    last one's potentials, or from zero.
+    """
+
+    FLOATING_EPS_R = 1e4
+
+    def __init__(
+        self, sensor: MeshSensor, excitation_frequency: float, *, warm_start: bool = True
+    ) -> None:
+        self._excitation_frequency = excitation_frequency
+        self._mesh = sensor.mesh
+        self._centroids = sensor.mesh.centroids
+        self._solver = MaskedSolver(
+            sensor.mesh, sensor.names, sensor.ground, sensor.eps_r, profiles=sensor.profiles,
+            warm_start=warm_start,
+        )  # fmt: skip
+        self.empty: Array = self._solver.step(np.full(self._mesh.n_tets, -1), [])
+        """Maxwell matrix of the empty mesh [F], shape (terminals, terminals)."""
+
+    def reset(self) -> None:
+        """Forget the last solution."""
+        self._solver.reset()
+
+    def potentials(self, points: Array) -> Array:
+        """Not offered.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError('method "fem_masked" gives no potentials; use "surface"')
+
+    def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
+        """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
+        assert not jacobian
+        inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)
+        eps = np.ones(len(scene))
+        for i, body in enumerate(scene):
+            if not isinstance(body.grounding, str):
+                raise SceneError(
+                    f"body {body.name or i} is tied to ground through {body.grounding} F; method "
+                    "'fem_masked' knows only grounded and floating bodies"
+                )
+            if not getattr(body.shape, "closed", True):
+                raise SceneError(
+                    f"body {body.name or i} is an open surface, and method 'fem_masked' needs an "
+                    "inside: close it, give a DepthFrame, or use method 'surface'"
+                )
+            local = body.pose.inverse().apply(self._centroids)
+            within = body.shape.signed_distance(local) < 0
+            conducts = body.material.is_conductor(self._excitation_frequency)
+            if conducts:
+                eps[i] = GROUNDED if body.grounding == "grounded" else self.FLOATING_EPS_R
+                inside[within] = i
+            else:
+                eps[i] = body.material.at(self._excitation_frequency).eps_r
+                taken = inside >= 0
+                conductor = np.array(
+                    [b.material.is_conductor(self._excitation_frequency) for b in scene]
+                )
+                inside[within & ~(taken & conductor[inside])] = i
+        matrix = self._solver.step(inside, eps.tolist())
+        stats = self._solver.stats
+        goal = self._solver.tolerance * float(np.abs(matrix).max())
+        free = self._mesh.n_points - stats.grounded_nodes
+        return Change(matrix - self.empty, goal, int(stats.iterations), free)

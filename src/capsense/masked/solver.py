@@ -13,7 +13,6 @@ it is then floating, and CG needs more iterations the larger the contrast.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -50,10 +49,6 @@ class MaskedStats:
     """CG iterations, summed over the electrodes; 0 with a direct solver."""
     residual: float
     """Largest relative residual over the electrodes, in the norm of the stopping rule."""
-    update_time: float
-    """Wall time of the residual update [s]."""
-    solve_time: float
-    """Wall time of the solve and the capacitances [s]."""
 
 
 class MaskedSolver:
@@ -120,7 +115,7 @@ class MaskedSolver:
         )
         self._background = check_eps_r(mesh, eps_background)
         self._map = StiffnessMap(mesh)
-        self._stats = MaskedStats(0, 0, 0, 0.0, 0.0, 0.0)
+        self._stats = MaskedStats(0, 0, 0, 0.0)
         self.reset()
 
     def reset(self) -> None:
@@ -183,7 +178,6 @@ class MaskedSolver:
             FieldError: If `eps_r` does not fit the mesh.
             SolveError: If `grounded` does not fit, or CG does not reach its tolerance.
         """
-        started = time.perf_counter()
         changed = self._update(check_eps_r(self.mesh, eps_r))
         free = self._free
         if grounded is not None:
@@ -192,7 +186,6 @@ class MaskedSolver:
                 raise SolveError(f"grounded must hold {self.mesh.n_tets} booleans")
             free = free.copy()
             free[self.mesh.tets[cells].ravel()] = False
-        updated = time.perf_counter()
         last = self._potentials if self.warm_start else 0.0
         potentials = np.where(free[:, None], last, self._dirichlet)
         iterations, residual = self._solve(potentials, np.flatnonzero(free))
@@ -203,8 +196,6 @@ class MaskedSolver:
             grounded_nodes=int(self._free.sum() - free.sum()),
             iterations=iterations,
             residual=residual,
-            update_time=updated - started,
-            solve_time=time.perf_counter() - updated,
         )
         return 0.5 * (capacitance + capacitance.T)
 

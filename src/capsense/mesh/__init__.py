@@ -7,5 +7,3 @@ from capsense.mesh.gmsh_mesher import mesh_design
 from capsense.mesh.io import load_mesh, save_mesh
 from capsense.mesh.lattice import kuhn_tets
 from capsense.mesh.tetmesh import MeshQuality, TetMesh
-
-__all__ = ["MeshQuality", "TetMesh", "kuhn_tets", "load_mesh", "mesh_design", "save_mesh"]

@@ -97,11 +97,9 @@ def mesh_design(
         MissingDependencyError: If Gmsh or a shared library that it needs is not installed.
     """
     sizes = {
-        "size_at_edges": size_at_edges,
-        "size_far": size_far,
-        "growth": growth,
+        "size_at_edges": size_at_edges, "size_far": size_far, "growth": growth,
         "layers_across": layers_across,
-    }
+    }  # fmt: skip
     for name, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise MeshError(f"{name} must be positive, not {value}")
@@ -179,12 +177,10 @@ def _session(gmsh: ModuleType) -> Iterator[None]:
 
 def _named_surfaces(design: Design) -> dict[str, Surface]:
     surfaces: dict[str, Surface] = {}
-    named = [(item.name, item.surface) for item in design.electrodes]
-    named += [(item.name, item.surface) for item in design.conductors]
-    for name, surface in named:
-        if name in surfaces or name == GROUND:
-            raise MeshError(f"the name {name!r} is used twice; conductors need unique names")
-        surfaces[name] = surface
+    for item in design.sheets:
+        if item.name in surfaces or item.name == GROUND:
+            raise MeshError(f"the name {item.name!r} is used twice; conductors need unique names")
+        surfaces[item.name] = item.surface
     return surfaces
 
 
@@ -336,10 +332,7 @@ def _line_ends(gmsh: ModuleType, tags: list[int]) -> Array:
 
 
 def _extract(
-    gmsh: ModuleType,
-    design: Design,
-    volumes: dict[str, list[int]],
-    sheets: dict[str, list[int]],
+    gmsh: ModuleType, design: Design, volumes: dict[str, list[int]], sheets: dict[str, list[int]]
 ) -> TetMesh:
     mesher = gmsh.model.mesh
     tags, coordinates, _ = mesher.getNodes()

@@ -1,4 +1,8 @@
-"""Import and export of meshes: Gmsh `.msh`, VTK `.vtu` and the published `.mat` files."""
+"""Import and export of meshes: Gmsh `.msh`, VTK `.vtu` and the published `.mat` files.
+
+MATLAB's files of version 5 (``-v6``, ``-v7``) are read here and not by SciPy, where a damaged file
+may end the process.
+"""
 
 from __future__ import annotations
 

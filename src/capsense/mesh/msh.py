@@ -1,4 +1,9 @@
-"""Gmsh's mesh format, versions 2.2 and 4.1, with its physical groups."""
+"""Gmsh's mesh format, versions 2.2 and 4.1, with its physical groups.
+
+It is read as text or binary and written as text. A node group is written as the triangles whose
+three corners it holds, and any node left over as a point, so that reading the file gives the same
+group.
+"""
 
 from __future__ import annotations
 

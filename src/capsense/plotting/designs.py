@@ -74,59 +74,45 @@ def outline_patch(polygon: Polygon, **style: Any) -> PathPatch:
     return PathPatch(Path(np.concatenate(rings), np.concatenate(codes)), **style)
 
 
+def add_surface(ax: Axes, surface: Surface, label: str = "", **style: Any) -> None:
+    """Draw a surface seen from above, in millimetres; ``style`` as ``PathPatch`` takes it."""
+    for number, outline in enumerate(outlines(surface)):
+        ax.add_patch(outline_patch(outline, label="" if number else label, **style))
+
+
+def _note(ax: Axes, text: str, at: tuple[float, float], **style: Any) -> None:
+    """A word in the picture, by default small and in the middle of its place."""
+    ax.annotate(text, at, **{"ha": "center", "va": "center", "fontsize": 8, "color": INK, **style})
+
+
 def _top_view(design: Design, ax: Axes) -> None:
     reach: list[Array] = []
     for layer in sorted(design.layers, key=lambda k: float(k.upper[2])):
         low, high = layer.lower[:2] * 1e3, layer.upper[:2] * 1e3
-        outline = shapely.geometry.box(*low, *high)
-        label = f"{layer.name} ({layer.material}, εr {layer.eps_r:g})"
-        if layer.material == "custom":
-            label = f"{layer.name} (εr {layer.eps_r:g})"
-        ax.add_patch(
-            outline_patch(
-                outline, fc=LAYER_COLOUR, ec="#9a9c86", lw=1.0, ls="--", label=label, zorder=0
-            )
-        )
+        matter = "" if layer.material == "custom" else f"{layer.material}, "
+        style: dict[str, Any] = {"fc": LAYER_COLOUR, "ec": "#9a9c86", "lw": 1.0, "ls": "--"}
+        label = f"{layer.name} ({matter}εr {layer.eps_r:g})"
+        plate = shapely.geometry.box(*low, *high)
+        ax.add_patch(outline_patch(plate, label=label, zorder=0, **style))
         reach += [low, high]
     conductors = sorted(design.conductors, key=lambda c: float(c.surface.bounds[1, 2]))
     top = max(float(e.surface.bounds[1, 2]) for e in design.electrodes)
     for order, conductor in enumerate(conductors, start=1):
         buried = float(conductor.surface.bounds[1, 2]) < top - 1e-5 and bool(design.layers)
-        style: dict[str, Any] = {
-            "fc": "none" if buried else ROLE_COLOURS[conductor.role],
-            "ec": ROLE_COLOURS[conductor.role] if buried else "#5d6b73",
-            "lw": 1.6 if buried else 0.6,
-            "ls": ":" if buried else "-",
-        }
+        colour = ROLE_COLOURS[conductor.role]
+        style = {"fc": colour, "ec": "#5d6b73", "lw": 0.6, "ls": "-"}
+        if buried:
+            style = {"fc": "none", "ec": colour, "lw": 1.6, "ls": ":"}
         label = f"{conductor.name} ({conductor.role.value}{', below' if buried else ''})"
-        for number, outline in enumerate(outlines(conductor.surface)):
-            ax.add_patch(
-                outline_patch(
-                    outline, label="" if number else label, zorder=order / 100 + 1, **style
-                )
-            )
+        add_surface(ax, conductor.surface, label, zorder=order / 100 + 1, **style)
         reach += list(conductor.surface.bounds[:, :2] * 1e3)
     for number, electrode in enumerate(design.electrodes):
-        parts = outlines(electrode.surface)
-        for part, outline in enumerate(parts):
-            label = "" if number or part else "electrodes"
-            fill = ELECTRODES[number % 2]
-            ax.add_patch(
-                outline_patch(outline, fc=fill, ec="#7d4510", lw=0.8, label=label, zorder=2)
-            )
+        label, style = "" if number else "electrodes", {"ec": "#7d4510", "lw": 0.8, "zorder": 2}
+        add_surface(ax, electrode.surface, label, fc=ELECTRODES[number % 2], **style)
         reach += list(electrode.surface.bounds[:, :2] * 1e3)
-        x, y, room = _label_place(electrode.surface, parts)
-        ax.annotate(
-            electrode.name,
-            (x, y),
-            ha="center",
-            va="center",
-            fontsize=9,
-            color=INK,
-            zorder=3,
-            fontweight="bold",
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": room},
-        )
+        x, y, room = _label_place(electrode.surface, outlines(electrode.surface))
+        back = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": room}
+        _note(ax, electrode.name, (x, y), fontsize=9, zorder=3, fontweight="bold", bbox=back)
     points = np.array(reach)
     margin = 0.06 * float(np.ptp(points, axis=0).max())
     ax.set_xlim(points[:, 0].min() - margin, points[:, 0].max() + margin)
@@ -182,27 +168,15 @@ def _side_view(design: Design, ax: Axes) -> None:
         return float(np.interp(z * 1e3, levels, np.arange(len(levels))))
 
     ax.axhline(height(backplane), color=INK, lw=1.5)
-    ax.annotate(
-        "grounded floor of the domain",
-        (0.01, height(backplane)),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 3),
-        textcoords="offset points",
-        fontsize=8,
-        color=INK,
-    )
+    place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    floor = (0.01, height(backplane))
+    _note(ax, "grounded floor of the domain", floor, xytext=(0, 3), ha="left", va="bottom", **place)
     for layer in design.layers:
         x, width = layer.lower[0] * 1e3, (layer.upper[0] - layer.lower[0]) * 1e3
         bottom, top = height(layer.lower[2]), height(layer.upper[2])
         ax.bar(x, top - bottom, width, bottom, align="edge", fc=LAYER_COLOUR, ec="#9a9c86", lw=0.8)
-        ax.annotate(
-            f"{layer.name}, {(layer.upper[2] - layer.lower[2]) * 1e3:g} mm",
-            (x + width / 2, (bottom + top) / 2),
-            ha="center",
-            va="center",
-            fontsize=8,
-            color=INK,
-        )
+        thick = f"{layer.name}, {(layer.upper[2] - layer.lower[2]) * 1e3:g} mm"
+        _note(ax, thick, (x + width / 2, (bottom + top) / 2))
     for conductor in design.conductors:
         _edge_on(ax, conductor.surface, height, ROLE_COLOURS[conductor.role])
     for number, electrode in enumerate(design.electrodes):

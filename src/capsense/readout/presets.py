@@ -121,7 +121,7 @@ def build(
     part = chip if isinstance(chip, Chip) else chip_of(chip)
     chosen = options or ReadoutOptions()
     patterns = tuple(chosen.patterns) or default_patterns(part, electrodes)
-    ChannelBank(patterns, electrodes)  # refuses what is wrong before a schedule is made of it
+    bank = ChannelBank(patterns, electrodes)
     rate = part.rate(chosen.rate)
     if rate is None:
         rates = ", ".join(f"{r.per_second:.4g}" for r in part.rates)
@@ -130,9 +130,8 @@ def build(
         )
     plan = schedule_of(part, patterns, 1.0 / rate.per_second - part.gap)
     idle = idle_of(chosen.period, plan.period)
-    return Readout(
-        patterns,
-        electrodes,
+    out = Readout(
+        bank,
         dataclasses.replace(plan, idle=idle, latency=chosen.latency),
         law_of(part, chosen, len(patterns)),
         dac=_dac_of(part, chosen.capdac),
@@ -140,8 +139,9 @@ def build(
         stages=(*chosen.stages, *_stages(part, rate.rms, chosen)),
         detector=chosen.detector or part.detector,
         seed=chosen.seed,
-        name=part.title,
     )
+    out.name = part.title
+    return out
 
 
 def default_patterns(chip: Chip, electrodes: Sequence[str]) -> tuple[Pattern, ...]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from capsense._validate import as_number
 from capsense.errors import ReadoutError
-from capsense.readout.channels import ChannelBank, Pattern
+from capsense.readout.channels import ChannelBank
 from capsense.readout.checks import Array, real, require, require_whole
 from capsense.readout.converter import CapDac, Conversion, Law
 from capsense.readout.counts import Counts
@@ -58,8 +58,7 @@ class Readout:
     :meth:`due` names, and nothing is interpolated.
 
     Args:
-        patterns: The channels.
-        electrodes: Electrode names in matrix order.
+        bank: The channels of a sensor.
         schedule: When each channel is sampled.
         law: The converter.
         dac: The converter's offset DAC.
@@ -67,18 +66,23 @@ class Readout:
         stages: Drift and noise, in order.
         detector: Digital logic; none by default.
         seed: Of all random numbers. The same seed gives the same numbers, to the last bit.
-        name: For titles.
 
     Raises:
         ReadoutError: The parts do not fit each other.
     """
 
     def __init__(
-        self, patterns: Sequence[Pattern], electrodes: Sequence[str], schedule: Schedule, law: Law,
-        *, dac: CapDac | None = None, wiring: Wiring | None = None, stages: Sequence[Stage] = (),
-        detector: Detector | None = None, seed: int = 0, name: str = "readout",
+        self, bank: ChannelBank, schedule: Schedule, law: Law, *, dac: CapDac | None = None,
+        wiring: Wiring | None = None, stages: Sequence[Stage] = (),
+        detector: Detector | None = None, seed: int = 0,
     ) -> None:  # fmt: skip
-        self.bank = ChannelBank(patterns, electrodes)
+        if not isinstance(bank, ChannelBank):
+            raise ReadoutError(
+                f"bank is {bank!r}; give the channels, ChannelBank(patterns, electrodes)"
+            )
+        self.bank = bank
+        self.name = "readout"
+        """For titles."""
         for kind, parts in ((Wiring, [wiring]), (Detector, [detector]), (Stage, stages)):
             for part in parts:
                 if part is not None and not isinstance(part, kind):
@@ -89,7 +93,7 @@ class Readout:
                 "make them the same"
             )
         self.schedule, self.law, self.dac = schedule, law, dac
-        self.stages, self.detector, self.name = tuple(stages), detector, name
+        self.stages, self.detector = tuple(stages), detector
         self.wiring = wiring or Wiring()
         mixing, self._offset = self.wiring.start(np.array([p.is_self for p in self.bank.patterns]))
         self._mixing = None if np.array_equal(mixing, np.eye(len(self.bank))) else mixing

@@ -1,4 +1,9 @@
-"""What other programs look at: transforms, matrices, images and markers as ROS 2 messages."""
+"""What other programs look at: transforms, matrices, images and markers as ROS 2 messages.
+
+Standard messages come with ``rosbags``; those of ``capsense_msgs`` lie in a ROS 2 package of that
+name beside this module. Stored schemas hold the definition and those of all messages in it, as
+ROS 2 wants.
+"""
 
 from __future__ import annotations
 

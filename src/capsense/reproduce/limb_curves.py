@@ -3,6 +3,10 @@
 The limb is a capsule that lies across the electrode's middle. Distance is that between the
 electrode's plane and the nearest skin. Readings are tared at a stated pose, as capacitive
 distance sensors are: :data:`RETREAT`, to the side of the limb and along it.
+
+One electrode is fitted to the slopes of public data above a human arm. The data's electrode, its
+mounting and the zero of its distance are not described. So three figures are fitted to four slopes:
+the electrode's edge, an offset of its distance, and the tare.
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""Scenario 2's worlds: one limb, and a sensor that is put where it should be."""
+"""Scenario 2's worlds: one limb, and a sensor that is put where it should be.
+
+The world's origin is the middle of a forearm or of a lower leg, whose axis lies along x, its far
+end at −x; z is up. The sensor looks down. What Schöffmann et al. 2022 do not give, sizes of their
+participants and the ways of their sensor, is chosen here; the four offsets are those that Erickson
+et al. 2019 (arXiv 1904.02111) estimate.
+"""
 
 from __future__ import annotations
 

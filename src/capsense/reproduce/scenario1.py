@@ -14,15 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from capsense._style import COLOURS, FAINT, INK, LABELS, LEGEND, TITLES, bare
+from capsense.readout.calibration import cross_correlation
 from capsense.reproduce.harness import Outcome, Report, ReportTable, Row, judged
-from capsense.reproduce.metrics import (
-    correlation_of_change,
-    correlations,
-    cross_correlation,
-    raw_correlation,
-    rmse,
-)
-from capsense.reproduce.scenario1_fit import matrices, mutual, normalised
 from capsense.reproduce.scenario1_setup import (
     TRIANGLE,
     ZIGZAG,
@@ -33,8 +26,17 @@ from capsense.reproduce.scenario1_setup import (
     Scenario1Setup,
     load_curves,
     load_setup,
+    matrices,
+    mutual,
+    normalised,
 )
-from capsense.reproduce.store import Store
+from capsense.reproduce.store import (
+    Store,
+    correlation_of_change,
+    correlations,
+    raw_correlation,
+    rmse,
+)
 from capsense.simulator import Simulator
 
 MEASURED, PAPER, OURS = INK, COLOURS[1], COLOURS[0]

@@ -19,6 +19,7 @@ import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.field.background import BuildSettings
 from capsense.mesh.lattice import MeshSettings
+from capsense.readout.calibration import cross_correlation
 from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
 from capsense.reproduce.limb_worlds import (
     PARTICIPANTS,
@@ -32,8 +33,7 @@ from capsense.reproduce.limb_worlds import (
     read_poses,
     rides,
 )
-from capsense.reproduce.metrics import correlations, cross_correlation, raw_correlation
-from capsense.reproduce.store import Store
+from capsense.reproduce.store import Store, correlations, raw_correlation
 from capsense.scene.scene import Grounding
 from capsense.simulator import Method
 
@@ -53,7 +53,7 @@ authors give 107 ms a step."""
 
 
 @dataclass(frozen=True)
-class Run:
+class Variant:
     """How all rides are simulated."""
 
     title: str
@@ -75,20 +75,20 @@ LINES: tuple[dict[str, Any], ...] = (
 """Of reference, depth camera and the paper's scheme: the first two nearly coincide."""
 AGAIN = "again"
 """The reference read by a second chip: what its noise leaves of a correlation."""
-RUNS: dict[str, Run] = {
-    REFERENCE: Run("accurate, geometry, MuJoCo"),
-    DEPTH: Run("accurate, depth camera, MuJoCo", view="depth_camera"),
-    PAPER: Run(
+RUNS: dict[str, Variant] = {
+    REFERENCE: Variant("accurate, geometry, MuJoCo"),
+    DEPTH: Variant("accurate, depth camera, MuJoCo", view="depth_camera"),
+    PAPER: Variant(
         "the paper's scheme, depth camera, MuJoCo", view="depth_camera", method="fem_masked",
         resolution=COARSE,
     ),
-    "fine": Run(
+    "fine": Variant(
         "the paper's scheme, mesh seven times as fine", view="depth_camera", method="fem_masked",
         rides=1,
     ),
-    "person": Run("accurate, geometry, person on 100 pF", grounding=1e-10),
-    "bullet": Run("accurate, geometry, PyBullet", simulator="pybullet"),
-    "bullet_depth": Run(
+    "person": Variant("accurate, geometry, person on 100 pF", grounding=1e-10),
+    "bullet": Variant("accurate, geometry, PyBullet", simulator="pybullet"),
+    "bullet_depth": Variant(
         "accurate, depth camera, PyBullet", simulator="pybullet", view="depth_camera"
     ),
 }  # fmt: skip
@@ -123,7 +123,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     )
 
 
-def _changes(store: Store, how: Run, person: str, ways: list[Ride]) -> Array:
+def _changes(store: Store, how: Variant, person: str, ways: list[Ride]) -> Array:
     """Change of the self-capacitances over a participant's rides [F]."""
     ways = ways[: how.rides]
 

@@ -10,15 +10,3 @@ from capsense.scenario.model import (
     Trajectory,
     play,
 )
-
-__all__ = [
-    "Channel",
-    "Excitation",
-    "MovingBody",
-    "Sample",
-    "Scenario",
-    "Trajectory",
-    "load_scenario",
-    "parse_scenario",
-    "play",
-]

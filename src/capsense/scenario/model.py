@@ -313,10 +313,6 @@ class Scenario:
         """
         return Scene([b.at(time) for b in self.bodies])
 
-    def path_of(self, index: int) -> list[Pose]:
-        """The poses of body ``index`` at the sample times."""
-        return [self.bodies[index].at(float(t)).pose for t in self.times]
-
     def resampled(self, sample_rate: float) -> Scenario:
         """The same scenario at another sample rate [Hz].
 

@@ -8,33 +8,3 @@ from capsense.scene.mesh_shape import DeformableSurface, RestSurface, SurfaceMes
 from capsense.scene.pose import Pose
 from capsense.scene.scene import Body, PackedScene, Scene
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Shape, ShapeKind, Sphere
-
-__all__ = [
-    "MATERIALS",
-    "Body",
-    "Box",
-    "Capsule",
-    "Cylinder",
-    "DeformableSurface",
-    "DepthFrame",
-    "Ellipsoid",
-    "Layers",
-    "Material",
-    "OrthographicCamera",
-    "PackedScene",
-    "PerspectiveCamera",
-    "Pose",
-    "Raster",
-    "RestSurface",
-    "Scene",
-    "Shape",
-    "ShapeKind",
-    "Sphere",
-    "SurfaceMesh",
-    "TriMesh",
-    "decode_permittivity",
-    "encode_permittivity",
-    "material",
-    "point_surface",
-    "render_depth",
-]

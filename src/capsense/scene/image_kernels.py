@@ -1,4 +1,10 @@
-"""Compiled loops over pixels: layers, groups of pixels, triangles drawn into images."""
+"""Compiled loops over pixels: layers, groups of pixels, triangles drawn into images.
+
+The rasteriser keeps every surface that a pixel's ray meets. Rays run along z through pixel centres,
+which lie at whole numbers of (u, v). A pixel belongs to a triangle by half-open spans whose ends
+are computed per edge, so that triangles that share an edge leave neither gaps nor overlaps: a
+closed surface is met an even number of times everywhere.
+"""
 
 from __future__ import annotations
 

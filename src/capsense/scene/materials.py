@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from types import MappingProxyType
+from typing import Any
 
 from capsense._validate import as_number
 from capsense.constants import EPS0
@@ -54,11 +57,14 @@ class ColeCole:
         return total + sum(s / (1 + (1j * omega * tau) ** (1 - a)) for s, tau, a in self.terms)
 
 
-_PS, _NS, _US, _MS = 1e-12, 1e-9, 1e-6, 1e-3
+DATA: Mapping[str, Any] = tomllib.loads(
+    resources.files("capsense.scene").joinpath("materials.toml").read_text(encoding="utf-8")
+)
+"""The tables of ``materials.toml``: materials, aliases, tissues, paths to ground."""
 
 
-def _tissue(eps_inf: float, sigma: float, *terms: tuple[float, float, float]) -> ColeCole:
-    units = (_PS, _NS, _US, _MS)
+def _tissue(eps_inf: float, sigma: float, terms: Sequence[Sequence[float]]) -> ColeCole:
+    units = (1e-12, 1e-9, 1e-6, 1e-3)
     return ColeCole(
         eps_inf,
         tuple((s, tau * unit, a) for (s, tau, a), unit in zip(terms, units, strict=True) if s > 0),
@@ -67,37 +73,9 @@ def _tissue(eps_inf: float, sigma: float, *terms: tuple[float, float, float]) ->
 
 
 GABRIEL: Mapping[str, ColeCole] = MappingProxyType(
-    {
-        "skin dry": _tissue(
-            4, 0.0002, (32, 7.234, 0), (1100, 32.481, 0.2), (0, 159.155, 0.2), (0, 15.915, 0.2)
-        ),
-        "skin wet": _tissue(
-            4, 0.0004, (39, 7.958, 0.1), (280, 79.577, 0), (3e4, 1.592, 0.16), (3e4, 1.592, 0.2)
-        ),
-        "muscle": _tissue(
-            4, 0.2, (50, 7.234, 0.1), (7000, 353.678, 0.1), (1.2e6, 318.310, 0.1), (2.5e7, 2.274, 0)
-        ),
-        "fat": _tissue(
-            2.5, 0.035, (9, 7.958, 0.2), (35, 15.915, 0.1), (3.3e4, 159.155, 0.05),
-            (1e7, 15.915, 0.01),
-        ),
-        "bone cortical": _tissue(
-            2.5, 0.02, (10, 13.263, 0.2), (180, 79.577, 0.2), (5e3, 159.155, 0.2), (1e5, 15.915, 0)
-        ),
-        "bone cancellous": _tissue(
-            2.5, 0.07, (18, 13.263, 0.22), (300, 79.577, 0.25), (2e4, 159.155, 0.2),
-            (2e7, 15.915, 0),
-        ),
-        "blood": _tissue(
-            4, 0.7, (56, 8.377, 0.1), (5200, 132.629, 0.1), (0, 159.155, 0.2), (0, 15.915, 0)
-        ),
-    }
-)  # fmt: skip
-"""Parameters of S. Gabriel, R. W. Lau and C. Gabriel, "The dielectric properties of biological
-tissues: III", Phys. Med. Biol. 41 (1996) 2271; 10 Hz to 100 GHz. Fat is infiltrated fat.
-
-The ionic conductivity of skin, 0.2 and 0.4 mS/m, is printed as 0.000 in tables of three decimals;
-it is what the published conductivities of skin need (tests/scene/test_dispersion.py)."""
+    {name: _tissue(**figures) for name, figures in DATA["tissues"].items()}
+)
+"""Cole-Cole models of tissues, after Gabriel et al. 1996."""
 
 
 CONDUCTOR_PERMITTIVITY = 1000.0
@@ -190,48 +168,6 @@ def _require_frequency(frequency: float) -> None:
         raise SceneError(f"frequency is {frequency!r} Hz; give a positive finite number")
 
 
-_METAL = "resistivity at 20 °C, common handbook value; any metal is an ideal conductor here"
-_PERMITTIVITY = "common range of datasheets and tables: "
-_GABRIEL = "Gabriel et al. 1996, four-term Cole-Cole model, evaluated at 250 kHz: "
-
-_TABLE = (
-    Material("air", 1.0, 0.0, "1.0006 at 1 bar, rounded to the vacuum the domain is made of"),
-    # Metals.
-    Material("steel", 1.0, 6.99e6, "carbon steel 1010, 1.43e-7 ohm m; " + _METAL),
-    Material("stainless steel", 1.0, 1.45e6, "grade 304, 6.9e-7 ohm m; " + _METAL),
-    Material("copper", 1.0, 5.96e7, "1.68e-8 ohm m; " + _METAL),
-    Material("aluminium", 1.0, 3.77e7, "2.65e-8 ohm m; " + _METAL),
-    # Insulators. Their losses are far below what capacitive readouts resolve: sigma = 0.
-    Material("polycarbonate", 2.9, 0.0, _PERMITTIVITY + "2.8-3.0"),
-    Material("FR4", 4.5, 0.0, _PERMITTIVITY + "4.3-5.0"),
-    Material("glass", 5.0, 0.0, _PERMITTIVITY + "4-10, borosilicate 4.3-5.0"),
-    Material("wood", 3.0, 0.0, _PERMITTIVITY + "dry 2-6, lower half; wet wood has 10-30"),
-    Material("silicone rubber", 3.5, 0.0, _PERMITTIVITY + "3.2-9.8, unfilled grades low"),
-    Material("PLA", 3.0, 0.0, _PERMITTIVITY + "PLA, PET-G and ABS 2.88-3.48 at 1-100 MHz"),
-    Material("cotton", 3.2, 0.0, _PERMITTIVITY + "dry fibre 3.2; fabric with air lower"),
-    # Water: 78.54 (1 - 4.579e-3 (T - 25) + 1.19e-5 (T - 25)^2 - 2.8e-8 (T - 25)^3), T in °C.
-    Material("water", 78.5, 0.05, "eps_r at 25 °C; sigma of tap water, common 0.005-0.08 S/m"),
-    Material("deionised water", 78.5, 5.5e-6, "eps_r and sigma of pure water at 25 °C"),
-    # Tissues, at 250 kHz. All count as conductors there; fat and cortical bone not at 1 MHz.
-    Material("skin", 1098.0, 1.46e-3, _GABRIEL + "dry skin", GABRIEL["skin dry"]),
-    Material("wet skin", 7180.0, 0.131, _GABRIEL + "wet skin", GABRIEL["skin wet"]),
-    Material("muscle", 5763.0, 0.396, _GABRIEL + "muscle", GABRIEL["muscle"]),
-    Material("fat", 67.79, 0.0436, _GABRIEL + "infiltrated fat", GABRIEL["fat"]),
-    Material("blood", 4813.0, 0.715, _GABRIEL + "blood", GABRIEL["blood"]),
-    Material("cortical bone", 197.0, 0.0212, _GABRIEL + "cortical bone", GABRIEL["bone cortical"]),
-    Material(
-        "cancellous bone", 366.4, 0.0850, _GABRIEL + "cancellous bone", GABRIEL["bone cancellous"]
-    ),
-    Material(
-        "human",
-        5763.0,
-        0.396,
-        _GABRIEL + "muscle, standing for a limb as a whole",
-        GABRIEL["muscle"],
-    ),
-)
-
-
 def water(temperature: float, sigma: float = 0.05) -> Material:
     """Water at a temperature; from below 1 GHz down its permittivity does not depend on frequency.
 
@@ -252,17 +188,17 @@ def water(temperature: float, sigma: float = 0.05) -> Material:
     return Material(f"water at {temperature:g} °C", eps_r, sigma, "permittivity: handbook series")
 
 
-MATERIALS: Mapping[str, Material] = MappingProxyType({m.name: m for m in _TABLE})
+MATERIALS: Mapping[str, Material] = MappingProxyType(
+    {
+        name: Material(
+            name, m["eps_r"], m.get("sigma", 0.0), m["source"], GABRIEL.get(m.get("tissue"))
+        )
+        for name, m in DATA["materials"].items()
+    }
+)
 """The known materials by name."""
 
-_ALIASES = {
-    **{name.lower(): name for name in MATERIALS},
-    "aluminum": "aluminium",
-    "dry wood": "wood",
-    "dry skin": "skin",
-    "tap water": "water",
-    "deionized water": "deionised water",
-}
+_ALIASES = {**{name.lower(): name for name in MATERIALS}, **DATA["aliases"]}
 
 
 def material(name: str) -> Material:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from capsense._validate import as_number
 from capsense.errors import SceneError
-from capsense.scene.materials import Material
+from capsense.scene.materials import DATA, Material
 from capsense.scene.materials import material as find_material
 from capsense.scene.pose import Pose
 from capsense.scene.shapes import Shape
@@ -71,18 +71,7 @@ class GroundPath:
 
 
 GROUND_PATHS: Mapping[str, GroundPath] = MappingProxyType(
-    {
-        "human-body model": GroundPath(
-            100e-12, 1.5e3, source="ANSI/ESDA/JEDEC JS-001, human-body model: 100 pF, 1.5 kohm"
-        ),
-        "IEC 61000-4-2": GroundPath(150e-12, 330.0, source="IEC 61000-4-2: 150 pF, 330 ohm"),
-        "standing, thick soles": GroundPath(
-            100e-12, source="lower end of 100-300 pF, the range common in EMC literature"
-        ),
-        "standing, thin soles": GroundPath(
-            300e-12, source="upper end of 100-300 pF, the range common in EMC literature"
-        ),
-    }
+    {name: GroundPath(**figures) for name, figures in DATA["ground_paths"].items()}
 )
 """Models of a person's path to ground, by name."""
 

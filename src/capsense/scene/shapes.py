@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
@@ -128,11 +128,26 @@ def _frozen(*values: float) -> Array:
 
 
 class _Primitive(Shape):
-    """A shape whose bounding box is centred on its origin."""
+    """A shape that is a few lengths, its bounding box centred on its origin."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            check = _size if f.type == "float" else _sizes
+            checked = check(type(self).__name__, f.name, getattr(self, f.name))
+            object.__setattr__(self, f.name, checked)
 
     @cached_property
     def packed(self) -> tuple[float, ...]:
         return (*self.params.tolist(), 0.0, 0.0, 0.0)
+
+    @property
+    @abstractmethod
+    def _corner(self) -> ArrayLike:
+        """Upper corner of the bounding box [m], shape (3,)."""
+
+    def bounds(self) -> Array:
+        corner = np.asarray(self._corner)
+        return np.array([-corner, corner])
 
 
 @dataclass(frozen=True)
@@ -147,9 +162,6 @@ class Box(_Primitive):
 
     kind = ShapeKind.BOX
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "size", _sizes("Box", "size", self.size))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(*(0.5 * s for s in self.size))
@@ -158,8 +170,9 @@ class Box(_Primitive):
     def volume(self) -> float:
         return math.prod(self.size)
 
-    def bounds(self) -> Array:
-        return np.array([-self.params, self.params])
+    @property
+    def _corner(self) -> Array:
+        return self.params
 
     def signed_distance(self, points: ArrayLike) -> Array:
         q = np.abs(as_points(points)) - self.params
@@ -183,9 +196,6 @@ class Sphere(_Primitive):
 
     kind = ShapeKind.SPHERE
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _size("Sphere", "radius", self.radius))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(self.radius, 0.0, 0.0)
@@ -194,8 +204,9 @@ class Sphere(_Primitive):
     def volume(self) -> float:
         return 4 / 3 * math.pi * self.radius**3
 
-    def bounds(self) -> Array:
-        return np.array([[-self.radius] * 3, [self.radius] * 3])
+    @property
+    def _corner(self) -> tuple[float, ...]:
+        return (self.radius,) * 3
 
     def signed_distance(self, points: ArrayLike) -> Array:
         return np.linalg.norm(as_points(points), axis=1) - self.radius
@@ -219,10 +230,6 @@ class Capsule(_Primitive):
 
     kind = ShapeKind.CAPSULE
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _size("Capsule", "radius", self.radius))
-        object.__setattr__(self, "length", _size("Capsule", "length", self.length))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(self.radius, 0.5 * self.length, 0.0)
@@ -231,9 +238,9 @@ class Capsule(_Primitive):
     def volume(self) -> float:
         return math.pi * self.radius**2 * (self.length + 4 / 3 * self.radius)
 
-    def bounds(self) -> Array:
-        top = np.array([self.radius, self.radius, 0.5 * self.length + self.radius])
-        return np.array([-top, top])
+    @property
+    def _corner(self) -> tuple[float, ...]:
+        return self.radius, self.radius, 0.5 * self.length + self.radius
 
     def signed_distance(self, points: ArrayLike) -> Array:
         p = as_points(points).copy()
@@ -264,10 +271,6 @@ class Cylinder(_Primitive):
 
     kind = ShapeKind.CYLINDER
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _size("Cylinder", "radius", self.radius))
-        object.__setattr__(self, "length", _size("Cylinder", "length", self.length))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(self.radius, 0.5 * self.length, 0.0)
@@ -276,9 +279,9 @@ class Cylinder(_Primitive):
     def volume(self) -> float:
         return math.pi * self.radius**2 * self.length
 
-    def bounds(self) -> Array:
-        top = np.array([self.radius, self.radius, 0.5 * self.length])
-        return np.array([-top, top])
+    @property
+    def _corner(self) -> tuple[float, ...]:
+        return self.radius, self.radius, 0.5 * self.length
 
     def signed_distance(self, points: ArrayLike) -> Array:
         p = as_points(points)
@@ -307,9 +310,6 @@ class Ellipsoid(_Primitive):
 
     kind = ShapeKind.ELLIPSOID
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radii", _sizes("Ellipsoid", "radii", self.radii))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(*self.radii)
@@ -318,8 +318,9 @@ class Ellipsoid(_Primitive):
     def volume(self) -> float:
         return 4 / 3 * math.pi * math.prod(self.radii)
 
-    def bounds(self) -> Array:
-        return np.array([-self.params, self.params])
+    @property
+    def _corner(self) -> Array:
+        return self.params
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """Distance to the surface, exact to about 1e-9 of the smallest radius.

@@ -19,8 +19,13 @@ from capsense.errors import (
     SceneError,
     SolveError,
 )
-from capsense.scenario.bodies import ScenarioTable, read_grounding, read_material, read_pose
-from capsense.scenario.loader import read_bodies
+from capsense.scenario.loader import (
+    ScenarioTable,
+    read_bodies,
+    read_grounding,
+    read_material,
+    read_pose,
+)
 from capsense.scene import Body, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.scene import Grounding

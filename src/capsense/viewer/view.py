@@ -19,6 +19,15 @@ from capsense.viewer.charts import OCTAVES, Plane, heat_map, make_charts, palett
 from capsense.viewer.player import Playback
 from capsense.viewer.scene_drawing import SceneDrawing
 
+try:
+    from viser import ViserServer
+
+    from capsense.viewer.visitors import guarded
+except ImportError as error:
+    raise MissingDependencyError(
+        'the view needs viser; install it with: pip install "capsense[view]"'
+    ) from error
+
 if TYPE_CHECKING:
     from viser import GuiApi
 
@@ -240,15 +249,6 @@ def send_video(client: Any, player: Playback, wait: Callable[[float], None] = ti
 def _seen(client: Any) -> Any:
     return client.get_render(*SIZE, transport_format="png")[..., :3]
 
-
-try:
-    from viser import ViserServer
-
-    from capsense.viewer.visitors import guarded
-except ImportError as error:
-    raise MissingDependencyError(
-        'the view needs viser; install it with: pip install "capsense[view]"'
-    ) from error
 
 PERIOD = 0.05
 """The page changes no more often [s]."""

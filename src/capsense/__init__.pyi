@@ -1,0 +1,62 @@
+"""The public names, and where they are from; see ``docs/conventions.md``."""
+
+from capsense import humans
+from capsense.adapters import assistive_gym, coppeliasim, mujoco, pybullet
+from capsense.adapters.attached import AttachedSensor
+from capsense.design.loader import available_designs, load_design
+from capsense.design.model import Design
+from capsense.errors import (
+    AdapterError,
+    BatchError,
+    CapSenseError,
+    DesignError,
+    ProtocolError,
+    RecordingError,
+    ScenarioError,
+    SceneError,
+    SkinError,
+    SolveError,
+)
+from capsense.fleet.fleet import Fleet, FleetReading
+from capsense.plotting.runs import plot
+from capsense.reading import Reading, StepStats
+from capsense.readout.calibration import calibrate
+from capsense.readout.chips import available_chips
+from capsense.readout.config import load_readout
+from capsense.readout.counts import Counts
+from capsense.readout.readout import Readout
+from capsense.recording.reader import open_recording, replay
+from capsense.recording.recorder import Recorder, record
+from capsense.scenario import Scenario, load_scenario
+from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
+from capsense.scene.depth import (
+    DepthFrame,
+    decode_permittivity,
+    encode_permittivity,
+    point_surface,
+)
+from capsense.scene.layers import Layers, render_depth
+from capsense.scene.materials import MATERIALS, Material
+from capsense.scene.mesh_shape import DeformableSurface, TriMesh
+from capsense.scene.pose import Pose
+from capsense.scene.scene import Body, Scene
+from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
+from capsense.server.client import Client
+from capsense.simulator import Simulator
+from capsense.skin import Skin
+from capsense.viewer.show import show
+
+__version__: str
+
+__all__ = [
+    "MATERIALS", "AdapterError", "AttachedSensor", "BatchError", "Body", "Box", "CapSenseError",
+    "Capsule", "Client", "Counts", "Cylinder", "DeformableSurface", "DepthFrame", "Design",
+    "DesignError", "Ellipsoid", "Fleet", "FleetReading", "Layers", "Material",
+    "OrthographicCamera", "PerspectiveCamera", "Pose", "ProtocolError", "Reading", "Readout",
+    "Recorder", "RecordingError", "Scenario", "ScenarioError", "Scene", "SceneError",
+    "Simulator", "Skin", "SkinError", "SolveError", "Sphere", "StepStats", "TriMesh",
+    "__version__", "assistive_gym", "available_chips", "available_designs", "calibrate",
+    "coppeliasim", "decode_permittivity", "encode_permittivity", "humans", "load_design",
+    "load_readout", "load_scenario", "mujoco", "open_recording", "plot", "point_surface",
+    "pybullet", "record", "render_depth", "replay", "show",
+]  # fmt: skip

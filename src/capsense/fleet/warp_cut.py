@@ -1,0 +1,241 @@
+"""What the Warp kernels of a fleet work with, and how they cut bodies into clusters.
+
+A *view* is one sensor in one environment. What belongs to a view has its number as the last index,
+so that neighbouring threads of a GPU touch neighbouring numbers. Every body is cut into K clusters:
+starting from the whole, the one that is largest against its distance from the design is split. The
+cluster that is split keeps its place for the first part, and the second part takes the next one,
+so that the change from clusters to charge functions, and of matrices with it, is done in place.
+
+Symbols and formulas are those of ``docs/theory.md``; lengths in metres, 4π eps0 = 1.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from capsense.surface.place_kernels import DEEP, GAP, SHORE, STEEP
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+WIDTH = 64
+"""Columns of a table that a thread works out at a time."""
+row = wp.types.vector(length=WIDTH, dtype=wp.float32)
+
+_NEAREST = wp.constant(1e-3)
+_HALF = wp.constant(0.5)
+_GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in GAP)
+_DEEP, _STEEP, _SHORE = wp.constant(DEEP), wp.constant(STEEP), wp.constant(SHORE)
+
+
+@wp.struct
+class Shapes:
+    """All shapes, of size 1, one behind the other."""
+
+    first: wp.array(dtype=wp.int32)  # first cluster of a shape
+    functions: wp.array(dtype=wp.int32)  # how many functions have energies
+    block: wp.array(dtype=wp.int64)  # where its energies begin
+    radius: wp.array(dtype=wp.float32)
+    kids: wp.array2d(dtype=wp.int32)  # parts of a cluster, from 0 within the shape; -1 for none
+    function: wp.array(dtype=wp.int32)
+    charge: wp.array(dtype=wp.float32)
+    center: wp.array(dtype=wp.vec3)
+    points: wp.array2d(dtype=wp.vec3)
+    extent: wp.array(dtype=wp.float32)
+    energy: wp.array(dtype=wp.float32)
+    impedance: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Places:
+    """What stands in the places of all environments, (e, b)."""
+
+    choice: wp.array2d(dtype=wp.int32)
+    scale: wp.array2d(dtype=wp.float32)
+    softness: wp.array2d(dtype=wp.float32)
+    tie: wp.array2d(dtype=wp.float32)
+    neutral: wp.array2d(dtype=wp.int32)
+    hidden: wp.array2d(dtype=wp.int32)  # whether a sensor does not see a place, (s, b)
+
+
+@wp.struct
+class Response:
+    """Green's function of the design."""
+
+    near: wp.array(dtype=wp.vec3)
+    near_table: wp.array2d(dtype=row)  # (sources, passes)
+    far: wp.array(dtype=wp.vec3)
+    far_table: wp.array2d(dtype=row)
+    lead: wp.int32
+    terminals: wp.int32
+    floor: wp.float32
+    cover: wp.float32
+    blend0: wp.float32
+    blend1: wp.float32
+    box0: wp.vec3
+    box1: wp.vec3
+    room0: wp.vec3
+    room1: wp.vec3
+    unit: wp.float32  # 4π eps0 [F/m]
+    empty: wp.array2d(dtype=wp.float32)  # matrix in the empty domain [F]
+    screened: wp.array2d(dtype=wp.float32)  # bound of what it changes by [F]
+
+
+@wp.struct
+class WarpCut:
+    """Clusters and functions of every view, K for each place; n = b K."""
+
+    pose: wp.array2d(dtype=wp.transform)  # of the bodies in the sensor frame, (b, v)
+    node: wp.array2d(dtype=wp.int32)  # cluster in each place, -1 for none, (n, v)
+    score: wp.array2d(dtype=wp.float32)
+    split: wp.array2d(dtype=wp.int32)  # place of the cluster that was split for this one, (n, v)
+    part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
+    number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
+    points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
+    extent: wp.array2d(dtype=wp.float32)
+    beyond: wp.array2d(dtype=wp.float32)
+    near: wp.array2d(dtype=wp.float32)  # share of the near sources, (n, v)
+
+
+@wp.func
+def _smooth(x: float):
+    y = wp.clamp(x, 0.0, 1.0)
+    return y * y * (3.0 - 2.0 * y)
+
+
+@wp.func
+def _off(p: wp.vec3, low: wp.vec3, high: wp.vec3):
+    """How far a point is from a box along each axis."""
+    return wp.vec3(
+        wp.max(wp.max(low[0] - p[0], p[0] - high[0]), 0.0),
+        wp.max(wp.max(low[1] - p[1], p[1] - high[1]), 0.0),
+        wp.max(wp.max(low[2] - p[2], p[2] - high[2]), 0.0),
+    )
+
+
+@wp.func
+def _need(shapes: Shapes, green: Response, at: wp.transform, scale: float, node: int):
+    """Extent of a cluster over its distance from the design; 0 for a single panel."""
+    if shapes.kids[node, 0] < 0:
+        return float(0.0)
+    size = scale * shapes.extent[node]
+    p = wp.transform_point(at, scale * shapes.center[node])
+    away = wp.length(_off(p, green.box0, green.box1))
+    return size / (wp.max(away, _HALF * size) + _NEAREST)
+
+
+@wp.kernel
+def choose(
+    shapes: Shapes, places: Places, green: Response, bodies: wp.array2d(dtype=wp.transform),
+    sensors: wp.array2d(dtype=wp.transform), clusters: int, cut: WarpCut,
+):  # fmt: skip
+    """Cut every body that a sensor sees into clusters."""
+    b, v = wp.tid()
+    e = v // sensors.shape[1]
+    s = v % sensors.shape[1]
+    u = places.choice[e, b]
+    o = b * clusters
+    for j in range(clusters):
+        cut.node[o + j, v] = -1
+        cut.number[o + j, v] = -1
+    if u < 0 or places.hidden[s, b] != 0:
+        return
+    at = wp.transform_multiply(wp.transform_inverse(sensors[e, s]), bodies[e, b])
+    cut.pose[b, v] = at
+    scale = places.scale[e, b]
+    away = _off(wp.transform_get_translation(at), green.room0, green.room1)
+    if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u]:
+        return
+    first = shapes.first[u]
+    cut.node[o, v] = first
+    cut.score[o, v] = _need(shapes, green, at, scale, first)
+    if places.neutral[e, b] == 0:
+        cut.number[o, v] = 0
+    for j in range(1, clusters):
+        best = int(0)
+        most = float(0.0)
+        for i in range(j):
+            if cut.score[o + i, v] > most:
+                most = cut.score[o + i, v]
+                best = i
+        if most > 0.0:
+            k = cut.node[o + best, v]
+            x = first + shapes.kids[k, 0]
+            y = first + shapes.kids[k, 1]
+            cut.split[o + j, v] = best
+            cut.part[o + j, v] = shapes.charge[x] / shapes.charge[k]
+            cut.number[o + j, v] = shapes.function[k]
+            cut.node[o + best, v] = x
+            cut.node[o + j, v] = y
+            cut.score[o + best, v] = _need(shapes, green, at, scale, x)
+            cut.score[o + j, v] = _need(shapes, green, at, scale, y)
+        else:
+            cut.score[o + j, v] = 0.0
+
+
+@wp.func
+def _lift(p: wp.vec3, gap: float, green: Response):
+    """Keep a point off a flat design, as ``place_kernels.lift``."""
+    away = _off(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
+    way = wp.length(away)
+    if way >= 2.0 * gap:
+        return p
+    q = p
+    if way == 0.0:
+        depth = green.box1[2] - p[2]
+        axis = 2
+        to = green.box1[2] + gap
+        for i in range(2):
+            if p[i] - green.box0[i] < depth:
+                depth = p[i] - green.box0[i]
+                axis = i
+                to = green.box0[i] - gap
+            if green.box1[i] - p[i] < depth:
+                depth = green.box1[i] - p[i]
+                axis = i
+                to = green.box1[i] + gap
+        q[axis] = to
+        return q
+    ratio = (gap + way * way / (4.0 * gap)) / way
+    for i in range(3):
+        edge = wp.min(p[i], green.box1[i])
+        if i < 2:
+            edge = wp.max(edge, green.box0[i])
+        q[i] = edge + ratio * (p[i] - edge)
+    return q
+
+
+@wp.kernel
+def place(
+    shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
+):
+    """Points of all clusters in the sensor frame, and where they stand to design and walls."""
+    i, v = wp.tid()
+    k = cut.node[i, v]
+    if k < 0:
+        return
+    b = i // clusters
+    scale = places.scale[v // sensors, b]
+    at = cut.pose[b, v]
+    size = scale * shapes.extent[k]
+    p0 = wp.transform_point(at, scale * shapes.points[k, 0])
+    p3 = wp.transform_point(at, scale * shapes.points[k, 3])
+    c = 0.5 * (p0 + p3)
+    out = wp.length(_off(c, green.room0, green.room1))
+    deep = float(0.0)
+    if green.cover < 1.0:
+        depth = wp.min(1.0, green.box1[2] - c[2])
+        for d in range(2):
+            depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
+            depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
+        deep = depth - _DEEP
+    cut.beyond[i, v] = _smooth(wp.max(out, deep) / _SHORE)
+    gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
+    for q in range(4):
+        p = wp.transform_point(at, scale * shapes.points[k, q])
+        if green.cover < 1.0:
+            p = _lift(p, gap, green)
+        cut.points[i, q, v] = p
+    cut.extent[i, v] = size
+    middle = 0.5 * (cut.points[i, 0, v] + cut.points[i, 3, v])
+    away = wp.length(_off(middle, green.box0, green.box1))
+    cut.near[i, v] = _smooth((green.blend1 - away) / (green.blend1 - green.blend0))
