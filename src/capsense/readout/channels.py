@@ -190,7 +190,9 @@ class ChannelBank:
             out[..., k] += self._induced(matrix, shield_coupling, k)
         out = self._sign * out
         if not np.isfinite(out).all():
-            raise ReadoutError("capacitance holds a number that is not finite; correct the readings")
+            raise ReadoutError(
+                "capacitance holds a number that is not finite; correct the readings"
+            )
         return out
 
     def _induced(self, matrix: Array, coupling: Array | None, k: int) -> Array:
