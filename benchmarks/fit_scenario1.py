@@ -14,9 +14,7 @@ from dataclasses import replace
 from itertools import combinations, product
 
 import numpy as np
-
-from capsense.reproduce.metrics import cross_correlation, rmse
-from capsense.reproduce.scenario1_fit import (
+from scenario1_fit import (
     Fit,
     Grid,
     ResponseTable,
@@ -26,8 +24,18 @@ from capsense.reproduce.scenario1_fit import (
     predicted,
     tabulate,
 )
-from capsense.reproduce.scenario1_setup import Array, Scenario1Setup, load_curves, load_setup
-from capsense.reproduce.scenario1_signal import matrices, mutual, normalised
+
+from capsense.readout.calibration import cross_correlation
+from capsense.reproduce.scenario1_setup import (
+    Array,
+    Scenario1Setup,
+    load_curves,
+    load_setup,
+    matrices,
+    mutual,
+    normalised,
+)
+from capsense.reproduce.store import rmse
 from capsense.simulator import Simulator
 
 BOARDS = ("stripe", "patch")

@@ -7,12 +7,10 @@ from peers_iterative import TOLERANCE
 from peers_task import DESIGN, SIZE, Array, bar_corners, design, within
 
 import capsense as cs
-from capsense.masked.mesh_sensor import lattice_sensor
-from capsense.masked.planes import plan_axes
-from capsense.masked.scenes import MaskedScenes
+from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor, plan_axes
 from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh
-from capsense.mesh.settings import MeshSettings
+from capsense.mesh.lattice import MeshSettings
 from capsense.simulator import PresetName
 
 PUBLISHED_TOLERANCE = 1e-5

@@ -38,6 +38,7 @@ from field_cases import (
 from fit_scenario1 import held_out, level_boards, likeness, simulators, tables_of
 from machine import describe_machine
 from reference_scenes import MAP, MORE, ReferenceScene, reference_scenes
+from scenario1_fit import tabulate
 from validation_results import (
     BOARDS,
     ELEMENTS,
@@ -52,7 +53,6 @@ from validation_results import (
 
 import capsense as cs
 from capsense.constants import EPS0
-from capsense.reproduce.scenario1_fit import tabulate
 from capsense.reproduce.scenario1_setup import load_setup
 
 ROOT = Path(__file__).parents[1]

@@ -13,8 +13,8 @@ from shaded import Camera, Part, frame_of, picture, save_animation
 
 import capsense as cs
 from capsense._style import COLOURS, INK, LABELS, LEGEND, dress
-from capsense.design.draw import outline_patch, outlines
 from capsense.humans import Build, arm
+from capsense.plotting.designs import outline_patch, outlines
 
 SECONDS = 8.0
 """How long the story lasts [s]."""

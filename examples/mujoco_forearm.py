@@ -36,7 +36,7 @@ from forearm_story import (
 from shaded import Part, capsule
 
 import capsense as cs
-from capsense.humans.export import mjcf_body
+from capsense.humans.formats import mjcf_body
 
 PIXELS = 64
 """Along each side of the depth image, which is as wide as the sensor's domain."""

@@ -13,7 +13,7 @@ import numpy as np
 
 import capsense as cs
 from capsense.humans import Build, arm
-from capsense.humans.export import mjcf_body
+from capsense.humans.formats import mjcf_body
 
 SHELL_RADIUS, SHELL_LENGTH = 0.048, 0.090
 """Radius of the electrodes and length of a ring [m], as in the design."""

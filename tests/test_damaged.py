@@ -27,9 +27,10 @@ from capsense import errors
 from capsense.cli.main import main
 from capsense.design import load_design
 from capsense.design.stl import read_stl
-from capsense.mesh import TetMesh, kuhn_tets, load_mesh, mat_reader, save_mesh
+from capsense.mesh import TetMesh, kuhn_tets, load_mesh, save_mesh
+from capsense.mesh import io as mesh_io
 from capsense.readout import recording as tables
-from capsense.recording import records
+from capsense.recording import files
 from capsense.server.frames import pack_depth, unpack_depth
 from capsense.server.messages import parse, read_scene
 
@@ -207,7 +208,7 @@ def test_numbers_of_an_unknown_type_in_a_mat_file(tmp_path: Path, number: int) -
 
 def test_files_that_inflate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What would take up more memory than a limit is not unpacked."""
-    for module in (mat_reader, tables, records):
+    for module in (mesh_io, tables, files):
         monkeypatch.setattr(module, "_MOST", 1000)
     form = mesh_file(tmp_path, "mat")
     with pytest.raises(errors.MeshError, match="inflates to more than 1,000 bytes"):
@@ -233,7 +234,7 @@ def test_a_chunk_of_zeros(tmp_path: Path, told: int) -> None:
     head = struct.pack("<QQQI", 0, 0, told or len(zeros), zlib.crc32(zeros) if told else 0)
     chunk = head + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(data)) + data
     path = tmp_path / "a.mcap"
-    path.write_bytes(records.MAGIC + struct.pack("<BQ", 6, len(chunk)) + chunk)
+    path.write_bytes(files.MAGIC + struct.pack("<BQ", 6, len(chunk)) + chunk)
     with pytest.raises(errors.RecordingError, match="a record of kind 0"):
         cs.open_recording(path)
 

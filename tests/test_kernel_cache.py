@@ -25,7 +25,7 @@ if len(sys.argv) > 1:
     make = tempfile.mkdtemp
     tempfile.mkdtemp = lambda dir=None, **n: make(dir=dir, **n) if dir else refuse(0)
 import capsense
-from capsense.scene import layer_kernels
+from capsense.scene import image_kernels
 print(os.environ.get("NUMBA_CACHE_DIR"))
 """
 

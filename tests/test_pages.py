@@ -16,7 +16,8 @@ from capsense.scenario import parse_scenario
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *DOCS]
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -65,7 +66,7 @@ def test_links(page: Path) -> None:
 def test_pages_are_in_the_navigation() -> None:
     """Every page of docs/ is listed in mkdocs.yml."""
     listed = set(re.findall(r"- (\S+\.md)", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
-    assert listed == {p.name for p in (ROOT / "docs").glob("*.md")}
+    assert listed == {p.relative_to(ROOT / "docs").as_posix() for p in DOCS}
 
 
 def test_conventions_of_an_asymmetric_pose() -> None:

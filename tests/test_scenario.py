@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 import capsense as cs
 from capsense.errors import CapSenseError, DesignError, ScenarioError
 from capsense.scenario import Excitation, Trajectory, load_scenario, parse_scenario
-from capsense.scenario.channels import channels_of
-from capsense.scenario.trajectory import slerp
+from capsense.scenario.model import channels_of, slerp
 from capsense.scene import Pose
 
 ROOT = Path(__file__).parents[1]
@@ -146,7 +145,7 @@ def test_times() -> None:
 def test_path() -> None:
     """The way of a body is its pose at each sample."""
     scenario = parse_scenario(BASE)
-    path = scenario.path_of(0)
+    path = [scenario.bodies[0].at(float(t)).pose for t in scenario.times]
     assert len(path) == scenario.count
     assert path[10] == scenario.scene_at(1.0)["bar"].pose
 
@@ -449,7 +448,9 @@ def test_steel_bar_example() -> None:
     assert bar.body.grounding == "grounded"
     assert bar.trajectory is not None
     assert set(bar.trajectory.speeds) == {0.116}
-    heights = [p.position[2] for p in scenario.path_of(0)]
+    heights = [
+        p.position[2] for p in [scenario.bodies[0].at(float(t)).pose for t in scenario.times]
+    ]
     assert min(heights) == heights[0]
 
 

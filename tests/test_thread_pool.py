@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 
 import pytest
 
-from capsense._thread_pool import ThreadPool, some_failed
+from capsense._thread_pool import ThreadPool, processors, some_failed
 from capsense.errors import SceneError
 
 
@@ -74,3 +75,9 @@ def test_refused(threads: object) -> None:
     """Not a positive whole number."""
     with pytest.raises(SceneError, match=r"threads is .*give a whole number from 1"):
         ThreadPool(threads)  # type: ignore[arg-type]
+
+
+def test_processors_where_a_system_does_not_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """macOS and Windows have no affinity: all processors count."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    assert processors() == os.cpu_count()

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from capsense.reproduce.registry import STUDIES
+from capsense.reproduce.harness import STUDIES
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")

@@ -18,27 +18,28 @@ from capsense.errors import (
     SolveError,
 )
 from capsense.fleet.fleet import Fleet, FleetReading
+from capsense.plotting.runs import plot
 from capsense.reading import Reading, StepStats
 from capsense.readout.calibration import calibrate
 from capsense.readout.chips import available_chips
 from capsense.readout.config import load_readout
 from capsense.readout.counts import Counts
 from capsense.readout.readout import Readout
-from capsense.recording.reader import open_recording
+from capsense.recording.reader import open_recording, replay
 from capsense.recording.recorder import Recorder, record
-from capsense.recording.replay import replay
 from capsense.scenario import Scenario, load_scenario
-from capsense.scene.body import Body
 from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
-from capsense.scene.deformable import DeformableSurface
-from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
-from capsense.scene.layers import Layers
+from capsense.scene.depth import (
+    DepthFrame,
+    decode_permittivity,
+    encode_permittivity,
+    point_surface,
+)
+from capsense.scene.layers import Layers, render_depth
 from capsense.scene.materials import MATERIALS, Material
-from capsense.scene.mesh_shape import TriMesh
-from capsense.scene.point_surface import point_surface
+from capsense.scene.mesh_shape import DeformableSurface, TriMesh
 from capsense.scene.pose import Pose
-from capsense.scene.raster import render_depth
-from capsense.scene.scene import Scene
+from capsense.scene.scene import Body, Scene
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from capsense.server.client import Client
 from capsense.simulator import Simulator
@@ -56,6 +57,6 @@ __all__ = [
     "Simulator", "Skin", "SkinError", "SolveError", "Sphere", "StepStats", "TriMesh",
     "__version__", "assistive_gym", "available_chips", "available_designs", "calibrate",
     "coppeliasim", "decode_permittivity", "encode_permittivity", "humans", "load_design",
-    "load_readout", "load_scenario", "mujoco", "open_recording", "point_surface", "pybullet",
-    "record", "render_depth", "replay", "show",
+    "load_readout", "load_scenario", "mujoco", "open_recording", "plot", "point_surface",
+    "pybullet", "record", "render_depth", "replay", "show",
 ]  # fmt: skip

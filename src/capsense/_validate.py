@@ -49,21 +49,14 @@ def read_toml(
 ) -> dict[str, Any]:
     """The content of a TOML file.
 
-    Parameters
-    ----------
-    path
-        The file.
-    what
-        What it is, for messages, such as ``design``.
-    error
-        The exception to raise.
-    hint
-        A further mend for a file that is not there.
+    Args:
+        path: The file.
+        what: What it is, for messages, such as ``design``.
+        error: The exception to raise.
+        hint: A further mend for a file that is not there.
 
-    Raises
-    ------
-    CapSenseError
-        An ``error`` that names the path, if it is missing, unreadable or not TOML.
+    Raises:
+        CapSenseError: An ``error`` that names the path, if it is missing, unreadable or not TOML.
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
@@ -80,16 +73,11 @@ class Table:
 
     Subclasses set :attr:`error_type` to the exception of their kind of file.
 
-    Parameters
-    ----------
-    data
-        The raw table.
-    source
-        Name of the file, for messages.
-    item
-        What the table describes, for messages, such as ``electrode "E1"``.
-    limit
-        Largest plausible length [m], such as the domain's longest edge.
+    Args:
+        data: The raw table.
+        source: Name of the file, for messages.
+        item: What the table describes, for messages, such as ``electrode "E1"``.
+        limit: Largest plausible length [m], such as the domain's longest edge.
     """
 
     error_type: ClassVar[type[CapSenseError]] = CapSenseError

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 import capsense as cs
+from capsense._thread_pool import processors
 from capsense.scene.depth import DepthFrame
 from capsense.simulator import Simulator
 
@@ -171,7 +172,7 @@ def time_batch(sim: Simulator, threads: int | None = None) -> dict[str, float]:
     """Scenes a second of ``step_batch``, by the clock, and as many as the processor's time of one
     scene gives times the threads.
     """
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or processors()
     rates = []
     for k in range(2 + REPEATS):  # the first two make room for results
         scenes = batch_scenes(after=k)

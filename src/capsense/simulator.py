@@ -20,12 +20,11 @@ from capsense.errors import BatchError, FieldError, ReadoutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.change import Change
-from capsense.field.terminals import Terminals
+from capsense.field.change import Change, Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
-from capsense.scene.shape import as_points
+from capsense.scene.shapes import as_points
 
 if TYPE_CHECKING:
     from capsense.masked import MeshSensor
@@ -113,6 +112,11 @@ class Simulator:
         """The mesh that was given in place of a design, or None."""
         given = self.mesh.design if self.mesh is not None else cast("Design | str | Path", design)
         self.design = given if isinstance(given, Design) else load_design(given)
+        if self.method == "fem_masked" and self.design.domain.open:
+            raise ValueError(
+                f"design {self.design.name!r} has an open domain, which method 'fem_masked' cannot "
+                "mesh; use method 'surface', or leave out open = true"
+            )
         self.settings = settings or default_settings(self.design)
         """Numerical settings of the background field."""
         self.steps = 0
@@ -151,8 +155,7 @@ class Simulator:
     def _make_solver(self) -> tuple[_Solver, Array]:
         """The solver, and the matrix of all terminals in the empty domain [F]."""
         if self.method == "fem_masked":
-            from capsense.masked.mesh_sensor import lattice_sensor
-            from capsense.masked.scenes import MaskedScenes
+            from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor
 
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 import capsense as cs
-from capsense.cli.main import build_parser, main
-from capsense.cli.registry import COMMANDS, load_commands
-from capsense.cli.tables import facts, grouped, seconds, table
+from capsense.cli.console import facts, grouped, seconds, table
+from capsense.cli.main import COMMANDS, build_parser, main
 
 
 def output_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -110,18 +109,17 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_help_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     """Each help page has examples, which parse, and the exit codes."""
-    for command in load_commands():
+    for command in COMMANDS:
         with pytest.raises(SystemExit) as stopped:
-            main([command.NAME, "--help"])
+            main([command.name, "--help"])
         assert stopped.value.code == 0
         text = capsys.readouterr().out
         assert "exit codes:" in text
-        examples = [e.split("   ")[0].split() for e in command.EXAMPLES.splitlines()]
+        examples = [e.split("   ")[0].split() for e in command.examples.splitlines()]
         assert len(examples) >= 2
         for words in examples:
-            assert words[:2] == ["capsense", command.NAME]
+            assert words[:2] == ["capsense", command.name]
             build_parser().parse_args(words[1:])
-    assert len(COMMANDS) == len(load_commands())
 
 
 @pytest.mark.parametrize("arguments", [[], ["walk"], ["run"], ["run", "x.toml"]])

@@ -13,7 +13,8 @@ from ball_scenario import ball_scenario
 from maxwell import random_maxwell
 from relative import near
 
-from capsense.cli.main import BAD_INPUT, OK, main
+from capsense.cli.console import BAD_INPUT, OK
+from capsense.cli.main import main
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, mutual_patterns, self_patterns
 from capsense.readout.chips import CHIPS

@@ -10,9 +10,8 @@ import pytest
 import shapely
 
 from capsense.design import Design, Surface, load_design, parse_design
-from capsense.design.contact import find_contact
-from capsense.design.curved import STRIP_ERROR
-from capsense.design.geometry import ring_vertices
+from capsense.design.geometry import find_contact, ring_vertices
+from capsense.design.shapes import STRIP_ERROR
 from capsense.errors import DesignError
 
 Array = np.ndarray

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from capsense.design import Design, Surface, parse_design
-from capsense.design.contact import find_contact
-from capsense.design.geometry import ring_vertices
+from capsense.design.geometry import find_contact, ring_vertices
 from capsense.design.shapes import CHORD_ERROR, circle_segments
 from capsense.errors import DesignError
 

@@ -49,14 +49,14 @@ charges that a point charge q there draws to the walls is −NACL q / (4π eps0 
 def test_unit_square_plate(scale):
     """Analytic: a square plate's 0.366787 · 4π eps0 a, in series with the grounded cube's images.
 
-    The next term of the images is of order (a/L)⁵ = 1e-5. Panels lower C; measured: 0.35 % at the
-    default, 0.17 % at half the panel size.
+    The next term of the images is of order (a/L)⁵ = 1e-5. Measured: within 0.02 %; the default
+    cuts so small a design finer than its own sizes.
     """
     a, box = 0.05, 0.5
     free = figures()["unit_square_plate"]["C_over_4pi_eps0_a"] * 4 * math.pi * EPS0 * a
     expected = 1 / (1 / free - NACL / (4 * math.pi * EPS0 * box))
     got = capacitance(patches(rectangle((0, 0), (a, a))), scale)[0, 0]
-    assert -0.005 * scale < got / expected - 1 < 0.0
+    assert got == pytest.approx(expected, rel=2e-3 * scale)
 
 
 def test_disc_over_the_floor():
@@ -88,7 +88,7 @@ def test_disc_in_a_large_box(box):
     free = 2 * radius / math.pi  # over 4π eps0
     wanted = 4 * math.pi * EPS0 * free / (1 - 1.7476 * free / box)
     assert capacitance(design)[0, 0] == pytest.approx(wanted, rel=2e-3)
-    assert len(build_model(design).panels) < 1200
+    assert 2500 < len(build_model(design).panels) < 3500
 
 
 def test_two_stripes():

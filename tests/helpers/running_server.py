@@ -11,7 +11,7 @@ import urllib.request
 from typing import Any
 
 from capsense.server.client import Client
-from capsense.server.options import ServerOptions
+from capsense.server.connection import ServerOptions
 from capsense.server.server import Server
 
 WAIT = 20.0

@@ -20,7 +20,7 @@ from capsense.design.loader import parse_design
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.cache import load_or_build
 from capsense.field.green import to_arrays
-from capsense.mesh.settings import MeshSettings
+from capsense.mesh.lattice import MeshSettings
 
 SETTINGS = BuildSettings(panel_scale=8.0, mesh=MeshSettings().refined(0.5))
 

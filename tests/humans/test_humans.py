@@ -14,8 +14,7 @@ import pytest
 import capsense as cs
 from capsense.errors import MissingDependencyError
 from capsense.humans import Build, Limb, arm, leg, load_smplx
-from capsense.humans.export import mjcf_body
-from capsense.humans.smplx import close_openings
+from capsense.humans.formats import close_openings, mjcf_body
 
 LIMBS = [make(side=side) for make in (arm, leg) for side in ("left", "right")]  # type: ignore[arg-type]
 

@@ -68,6 +68,33 @@ def test_quantisation_error_is_uniform():
     assert abs(error.mean()) < 5 * 1e-15 / math.sqrt(12 * len(c))
 
 
+def test_zero_code():
+    """Analytic: 0 F is the code ``zero``, and one lsb more is the code after it."""
+    law = LinearLaw(1e-15, 0, 2**16 - 1, 2**15)
+    assert law.level(np.array([0.0, 1e-15])) == pytest.approx([2**15, 2**15 + 1])
+    assert law.capacitance(np.array([2**15, 2**15 + 1])) == pytest.approx([0.0, 1e-15], abs=1e-27)
+
+
+def test_full_scale_codes():
+    """Analytic: without headroom, and with amplifiers to spare, all codes but the last are used."""
+    assert ReciprocalLaw(1e-6, 1e-6, 3.3, headroom=0.0).high == 1023
+    assert ShuntLaw(ShuntFrontEnd(1e6, 1e3, 20.0, 3.0), 2.0).high == 2**15 - 1
+
+
+def test_shunt_law_by_its_full_scale():
+    """Analytic: a code is |V_o| over full scale, whatever the amplitude and the scale."""
+    front_end = ShuntFrontEnd(1e6, 1e3, 0.5, 3.0)  # at most 1.5 V of 2 V
+    law = ShuntLaw(front_end, 2.0)
+    assert law.high == math.ceil(0.75 * 2**15) - 1
+    c = np.array([1e-12, -1e-12])
+    volts = np.abs(front_end.output(np.abs(c)))
+    assert law.level(c) == near(np.sign(c) * volts / 2.0 * 2**15, rel=1e-12)
+
+
+def test_largest_nonlinearity_is_taken():
+    assert LinearLaw(1e-15, 0, 9, nonlinearity=0.1).nonlinearity == 0.1
+
+
 @pytest.mark.parametrize("share", [1e-4, -1e-3])
 def test_nonlinearity(share):
     """Analytic: none at the ends, all of it in the middle of the range; codes never fall."""
@@ -154,6 +181,7 @@ def test_dac_follows_only_if_it_may():
         conversion(channel, np.array([2e-12, 2e-12]))
         far = np.array([2e-12, 14e-12])
         assert conversion(channel, far)[2].tolist() == [Range.INSIDE, Range.ABOVE]
+        assert conversion.dac_codes.tolist() == [1, 4 if follow else 1]
         after = conversion(channel, far)
         assert after[2].tolist() == [0, 0 if follow else Range.ABOVE]
         assert after[1][0] == pytest.approx(2e-12, abs=1e-15)
@@ -161,8 +189,19 @@ def test_dac_follows_only_if_it_may():
             assert after[1][1] == pytest.approx(14e-12, abs=1e-15)
 
 
+@pytest.mark.parametrize("first", [0.0, 9e-12])
+def test_each_channel_sets_its_dac_at_its_first_sample(first):
+    """Also where another channel was converted before, on code 0 or above it."""
+    conversion = Conversion(LINEAR, CapDac(3e-12, 32), 2)
+    conversion(np.array([0]), np.array([first]))
+    reported = conversion(np.array([1]), np.array([92e-12]))[1]
+    assert conversion.dac_codes.tolist() == [round(first / 3e-12), 31]
+    assert reported == pytest.approx([92e-12], abs=1e-15)
+
+
 def test_dac_follows_both_ways_to_its_ends():
     """Half a converter's range at a time: up, down, and no further than the DAC goes."""
+    assert CapDac(3e-12, 12).nearest(np.array([-9e-12, 40e-12])).tolist() == [0, 11]
     for start, value, codes in (
         (0, 40e-12, [3, 6, 9, 11, 11]),
         (11, -20e-12, [8, 5, 2, 0, 0]),
@@ -183,10 +222,12 @@ def test_dac_follows_both_ways_to_its_ends():
         (lambda: LinearLaw(0.0, 0, 1), "lsb is 0.0"),
         (lambda: LinearLaw(1e-15, 5, 5), "codes run from 5 to 5"),
         (lambda: ReciprocalLaw(-1e-6, 1e-6, 3.3), "current is -1e-06"),
+        (lambda: ReciprocalLaw(1e-6, 0.0, 3.3), "time is 0.0"),
         (lambda: ReciprocalLaw(1e-6, 1e-6, 1.2), "codes run from 598 to 426"),
         (lambda: ResonanceLaw(0.0, 1e-12, 4e7), "inductance is 0.0"),
         (lambda: ResonanceLaw(1e-6, 1e-12, 4e4), "codes run from 67108864 to 67108864"),
         (lambda: ShuntLaw(ShuntFrontEnd(), math.nan), "full_scale is nan"),
+        (lambda: ShuntLaw(ShuntFrontEnd(), 0.0), "full_scale is 0.0"),
         (lambda: ShuntLaw(ShuntFrontEnd(gain=1e-9), 1.0), "codes run from 0 to 0"),
         (lambda: ShuntLaw(ShuntFrontEnd(), 1.0, 1), "bits is 1"),
         (lambda: LinearLaw("fine", 0, 1), "lsb is 'fine'"),

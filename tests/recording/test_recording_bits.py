@@ -15,16 +15,17 @@ from hypothesis import strategies as st
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
-from capsense.errors import RecordingError
-from capsense.recording.design_json import design_from_json, design_to_json
-from capsense.recording.messages import PACKAGE, Messages
-from capsense.recording.parts import (
+from capsense.codec import (
     body_fields,
+    design_from_json,
+    design_to_json,
     read_body,
     read_rest,
     read_shape,
     shape_fields,
 )
+from capsense.errors import RecordingError
+from capsense.recording.ros import PACKAGE, Messages
 from capsense.recording.session import describe
 from capsense.recording.steps import StepMessages
 from capsense.scene import RestSurface, SurfaceMesh

@@ -88,7 +88,7 @@ def test_counts_that_differ(sim: cs.Simulator, tmp_path: Path) -> None:
 def test_other_versions_are_told(
     tampered: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import capsense.recording.replay as module
+    import capsense.recording.reader as module
 
     here = {**module.versions(), "numba": "9.9", "processor": "other"}
     monkeypatch.setattr(module, "versions", lambda: here)

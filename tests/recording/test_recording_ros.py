@@ -75,7 +75,7 @@ def test_what_rosbag2_wants(recorded: Recorded) -> None:
 
 def test_type_hashes() -> None:
     """Hashes as ROS 2 itself has them, in its type description of the message."""
-    from capsense.recording.messages import Messages
+    from capsense.recording.ros import Messages
 
     known = {
         "std_msgs/msg/Header": "f49fb3ae2cf070f793645ff749683ac6"
@@ -238,7 +238,7 @@ def test_signals(recorded: Recorded, decoded: dict[str, list[tuple[int, Any]]]) 
 def test_package_of_the_messages() -> None:
     """A ROS 2 package: every message is there, and every package that they name."""
     from capsense import recording
-    from capsense.recording.messages import OWN
+    from capsense.recording.ros import OWN
 
     folder = Path(recording.__file__).parent / "capsense_msgs"
     texts = {path.stem: path.read_text() for path in folder.glob("msg/*.msg")}

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from capsense.reproduce import fig8
-from capsense.reproduce.study import Outcome
-from capsense.reproduce.write import write_outcome
+from capsense.reproduce.harness import Outcome, write_outcome
 
 FIGURES = Path(__file__).parents[1] / "data" / "reference_capacitances.json"
 

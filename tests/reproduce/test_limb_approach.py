@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsense.reproduce import limb_fit
+from capsense.reproduce import limb_curves
+from capsense.reproduce.harness import Outcome, write_outcome
 from capsense.reproduce.limb_approach import run
 from capsense.reproduce.limb_curves import (
+    EDGES,
+    FAR,
     FITS,
     RANGES,
     counts,
@@ -19,9 +22,6 @@ from capsense.reproduce.limb_curves import (
     slopes,
     zero_distance,
 )
-from capsense.reproduce.limb_fit import EDGES, FAR
-from capsense.reproduce.study import Outcome
-from capsense.reproduce.write import write_outcome
 
 
 @pytest.mark.parametrize("power", [-1.0, -2.5])
@@ -125,8 +125,8 @@ def test_fit_to_the_arm_finds_its_figures(monkeypatch: pytest.MonkeyPatch) -> No
     seen = reading(np.array(true[0]), z[:-3] + true[1]) - true[2] * reading(
         np.array(true[0]), np.array(0.15 + true[1])
     )
-    monkeypatch.setattr(limb_fit, "ARM", tuple(slopes(z[:-3], seen)))
-    found = limb_fit.fit_arm(EDGES, z, reading(edges, z))
+    monkeypatch.setattr(limb_curves, "ARM", tuple(slopes(z[:-3], seen)))
+    found = limb_curves.fit_arm(EDGES, z, reading(edges, z))
     assert found.apart < 0.003
     assert found.figures[1] == pytest.approx(true[1], abs=0.003)
     assert all(low <= value <= high for value, (low, high) in zip(true, found.ranges, strict=True))
@@ -135,6 +135,6 @@ def test_fit_to_the_arm_finds_its_figures(monkeypatch: pytest.MonkeyPatch) -> No
 def test_fit_to_the_arm_says_where_there_is_none() -> None:
     """Readings that fall as 1/d⁶ are too steep wherever the offset ends."""
     z = np.append(distances(6), FAR)
-    found = limb_fit.fit_arm(EDGES, z, np.tile(1e-20 * z**-6.0, (len(EDGES), 1)))
+    found = limb_curves.fit_arm(EDGES, z, np.tile(1e-20 * z**-6.0, (len(EDGES), 1)))
     assert found.ranges == ()
-    assert found.apart > limb_fit.WITHIN
+    assert found.apart > limb_curves.WITHIN

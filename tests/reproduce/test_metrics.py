@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from capsense.reproduce.metrics import (
+from capsense.readout.calibration import cross_correlation
+from capsense.reproduce.store import (
     correlation_of_change,
-    cross_correlation,
     raw_correlation,
     rmse,
 )

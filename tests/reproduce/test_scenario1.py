@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import csv
 import json
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,17 @@ import capsense as cs
 from capsense.cli.main import main
 from capsense.errors import ScenarioError
 from capsense.reproduce import scenario1
-from capsense.reproduce.scenario1_fit import (
-    fit,
-    fit_without,
-    own_figures,
-    predicted,
-    tabulate,
+from capsense.reproduce.scenario1_setup import (
+    DATA,
+    FILE,
+    load_curves,
+    load_setup,
+    normalised,
+    parse_setup,
 )
-from capsense.reproduce.scenario1_setup import DATA, FILE, load_curves, load_setup, parse_setup
-from capsense.reproduce.scenario1_signal import normalised
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from scenario1_fit import fit, fit_without, own_figures, predicted, tabulate
 
 SETUP = load_setup()
 STRIPE = SETUP.boards["stripe"]

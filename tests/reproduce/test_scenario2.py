@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.reproduce import limb_rides, limb_worlds, scenario2
-from capsense.reproduce.limb_rides import PARTICIPANTS, clearance, course, rides, sensor_pose
-from capsense.reproduce.study import Outcome
+from capsense.reproduce import limb_worlds, scenario2
+from capsense.reproduce.harness import Outcome
+from capsense.reproduce.limb_worlds import PARTICIPANTS, clearance, course, rides, sensor_pose
 
 
 def test_rides_are_the_same_at_every_call_and_within_their_bounds() -> None:
@@ -30,7 +30,7 @@ def test_rides_are_the_same_at_every_call_and_within_their_bounds() -> None:
         assert b - 0.3 * (b - a) < y <= b
     for way in ways:
         assert way.time == pytest.approx(np.linspace(0.0, 4.0, 21))
-        assert clearance(course(PARTICIPANTS["3"], way.which), way.poses) > limb_rides.CLEARANCE
+        assert clearance(course(PARTICIPANTS["3"], way.which), way.poses) > limb_worlds.CLEARANCE
         x = np.array([p.position[0] for p in way.poses])
         assert np.sort(x) == pytest.approx(np.linspace(-0.1, 0.1, 21))
 
@@ -56,7 +56,7 @@ def test_sensor_pose() -> None:
 @pytest.mark.parametrize(
     ("which", "upper", "lower"), [("arm", "forearm", "hand"), ("leg", "shank", "foot")]
 )
-def test_course_lies_along_x(which: limb_rides.Which, upper: str, lower: str) -> None:
+def test_course_lies_along_x(which: limb_worlds.Which, upper: str, lower: str) -> None:
     place = course(PARTICIPANTS["2"], which)
     poses = place.limb.forward()
     near, far = (place.frame.apply(poses[name].position) for name in (upper, lower))

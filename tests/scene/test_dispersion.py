@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capsense.constants import EPS0
-from capsense.scene.dispersion import GABRIEL
+from capsense.scene.materials import GABRIEL
 
 # Table 3 of "Electrical exposure analysis of galvanic-coupled intra-body communication based on the
 # empirical arm models", BioMed. Eng. OnLine 17 (2018), s12938-018-0473-9: frequency [kHz], then

@@ -6,8 +6,7 @@ import pytest
 from capsense.constants import EPS0
 from capsense.errors import SceneError
 from capsense.scene import MATERIALS, Material, material
-from capsense.scene.dispersion import ColeCole
-from capsense.scene.materials import water
+from capsense.scene.materials import ColeCole, water
 
 # Gabriel 1996, four-term Cole-Cole: eps_inf, sigma_ion [S/m], then step, tau [s], alpha per term.
 GABRIEL = {

@@ -9,7 +9,7 @@ from numba import njit
 
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Capsule, Ellipsoid, Pose, Scene, ShapeKind, Sphere, TriMesh
-from capsense.scene.distance_kernels import triangle_distance2
+from capsense.scene.geometry_kernels import triangle_distance2
 
 
 def tri_mesh(mesh):

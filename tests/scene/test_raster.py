@@ -15,7 +15,7 @@ from capsense.scene import (
     Pose,
     render_depth,
 )
-from capsense.scene.raster_kernels import LEAST_COSINE
+from capsense.scene.image_kernels import LEAST_COSINE
 
 
 def render_slowly(vertices, faces, size, resolution, thickness=0.0):

@@ -11,7 +11,7 @@ from running_server import RunningServer
 
 import capsense as cs
 from capsense.errors import CapSenseError, ProtocolError, ServerError
-from capsense.server.options import Limits, ServerOptions
+from capsense.server.connection import Limits, ServerOptions
 from capsense.server.sensor import ServedSensor
 from capsense.server.server import Server
 from capsense.simulator import Simulator

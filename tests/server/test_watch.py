@@ -12,8 +12,8 @@ pytest.importorskip("websockets", reason='needs websockets: pip install "capsens
 
 from running_server import RunningServer
 
+from capsense.codec import design_from_json
 from capsense.errors import ProtocolError
-from capsense.recording.design_json import design_from_json
 from capsense.server.frames import DepthMessage, ReadingMessage
 from capsense.server.messages import MessageTable, read_scene
 

@@ -10,7 +10,7 @@ import trimesh
 
 import capsense as cs
 from capsense.surface import store
-from capsense.surface.standing import standing
+from capsense.surface.store import standing
 
 Array = np.ndarray
 

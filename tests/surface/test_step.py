@@ -19,17 +19,15 @@ import capsense as cs
 from capsense.field.green import GreenFunction
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block
-from capsense.surface.changing import ChangingBody
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.matter import CONDUCTING, UNIT
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
 from capsense.surface.panels import panels_of
-from capsense.surface.place_kernels import BODY, Green
-from capsense.surface.rigid import Clusters, RigidShape, rigid_shape, split
-from capsense.surface.solver import Preset, SurfaceSolver, pack_green
-from capsense.surface.step import Solution, prepared, solve, solve_lossy
-from capsense.surface.vector_kernels import (
+from capsense.surface.pieces import ChangingBody
+from capsense.surface.place_kernels import (
+    BODY,
+    Green,
     cholesky,
     multiply,
     multiply_simd,
@@ -38,6 +36,9 @@ from capsense.surface.vector_kernels import (
     source_potentials,
     substitute,
 )
+from capsense.surface.rigid import Clusters, RigidShape, rigid_shape, split
+from capsense.surface.solver import Preset, SurfaceSolver, pack_green
+from capsense.surface.step import Solution, prepared, solve, solve_lossy
 
 Array = np.ndarray
 BALL, FINGER, BOX = cs.Sphere(0.03), cs.Capsule(0.008, 0.06), cs.Box((0.1, 0.06, 0.02))

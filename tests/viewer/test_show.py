@@ -14,8 +14,8 @@ pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
 from view_sources import Counting, until
 
 import capsense as cs
-from capsense.viewer.export import SIZE, send_picture, send_video
 from capsense.viewer.player import Player
+from capsense.viewer.view import SIZE, send_picture, send_video
 
 ARM = """<mujoco><worldbody>
 <body name="arm" pos="0 0 .3"><joint type="slide" axis="1 0 0"/>

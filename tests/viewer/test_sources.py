@@ -12,7 +12,7 @@ import pytest
 import capsense as cs
 from capsense.errors import ProtocolError, RecordingError, ServerError
 from capsense.scenario import parse_scenario
-from capsense.viewer.plane import Plane, region
+from capsense.viewer.charts import Plane, region
 from capsense.viewer.source import Frame, RecordingSource, ScenarioSource
 
 DATA = {
@@ -112,7 +112,7 @@ class TestWatched:
         """Scenes and readings are those of the client; shapes that stay are not made anew."""
         from running_server import RunningServer
 
-        from capsense.viewer.watched import Watched
+        from capsense.viewer.source import Watched
 
         with RunningServer("six_patch", watch=True) as server, server.client() as client:
             sensor = client.open(material="steel", back=0.02)
@@ -155,7 +155,7 @@ class TestWatched:
         """It says what it waits for, and finds a new sensor of the same design by itself."""
         from running_server import RunningServer
 
-        from capsense.viewer.watched import Watched
+        from capsense.viewer.source import Watched
 
         with RunningServer("patch", "six_patch", watch=True) as server:
             told = threading.Event()
@@ -189,7 +189,7 @@ class TestWatched:
         """No server, no permission, a wrong token, no such sensor."""
         from running_server import RunningServer
 
-        from capsense.viewer.watched import Watched
+        from capsense.viewer.source import Watched
 
         with pytest.raises(ServerError, match=r"no server to watch at ws://127\.0\.0\.1:9"):
             Watched("ws://127.0.0.1:9")

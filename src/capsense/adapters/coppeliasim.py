@@ -35,8 +35,8 @@ from capsense.design.model import Design
 from capsense.errors import AdapterError, SceneError, require_package
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
-from capsense.scene.body import Grounding
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
+from capsense.scene.scene import Grounding
 from capsense.simulator import Simulator, make_readout
 
 __all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]

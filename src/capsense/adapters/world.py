@@ -15,10 +15,10 @@ from capsense.adapters.rules import Tie
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
-from capsense.scene.surface_mesh import SHEET_THICKNESS
+from capsense.scene.mesh_shape import SHEET_THICKNESS
 
 if TYPE_CHECKING:
-    from capsense.scene.deformable import DeformableSurface
+    from capsense.scene.mesh_shape import DeformableSurface
 
 Array = NDArray[np.float64]
 
@@ -199,7 +199,7 @@ class World:
 
     def _soft_bodies(self, frames: Frames) -> list[Body]:
         """The deformables that reach into the domain, as they are now."""
-        from capsense.scene.deformable import DeformableSurface
+        from capsense.scene.mesh_shape import DeformableSurface
 
         rotation = Pose((0, 0, 0), frames.sensor_quaternion).rotation
         out = []

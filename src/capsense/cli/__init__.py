@@ -1,1 +1,1 @@
-"""The ``capsense`` command: one module per subcommand, listed in :mod:`capsense.cli.registry`."""
+"""The ``capsense`` command: its subcommands are listed in :mod:`capsense.cli.main`."""

@@ -4,33 +4,29 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from capsense.cli.console import (
+    OK,
+    PICTURES,
+    BuildProgress,
+    Command,
+    check_picture,
+    facts,
+    field_figures,
+    grouped,
+    progress_shown,
+    table,
+)
 from capsense.errors import DesignError
 
 if TYPE_CHECKING:
     from capsense.design import Design, Surface
     from capsense.simulator import Simulator
 
-NAME = "design"
-HELP = "print a sensor design with its field's figures and baseline, or draw it"
-DESCRIPTION = """\
-Print what a sensor design is made of, the figures of its field, and its baseline: the
-capacitance matrix with nothing in front of it. The field is computed at a design's first
-use and kept in the user's cache; --no-build leaves it alone.
-"""
-EXAMPLES = """\
-  capsense design --list
-  capsense design six_patch
-  capsense design stripe --no-build -o stripe.png     draw it: top view and stack
-  capsense design my/sensor.toml
-"""
-PICTURES = (".png", ".svg", ".pdf")
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _design_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
         "design", metavar="NAME|FILE", nargs="?", help="a packaged design, or a design .toml"
@@ -49,9 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
 
 
-def execute(args: argparse.Namespace) -> int:
+def _design(args: argparse.Namespace) -> int:
     """Print, and draw if asked to, and return the exit code."""
-    from capsense.cli.main import OK
 
     if args.list:
         print(_listing())
@@ -61,14 +56,14 @@ def execute(args: argparse.Namespace) -> int:
             "no design given; name a packaged one or a .toml file, or see capsense design --list"
         )
     if args.output is not None:
-        _check_picture(args.output)
+        check_picture("--output", args.output, DesignError)
 
     from capsense.design import load_design
 
     design = load_design(args.design)
     print(describe(design))
     if args.output is not None:
-        from capsense.design.draw import draw_design
+        from capsense.plotting.designs import draw_design
 
         draw_design(design).get_figure().savefig(args.output, dpi=150)  # type: ignore[union-attr]
         print(f"\ndrawn to {args.output}")
@@ -77,26 +72,14 @@ def execute(args: argparse.Namespace) -> int:
         print(f"\ndraw it with: capsense design {design_file} --no-build -o {picture}")
     if not args.no_build:
         import capsense
-        from capsense.cli.progress import BuildProgress
 
-        with BuildProgress(shown=not args.quiet and sys.stderr.isatty()) as progress:
+        with BuildProgress(shown=progress_shown(args.quiet)) as progress:
             simulator = capsense.Simulator(design, progress=progress)
         print(f"\n{describe_field(simulator)}")
     return OK
 
 
-def _check_picture(path: Path) -> None:
-    """Refuse before any computation what Matplotlib would refuse after it."""
-    if path.suffix.lower() not in PICTURES:
-        raise DesignError(
-            f"--output {path} is no picture; give a name that ends in {', '.join(PICTURES)}"
-        )
-    if not path.parent.is_dir():
-        raise DesignError(f"--output {path}: there is no folder {path.parent}; make it first")
-
-
 def _listing() -> str:
-    from capsense.cli.tables import table
     from capsense.design import available_designs, load_design
 
     rows = []
@@ -108,13 +91,13 @@ def _listing() -> str:
 
 def describe(design: Design) -> str:
     """What a design is made of, as text."""
-    from capsense.cli.tables import facts, table
 
     x, y, z = (1e3 * s for s in design.domain.size)
+    walls = "open, from" if design.domain.open else "floor"
     head = [
         ("design", design.name),
         ("", design.description),
-        ("domain", f"{x:g} × {y:g} × {z:g} mm, floor {design.domain.backplane * 1e3:g} mm below"),
+        ("domain", f"{x:g} × {y:g} × {z:g} mm, {walls} {design.domain.backplane * 1e3:g} mm below"),
         ("hash", design.content_hash()[:16]),
     ]
     blocks = [
@@ -163,7 +146,6 @@ def describe_field(simulator: Simulator) -> str:
     """Figures of the field and baseline matrix, as text."""
     import numpy as np
 
-    from capsense.cli.tables import facts, field_figures, grouped, table
     from capsense.scene import Scene
 
     names = simulator.electrode_names
@@ -178,3 +160,22 @@ def describe_field(simulator: Simulator) -> str:
         head = "self, shields driven [pF]"
         text += f"\n\n{table((head, *names), [('', *(f'{c * 1e12:.4f}' for c in guarded))])}"
     return text
+
+
+DESIGN = Command(
+    "design",
+    "print a sensor design with its field's figures and baseline, or draw it",
+    """\
+Print what a sensor design is made of, the figures of its field, and its baseline: the
+capacitance matrix with nothing in front of it. The field is computed at a design's first
+use and kept in the user's cache; --no-build leaves it alone.
+""",
+    """\
+  capsense design --list
+  capsense design six_patch
+  capsense design stripe --no-build -o stripe.png     draw it: top view and stack
+  capsense design my/sensor.toml
+""",
+    _design_arguments,
+    _design,
+)

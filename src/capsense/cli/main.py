@@ -10,10 +10,16 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from capsense.cli.registry import load_commands
+from capsense.cli import design, optimise, recordings, run, serve, studies
+from capsense.cli.console import BAD_INPUT, FAILED, INTERRUPTED, OK, Interrupt, say
 from capsense.errors import CapSenseError, FieldError, SolveError
 
-OK, FAILED, BAD_INPUT, TARGET_MISSED, DIFFERS, INTERRUPTED = 0, 1, 2, 3, 3, 130
+COMMANDS = (
+    run.RUN, run.RECORD, recordings.REPLAY, recordings.EXPORT, design.DESIGN, recordings.READOUT,
+    studies.DATASET, optimise.OPTIMISE, studies.BENCH, studies.REPRODUCE, serve.SERVE, serve.VIEW,
+)  # fmt: skip
+"""The subcommands, in the order of ``--help``. A new one is written as a
+:class:`~capsense.cli.console.Command` and listed here."""
 
 EXIT_CODES = """\
 exit codes:
@@ -51,12 +57,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=_Version, help="print the version and exit")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in load_commands():
+    for command in COMMANDS:
         sub = commands.add_parser(
-            command.NAME,
-            help=command.HELP,
-            description=command.DESCRIPTION,
-            epilog=f"examples:\n{command.EXAMPLES}\n{EXIT_CODES}",
+            command.name,
+            help=command.help,
+            description=command.description,
+            epilog=f"examples:\n{command.examples}\n{EXIT_CODES}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
@@ -69,26 +75,15 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     say(f"warning: {message}")
 
 
-def say(message: str) -> None:
-    """One line on stderr."""
-    print(f"capsense: {' '.join(message.split())}", file=sys.stderr)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    Parameters
-    ----------
-    argv
-        Arguments after the program's name; those of the process by default.
+    Args:
+        argv: Arguments after the program's name; those of the process by default.
 
-    Returns
-    -------
-    int
+    Returns:
         The exit code, see :data:`EXIT_CODES`.
     """
-    from capsense.cli.interrupt import Interrupt
-
     args = build_parser().parse_args(argv)
     with warnings.catch_warnings(), Interrupt():
         warnings.showwarning = _show_warning

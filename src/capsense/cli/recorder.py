@@ -5,21 +5,20 @@ from __future__ import annotations
 import csv
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capsense.errors import ScenarioError
-from capsense.recording.tables import column_meanings, csv_row, reading_arrays, replacing
-from capsense.recording.versions import versions
-from capsense.scenario import Channel, Sample, Scenario
+from capsense.recording.session import versions
+from capsense.recording.tables import Run, column_meanings, csv_row, replacing
+from capsense.scenario import Sample, Scenario
 
 if TYPE_CHECKING:
     from capsense.reading import Reading
 
-Array = NDArray[np.float64]
 
 FILES = ("readings.csv", "readings.npz", "summary.json", "plot.png")
 """What a run leaves in its output folder."""
@@ -28,17 +27,13 @@ FILES = ("readings.csv", "readings.npz", "summary.json", "plot.png")
 def prepare_folder(folder: Path, *, force: bool) -> None:
     """Make the output folder, and see that it can be written to.
 
-    Parameters
-    ----------
-    folder
-        Where results go; made with its parents if it is not there.
-    force
-        Take a folder that holds something, and remove earlier results from it.
+    Args:
+        folder: Where results go; made with its parents if it is not there.
+        force: Take a folder that holds something, and remove earlier results from it.
 
-    Raises
-    ------
-    ScenarioError
-        If it is a file, holds something and ``force`` is not set, or cannot be written to.
+    Raises:
+        ScenarioError: If it is a file, holds something and ``force`` is not set, or cannot be
+            written to.
     """
     if folder.exists() and not folder.is_dir():
         raise ScenarioError(f"output {folder} is a file; give a folder")
@@ -63,32 +58,17 @@ def prepare_folder(folder: Path, *, force: bool) -> None:
 class RunWriter:
     """Takes samples, writes ``readings.csv`` row by row, and the other files at the end.
 
-    Parameters
-    ----------
-    folder
-        An output folder made by :func:`prepare_folder`.
-    scenario
-        The scenario that is run.
-    empty
-        The sensor's reading with nothing in front of it.
+    Args:
+        folder: An output folder made by :func:`prepare_folder`.
+        scenario: The scenario that is run.
+        empty: The sensor's reading with nothing in front of it.
     """
 
     def __init__(self, folder: Path, scenario: Scenario, empty: Reading) -> None:
         self.folder = folder
         self.scenario = scenario
-        self.baseline = np.asarray(empty.capacitance, dtype=float)
-        self.self_baseline = np.asarray(empty.self_capacitance, dtype=float)
-        self.levels = np.array([c.read(empty) for c in scenario.channels])
-        self.count = 0
-        size, electrodes = scenario.count, len(self.baseline)
-        bodies = len(scenario.bodies)
-        self._capacitance = np.empty((size, electrodes, electrodes))
-        self._delta = np.empty((size, electrodes, electrodes))
-        self._self = np.empty((size, electrodes))
-        self._values = np.empty((size, len(scenario.channels)))
-        self._positions = np.empty((size, bodies, 3))
-        self._quaternions = np.empty((size, bodies, 4))
-        self._stats = np.empty((size, 4))
+        names = tuple(str(b.body.name) for b in scenario.bodies)
+        self.run = Run(scenario.name, scenario.design, scenario.channels, empty, names)
         self._file = (folder / FILES[0]).open("w", newline="", encoding="utf-8")
         self._rows = csv.writer(self._file, lineterminator="\n")
         self._rows.writerow([name for name, _ in column_meanings(scenario.channels)])
@@ -96,44 +76,17 @@ class RunWriter:
 
     def add(self, sample: Sample) -> None:
         """Keep one sample, and write its row."""
-        k, reading = sample.index, sample.reading
-        self._capacitance[k] = reading.capacitance
-        self._delta[k] = reading.delta
-        self._self[k] = reading.self_capacitance
-        self._values[k] = sample.values
-        for b, body in enumerate(sample.scene):
-            self._positions[k, b] = body.pose.position
-            self._quaternions[k, b] = body.pose.quaternion
-        stats = reading.stats
-        self._stats[k] = (
-            stats.iterations,
-            stats.solver_error,
-            stats.wall_time,
-            stats.unknowns,
-        )
-        self._rows.writerow(csv_row(sample.time, self._values[k], self.levels))
+        run = self.run
+        run.times.append(sample.time)
+        run.readings.append(sample.reading)
+        run.scenes.append(sample.scene)
+        self._rows.writerow(csv_row(sample.time, np.array(sample.values), run.levels))
         self._file.flush()
-        self.count = k + 1
 
     @property
-    def times(self) -> Array:
-        """Times [s] of the samples so far, shape (n,)."""
-        return self.scenario.times[: self.count]
-
-    @property
-    def values(self) -> Array:
-        """Channels [F] of the samples so far, shape (n, K)."""
-        return self._values[: self.count]
-
-    @property
-    def positions(self) -> Array:
-        """Origins of the bodies [m] in the samples so far, shape (n, B, 3)."""
-        return self._positions[: self.count]
-
-    @property
-    def capacitance(self) -> Array:
-        """Maxwell matrices [F] of the samples so far, shape (n, M, M)."""
-        return self._capacitance[: self.count]
+    def count(self) -> int:
+        """Samples so far."""
+        return len(self.run.times)
 
     def close(self) -> None:
         """Close the table."""
@@ -141,33 +94,22 @@ class RunWriter:
 
     def write_arrays(self) -> None:
         """Write ``readings.npz``."""
-        n = self.count
-        arrays = reading_arrays(
-            time=self.times, capacitance=self._capacitance[:n], delta=self._delta[:n],
-            baseline=self.baseline, self_capacitance=self._self[:n],
-            self_baseline=self.self_baseline, electrodes=self.scenario.design.electrode_names,
-            channels=self.scenario.channels, values=self._values[:n], levels=self.levels,
-            bodies=[str(b.body.name) for b in self.scenario.bodies],
-            positions=self._positions[:n], quaternions=self._quaternions[:n],
-            iterations=self._stats[:n, 0], error_estimate=self._stats[:n, 1],
-            step_time=self._stats[:n, 2],
-        )  # fmt: skip
         with replacing(self.folder / FILES[1]) as path, path.open("wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+            np.savez_compressed(file, **self.run.arrays())  # type: ignore[arg-type]
 
     def summary(
         self, field: dict[str, Any], *, interrupted: bool, failure: str | None
     ) -> dict[str, Any]:
         """What ``summary.json`` holds."""
         scenario, n = self.scenario, self.count
-        stats = self._stats[:n]
+        stats = [r.stats for r in self.run.readings]
         return {
             "scenario": scenario.name,
             "design": scenario.design.name,
             "design_hash": scenario.design.content_hash(),
             "electrodes": list(scenario.design.electrode_names),
             "shields": sum(c.role == "shield" for c in scenario.design.conductors),
-            "bodies": [b.body.name for b in scenario.bodies],
+            "bodies": list(self.run.bodies),
             "field": field,
             "method": scenario.method,
             "excitation": scenario.excitation.value,
@@ -176,25 +118,24 @@ class RunWriter:
             "samples_planned": scenario.count,
             "interrupted": interrupted,
             "failure": failure,
-            "step_time_s": _quantiles(stats[:, 2]),
-            "unknowns": _quantiles(stats[:, 3]),
-            "iterations": _quantiles(stats[:, 0]),
-            "largest_error_estimate_F": _largest(stats[:, 1]),
+            "step_time_s": _quantiles([s.wall_time for s in stats]),
+            "unknowns": _quantiles([s.unknowns for s in stats]),
+            "iterations": _quantiles([s.iterations for s in stats]),
+            "largest_error_estimate_F": max((s.solver_error for s in stats), default=None),
             "channels": [
-                self._channel_summary(k, channel) for k, channel in enumerate(scenario.channels)
+                {
+                    "name": channel.column_name,
+                    "meaning": channel.meaning,
+                    "baseline_F": float(level),
+                    "min_F": float(values.min()) if n else None,
+                    "max_F": float(values.max()) if n else None,
+                }
+                for channel, level, values in zip(
+                    scenario.channels, self.run.levels, self.run.values.T, strict=True
+                )
             ],
             "columns": dict(column_meanings(scenario.channels)),
             "versions": versions(),
-        }
-
-    def _channel_summary(self, k: int, channel: Channel) -> dict[str, Any]:
-        values = self.values[:, k]
-        return {
-            "name": channel.column_name,
-            "meaning": channel.meaning,
-            "baseline_F": float(self.levels[k]),
-            "min_F": float(values.min()) if len(values) else None,
-            "max_F": float(values.max()) if len(values) else None,
         }
 
     def write_summary(self, summary: dict[str, Any]) -> None:
@@ -204,15 +145,11 @@ class RunWriter:
             path.write_text(text + "\n", encoding="utf-8")
 
 
-def _quantiles(values: Array) -> dict[str, float] | None:
+def _quantiles(values: Sequence[float]) -> dict[str, float] | None:
     if not len(values):
         return None
     return {
         "median": float(np.median(values)),
         "p95": float(np.percentile(values, 95)),
-        "max": float(values.max()),
+        "max": float(max(values)),
     }
-
-
-def _largest(values: Array) -> float | None:
-    return float(values.max()) if len(values) else None

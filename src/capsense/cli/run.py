@@ -1,4 +1,4 @@
-"""``capsense run``: a scenario file in, readings out."""
+"""``capsense run`` and ``capsense record``: a scenario file in, readings or a recording out."""
 
 from __future__ import annotations
 
@@ -9,72 +9,72 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from capsense.cli.console import (
+    INTERRUPTED,
+    OK,
+    BuildProgress,
+    Command,
+    Interrupt,
+    add_quiet,
+    facts,
+    field_figures,
+    grouped,
+    progress_shown,
+    sample_rate,
+    say,
+    seconds,
+    table,
+)
+from capsense.errors import RecordingError
+
 if TYPE_CHECKING:
-    from capsense.cli.interrupt import Interrupt
     from capsense.cli.recorder import RunWriter
+    from capsense.recording.recorder import Recorder
     from capsense.scenario import Sample, Scenario
     from capsense.simulator import Simulator
 
-NAME = "run"
-HELP = "simulate a scenario file and write its readings"
-DESCRIPTION = """\
-Simulate a scenario: a sensor, bodies that move in front of it, and how it is sampled.
 
-The output folder receives
-  readings.csv   one row per sample: time and capacitances, written as they are computed
-  readings.npz   the same as arrays, with full matrices and the bodies' poses
-  summary.json   what was computed, how long it took, versions
-  plot.png       the signals, and the bodies' way over the electrodes
-
-Ctrl-C finishes the sample at hand and keeps what was computed.
-The field of a design is computed once, at its first use, and kept in the user's cache.
-"""
-EXAMPLES = """\
-  capsense run examples/hand_approach.toml -o out/
-  capsense run examples/steel_bar_triangle.toml -o out/ --force
-  capsense run my.toml -o quick/ --rate 2        a quick look: two samples a second
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
+def _add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", metavar="SCENARIO.toml", type=Path, help="the scenario file")
+    parser.add_argument(
+        "--rate", metavar="HZ", type=sample_rate, help="sample rate, instead of the scenario's"
+    )
+    add_quiet(parser)
+
+
+def chosen_scenario(args: argparse.Namespace) -> Scenario:
+    """The scenario file of the arguments, at their sample rate if they have one."""
+    from capsense.scenario import load_scenario
+
+    scenario = load_scenario(args.scenario)
+    return scenario if args.rate is None else scenario.resampled(args.rate)
+
+
+def _load(args: argparse.Namespace) -> Scenario:
+    """The scenario; warns of bodies that it does without."""
+    scenario = chosen_scenario(args)
+    for name in absent_bodies(scenario):
+        say(f'warning: body "{name}" never enters the domain; it has no effect')
+    return scenario
+
+
+def _run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    _add_scenario(parser)
     parser.add_argument(
         "-o", "--output", metavar="DIR", type=Path, required=True, help="folder for the results"
     )
     parser.add_argument(
         "--force", action="store_true", help="replace the results in a folder that is not empty"
     )
-    parser.add_argument(
-        "--rate", metavar="HZ", type=sample_rate, help="sample rate, instead of the scenario's"
-    )
-    parser.add_argument(
-        "-q", "--quiet", action="store_true", help="no progress bar, no summary; errors only"
-    )
 
 
-def sample_rate(text: str) -> float:
-    """A sample rate [Hz] from the command line."""
-    value = float(text)
-    if not 1e-3 <= value <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text} Hz; give a number from 0.001 to 1e6")
-    return value
-
-
-def execute(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace) -> int:
     """Run the scenario and return the exit code."""
-    from capsense.cli.interrupt import Interrupt
-    from capsense.cli.main import INTERRUPTED, OK, say
     from capsense.cli.recorder import RunWriter, prepare_folder
-    from capsense.cli.tables import field_figures
-    from capsense.scenario import load_scenario
     from capsense.scene import Scene
 
-    scenario = load_scenario(args.scenario)
-    if args.rate is not None:
-        scenario = scenario.resampled(args.rate)
-    for name in absent_bodies(scenario):
-        say(f'warning: body "{name}" never enters the domain; it has no effect')
+    scenario = _load(args)
     made = not args.output.exists()
     prepare_folder(args.output, force=args.force)
     with Interrupt() as interrupt:
@@ -105,7 +105,7 @@ def execute(args: argparse.Namespace) -> int:
                 raise
             say(f"error: the results could not be written: {error.strerror}")
     if not args.quiet:
-        print(report(summary, args.output))
+        print(_run_report(summary, args.output))
     if failure is not None:
         time = scenario.times[recorder.count]
         say(
@@ -135,15 +135,9 @@ def absent_bodies(scenario: Scenario) -> list[str]:
     return [str(b.body.name) for b, ever in zip(scenario.bodies, seen, strict=True) if not ever]
 
 
-def progress_shown(quiet: bool) -> bool:
-    """Whether there is somebody to watch a bar."""
-    return not quiet and sys.stderr.isatty()
-
-
 def build_simulator(scenario: Scenario, *, quiet: bool) -> Simulator:
     """The simulator that a scenario asks for, with a bar while its field is built."""
     import capsense
-    from capsense.cli.progress import BuildProgress
 
     with BuildProgress(shown=progress_shown(quiet)) as progress:
         return capsense.Simulator(scenario.design, method=scenario.method, progress=progress)
@@ -173,18 +167,17 @@ def play_samples(
 
 
 def _write(recorder: RunWriter, summary: dict[str, Any]) -> None:
-    from capsense.cli.plot import plot_run
+    from capsense.plotting.runs import plot_run
 
     recorder.write_arrays()
     recorder.write_summary(summary)
     if recorder.count:
-        plot_run(recorder).savefig(recorder.folder / "plot.png", dpi=150)
+        plot_run(recorder.run).savefig(recorder.folder / "plot.png", dpi=150)
 
 
-def report(summary: dict[str, Any], folder: Path) -> str:
+def _run_report(summary: dict[str, Any], folder: Path) -> str:
     """The summary for people."""
     from capsense.cli.recorder import FILES
-    from capsense.cli.tables import facts, grouped, seconds, table
 
     field = ", ".join(f"{grouped(value)} {key}" for key, value in summary["field"].items())
     samples = f"{summary['samples']} of {summary['samples_planned']}"
@@ -226,3 +219,119 @@ def _channel_row(channel: dict[str, Any]) -> list[str]:
     level, low, high = (channel[key] for key in ("baseline_F", "min_F", "max_F"))
     share = [f"{100 * v / level:.2f}" if level else "–" for v in (low, high)]
     return [channel["name"], *(f"{v * 1e12:.5f}" for v in (level, low, high)), *share]
+
+
+RUN = Command(
+    "run",
+    "simulate a scenario file and write its readings",
+    """\
+Simulate a scenario: a sensor, bodies that move in front of it, and how it is sampled.
+
+The output folder receives
+  readings.csv   one row per sample: time and capacitances, written as they are computed
+  readings.npz   the same as arrays, with full matrices and the bodies' poses
+  summary.json   what was computed, how long it took, versions
+  plot.png       the signals, and the bodies' way over the electrodes
+
+Ctrl-C finishes the sample at hand and keeps what was computed.
+The field of a design is computed once, at its first use, and kept in the user's cache.
+""",
+    """\
+  capsense run examples/hand_approach.toml -o out/
+  capsense run examples/steel_bar_triangle.toml -o out/ --force
+  capsense run my.toml -o quick/ --rate 2        a quick look: two samples a second
+""",
+    _run_arguments,
+    _run,
+)
+
+
+def _record_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    _add_scenario(parser)
+    parser.add_argument(
+        "-o", "--output", metavar="FILE.mcap", type=Path, required=True, help="the recording"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    parser.add_argument(
+        "--readout", metavar="CHIP|FILE.toml",
+        help="record what a chip reports, too: its name, or a readout file",
+    )  # fmt: skip
+    parser.add_argument(
+        "--name", default="sensor", help="of the sensor: its frame, and the beginning of its topics"
+    )
+
+
+def _record(args: argparse.Namespace) -> int:
+    """Record the scenario and return the exit code."""
+    from capsense.recording.files import check_target
+    from capsense.recording.recorder import Recorder, check_name, make_readout
+    from capsense.recording.ros import require
+
+    require()
+    scenario = _load(args)
+    if args.output.suffix != ".mcap":
+        raise RecordingError(
+            f"--output {args.output}: recordings are MCAP files; give a name that ends in .mcap"
+        )
+    check_target(args.output, overwrite=args.force)
+    check_name(args.name)
+    make_readout(args.readout, scenario.design.electrode_names)
+    with Interrupt() as interrupt:
+        simulator = build_simulator(scenario, quiet=args.quiet)
+        recorder = Recorder(
+            args.output, simulator, name=args.name, readout=args.readout, scenario=scenario,
+            overwrite=args.force,
+        )  # fmt: skip
+        interrupt.deferring = True
+        try:
+            with recorder:
+                play_samples(
+                    scenario, simulator,
+                    lambda s: recorder.write(s.time, s.scene, s.reading),
+                    interrupt, quiet=args.quiet,
+                )  # fmt: skip
+        except Exception:
+            time = scenario.times[min(recorder.count, scenario.count - 1)]
+            say(f"stopped at sample {recorder.count} of {scenario.count} (t = {time:g} s)")
+            raise
+    if not args.quiet:
+        print(_record_report(scenario, recorder))
+    if interrupt.requested and recorder.count < scenario.count:
+        say(f"interrupted after {recorder.count} of {scenario.count} samples, which are kept")
+        return INTERRUPTED
+    return OK
+
+
+def _record_report(scenario: Scenario, recorder: Recorder) -> str:
+
+    size = recorder.path.stat().st_size
+    return facts(
+        [
+            ("scenario", scenario.name),
+            ("design", f"{scenario.design.name}, {len(scenario.design.electrodes)} electrodes"),
+            ("samples", f"{recorder.count} of {scenario.count}, at {scenario.sample_rate:g} Hz"),
+            ("recording", f"{recorder.path}, {size / 1e6:.2f} MB"),
+        ]
+    )
+
+
+RECORD = Command(
+    "record",
+    "simulate a scenario file and record every step as MCAP, for ROS 2 and Foxglove",
+    """\
+Simulate a scenario, and record every step in an MCAP file of ROS 2 messages: bodies and their
+poses, capacitance matrices, transforms, markers, and the counts of a readout. Foxglove and
+'ros2 bag' open it; 'capsense replay' simulates it again and compares; 'capsense export' makes
+tables of it.
+
+Every half second all that was computed is put into the file. Whatever ends the process, the
+rest can be read.
+""",
+    """\
+  capsense record examples/hand_approach.toml -o hand.mcap
+  capsense record examples/hand_approach.toml -o hand.mcap --readout fdc1004 --force
+""",
+    _record_arguments,
+    _record,
+)

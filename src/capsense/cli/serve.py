@@ -1,4 +1,4 @@
-"""``capsense serve``: sensors for Unity, browsers and other programs, over a WebSocket."""
+"""``capsense serve`` and ``capsense view``: sensors for other programs, and in a browser."""
 
 from __future__ import annotations
 
@@ -6,35 +6,35 @@ import argparse
 import json
 import logging
 import signal
+import socket
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from capsense.cli.console import (
+    OK,
+    BuildProgress,
+    Command,
+    progress_shown,
+    sample_rate,
+    say,
+)
+from capsense.cli.run import build_simulator, chosen_scenario
+
 if TYPE_CHECKING:
-    from capsense.server.options import Limits
+    from capsense.server.connection import Limits
     from capsense.server.server import Server
+    from capsense.viewer.player import Playback
+    from capsense.viewer.view import LiveView
 
-NAME = "serve"
-HELP = "serve sensors to Unity, browsers and other programs"
-DESCRIPTION = """\
-Serve sensors over a WebSocket: clients send depth images or bodies, and receive capacitances.
 
-Logs one JSON object a line on stderr. GET /health on the same port answers how it is. Ctrl-C, or a
-request to terminate, finishes what is in work, closes all connections and ends with exit code 0; a
-second one stops at once.
-"""
-EXAMPLES = """\
-  capsense serve --design six_patch
-  capsense serve --design six_patch --design my.toml --readout fdc1004
-  capsense serve --design stripe --host 0.0.0.0 --token-file token.txt
-  capsense serve --design stripe --origin http://localhost:3000      for a web page
-"""
 SWITCH_INTERVAL = 5e-4
 """Time [s] after which Python's threads take turns, so that no client waits long for another."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _serve_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
         "--design", metavar="NAME|FILE.toml", action="append", required=True,
@@ -68,13 +68,11 @@ _LIMITS = {
 }
 
 
-def execute(args: argparse.Namespace) -> int:
+def _serve(args: argparse.Namespace) -> int:
     """Serve until told to stop, and return the exit code."""
     import asyncio
 
-    from capsense.cli.main import OK
-    from capsense.cli.progress import BuildProgress
-    from capsense.server.options import ServerOptions
+    from capsense.server.connection import ServerOptions
     from capsense.server.server import Server
 
     options = ServerOptions(
@@ -82,7 +80,7 @@ def execute(args: argparse.Namespace) -> int:
         tuple(args.origin), _limits(args), args.watch,
     )  # fmt: skip
     logger = _logger(quiet=args.quiet)
-    with BuildProgress(shown=not args.quiet and sys.stderr.isatty()) as progress:
+    with BuildProgress(shown=progress_shown(args.quiet)) as progress:
         server = Server(options, progress=progress, logger=logger)
     sys.setswitchinterval(SWITCH_INTERVAL)
     asyncio.run(_run(server))
@@ -90,7 +88,7 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _limits(args: argparse.Namespace) -> Limits:
-    from capsense.server.options import Limits
+    from capsense.server.connection import Limits
 
     values = {name: getattr(args, f"max_{name}") for name in _LIMITS}
     return Limits(**{name: value for name, value in values.items() if value is not None})
@@ -150,3 +148,170 @@ def _logger(*, quiet: bool) -> logging.Logger:
     logger.setLevel(logging.ERROR if quiet else logging.INFO)
     logger.propagate = False
     return logger
+
+
+SERVE = Command(
+    "serve",
+    "serve sensors to Unity, browsers and other programs",
+    """\
+Serve sensors over a WebSocket: clients send depth images or bodies, and receive capacitances.
+
+Logs one JSON object a line on stderr. GET /health on the same port answers how it is. Ctrl-C, or a
+request to terminate, finishes what is in work, closes all connections and ends with exit code 0; a
+second one stops at once.
+""",
+    """\
+  capsense serve --design six_patch
+  capsense serve --design six_patch --design my.toml --readout fdc1004
+  capsense serve --design stripe --host 0.0.0.0 --token-file token.txt
+  capsense serve --design stripe --origin http://localhost:3000      for a web page
+""",
+    _serve_arguments,
+    _serve,
+)
+
+
+LOOPBACK = ("localhost", "::1")
+
+
+def _view_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "scenario", metavar="SCENARIO.toml", type=Path, nargs="?", help="the scenario file"
+    )
+    parser.add_argument("--replay", metavar="FILE.mcap", type=Path, help="show a recording")
+    parser.add_argument("--connect", metavar="URL", help="watch a server, ws://HOST:PORT")
+    parser.add_argument(
+        "--sensor", metavar="CLIENT:SENSOR", type=_address,
+        help="which of the server's, by its log's numbers; default the one opened last",
+    )  # fmt: skip
+    parser.add_argument(
+        "--token-file", metavar="FILE", type=Path, help="file with the token the server asks for"
+    )
+    parser.add_argument(
+        "--rate", metavar="HZ", type=sample_rate, help="sample rate, instead of the scenario's"
+    )
+    parser.add_argument("--host", default="127.0.0.1", help="address; default this machine only")
+    parser.add_argument("--port", type=int, default=8080, help="default 8080; 0 for any")
+    parser.add_argument("--paused", action="store_true", help="do not start to play")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print the page's address only")
+
+
+def _view(args: argparse.Namespace) -> int:
+    """Show it until told to stop, and return the exit code."""
+    from capsense.viewer.view import LiveView, check_address
+
+    _check_view(args)
+    check_address(args.host, args.port)
+    player = _player(args)
+    try:
+        view = LiveView(player, host=args.host, port=args.port)
+        try:
+            _announce(view, args)
+            if args.paused:
+                player.pause()
+            else:
+                player.play()
+            view.run(threading.Event())
+        except KeyboardInterrupt:  # its proper end
+            pass
+        finally:
+            view.stop()
+    finally:
+        player.stop()
+    return OK
+
+
+def _address(text: str) -> tuple[int, int]:
+    """Parse ``--sensor``."""
+    client, colon, sensor = text.partition(":")
+    if not (colon and client.isdecimal() and sensor.isdecimal()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not CLIENT:SENSOR, such as 3:0")
+    return int(client), int(sensor)
+
+
+def _check_view(args: argparse.Namespace) -> None:
+    """Raise for arguments that do not go together."""
+    from capsense.errors import ScenarioError
+
+    given = {
+        "a scenario": args.scenario is not None,
+        "--replay": args.replay is not None,
+        "--connect": args.connect is not None,
+    }
+    if sum(given.values()) != 1:
+        found = " and ".join(name for name, there in given.items() if there) or "nothing"
+        raise ScenarioError(
+            f"{found} is given; give one of a scenario file, --replay FILE.mcap, --connect URL"
+        )
+    for option, value, only in (
+        ("--sensor", args.sensor, "--connect"),
+        ("--token-file", args.token_file, "--connect"),
+        ("--rate", args.rate, "a scenario"),
+    ):
+        if value is not None and not given[only]:
+            raise ScenarioError(f"{option} goes with {only} only; leave it out")
+
+
+def _player(args: argparse.Namespace) -> Playback:
+    """What is to be shown, ready to play."""
+    from capsense.viewer.player import Player
+
+    with BuildProgress(shown=progress_shown(args.quiet)) as progress:
+        if args.connect is not None:
+            from capsense.viewer.show import Follower
+            from capsense.viewer.source import Watched
+
+            token = read_token(args.token_file) or ""
+            return Follower(
+                Watched(
+                    args.connect, token=token, which=args.sensor, progress=progress,
+                    waiting=lambda: say("waiting for a client to open a sensor"),
+                )
+            )  # fmt: skip
+        from capsense.viewer.source import RecordingSource, ScenarioSource
+
+        if args.replay is not None:
+            from capsense.recording.reader import open_recording
+
+            return Player(RecordingSource(open_recording(args.replay), progress))
+    scenario = chosen_scenario(args)
+    return Player(ScenarioSource(scenario, build_simulator(scenario, quiet=args.quiet)))
+
+
+def _announce(view: LiveView, args: argparse.Namespace) -> None:
+    """Say where the page is, and how to get at it."""
+
+    if args.host.startswith("127.") or args.host in LOOPBACK:
+        if not args.quiet:
+            port = view.url.rpartition(":")[2]
+            say(
+                f"from another machine: ssh -L {port}:{view.url.removeprefix('http://')} "
+                f"{socket.gethostname()}, then open http://localhost:{port} there; Ctrl-C ends it"
+            )
+    else:
+        say("warning: whoever reaches this address sees the page and can move it about")
+    print(view.url, flush=True)  # last: whoever waits for it may stop the view at once
+
+
+VIEW = Command(
+    "view",
+    "show a sensor at work, live in a web browser",
+    """\
+Show a sensor in a web browser: its electrodes coloured by their signals, the bodies, the potential
+on a plane, charts of the channels, and the matrix. Time can be paused, stepped and moved about in.
+
+A scenario is simulated as it is shown; --replay shows a recording; --connect watches what clients
+of a running 'capsense serve --watch' do.
+
+No display is needed: the page is served, by default to browsers on this machine, and needs nothing
+from the internet. Ctrl-C, or a request to terminate, ends it with exit code 0.
+""",
+    """\
+  capsense view examples/hand_approach.toml
+  capsense view --replay hand.mcap --port 9000
+  capsense view --connect ws://127.0.0.1:8765
+""",
+    _view_arguments,
+    _view,
+)

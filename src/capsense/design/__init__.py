@@ -3,17 +3,3 @@
 from capsense.design.geometry import Facet, Surface
 from capsense.design.loader import available_designs, load_design, parse_design
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
-
-__all__ = [
-    "Conductor",
-    "Design",
-    "Domain",
-    "Electrode",
-    "Facet",
-    "Layer",
-    "Role",
-    "Surface",
-    "available_designs",
-    "load_design",
-    "parse_design",
-]

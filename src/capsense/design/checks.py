@@ -1,15 +1,28 @@
-"""Checks on a whole design: short circuits, things that leave the box, layers cut by sheets."""
+"""Checks on a whole design, and the free gap that is cut into a pour around electrodes."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry import Polygon
+from shapely.geometry.polygon import orient
 
-from capsense.design.contact import TOUCH, coplanar_overlap, enters_box, find_contact
-from capsense.design.geometry import Facet, Surface
+from capsense.design.geometry import (
+    TOUCH,
+    Facet,
+    Surface,
+    boundary_segments,
+    coplanar_overlap,
+    enters_box,
+    find_contact,
+    in_plane_of,
+)
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
+from capsense.design.tables import DesignTable
 from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
@@ -18,12 +31,11 @@ Array = NDArray[np.float64]
 def check_design(design: Design, *, source: str = "design") -> None:
     """Refuse a design that could not be built, or that the field solver could not treat.
 
-    Raises
-    ------
-    DesignError
-        If there is no electrode; if a name is used twice; if an electrode touches another, or a
-        conductor; if anything leaves the domain; if layers overlap; if a sheet crosses a layer's
-        surface. The message names ``source``, the item, the value and the mend.
+    Raises:
+        DesignError: If there is no electrode; if a name is used twice; if an electrode touches
+            another, or a conductor; if anything leaves the domain; if layers overlap; if a sheet
+            crosses a layer's surface. The message names ``source``, the item, the value and the
+            mend.
     """
     if not design.electrodes:
         raise DesignError(f"{source}: design has no electrode; add an [[electrode]] table")
@@ -80,36 +92,30 @@ def _at(point: Array) -> str:
     return "(" + ", ".join(f"{x:.6g}" for x in np.round(point, 9) + 0.0) + ") m"
 
 
+def _beyond(bounds: Array, domain: Domain, margin: float) -> Iterator[tuple[str, str]]:
+    """What bounds, shape (2, 3), do that are not ``margin`` inside, and where, in words."""
+    walls = np.array([domain.lower, domain.upper])
+    room = (bounds - walls) * [[1.0], [-1.0]]
+    for axis, side in zip(*np.nonzero(margin > room.T), strict=True):
+        name, value, wall = "xyz"[axis], bounds[side, axis], walls[side, axis]
+        verb = "touches" if abs(value - wall) < TOUCH else "leaves"
+        yield verb, f"it reaches {name} = {value:.6g} m and the wall is at {name} = {wall:.6g} m"
+
+
 def _inside_domain(sheet: Electrode | Conductor, domain: Domain, source: str) -> None:
-    for axis, name in enumerate("xyz"):
-        low, high = sheet.surface.bounds[:, axis]
-        wall_low, wall_high = float(domain.lower[axis]), float(domain.upper[axis])
-        for value, wall, out in (
-            (low, wall_low, low - wall_low < TOUCH),
-            (high, wall_high, wall_high - high < TOUCH),
-        ):
-            if out:
-                kind = "touches" if abs(value - wall) < TOUCH else "leaves"
-                raise DesignError(
-                    f"{source}: {_label(sheet)}: {kind} the grounded box: it reaches "
-                    f"{name} = {value:.6g} m and the wall is at {name} = {wall:.6g} m; move it "
-                    "inside (center, z, size) or enlarge domain size or backplane; "
-                    "lengths are metres"
-                )
+    for verb, where in _beyond(sheet.surface.bounds, domain, TOUCH):
+        raise DesignError(
+            f"{source}: {_label(sheet)}: {verb} the grounded box: {where}; move it inside (center, "
+            "z, size) or enlarge domain size or backplane; lengths are metres"
+        )
 
 
 def _layer_inside_domain(layer: Layer, domain: Domain, source: str) -> None:
-    for axis, name in enumerate("xyz"):
-        for value, wall, out in (
-            (layer.lower[axis], domain.lower[axis], layer.lower[axis] < domain.lower[axis] - TOUCH),
-            (layer.upper[axis], domain.upper[axis], layer.upper[axis] > domain.upper[axis] + TOUCH),
-        ):
-            if out:
-                raise DesignError(
-                    f"{source}: {_label(layer)}: leaves the domain: it reaches {name} = "
-                    f"{value:.6g} m and the wall is at {name} = {wall:.6g} m; reduce its size or "
-                    "z, or enlarge domain size or backplane; lengths are metres"
-                )
+    for _, where in _beyond(np.array([layer.lower, layer.upper]), domain, -TOUCH):
+        raise DesignError(
+            f"{source}: {_label(layer)}: leaves the domain: {where}; reduce its size or z, or "
+            "enlarge domain size or backplane; lengths are metres"
+        )
 
 
 def _apart(one: Layer, other: Layer, source: str) -> None:
@@ -158,3 +164,56 @@ def _not_crossing(sheet: Electrode | Conductor, layer: Layer, source: str) -> No
         f"to {_at(high)}, the layer {_at(layer.lower)} to {_at(layer.upper)}; put it on a face of "
         f"the layer (such as z = {layer.upper[2]:g}), or wholly inside or outside"
     )
+
+
+SLIVER = 1e-5
+"""Remainders narrower than this [m] are dropped: no board house would etch them."""
+GRID = 1e-9
+"""Coordinates of cut outlines are snapped to this grid [m]."""
+
+
+def cut_clearance(table: DesignTable, surface: Surface, electrodes: Sequence[Electrode]) -> Surface:
+    """Cut ``clearance`` [m] around every electrode that lies in a facet's plane.
+
+    The gap's outline is the electrode's, offset with mitred corners. What remains may be several
+    pieces with holes; they stay one conductor, as a pour stitched by vias is. A pour in another
+    plane than the electrodes' keeps its outline.
+
+    Raises
+    ------
+    DesignError
+        If ``clearance`` is no positive length, if the conductor is not flat, or if nothing of it
+        remains.
+    """
+    clearance = table.length("clearance")
+    facets: list[Facet] = []
+    cut = False
+    for facet in surface.facets:
+        gaps = []
+        for electrode in electrodes:
+            for other in electrode.surface.facets:
+                outline = in_plane_of(facet, other)
+                if outline is not None:
+                    gaps.append(outline.buffer(clearance, join_style="mitre", mitre_limit=2.0))
+        if not gaps:
+            facets.append(facet)
+            continue
+        cut = True
+        rest = shapely.difference(
+            facet.polygon, shapely.union_all(gaps, grid_size=GRID), grid_size=GRID
+        )
+        for piece in shapely.get_parts(rest):
+            if isinstance(piece, Polygon) and not piece.buffer(-SLIVER / 2).is_empty:
+                facets.append(Facet(orient(piece), facet.origin, facet.axes))
+    if not cut:
+        return surface
+    if any(in_plane_of(surface.facets[0], f) is None for f in surface.facets):
+        raise table.error(
+            f"clearance = {clearance:g} needs a flat conductor; give the pour as a planar shape of "
+            "its own"
+        )
+    if not facets:
+        raise table.error(
+            f"clearance = {clearance:g} leaves nothing of it; make it larger or reduce clearance"
+        )
+    return Surface(tuple(facets), np.concatenate([boundary_segments(f) for f in facets]))

@@ -10,15 +10,19 @@ from typing import Any
 import numpy as np
 
 from capsense._validate import nearest, read_toml, suggest
-from capsense.design.checks import check_design, snap_to_layers
-from capsense.design.clearance import cut_clearance
-from capsense.design.curved import bend_sheet, cylinder_surface, is_level, read_bend
+from capsense.design.checks import check_design, cut_clearance, snap_to_layers
 from capsense.design.geometry import Surface
-from capsense.design.materials import LAYER_EPS_R
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
-from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import DesignTable
-from capsense.design.shapes import SHAPES, box_surface, planar_surface
+from capsense.design.shapes import (
+    SHAPES,
+    bend_sheet,
+    box_surface,
+    cylinder_surface,
+    is_level,
+    planar_surface,
+    read_bend,
+)
+from capsense.design.tables import LAYER_EPS_R, PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
 STL_KEYS = ("file", "unit", "scale", "part", "closed")
@@ -46,22 +50,17 @@ def available_designs() -> tuple[str, ...]:
 def load_design(name_or_path: str | Path) -> Design:
     """Load a sensor design.
 
-    Parameters
-    ----------
-    name_or_path
-        Name of a packaged design, see :func:`available_designs`, or path to a design ``.toml``.
+    Args:
+        name_or_path: Name of a packaged design, see :func:`available_designs`, or path to a design
+            ``.toml``.
 
-    Returns
-    -------
-    Design
+    Returns:
         The checked design; lengths in metres, in the sensor frame (origin at the centre of the
         electrode plane, z out of the sensor).
 
-    Raises
-    ------
-    DesignError
-        If there is no such design, or if anything in its file is wrong; the message names the
-        file, the item, the value and the mend.
+    Raises:
+        DesignError: If there is no such design, or if anything in its file is wrong; the message
+            names the file, the item, the value and the mend.
     """
     text = str(name_or_path)
     if isinstance(name_or_path, str) and not text.endswith(".toml") and not set("/\\") & set(text):
@@ -89,19 +88,13 @@ def parse_design(
 ) -> Design:
     """Build a checked design from the content of a design file, given as nested dicts.
 
-    Parameters
-    ----------
-    data
-        What ``tomllib`` makes of a design file.
-    source
-        Name of the file, for messages.
-    folder
-        Folder that STL files are relative to; the current one by default.
+    Args:
+        data: What ``tomllib`` makes of a design file.
+        source: Name of the file, for messages.
+        folder: Folder that STL files are relative to; the current one by default.
 
-    Raises
-    ------
-    DesignError
-        If anything is wrong; the message names the item, the value and the mend.
+    Raises:
+        DesignError: If anything is wrong; the message names the item, the value and the mend.
     """
     top = DesignTable(data, source, "design")
     top.only(TOP_KEYS)
@@ -119,9 +112,13 @@ def parse_design(
             out.append(DesignTable(raw, source, tag, limit))
         return out
 
-    electrodes = [_read_electrode(t, where, domain) for t in items("electrode")]
+    electrodes = [
+        Electrode(t.string("name"), _read_surface(t, where, domain, ())) for t in items("electrode")
+    ]
     for table in items("electrodes_from_stl"):
-        electrodes += _read_stl_group(table, where, domain)
+        from capsense.design.stl_shape import read_imprint_group
+
+        electrodes += read_imprint_group(table, where, domain)
     layers = [_read_layer(t) for t in items("layer")]
     stack = tuple(layers)
     electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack)) for e in electrodes]
@@ -151,7 +148,7 @@ def parse_design(
 
 
 def _read_domain(table: DesignTable) -> Domain:
-    table.only(("size", "backplane"))
+    table.only(("size", "backplane", "open"))
     sx, sy, sz = table.sizes("size", 3, "[x, y, z] in metres")
     backplane = table.length("backplane")
     if backplane >= sz:
@@ -159,7 +156,7 @@ def _read_domain(table: DesignTable) -> Domain:
             f"backplane = {backplane:g} must be smaller than the box's height, {sz:g}; it is the "
             "distance from the electrode plane z = 0 down to the box's floor"
         )
-    return Domain((sx, sy, sz), backplane)
+    return Domain((sx, sy, sz), backplane, table.boolean("open", False))
 
 
 def _read_build(table: DesignTable) -> dict[str, float]:
@@ -195,16 +192,6 @@ def _bent(sheet: Electrode | Conductor, radius: float, source: str) -> Surface:
         return sheet.surface
     item = f'{source}: {type(sheet).__name__.lower()} "{sheet.name}"'
     return bend_sheet(item, sheet.surface, radius)
-
-
-def _read_electrode(table: DesignTable, folder: Path, domain: Domain) -> Electrode:
-    return Electrode(table.string("name"), _read_surface(table, folder, domain, ()))
-
-
-def _read_stl_group(table: DesignTable, folder: Path, domain: Domain) -> list[Electrode]:
-    from capsense.design.stl_shape import read_imprint_group
-
-    return read_imprint_group(table, folder, domain)
 
 
 def _read_conductor(

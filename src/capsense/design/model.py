@@ -14,15 +14,29 @@ from capsense.design.geometry import Surface, ring_vertices
 
 Array = NDArray[np.float64]
 
+_INFINITY = 1e5
+"""How many box sizes below an open domain its ground lies."""
+
 
 @dataclass(frozen=True)
 class Domain:
-    """The grounded box around a sensor, centred in x and y, its floor at z = −backplane."""
+    """The grounded box around a sensor, centred in x and y, its floor at z = −backplane.
+
+    An open domain has no walls: ground is at infinity, and the box only says where bodies are
+    looked for.
+    """
 
     size: tuple[float, float, float] = (0.5, 0.5, 0.5)
     """Full edge lengths of the box [m]."""
     backplane: float = 0.010
     """Distance from the electrode plane z = 0 down to the box's floor [m]."""
+    open: bool = False
+    """Whether there are no grounded walls and no floor."""
+
+    @property
+    def floor(self) -> float:
+        """Height of the grounded floor [m]; of an open domain, so far down that it does nothing."""
+        return -_INFINITY * max(self.size) if self.open else -self.backplane
 
     @property
     def lower(self) -> Array:
@@ -109,6 +123,7 @@ def design_hash(design: Design) -> str:
     """SHA-256 (hex) over everything of a design that its fields depend on."""
     lines = ["capsense design 1"]
     lines.append(f"domain {_nanometres(np.array([*design.domain.size, design.domain.backplane]))}")
+    lines += ["open"] * design.domain.open
     for electrode in design.electrodes:
         lines += ["electrode", *_surface_lines(electrode.surface)]
     others = [

@@ -30,10 +30,9 @@ CREASE_DEGREES = 30.0
 def read_stl(path: Path) -> Array:
     """Triangles of a binary or ASCII STL file, in the file's unit, shape (n, 3, 3).
 
-    Raises
-    ------
-    DesignError
-        If the file cannot be read, or is no STL file, or has more than 20,000 triangles.
+    Raises:
+        DesignError: If the file cannot be read, or is no STL file, or has more than 20,000
+            triangles.
     """
     try:
         raw = path.read_bytes()
@@ -107,11 +106,9 @@ class SheetMesh:
 def weld(triangles: Array) -> SheetMesh:
     """Weld triangles [m], shape (n, 3, 3), to a mesh and make sure that it is a manifold.
 
-    Raises
-    ------
-    DesignError
-        If triangles are degenerate or double, if an edge has more than two faces, or if the
-        sheet has only one side.
+    Raises:
+        DesignError: If triangles are degenerate or double, if an edge has more than two faces, or
+            if the sheet has only one side.
     """
     grid = np.rint(triangles.reshape(-1, 3) / WELD).astype(np.int64)
     _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)

@@ -11,9 +11,8 @@ from shapely.affinity import translate
 from capsense._validate import UNITS
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Domain, Electrode
-from capsense.design.placement import PLACEMENT_KEYS, read_placement
-from capsense.design.schema import DesignTable
 from capsense.design.stl import SheetMesh, read_stl, sheet_surface, weld
+from capsense.design.tables import PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
@@ -69,10 +68,8 @@ def _require_closed(table: DesignTable, mesh: SheetMesh, why: str) -> None:
 def read_stl_surface(table: DesignTable, folder: Path, domain: Domain) -> Surface:
     """Read an item of shape "stl": an open sheet, a closed shell, or one part of an imprinted box.
 
-    Raises
-    ------
-    DesignError
-        If the file, its unit or its content is wrong.
+    Raises:
+        DesignError: If the file, its unit or its content is wrong.
     """
     if "part" in table:
         return _read_part(table, folder, domain)
@@ -117,10 +114,8 @@ def read_imprint_group(table: DesignTable, folder: Path, domain: Domain) -> list
 
     Keys are ``file``, ``unit`` and ``name``, in which "{}" becomes the part's number from 1.
 
-    Raises
-    ------
-    DesignError
-        If the file, its unit or its content is wrong, or if ``name`` has no "{}".
+    Raises:
+        DesignError: If the file, its unit or its content is wrong, or if ``name`` has no "{}".
     """
     table.only(("file", "unit", "name"))
     name = table.string("name", "E{}")
@@ -138,10 +133,8 @@ def imprinted_parts(table: DesignTable, folder: Path, domain: Domain) -> list[Su
     would short the electrode. The box is moved so that its floor's centre comes to x = y = 0 and
     the floor to z = −backplane; a mesa of height h then is an electrode at z = h − backplane.
 
-    Raises
-    ------
-    DesignError
-        If the surface is not closed, differs in size from the domain, or has no mesas.
+    Raises:
+        DesignError: If the surface is not closed, differs in size from the domain, or has no mesas.
     """
     file = table.string("file")
     mesh = _weld(table, _read_triangles(table, folder))

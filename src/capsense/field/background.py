@@ -12,7 +12,7 @@ from capsense.design.model import Design
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
 from capsense.field.green import GreenFunction, build_green
-from capsense.mesh.settings import MeshSettings
+from capsense.mesh.lattice import MeshSettings
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]

@@ -34,10 +34,12 @@ _FEW_FACETS = 64
 """Sheets of more facets than this are curved; their facets are not searched for narrow gaps."""
 _FAR_PLANE = 0.01
 """Parallel sheets farther apart than this [m] need no panels of their distance."""
-_AMPLE, _FINEST = 4_500, 0.5
-"""Designs of fewer panels than this are cut finer, down to this share of the default sizes."""
-_GROWTH = 1.7
-"""The number of panels goes with their size to minus this power."""
+_FEW, _MANY = 3_000, 9_000
+"""Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
+_FINEST, _COARSEST = 0.5, 8.0
+"""The finest, and where the search begins, as multiples of the default sizes."""
+_POWER = 1.7
+"""The number of panels goes with their size to minus this power, about."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Accuracy:
     """Panel sizes of the boundary-element solution, as multiples of the default."""
 
     scale: float = 1.0
-    """Larger is coarser and faster. Up to 1, designs of few panels are cut finer still."""
+    """Larger is coarser and faster."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +95,8 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
         FieldError: The design needs more panels than fit in memory.
     """
     scale = (accuracy or Accuracy()).scale
-    if scale <= 1.0:
-        few = len(_cut(design, 1.0).panels) / _AMPLE
-        scale *= float(np.clip(few ** (1 / _GROWTH), _FINEST, 1.0))
-    model = _cut(design, scale)
+    fitted = _fitted(design)
+    model = _cut(design, scale * (fitted if scale <= 1.0 else max(fitted, 1.0)))
     if len(model.panels) > _MAX_PANELS:
         raise FieldError(
             f"design {design.name!r} needs {len(model.panels)} boundary panels, more than the "
@@ -105,9 +105,23 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
     return model
 
 
+def _fitted(design: Design) -> float:
+    """Panel sizes that a design can afford, as multiples of the default: 1 for most.
+
+    Sizes are halved from the coarsest on, so that no cut has many more panels than are allowed.
+    """
+    scale, count = _COARSEST, len(_cut(design, _COARSEST).panels)
+    while scale > 1.0 and count * 2**_POWER < 1.5 * _MANY:
+        scale /= 2
+        count = len(_cut(design, scale).panels)
+    if scale > 1.0 or count > _MANY:
+        return scale * (count / _MANY) ** (1 / _POWER)
+    return float(np.clip((count / _FEW) ** (1 / _POWER), _FINEST, 1.0))
+
+
 def _cut(design: Design, scale: float) -> BoundaryModel:
     """Cut a design into panels of the default sizes times ``scale``."""
-    floor = float(design.domain.lower[2])
+    floor = design.domain.floor
     names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
     flat: list[bool] = []
@@ -147,27 +161,39 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
     reach = 2.5 * thin if math.isfinite(thin) else 0.0
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
         width = 2 * facet.polygon.area / facet.polygon.length
-        edge = scale * max(min(0.01 * width, 0.075 * gap, 5e-5), 5e-6)
+        coarse = max(5e-5, 5e-4 * _extent(facet))
+        edge = scale * max(min(0.01 * width, 0.075 * gap, coarse), 5e-6)
         largest = scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
         add(facet, owner, _grading(facet, edge, largest, scale), 2.5 * spacing)
     for facet, thickness in _interfaces(design, sheets):
         edge = scale * min(3e-4, 0.3 * thickness)
         largest = scale * min(0.006, max(1.25 * thickness, 0.001))
+        largest = max(largest, scale * 0.01 * _extent(facet))
         add(facet, INTERFACE, _grading(facet, edge, largest, scale), reach)
     for facet in _walls(design):
         add(facet, GROUND, Grading(0.01, largest=scale * 0.04 * room_scale(design)), 0.0)
 
     return BoundaryModel(
-        concatenate(parts), np.concatenate(owners), np.concatenate(front), np.concatenate(back), floor,
+        concatenate(parts),
+        np.concatenate(owners),
+        np.concatenate(front),
+        np.concatenate(back),
+        floor,
         len(names),
-    )  # fmt: skip
+    )
 
 
 def _grading(facet: Facet, edge: float, largest: float, scale: float) -> Grading:
     """Long thin panels along straight rims, as fine as the facet's size asks for."""
-    extent = max(np.ptp(np.array(facet.polygon.bounds).reshape(2, 2), axis=0))
-    smallest = scale * min(max(0.08 * extent, 3e-4), 2.5e-3)
+    extent = _extent(facet)
+    smallest = scale * min(max(0.08 * extent, 3e-4), max(2.5e-3, 0.02 * extent))
     return Grading(edge, smallest=smallest, largest=max(largest, 1.01 * smallest))
+
+
+def _extent(facet: Facet) -> float:
+    """The longer side of a facet's bounding rectangle [m]."""
+    x0, y0, x1, y1 = facet.polygon.bounds
+    return float(max(x1 - x0, y1 - y0))
 
 
 def _smallest_gaps(sheets: list[tuple[Facet, int]]) -> list[float]:
@@ -251,7 +277,7 @@ def _interfaces(design: Design, sheets: list[tuple[Facet, int]]) -> list[tuple[F
                 np.abs((face.origin - lower) @ face.axes[2]),
                 np.abs((face.origin - upper) @ face.axes[2]),
             )
-            if on_wall < _PLANE_TOL:
+            if on_wall < _PLANE_TOL and not design.domain.open:
                 continue
             region = face.polygon
             for facet, _ in sheets:
@@ -269,7 +295,9 @@ def _interfaces(design: Design, sheets: list[tuple[Facet, int]]) -> list[tuple[F
 
 
 def _walls(design: Design) -> list[Facet]:
-    """Ceiling and side walls of the box; the floor is met by images."""
+    """Ceiling and side walls of the box; the floor is met by images. An open domain has none."""
+    if design.domain.open:
+        return []
     box = Layer("box", "", 1.0, design.domain.lower, design.domain.upper)
     return [f for f in _box_faces(box) if f.axes[2, 2] > -0.5]
 

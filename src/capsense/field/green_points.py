@@ -102,7 +102,7 @@ class Surroundings:
         """Points behind the chosen ones, (k,), (k,) -> (k, 3)."""
         points = self.points[chosen]
         back = -self.normals[chosen]
-        room = points[:, 2] - self.design.domain.lower[2]
+        room = points[:, 2] - self.design.domain.floor
         depth = np.minimum(depth, 0.6 * room / np.maximum(-back[:, 2], 1e-9))
         # not through another sheet and out again where bodies can be
         path = free_path(self.design, points, back)
@@ -194,7 +194,9 @@ def reachable_points(surface: Surroundings, sources: Array, clearance: float, co
 
 
 def wall_sources(design: Design, settings: GreenSettings) -> Array:
-    """Points outside of the ceiling and the side walls [m], shape (n, 3)."""
+    """Points outside of the ceiling and the side walls [m], none if open, shape (n, 3)."""
+    if design.domain.open:
+        return np.empty((0, 3))
     lower, upper = design.domain.lower, design.domain.upper
     off, k = settings.wall_offset * room_scale(design), settings.wall_grid
     low, high = lower - [off, off, 0.0], upper + off

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
-try:
-    import fcntl
-except ImportError:  # not a POSIX system
-    fcntl = None  # type: ignore[assignment]
+from filelock import FileLock, Timeout
 
 _log = logging.getLogger(__name__)
 
 _POLL = 0.1
 """Time between two attempts to take a lock [s]."""
-_BUSY = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
 @contextmanager
@@ -30,54 +22,27 @@ def exclusive(path: Path, waiting: Callable[[], None] = lambda: None) -> Iterato
     Yields whether it is held: where files cannot be locked or written, work goes on without. The
     file is removed in the end.
     """
-    file = _acquire(path, waiting)
+    lock = FileLock(path)
+    held = _acquire(lock, path, waiting)
     try:
-        yield file is not None
+        yield held
     finally:
-        if file is not None:
+        if held:
             with suppress(OSError):
-                path.unlink()
+                path.unlink()  # before others can have it; those who wait see that it is gone
             with suppress(OSError):
-                # a forked child shares the open file; closing it here would not free the lock
-                fcntl.flock(file, fcntl.LOCK_UN)
-            file.close()
+                lock.release()
 
 
-def _acquire(path: Path, waiting: Callable[[], None]) -> IO[bytes] | None:
-    if fcntl is None:
-        return None
+def _acquire(lock: FileLock, path: Path, waiting: Callable[[], None]) -> bool:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         while True:
-            file = open(path, "ab")  # noqa: SIM115
             try:
-                _take(file, waiting)
-                if _is_at(file, path):
-                    return file
-            except BaseException:
-                file.close()
-                raise
-            file.close()  # its last holder has removed it; another may be there by now
+                lock.acquire(timeout=_POLL, poll_interval=_POLL)
+                return True
+            except Timeout:
+                waiting()
     except OSError as error:
         _log.info("builds of the same field are not kept apart: %s", error)
-        return None
-
-
-def _take(file: IO[bytes], waiting: Callable[[], None]) -> None:
-    while True:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except OSError as error:
-            if error.errno not in _BUSY:
-                raise
-        waiting()
-        time.sleep(_POLL)
-
-
-def _is_at(file: IO[bytes], path: Path) -> bool:
-    """Whether an open file is still the one that its path leads to."""
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
         return False

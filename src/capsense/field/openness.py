@@ -31,7 +31,7 @@ def openness(design: Design, points: Array) -> Array:
     z, turn = 1 - 2 * k / _RAYS, k * math.pi * (3 - math.sqrt(5))
     side = np.sqrt(1 - z * z)
     rays = np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
-    floor = float(design.domain.lower[2])
+    floor = design.domain.floor
     out = np.empty(len(points))
     return filled(_fill_views, out, np.ascontiguousarray(points), rays, triangles, floor)
 

@@ -22,7 +22,7 @@ from capsense.errors import (
     SolveError,
 )
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.terminals import Terminals
+from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.step_kernels import Found, Poses, Sensor, step_rows
 from capsense.readout.counts import Held
@@ -99,8 +99,8 @@ class Fleet:
 
     Args:
         design: A design, its name, or the path of its file.
-        bodies: What stands in every environment, one body for each place; their poses are not
-            used. Rigid shapes, of matter without losses.
+        bodies: What stands in every environment, one body for each place; their poses are not used.
+            Rigid shapes, of matter without losses.
         count: How many environments, e.
         sensors: How many sensors of the design each has, s.
         device: ``"cpu"`` for the compiled core on all processors, or a device of Warp:
@@ -348,7 +348,8 @@ class Fleet:
         """Compare some environments with ``Simulator(preset="standard")``.
 
         Args:
-            poses, sensors: As :meth:`step` takes them, on the host.
+            poses: As :meth:`step` takes them, on the host.
+            sensors: As :meth:`step` takes them, on the host.
             samples: How many environments, drawn at random.
             seed: Of the draw.
 

@@ -2,12 +2,12 @@
 
 - :mod:`~capsense.humans.anthropometry`: how large people are
 - :mod:`~capsense.humans.limb`: chains of capsules with joints, posed in a scene
-- :mod:`~capsense.humans.export`: the same as MJCF and URDF
-- :mod:`~capsense.humans.smplx`: meshes of the SMPL family, with the user's own model files
+- :mod:`~capsense.humans.formats`: the same as MJCF and URDF
+- :mod:`~capsense.humans.formats`: meshes of the SMPL family, with the user's own model files
 """
 
 from capsense.humans.anthropometry import Build
+from capsense.humans.formats import load_smplx
 from capsense.humans.limb import Joint, Limb, LimbPart, Segment, arm, leg
-from capsense.humans.smplx import load_smplx
 
 __all__ = ["Build", "Joint", "Limb", "LimbPart", "Segment", "arm", "leg", "load_smplx"]

@@ -18,62 +18,32 @@ divided by 2 · 1.645, as for a normal distribution.
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import resources
 from statistics import NormalDist
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from capsense.errors import SceneError
 
 Sex = Literal["female", "male"]
 
-LENGTHS: Mapping[str, float] = MappingProxyType(
-    {
-        "upper arm": 0.186,
-        "forearm": 0.146,
-        "hand": 0.108,
-        "thigh": 0.245,
-        "shank": 0.246,
-        "ankle height": 0.039,
-        "foot": 0.152,
-        "foot breadth": 0.055,
-    }
+DATA: Mapping[str, Any] = tomllib.loads(
+    resources.files("capsense.humans").joinpath("people.toml").read_text(encoding="utf-8")
 )
+"""The tables of ``people.toml``: sizes of people, and the segments of their limbs."""
+LENGTHS: Mapping[str, float] = MappingProxyType(DATA["lengths"])
 """Lengths as fractions of stature (Drillis and Contini 1966)."""
-
-MASSES: Mapping[str, float] = MappingProxyType(
-    {
-        "upper arm": 0.028,
-        "forearm": 0.016,
-        "hand": 0.006,
-        "thigh": 0.100,
-        "shank": 0.0465,
-        "foot": 0.0145,
-    }
-)
+MASSES: Mapping[str, float] = MappingProxyType(DATA["masses"])
 """Masses as fractions of body mass (Winter 2009)."""
-
-STATURE: Mapping[Sex, tuple[float, float]] = MappingProxyType(
-    {"female": (1.6285, 0.0626), "male": (1.7562, 0.0669)}
-)
+STATURE: Mapping[Sex, tuple[float, float]] = MappingProxyType(DATA["stature"])
 """Mean [m] (ANSUR II) and standard deviation [m] (Huston 2009) of stature."""
-
-CIRCUMFERENCES: Mapping[str, Mapping[Sex, float]] = MappingProxyType(
-    {
-        "upper arm": {"female": 0.3056, "male": 0.3581},
-        "forearm": {"female": 0.2641, "male": 0.3101},
-        "wrist": {"female": 0.1548, "male": 0.1759},
-        "hand": {"female": 0.1866, "male": 0.2123},
-        "thigh": {"female": 0.6161, "male": 0.6251},
-        "calf": {"female": 0.3733, "male": 0.3923},
-    }
-)
+CIRCUMFERENCES: Mapping[str, Mapping[Sex, float]] = MappingProxyType(DATA["circumferences"])
 """Mean circumferences [m] at mean stature (ANSUR II)."""
-
-HAND_BREADTH: Mapping[Sex, float] = MappingProxyType({"female": 0.0782, "male": 0.0883})
+HAND_BREADTH: Mapping[Sex, float] = MappingProxyType(DATA["hand_breadth"])
 """Mean breadth of the hand at the knuckles [m] at mean stature (ANSUR II)."""
-
 ANKLE = 0.13
 """Circumference of the ankle as a fraction of stature; an estimate, rounded."""
 BODY_MASS_INDEX = 25.0

@@ -8,7 +8,7 @@ on both sides of the body alike.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, get_args
@@ -17,10 +17,10 @@ import numpy as np
 
 from capsense._validate import suggest
 from capsense.errors import SceneError
-from capsense.humans.anthropometry import Build
+from capsense.humans.anthropometry import DATA, Build
 from capsense.scene import Body, Capsule, Material, Pose
-from capsense.scene.body import Grounding, checked_grounding
 from capsense.scene.pose import Vec3
+from capsense.scene.scene import Grounding, checked_grounding
 
 Side = Literal["left", "right"]
 
@@ -152,14 +152,14 @@ class Limb:
         return [(f"{self.name}_{segment.name}_{k}", p) for k, p in enumerate(segment.parts, 1)]
 
     def mjcf(self, pose: Pose = Pose(), **options: object) -> str:  # noqa: B008
-        """A MuJoCo model of the limb; see :func:`capsense.humans.export.to_mjcf`."""
-        from capsense.humans.export import to_mjcf
+        """A MuJoCo model of the limb; see :func:`capsense.humans.formats.to_mjcf`."""
+        from capsense.humans.formats import to_mjcf
 
         return to_mjcf(self, pose, **options)  # type: ignore[arg-type]
 
     def urdf(self) -> str:
-        """A URDF of the limb; see :func:`capsense.humans.export.to_urdf`."""
-        from capsense.humans.export import to_urdf
+        """A URDF of the limb; see :func:`capsense.humans.formats.to_urdf`."""
+        from capsense.humans.formats import to_urdf
 
         return to_urdf(self)
 
@@ -196,44 +196,7 @@ def arm(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
     Raises:
         SceneError: Another side.
     """
-    s = _sign(side)
-    upper, fore = build.length("upper arm"), build.length("forearm")
-    biceps, belly, wrist = (build.radius(n) for n in ("upper arm", "forearm", "wrist"))
-    return Limb(
-        f"{side}_arm",
-        (
-            Segment(
-                "upper_arm", (0.0, 0.0, 0.0),
-                (
-                    _hinge("shoulder_flexion", (0, -1, 0), -60, 180),
-                    _hinge("shoulder_abduction", (-s, 0, 0), -50, 180),
-                    _hinge("shoulder_rotation", (0, 0, s), -90, 70),
-                ),
-                _along(upper, [(0.15, 0.75, biceps), (0.0, 1.0, belly)]),
-                build.segment_mass("upper arm"),
-            ),
-            Segment(
-                "forearm", (0.0, 0.0, -upper),
-                (
-                    _hinge("elbow_flexion", (0, -1, 0), 0, 150),
-                    _hinge("forearm_pronation", (0, 0, s), -80, 80),
-                ),
-                _along(fore, [
-                    (0.15, 0.35, belly), (0.0, 0.7, 0.5 * (belly + wrist)), (0.0, 1.0, wrist),
-                ]),
-                build.segment_mass("forearm"),
-            ),
-            Segment(
-                "hand", (0.0, 0.0, -fore),
-                (
-                    _hinge("wrist_flexion", (s, 0, 0), -70, 80),
-                    _hinge("wrist_deviation", (0, -1, 0), -30, 20),
-                ),
-                _hand(build),
-                build.segment_mass("hand"),
-            ),
-        ),
-    )  # fmt: skip
+    return _limb("arm", build, side)
 
 
 def leg(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
@@ -249,43 +212,32 @@ def leg(build: Build = Build(), side: Side = "right") -> Limb:  # noqa: B008
     Raises:
         SceneError: Another side.
     """
+    return _limb("leg", build, side)
+
+
+def _limb(kind: str, build: Build, side: Side) -> Limb:
+    """The limb that ``people.toml`` describes."""
     s = _sign(side)
-    upper, lower = build.length("thigh"), build.length("shank")
-    thigh, calf, ankle = (build.radius(n) for n in ("thigh", "calf", "ankle"))
-    return Limb(
-        f"{side}_leg",
-        (
-            Segment(
-                "thigh", (0.0, 0.0, 0.0),
-                (
-                    _hinge("hip_flexion", (0, -1, 0), -30, 120),
-                    _hinge("hip_abduction", (-s, 0, 0), -30, 45),
-                    _hinge("hip_rotation", (0, 0, s), -45, 45),
-                ),
-                _along(upper, [
-                    (0.1, 0.35, thigh), (0.0, 0.75, 0.5 * (thigh + calf)), (0.0, 1.0, calf),
-                ]),
-                build.segment_mass("thigh"),
-            ),
-            Segment(
-                "shank", (0.0, 0.0, -upper),
-                (_hinge("knee_flexion", (0, 1, 0), 0, 135),),
-                _along(lower, [
-                    (0.15, 0.4, calf), (0.0, 0.7, 0.5 * (calf + ankle)), (0.0, 1.0, ankle),
-                ]),
-                build.segment_mass("shank"),
-            ),
-            Segment(
-                "foot", (0.0, 0.0, -lower),
-                (
-                    _hinge("ankle_flexion", (0, -1, 0), -50, 20),
-                    _hinge("ankle_inversion", (s, 0, 0), -15, 35),
-                ),
-                _foot(build, s),
-                build.segment_mass("foot"),
-            ),
-        ),
-    )  # fmt: skip
+    segments, origin = [], (0.0, 0.0, 0.0)
+    for data in DATA[kind]:
+        name, length = data["name"], build.length(data["name"])
+        if name in ("hand", "foot"):
+            parts = _hand(build) if name == "hand" else _foot(build, s)
+        else:
+            parts = _along(length, [(a, b, _radius(build, n)) for a, b, n in data["parts"]])
+        joints = tuple(
+            _hinge(joint, (s * x + 0.0, y, s * z + 0.0), low, high)
+            for joint, (x, y, z), low, high in data["joints"]
+        )
+        mass = build.segment_mass(name)
+        segments.append(Segment(name.replace(" ", "_"), origin, joints, parts, mass))
+        origin = (0.0, 0.0, -length)
+    return Limb(f"{side}_{kind}", tuple(segments))
+
+
+def _radius(build: Build, names: Sequence[str]) -> float:
+    """Mean radius [m] of circumferences."""
+    return sum(build.radius(name) for name in names) / len(names)
 
 
 def _sign(side: str) -> float:

@@ -23,8 +23,8 @@ from capsense.errors import (
 from capsense.learning.settle import settled, settling
 from capsense.learning.spec import Spec
 from capsense.readout.readout import Readout
+from capsense.recording.session import versions
 from capsense.recording.tables import replacing
-from capsense.recording.versions import versions
 from capsense.simulator import Simulator, make_readout
 
 MANIFEST = "manifest.json"

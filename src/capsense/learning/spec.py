@@ -19,9 +19,14 @@ from capsense.design import Design
 from capsense.errors import MeshError, ScenarioError, SceneError
 from capsense.humans import Build, arm, leg
 from capsense.learning.labels import Near, Outline
-from capsense.scenario.bodies import read_body, read_grounding, read_material, read_pose
-from capsense.scenario.loader import read_design
-from capsense.scenario.schema import ScenarioTable
+from capsense.scenario.loader import (
+    ScenarioTable,
+    read_body,
+    read_design,
+    read_grounding,
+    read_material,
+    read_pose,
+)
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import PresetName
 

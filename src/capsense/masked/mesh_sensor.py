@@ -1,4 +1,8 @@
-"""A sensor that is given as a tetrahedral mesh, and the mesh of a design."""
+"""Sensors given as tetrahedral meshes, meshes of designs, and the scheme on scenes.
+
+The planes of a design's mesh follow the edges and faces of its sheets and layers, and spread out
+with distance from them. Tetrahedra whose centroid lies in a body take its material.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +10,176 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.design.geometry import Surface
+from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Design, Domain, Electrode
 from capsense.design.stl import sheet_surface, weld
 from capsense.errors import DesignError, MeshError, SceneError
-from capsense.masked.held_nodes import WALL, hold_nodes
-from capsense.masked.planes import plan_axes
+from capsense.field.boundary import terminals
+from capsense.field.change import Change
+from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh, kuhn_tets
-from capsense.mesh.settings import MeshSettings
+from capsense.mesh.lattice import MeshSettings
 from capsense.mesh.tetmesh import GROUND
+from capsense.scene import Scene
 
 Array = NDArray[np.float64]
+
+
+def plan_axes(design: Design, s: MeshSettings) -> tuple[Array, Array, Array]:
+    """Coordinates [m] of the planes across x, y and z, in increasing order."""
+    lower, upper = design.domain.lower, design.domain.upper
+    sheets = [b.surface for b in design.sheets]
+    out = []
+    for axis in range(3):
+        edges = np.concatenate([_sheet_planes(sheet, axis) for sheet in sheets])
+        edges = _merge(edges, s.merge, lower[axis], upper[axis])
+        faces = np.array([[la.lower[axis], la.upper[axis]] for la in design.layers]).ravel()
+        planes = _merge(np.concatenate([edges, faces]), s.merge, lower[axis], upper[axis])
+        if axis < 2:
+            gaps = np.diff(np.concatenate([[lower[axis]], edges, [upper[axis]]]))
+            size = np.clip(0.5 * np.minimum(gaps[1:], gaps[:-1]), 1.2 * s.merge, s.edge)
+            growth, far = s.growth, s.far
+        else:
+            size, growth, far = np.full(len(edges), s.face), s.growth_z, s.far_z
+        tall = s.tall if axis == 2 else 0.0
+        out.append(_graded(lower[axis], upper[axis], planes, edges, size, growth, far, tall))
+    return out[0], out[1], out[2]
+
+
+def _sheet_planes(sheet: Surface, axis: int) -> Array:
+    """Coordinates that planes should follow: edges and faces across an axis, bounds."""
+    rims = sheet.rims
+    flat = np.abs(rims[:, 0, axis] - rims[:, 1, axis]) < 1e-9
+    length = np.linalg.norm(rims[:, 1] - rims[:, 0], axis=1)
+    # short segments are the facets of an arc, not edges worth a plane of their own
+    total: dict[float, float] = {}
+    for c, ell in zip(np.round(rims[flat, 0, axis], 9), length[flat], strict=True):
+        total[c] = total.get(c, 0.0) + ell
+    keep = [c for c, ell in total.items() if ell > 0.002]
+    return np.concatenate([keep, sheet.bounds[:, axis]])
+
+
+def _merge(values: Array, distance: float, lower: float, upper: float) -> Array:
+    """Sort, drop what lies on the walls, and replace close groups by their middle."""
+    values = np.unique(np.round(values, 9))
+    values = values[(values > lower + distance / 2) & (values < upper - distance / 2)]
+    groups: list[list[float]] = []
+    for v in values:
+        if groups and v - groups[-1][0] < distance:
+            groups[-1].append(v)
+        else:
+            groups.append([v])
+    return np.array([(g[0] + g[-1]) / 2 for g in groups])
+
+
+def _graded(
+    lower: float,
+    upper: float,
+    planes: Array,
+    edges: Array,
+    size: Array,
+    growth: float,
+    far: float,
+    tall: float,
+) -> Array:
+    """Lay planes through ``planes``, spaced by ``size`` at ``edges`` and growing from there.
+
+    The spacing is at most ``far``, or the fraction ``tall`` of the distance from the edges.
+    """
+    stops = np.concatenate([[lower], planes, [upper]])
+    out = [lower]
+    for a, b in pairwise(stops):
+        t = np.linspace(a, b, 801)
+        mid = 0.5 * (t[1:] + t[:-1])
+        away = np.abs(mid[:, None] - edges[None])
+        h = (size[None] + growth * away).min(axis=1)
+        h = np.minimum(h, np.maximum(far, tall * away.min(axis=1)))
+        count = np.concatenate([[0.0], np.cumsum(np.diff(t) / h)])
+        n = max(1, int(np.ceil(count[-1] - 0.1)))
+        out.extend(np.interp(np.arange(1, n) * count[-1] / n, count, t))
+        out.append(b)
+    return np.array(out)
+
+
+Axes = tuple[Array, Array, Array]
+Owner = NDArray[np.int64]
+
+FREE, WALL = -1, -2
+"""Owners of nodes that belong to no terminal: an unknown, or a node at 0 V."""
+
+_ON_PLANE = 1e-7
+
+
+def hold_nodes(design: Design, axes: Axes) -> Owner:
+    """Return the owner of each node, shape (nx, ny, nz): a terminal's number, FREE or WALL.
+
+    Nodes on the outer faces belong to ``WALL``.
+    """
+    names = terminals(design)
+    owner = np.full(tuple(len(a) for a in axes), FREE, dtype=np.int64)
+    for body in design.sheets:
+        who = names.index(body.name) if body.name in names else WALL
+        for facet in body.surface.facets:
+            k = int(np.argmin(np.abs(axes[2] - facet.origin[2])))
+            horizontal = abs(facet.axes[2, 2]) > 1 - 1e-12
+            if horizontal and abs(axes[2][k] - facet.origin[2]) < _ON_PLANE:
+                _claim_plane(axes, owner, facet, k, who)
+            else:
+                _claim_crossed(axes, owner, facet, who)
+    for axis in range(3):
+        face: list[slice | int] = [slice(None)] * 3
+        for end in (0, -1):
+            face[axis] = end
+            owner[tuple(face)] = WALL
+    return owner
+
+
+def _claim_plane(axes: Axes, owner: Owner, facet: Facet, k: int, who: int) -> None:
+    """Mark the nodes of plane k of the z axis that lie on a horizontal facet."""
+    x, y, _ = axes
+    xy = facet.to_sensor(shapely.get_coordinates(facet.polygon))[:, :2]
+    polygon = shapely.set_coordinates(shapely.Polygon(facet.polygon), xy)
+    closed = polygon.buffer(1e-8, join_style="mitre")
+    gx, gy = np.meshgrid(x, y, indexing="ij")
+    inside = shapely.contains_xy(closed, gx.ravel(), gy.ravel()).reshape(gx.shape)
+    owner[:, :, k][inside] = who
+
+
+def _claim_crossed(axes: Axes, owner: Owner, facet: Facet, who: int) -> None:
+    """Mark the nodes that a facet in general position goes through."""
+    for axis in range(3):
+        if abs(facet.axes[2, axis]) < 1e-6:
+            continue
+        p, q = [a for a in range(3) if a != axis]
+        # project the outline along the axis; the plane gives the coordinate
+        coords = facet.to_sensor(shapely.get_coordinates(facet.polygon))[:, [p, q]]
+        shadow = shapely.set_coordinates(shapely.Polygon(facet.polygon), coords)
+        shadow = shadow.buffer(1e-8, join_style="mitre")
+        x0, y0, x1, y1 = shadow.bounds
+        ip = np.flatnonzero((axes[p] >= x0) & (axes[p] <= x1))
+        iq = np.flatnonzero((axes[q] >= y0) & (axes[q] <= y1))
+        if not len(ip) or not len(iq):
+            continue
+        gp, gq = np.repeat(ip, len(iq)), np.tile(iq, len(ip))
+        inside = shapely.contains_xy(shadow, axes[p][gp], axes[q][gq])
+        gp, gq = gp[inside], gq[inside]
+        n = facet.axes[2]
+        t = (
+            facet.origin[axis]
+            - (n[p] * (axes[p][gp] - facet.origin[p]) + n[q] * (axes[q][gq] - facet.origin[q]))
+            / n[axis]
+        )
+        near = np.abs(axes[axis][:, None] - t[None]).argmin(axis=0)
+        on_node = np.abs(axes[axis][near] - t) < _ON_PLANE
+        index = [gp, gq]
+        index.insert(axis, near)
+        owner[tuple(i[on_node] for i in index)] = who
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +286,74 @@ def lattice_sensor(design: Design, terminals: Sequence[str], settings: MeshSetti
         inside = (mesh.centroids > layer.lower) & (mesh.centroids < layer.upper)
         eps[inside.all(axis=1)] = layer.eps_r
     return MeshSensor(mesh, tuple(terminals), (GROUND,), eps)
+
+
+class MaskedScenes:
+    """Masks the tetrahedra of a mesh with a scene's bodies and solves in full.
+
+    Floating conductors are met by a large permittivity, as a scheme that knows only permittivity
+    must; impedances to ground cannot be represented and are refused. Each scene is solved from the
+    last one's potentials, or from zero.
+    """
+
+    FLOATING_EPS_R = 1e4
+
+    def __init__(
+        self, sensor: MeshSensor, excitation_frequency: float, *, warm_start: bool = True
+    ) -> None:
+        self._excitation_frequency = excitation_frequency
+        self._mesh = sensor.mesh
+        self._centroids = sensor.mesh.centroids
+        self._solver = MaskedSolver(
+            sensor.mesh, sensor.names, sensor.ground, sensor.eps_r, profiles=sensor.profiles,
+            warm_start=warm_start,
+        )  # fmt: skip
+        self.empty: Array = self._solver.step(np.full(self._mesh.n_tets, -1), [])
+        """Maxwell matrix of the empty mesh [F], shape (terminals, terminals)."""
+
+    def reset(self) -> None:
+        """Forget the last solution."""
+        self._solver.reset()
+
+    def potentials(self, points: Array) -> Array:
+        """Not offered.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError('method "fem_masked" gives no potentials; use "surface"')
+
+    def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
+        """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
+        assert not jacobian
+        inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)
+        eps = np.ones(len(scene))
+        for i, body in enumerate(scene):
+            if not isinstance(body.grounding, str):
+                raise SceneError(
+                    f"body {body.name or i} is tied to ground through {body.grounding} F; method "
+                    "'fem_masked' knows only grounded and floating bodies"
+                )
+            if not getattr(body.shape, "closed", True):
+                raise SceneError(
+                    f"body {body.name or i} is an open surface, and method 'fem_masked' needs an "
+                    "inside: close it, give a DepthFrame, or use method 'surface'"
+                )
+            local = body.pose.inverse().apply(self._centroids)
+            within = body.shape.signed_distance(local) < 0
+            conducts = body.material.is_conductor(self._excitation_frequency)
+            if conducts:
+                eps[i] = GROUNDED if body.grounding == "grounded" else self.FLOATING_EPS_R
+                inside[within] = i
+            else:
+                eps[i] = body.material.at(self._excitation_frequency).eps_r
+                taken = inside >= 0
+                conductor = np.array(
+                    [b.material.is_conductor(self._excitation_frequency) for b in scene]
+                )
+                inside[within & ~(taken & conductor[inside])] = i
+        matrix = self._solver.step(inside, eps.tolist())
+        stats = self._solver.stats
+        goal = self._solver.tolerance * float(np.abs(matrix).max())
+        free = self._mesh.n_points - stats.grounded_nodes
+        return Change(matrix - self.empty, goal, int(stats.iterations), free)

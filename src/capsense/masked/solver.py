@@ -13,7 +13,6 @@ it is then floating, and CG needs more iterations the larger the contrast.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -50,10 +49,6 @@ class MaskedStats:
     """CG iterations, summed over the electrodes; 0 with a direct solver."""
     residual: float
     """Largest relative residual over the electrodes, in the norm of the stopping rule."""
-    update_time: float
-    """Wall time of the residual update [s]."""
-    solve_time: float
-    """Wall time of the solve and the capacitances [s]."""
 
 
 class MaskedSolver:
@@ -84,36 +79,24 @@ class MaskedSolver:
     ) -> None:
         """Assemble the empty domain.
 
-        Parameters
-        ----------
-        mesh
-            The fixed mesh.
-        electrode_groups
-            Node groups of the electrodes in matrix order, shape (M,).
-        ground_groups
-            Node groups held at 0 V.
-        eps_background
-            Relative permittivity of the empty domain: one number, or one per tetrahedron, (k,).
-        solver
-            "cg" or "lu".
-        tolerance
-            Relative residual that ends CG.
-        max_iterations
-            CG iterations after which a step fails.
-        warm_start
-            Whether CG starts from the potentials of the step before, or from zero.
-        profiles
-            Potential [V] of each node of an electrode that is driven with 1 V, by its group, each
-            of shape (g,); 1 where none is given.
+        Args:
+            mesh: The fixed mesh.
+            electrode_groups: Node groups of the electrodes in matrix order, shape (M,).
+            ground_groups: Node groups held at 0 V.
+            eps_background: Relative permittivity of the empty domain: one number, or one per
+                tetrahedron, (k,).
+            solver: "cg" or "lu".
+            tolerance: Relative residual that ends CG.
+            max_iterations: CG iterations after which a step fails.
+            warm_start: Whether CG starts from the potentials of the step before, or from zero.
+            profiles: Potential [V] of each node of an electrode that is driven with 1 V, by its
+                group, each of shape (g,); 1 where none is given.
 
-        Raises
-        ------
-        MeshError
-            If a group is unknown or empty, electrodes share nodes, or a profile does not fit.
-        FieldError
-            If `eps_background` does not fit the mesh.
-        SolveError
-            If a setting is out of range.
+        Raises:
+            MeshError: If a group is unknown or empty, electrodes share nodes, or a profile does not
+                fit.
+            FieldError: If `eps_background` does not fit the mesh.
+            SolveError: If a setting is out of range.
         """
         if solver not in ("cg", "lu"):
             raise SolveError(f"unknown solver {solver!r}; known: cg, lu")
@@ -156,22 +139,16 @@ class MaskedSolver:
     def step(self, inside: ArrayLike, body_eps_r: Sequence[float]) -> Array:
         """Capacitances with objects in the domain.
 
-        Parameters
-        ----------
-        inside
-            Index of the body that holds each tetrahedron's centroid, −1 for none, shape (k,).
-        body_eps_r
-            Relative permittivity of each body, or `GROUNDED`, shape (B,).
+        Args:
+            inside: Index of the body that holds each tetrahedron's centroid, −1 for none, shape
+                (k,).
+            body_eps_r: Relative permittivity of each body, or `GROUNDED`, shape (B,).
 
-        Returns
-        -------
-        ndarray
+        Returns:
             Maxwell capacitance matrix [F], shape (M, M), symmetric.
 
-        Raises
-        ------
-        SolveError
-            If the arrays do not fit, or CG does not reach its tolerance.
+        Raises:
+            SolveError: If the arrays do not fit, or CG does not reach its tolerance.
         """
         bodies = np.asarray(inside)
         if bodies.shape != (self.mesh.n_tets,) or not np.issubdtype(bodies.dtype, np.integer):
@@ -189,27 +166,18 @@ class MaskedSolver:
     def step_cells(self, eps_r: ArrayLike, grounded: ArrayLike | None = None) -> Array:
         """Capacitances for given permittivities of all tetrahedra.
 
-        Parameters
-        ----------
-        eps_r
-            Relative permittivities, objects included, shape (k,).
-        grounded
-            Tetrahedra that belong to conductors at 0 V, booleans of shape (k,). Electrode nodes
-            in them keep the electrode's potential.
+        Args:
+            eps_r: Relative permittivities, objects included, shape (k,).
+            grounded: Tetrahedra that belong to conductors at 0 V, booleans of shape (k,). Electrode
+                nodes in them keep the electrode's potential.
 
-        Returns
-        -------
-        ndarray
+        Returns:
             Maxwell capacitance matrix [F], shape (M, M), symmetric.
 
-        Raises
-        ------
-        FieldError
-            If `eps_r` does not fit the mesh.
-        SolveError
-            If `grounded` does not fit, or CG does not reach its tolerance.
+        Raises:
+            FieldError: If `eps_r` does not fit the mesh.
+            SolveError: If `grounded` does not fit, or CG does not reach its tolerance.
         """
-        started = time.perf_counter()
         changed = self._update(check_eps_r(self.mesh, eps_r))
         free = self._free
         if grounded is not None:
@@ -218,7 +186,6 @@ class MaskedSolver:
                 raise SolveError(f"grounded must hold {self.mesh.n_tets} booleans")
             free = free.copy()
             free[self.mesh.tets[cells].ravel()] = False
-        updated = time.perf_counter()
         last = self._potentials if self.warm_start else 0.0
         potentials = np.where(free[:, None], last, self._dirichlet)
         iterations, residual = self._solve(potentials, np.flatnonzero(free))
@@ -229,8 +196,6 @@ class MaskedSolver:
             grounded_nodes=int(self._free.sum() - free.sum()),
             iterations=iterations,
             residual=residual,
-            update_time=updated - started,
-            solve_time=time.perf_counter() - updated,
         )
         return 0.5 * (capacitance + capacitance.T)
 
@@ -286,19 +251,13 @@ def conjugate_gradients(
 
     Ends when sqrt(rᵀ D⁻¹ r) ≤ tolerance · sqrt(bᵀ D⁻¹ b) with r = b − K x.
 
-    Returns
-    -------
-    solution
-        x, shape (n,).
-    iterations
-        Iterations made.
-    residual
-        sqrt(rᵀ D⁻¹ r / bᵀ D⁻¹ b) at the end.
+    Returns:
+        solution: x, shape (n,).
+        iterations: Iterations made.
+        residual: sqrt(rᵀ D⁻¹ r / bᵀ D⁻¹ b) at the end.
 
-    Raises
-    ------
-    SolveError
-        If the tolerance is not reached in `max_iterations`.
+    Raises:
+        SolveError: If the tolerance is not reached in `max_iterations`.
     """
     scale = math.sqrt(_dot(load, inverse_diagonal * load))
     if scale == 0.0:

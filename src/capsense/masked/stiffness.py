@@ -33,19 +33,13 @@ Solver = Literal["direct", "cg"]
 def gradients(points: Array, tets: IntArray) -> tuple[Array, Array]:
     """Gradients of the hat functions, and the volumes, of linear tetrahedra.
 
-    Parameters
-    ----------
-    points
-        Node positions [m], shape (n, 3).
-    tets
-        Corner nodes, shape (k, 4).
+    Args:
+        points: Node positions [m], shape (n, 3).
+        tets: Corner nodes, shape (k, 4).
 
-    Returns
-    -------
-    grads
-        Gradient [1/m] of each corner's hat function, shape (k, 4, 3); they sum to zero.
-    volumes
-        Volume of each tetrahedron [m³], shape (k,), negative if it is inverted.
+    Returns:
+        grads: Gradient [1/m] of each corner's hat function, shape (k, 4, 3); they sum to zero.
+        volumes: Volume of each tetrahedron [m³], shape (k,), negative if it is inverted.
     """
     corners = points[tets]
     sides = corners[:, 1:] - corners[:, :1]
@@ -59,10 +53,8 @@ def gradients(points: Array, tets: IntArray) -> tuple[Array, Array]:
 def check_eps_r(mesh: TetMesh, eps_r: ArrayLike) -> Array:
     """Relative permittivity per element, shape (k,), from one number or k of them.
 
-    Raises
-    ------
-    FieldError
-        If the shape does not fit or a value is not positive and finite.
+    Raises:
+        FieldError: If the shape does not fit or a value is not positive and finite.
     """
     values = np.asarray(eps_r, dtype=np.float64)
     if values.shape not in ((), (mesh.n_tets,)):
@@ -83,10 +75,8 @@ def element_weights(mesh: TetMesh) -> Array:
 def link_weights(mesh: TetMesh, eps_r: ArrayLike = 1.0) -> Array:
     """Weight of every link, w_ab = −Σ_e ε0 ε_e V_e ∇λ_a·∇λ_b [F], shape (m,).
 
-    Raises
-    ------
-    FieldError
-        If `eps_r` is neither a positive number nor k of them.
+    Raises:
+        FieldError: If `eps_r` is neither a positive number nor k of them.
     """
     shares = element_weights(mesh) * check_eps_r(mesh, eps_r)[:, None]
     links = mesh.tet_edges.ravel()
@@ -106,10 +96,8 @@ def laplacian(edges: IntArray, weights: ArrayLike, n_points: int) -> sp.csr_matr
 def stiffness(mesh: TetMesh, eps_r: ArrayLike = 1.0) -> sp.csr_matrix:
     """P1 stiffness matrix K_ab = Σ_e ε0 ε_e V_e ∇λ_a·∇λ_b [F], shape (n, n).
 
-    Raises
-    ------
-    FieldError
-        If `eps_r` is neither a positive number nor k of them.
+    Raises:
+        FieldError: If `eps_r` is neither a positive number nor k of them.
     """
     return laplacian(mesh.edges, link_weights(mesh, eps_r), mesh.n_points)
 
@@ -168,14 +156,10 @@ class StiffnessMap:
     def update(self, data: Array, cells: IntArray, change: Array) -> None:
         """Add to the CSR values, in place, what a change of eps_r in some cells makes of them.
 
-        Parameters
-        ----------
-        data
-            CSR values [F], shape (nnz,).
-        cells
-            Distinct elements whose permittivity changed, shape (c,).
-        change
-            Change of their eps_r, shape (c,).
+        Args:
+            data: CSR values [F], shape (nnz,).
+            cells: Distinct elements whose permittivity changed, shape (c,).
+            change: Change of their eps_r, shape (c,).
         """
         where, local = self.element_entries
         np.add.at(data, where[cells].ravel(), (local[cells] * change[:, None]).ravel())
@@ -189,18 +173,14 @@ def unit_potentials(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Dirichlet values of the M unit problems, and which nodes are free.
 
-    Returns
-    -------
-    values
-        1 V, or the profile given, on electrode j in column j and 0 V elsewhere, shape (n, M).
-    free
-        Nodes on no electrode and not on ground, shape (n,).
+    Returns:
+        values: 1 V, or the profile given, on electrode j in column j and 0 V elsewhere, shape (n,
+            M).
+        free: Nodes on no electrode and not on ground, shape (n,).
 
-    Raises
-    ------
-    MeshError
-        If a group is unknown or empty, an electrode shares nodes with another or ground, or a
-        profile is of no electrode, of another shape, negative or not finite.
+    Raises:
+        MeshError: If a group is unknown or empty, an electrode shares nodes with another or ground,
+            or a profile is of no electrode, of another shape, negative or not finite.
     """
     electrodes, shapes = list(electrode_groups), dict(profiles or {})
     if not electrodes:
@@ -249,27 +229,18 @@ def capacitance_p1(
     and returns the energies C_ij = φ_iᵀ K φ_j. They bound the self terms from above, and
     an error δ of the potentials enters squared. What is in no group has a free surface (∂φ/∂n = 0).
 
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    eps_r
-        Relative permittivity, one number or one for each tetrahedron, shape (k,).
-    electrode_groups
-        Node groups in matrix order, shape (M,).
-    ground_groups
-        Node groups held at 0 V; may be empty.
-    solver
-        "direct" factorises (sparse LU; to some 50k nodes), "cg" iterates to a relative
-        residual of 1e-10 with a diagonal preconditioner.
+    Args:
+        mesh: The mesh.
+        eps_r: Relative permittivity, one number or one for each tetrahedron, shape (k,).
+        electrode_groups: Node groups in matrix order, shape (M,).
+        ground_groups: Node groups held at 0 V; may be empty.
+        solver: "direct" factorises (sparse LU; to some 50k nodes), "cg" iterates to a relative
+            residual of 1e-10 with a diagonal preconditioner.
 
-    Raises
-    ------
-    MeshError
-        If a group is unknown or empty, or electrodes share nodes.
-    FieldError
-        If `eps_r` does not fit, the solver is unknown, the system is singular, or CG does not
-        converge.
+    Raises:
+        MeshError: If a group is unknown or empty, or electrodes share nodes.
+        FieldError: If `eps_r` does not fit, the solver is unknown, the system is singular, or CG
+            does not converge.
     """
     if solver not in ("direct", "cg"):
         raise FieldError(f"unknown solver {solver!r}; known: direct, cg")

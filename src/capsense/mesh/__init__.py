@@ -5,8 +5,5 @@ Gmsh and meshio are imported where they are used.
 
 from capsense.mesh.gmsh_mesher import mesh_design
 from capsense.mesh.io import load_mesh, save_mesh
-from capsense.mesh.lattice_tets import kuhn_tets
-from capsense.mesh.quality import MeshQuality
-from capsense.mesh.tetmesh import TetMesh
-
-__all__ = ["MeshQuality", "TetMesh", "kuhn_tets", "load_mesh", "mesh_design", "save_mesh"]
+from capsense.mesh.lattice import kuhn_tets
+from capsense.mesh.tetmesh import MeshQuality, TetMesh

@@ -78,41 +78,28 @@ def mesh_design(
     and grows by `growth` metres per metre of distance up to `size_far`. Inside a layer it stays
     below the layer's thickness divided by `layers_across`.
 
-    Parameters
-    ----------
-    design
-        The sensor. Curved conductors are meshed as the facets they come in.
-    size_at_edges
-        Element size [m] at conductor rims.
-    size_far
-        Largest element size [m].
-    growth
-        Increase of the element size per unit distance from the rims.
-    layers_across
-        Elements wanted across the thickness of a layer; below 1, that much flatter elements
-        are accepted.
+    Args:
+        design: The sensor. Curved conductors are meshed as the facets they come in.
+        size_at_edges: Element size [m] at conductor rims.
+        size_far: Largest element size [m].
+        growth: Increase of the element size per unit distance from the rims.
+        layers_across: Elements wanted across the thickness of a layer; below 1, that much flatter
+            elements are accepted.
 
-    Returns
-    -------
-    TetMesh
+    Returns:
         Node groups: one for each electrode and conductor under its name, and "ground" for the
         outer box. Cell groups: one for each layer; where layers overlap the last one owns the
         cell. Nodes [m] in the sensor frame.
 
-    Raises
-    ------
-    MeshError
-        If a size is not positive, there are more than `MAX_FACETS` facets, an electrode
-        touches the box or another conductor, names are used twice, or Gmsh fails.
-    MissingDependencyError
-        If Gmsh or a shared library that it needs is not installed.
+    Raises:
+        MeshError: If a size is not positive, there are more than `MAX_FACETS` facets, an electrode
+            touches the box or another conductor, names are used twice, or Gmsh fails.
+        MissingDependencyError: If Gmsh or a shared library that it needs is not installed.
     """
     sizes = {
-        "size_at_edges": size_at_edges,
-        "size_far": size_far,
-        "growth": growth,
+        "size_at_edges": size_at_edges, "size_far": size_far, "growth": growth,
         "layers_across": layers_across,
-    }
+    }  # fmt: skip
     for name, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise MeshError(f"{name} must be positive, not {value}")
@@ -141,10 +128,9 @@ def mesh_design(
 def import_gmsh() -> ModuleType:
     """Import the Gmsh module.
 
-    Raises
-    ------
-    MissingDependencyError
-        If the package or a shared library is missing; the message gives the install command.
+    Raises:
+        MissingDependencyError: If the package or a shared library is missing; the message gives the
+            install command.
     """
     try:
         return importlib.import_module("gmsh")
@@ -191,12 +177,10 @@ def _session(gmsh: ModuleType) -> Iterator[None]:
 
 def _named_surfaces(design: Design) -> dict[str, Surface]:
     surfaces: dict[str, Surface] = {}
-    named = [(item.name, item.surface) for item in design.electrodes]
-    named += [(item.name, item.surface) for item in design.conductors]
-    for name, surface in named:
-        if name in surfaces or name == GROUND:
-            raise MeshError(f"the name {name!r} is used twice; conductors need unique names")
-        surfaces[name] = surface
+    for item in design.sheets:
+        if item.name in surfaces or item.name == GROUND:
+            raise MeshError(f"the name {item.name!r} is used twice; conductors need unique names")
+        surfaces[item.name] = item.surface
     return surfaces
 
 
@@ -348,10 +332,7 @@ def _line_ends(gmsh: ModuleType, tags: list[int]) -> Array:
 
 
 def _extract(
-    gmsh: ModuleType,
-    design: Design,
-    volumes: dict[str, list[int]],
-    sheets: dict[str, list[int]],
+    gmsh: ModuleType, design: Design, volumes: dict[str, list[int]], sheets: dict[str, list[int]]
 ) -> TetMesh:
     mesher = gmsh.model.mesh
     tags, coordinates, _ = mesher.getNodes()

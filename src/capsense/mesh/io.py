@@ -1,10 +1,16 @@
-"""Import and export of meshes: Gmsh `.msh`, VTK `.vtu` and the published `.mat` files."""
+"""Import and export of meshes: Gmsh `.msh`, VTK `.vtu` and the published `.mat` files.
+
+MATLAB's files of version 5 (``-v6``, ``-v7``) are read here and not by SciPy, where a damaged file
+may end the process.
+"""
 
 from __future__ import annotations
 
 import importlib
+import struct
+import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -13,10 +19,83 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import MeshError, MissingDependencyError
-from capsense.mesh.mat_reader import parse_mat
-from capsense.mesh.msh_reader import parse_msh
-from capsense.mesh.msh_writer import MshVersion, write_msh
+from capsense.mesh.msh import MshVersion, parse_msh, write_msh
 from capsense.mesh.tetmesh import GROUND, IntArray, TetMesh
+
+Numbers = NDArray[Any]
+
+_HEAD = 128
+_TYPES = {
+    1: "<i1", 2: "<u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8",
+    13: "<u8",
+}  # fmt: skip
+_MATRIX, _COMPRESSED = 14, 15
+_CELLS, _NUMBERS = 1, range(6, 16)
+"""Classes of arrays."""
+_MOST = 1_000_000_000
+"""A compressed array may become so large [bytes]: small files may hold very large ones."""
+
+
+def parse_mat(content: bytes) -> dict[str, Numbers | list[Numbers]]:
+    """Arrays of numbers by name, those of cells as lists; what is neither is left out.
+
+    After *MAT-File Format*, MathWorks, version R2024a.
+
+    Raises:
+        MeshError: The file is of another version, damaged, or inflates beyond 1 GB.
+    """
+    if content[124:128] != b"\x00\x01IM":
+        raise MeshError("it is no MAT-file of version 5, little-endian; save it with '-v7'")
+    found = {}
+    for kind, data in _elements(memoryview(content)[_HEAD:]):
+        if kind == _COMPRESSED:
+            kind, data = next(_elements(_inflated(data)), (0, data))
+        if kind == _MATRIX:
+            name, value = _matrix(data)
+            if value is not None:
+                found[name] = value
+    return found
+
+
+def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Type and content of the elements in a row."""
+    at = 0
+    while at < len(data):
+        kind, size = struct.unpack_from("<II", data, at)
+        start = at + 8
+        after = start + size if kind == _COMPRESSED else start + -(-size // 8) * 8
+        if kind >> 16:  # up to four bytes, packed with their type
+            kind, size, start, after = kind & 0xFFFF, kind >> 16, at + 4, start
+        if start + size > len(data):
+            raise MeshError("an array is cut off")
+        yield kind, data[start : start + size]
+        at = after
+
+
+def _inflated(data: memoryview) -> memoryview:
+    out = zlib.decompressobj().decompress(data, _MOST + 1)
+    if len(out) > _MOST:
+        raise MeshError(f"an array inflates to more than {_MOST:,} bytes; save it uncompressed")
+    return memoryview(out)
+
+
+def _matrix(data: memoryview) -> tuple[str, Numbers | list[Numbers] | None]:
+    """Name and content of an array; no content where it holds something else."""
+    parts = _elements(data)
+    flags, shape, name = (next(parts, (0, memoryview(b"")))[1] for _ in range(3))
+    kind = struct.unpack_from("<I", flags)[0] & 0xFF
+    label = bytes(name).decode("latin-1")
+    if kind == _CELLS:
+        cells = [_matrix(part)[1] for sort, part in parts if sort == _MATRIX]
+        return label, [c for c in cells if isinstance(c, np.ndarray)]
+    if kind not in _NUMBERS:
+        return label, None
+    sort, values = next(parts)
+    if sort not in _TYPES:
+        raise MeshError(f"array {label!r} has numbers of an unknown type, {sort}")
+    size = np.frombuffer(shape, "<i4").tolist()
+    return label, np.frombuffer(values, _TYPES[sort]).reshape(size, order="F")
+
 
 Unit = Literal["m", "mm", "cm"]
 
@@ -34,24 +113,18 @@ _NODE_PREFIX, _CELL_PREFIX = "node_group:", "cell_group:"
 def load_mesh(path: str | Path, unit: Unit | None = None) -> TetMesh:
     """Read a mesh from a `.msh`, `.vtu` or `.mat` file.
 
-    Parameters
-    ----------
-    path
-        The file. Physical groups of a `.msh` become groups of the mesh: those of volumes cell
-        groups, those of surfaces, curves and points node groups; a group without a name is
-        called ``physical_<dimension>_<number>``. Nodes outside every tetrahedron are dropped,
-        and only the corners of quadratic tetrahedra are kept.
-    unit
-        Unit of length of the file: "m" (the default for `.msh` and `.vtu`), "mm" or "cm" (the
-        default for `.mat`).
+    Args:
+        path: The file. Physical groups of a `.msh` become groups of the mesh: those of volumes cell
+            groups, those of surfaces, curves and points node groups; a group without a name is
+            called ``physical_<dimension>_<number>``. Nodes outside every tetrahedron are dropped,
+            and only the corners of quadratic tetrahedra are kept.
+        unit: Unit of length of the file: "m" (the default for `.msh` and `.vtu`), "mm" or "cm" (the
+            default for `.mat`).
 
-    Raises
-    ------
-    MeshError
-        If the suffix is not one of `SUFFIXES`, or the file is missing, unreadable, inconsistent,
-        holds no tetrahedra or holds other solids.
-    MissingDependencyError
-        If the file is a `.vtu` and meshio is not installed.
+    Raises:
+        MeshError: If the suffix is not one of `SUFFIXES`, or the file is missing, unreadable,
+            inconsistent, holds no tetrahedra or holds other solids.
+        MissingDependencyError: If the file is a `.vtu` and meshio is not installed.
     """
     path = Path(path)
     suffix = _suffix(path)
@@ -80,26 +153,19 @@ def save_mesh(
 ) -> None:
     """Write a mesh to a `.msh` (metres), `.vtu` (metres) or `.mat` (centimetres) file.
 
-    Parameters
-    ----------
-    mesh
-        The mesh, groups included. In `.mat` files the group "ground" joins the electrodes in
-        the list of Dirichlet nodes, every other node group is an electrode, and neither names
-        nor cell groups are kept.
-    path
-        The file to write.
-    point_data, cell_data
-        Only for `.vtu`: named arrays of shape (n, …) or (k, …) stored with the mesh.
-    msh_version
-        Only for `.msh`: format "4.1" or "2.2", both as text.
+    Args:
+        mesh: The mesh, groups included. In `.mat` files the group "ground" joins the electrodes in
+            the list of Dirichlet nodes, every other node group is an electrode, and neither names
+            nor cell groups are kept.
+        path: The file to write.
+        point_data: Only for `.vtu`: named arrays of shape (n, …), stored with the mesh.
+        cell_data: Only for `.vtu`: named arrays of shape (k, …), stored with the mesh.
+        msh_version: Only for `.msh`: format "4.1" or "2.2", both as text.
 
-    Raises
-    ------
-    MeshError
-        If the suffix is not one of `SUFFIXES`, data does not fit the mesh or the file type, or
-        the file cannot be written.
-    MissingDependencyError
-        If the file is a `.vtu` and meshio is not installed.
+    Raises:
+        MeshError: If the suffix is not one of `SUFFIXES`, data does not fit the mesh or the file
+            type, or the file cannot be written.
+        MissingDependencyError: If the file is a `.vtu` and meshio is not installed.
     """
     path = Path(path)
     suffix = _suffix(path)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,97 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._style import COLOURS
 from capsense.errors import MissingDependencyError, RecordingError
 from capsense.readout.counts import Counts, join
-from capsense.recording.foxglove import layout
 from capsense.recording.reader import Recording, Step
 from capsense.recording.session import Session
 from capsense.recording.tables import (
+    Run,
     column_meanings,
     csv_row,
-    reading_arrays,
     replacing,
     write_counts,
 )
+from capsense.scenario.model import Channel
+
+MAX_LINES = 8
+"""So many channels are drawn in a chart, the strongest."""
+_VIEW, _FOV = 0.5, 45.0
+
+
+def layout(name: str, channels: Sequence[Channel], peaks: NDArray[np.float64]) -> str:
+    """The layout of a recording, as JSON that Foxglove imports.
+
+    Args:
+        name: Of the sensor.
+        channels: Those in its ``signals``.
+        peaks: Their largest changes [F], shape (K,).
+    """
+    panels: dict[str, Any] = {"3D!sensor": _scene(name)}
+    for key, title, own in (("own", "electrodes", True), ("pairs", "pairs", False)):
+        found = [k for k, c in enumerate(channels) if (c.row == c.column) == own]
+        strongest = sorted(sorted(found, key=lambda k: -peaks[k])[:MAX_LINES])
+        if strongest:
+            drawn = [channels[k] for k in strongest]
+            panels[f"Plot!{key}"] = _chart(name, f"{title}, change [fF]", drawn)
+    return json.dumps(
+        {
+            "configById": panels,
+            "globalVariables": {},
+            "userNodes": {},
+            "playbackConfig": {"speed": 1},
+            "layout": _beside([key for key in panels if key.startswith("Plot")]),
+        },
+        indent=1,
+    )
+
+
+def _beside(charts: Sequence[str]) -> Any:
+    """The scene on the left, charts below each other on the right."""
+    right: Any = charts[0]
+    if len(charts) > 1:
+        right = {"direction": "column", "first": charts[0], "second": charts[1]}
+    return {"direction": "row", "first": "3D!sensor", "second": right, "splitPercentage": 55}
+
+
+def _scene(name: str) -> dict[str, Any]:
+    return {
+        "cameraState": {
+            "perspective": True, "distance": _VIEW, "phi": 60.0, "thetaOffset": 30.0,
+            "target": [0.0, 0.0, 0.0], "targetOffset": [0.0, 0.0, 0.1 * _VIEW],
+            "targetOrientation": [0.0, 0.0, 0.0, 1.0], "fovy": _FOV, "near": 1e-3, "far": 100.0,
+        },
+        "followMode": "follow-none", "followTf": name, "scene": {}, "transforms": {},
+        "topics": {f"/{name}/{topic}": {"visible": True} for topic in ("electrodes", "markers")},
+        "layers": {
+            "grid": {
+                "layerId": "foxglove.Grid", "instanceId": "grid", "label": "10 mm",
+                "visible": True, "frameLocked": True, "frameId": name, "size": 0.4,
+                "divisions": 40, "lineWidth": 1, "color": "#8a8f9440",
+                "position": [0.0, 0.0, 0.0], "rotation": [0.0, 0.0, 0.0],
+            }
+        },
+    }  # fmt: skip
+
+
+def _chart(name: str, title: str, channels: Sequence[Channel]) -> dict[str, Any]:
+    paths = [
+        {
+            "value": f'/{name}/signals.channels[:]{{name=="{channel.column_name}"}}.change',
+            "label": channel.label,
+            "color": COLOURS[k % len(COLOURS)],
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+        }
+        for k, channel in enumerate(channels)
+    ]
+    return {
+        "foxglovePanelTitle": title, "paths": paths, "xAxisVal": "timestamp", "isSynced": True,
+        "showLegend": True, "legendDisplay": "top", "showPlotValuesInLegend": True,
+        "showXAxisLabels": True, "showYAxisLabels": True, "sidebarDimension": 240,
+    }  # fmt: skip
+
 
 Array = NDArray[np.float64]
 
@@ -110,31 +190,20 @@ def _parquet(recording: Recording, path: Path) -> int:
     return n
 
 
+def run_of(recording: Recording, steps: list[Step]) -> Run:
+    """Steps of a recording as a run, by the recording's clock."""
+    s = recording.session
+    return Run(
+        s.title or s.name, s.design, s.channels, s.empty, (), [k.clock for k in steps],
+        [k.reading for k in steps], [k.scene for k in steps],
+    )  # fmt: skip
+
+
 def _npz(recording: Recording, path: Path) -> int:
-    session = recording.session
     steps = list(recording.steps())
     if not steps:
         raise RecordingError(f"{recording.path} holds no steps; there is nothing to export")
-    names = _body_names(steps)
-    positions = np.full((len(steps), len(names), 3), np.nan)
-    quaternions = np.full((len(steps), len(names), 4), np.nan)
-    for k, step in enumerate(steps):
-        for i, body in enumerate(step.scene):
-            b = names[body.name or f"body{i}"]
-            positions[k, b], quaternions[k, b] = body.pose.position, body.pose.quaternion
-    stats = [s.reading.stats for s in steps]
-    arrays = reading_arrays(
-        time=np.array([s.clock for s in steps]),
-        capacitance=np.array([s.reading.capacitance for s in steps]),
-        delta=np.array([s.reading.delta for s in steps]),
-        baseline=session.empty.capacitance,
-        self_capacitance=np.array([s.reading.self_capacitance for s in steps]),
-        self_baseline=session.empty.self_capacitance, electrodes=session.design.electrode_names,
-        channels=session.channels, values=np.array([_values(session, s) for s in steps]),
-        levels=_levels(session), bodies=list(names), positions=positions, quaternions=quaternions,
-        iterations=[s.iterations for s in stats],
-        error_estimate=[s.solver_error for s in stats], step_time=[s.wall_time for s in stats],
-    )  # fmt: skip
+    arrays = run_of(recording, steps).arrays()
     arrays["episode"] = np.array([s.episode for s in steps])
     counts = [c for c in (s.reading.counts for s in steps) if c is not None]
     if counts:
@@ -142,14 +211,6 @@ def _npz(recording: Recording, path: Path) -> int:
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     return len(steps)
-
-
-def _body_names(steps: list[Step]) -> dict[str, int]:
-    """Names of all bodies in the order of their appearance, numbered."""
-    found = dict.fromkeys(
-        body.name or f"body{i}" for step in steps for i, body in enumerate(step.scene)
-    )
-    return {name: k for k, name in enumerate(found)}
 
 
 def _all_counts(recording: Recording) -> Counts:
@@ -203,7 +264,7 @@ def _mcap(recording: Recording, path: Path) -> int:
     from mcap.records import Attachment, Channel, Message, Metadata, Schema
     from mcap.writer import Writer
 
-    from capsense.recording.records import read_records
+    from capsense.recording.files import read_records
 
     schemas: dict[int, int] = {}
     channels: dict[int, int] = {}

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from capsense.errors import MissingDependencyError
-from capsense.recording.messages import PACKAGE, Messages, lasting
+from capsense.recording.ros import PACKAGE, Messages, lasting
 
 _BLOCK_MS = 1
 """How long a writer waits for a reader that does not keep up [ms]."""

@@ -13,18 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from capsense.adapters.attached import AttachedSensor
+from capsense.codec import design_to_json
 from capsense.errors import ReadoutError, RecordingError
 from capsense.reading import Reading
 from capsense.readout.config import file_content, parse_readout
 from capsense.readout.readout import Readout
-from capsense.recording.design_json import design_to_json
+from capsense.recording.files import McapFile
 from capsense.recording.live import LiveTopics
-from capsense.recording.mcap_file import McapFile
-from capsense.recording.messages import require
+from capsense.recording.ros import require
 from capsense.recording.session import DESIGN, NAME, SESSION, Session, describe
 from capsense.recording.steps import Moment, StepMessages
-from capsense.scenario.channels import Excitation
-from capsense.scenario.model import Scenario
+from capsense.scenario.model import Excitation, Scenario
 from capsense.scene import DepthFrame, Scene
 from capsense.simulator import Simulator
 

@@ -3,25 +3,43 @@
 from __future__ import annotations
 
 import json
+import platform
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, cast, get_args
 
 import numpy as np
+from llvmlite.binding import get_host_cpu_name
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
 from capsense.errors import RecordingError
-from capsense.field.background import BuildSettings
-from capsense.mesh.settings import MeshSettings
+from capsense.field.background import NUMERICS, BuildSettings
+from capsense.mesh.lattice import MeshSettings
 from capsense.reading import Reading, StepStats
 from capsense.readout.config import parse_readout
 from capsense.readout.readout import Readout
-from capsense.recording.versions import versions
-from capsense.scenario.channels import Channel, Excitation, channels_of
-from capsense.scenario.model import FORMER_METHODS, METHODS
+from capsense.scenario.model import FORMER_METHODS, METHODS, Channel, Excitation, channels_of
 from capsense.simulator import Method, PresetName, Simulator
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the packages that compute and the fields' numerics; the processor."""
+    out = {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": get_host_cpu_name(),
+        "numerics": str(NUMERICS),
+    }
+    for package in ("capsense", "numpy", "scipy", "numba"):
+        try:
+            out[package] = version(package)
+        except PackageNotFoundError:
+            out[package] = "not installed"
+    return out
+
 
 Array = NDArray[np.float64]
 
@@ -61,7 +79,7 @@ class Session:
     readout: Mapping[str, Any] | None
     """Content of the readout's file, where replaying can build it again."""
     versions: Mapping[str, str]
-    """Of what the numbers depend on, see :func:`~capsense.recording.versions.versions`."""
+    """Of what the numbers depend on, see :func:`~capsense.recording.session.versions`."""
 
     @property
     def channels(self) -> tuple[Channel, ...]:

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from capsense._style import signal_colours
+from capsense.codec import CHANGING, body_fields, shape_fields
 from capsense.reading import Reading
 from capsense.readout.counts import Counts
-from capsense.recording.messages import PACKAGE, Messages
-from capsense.recording.parts import CHANGING, body_fields, shape_fields
-from capsense.recording.ros import WORLD, Composer
+from capsense.recording.ros import PACKAGE, WORLD, Composer, Messages
 from capsense.recording.session import Session, shield_coupling
 from capsense.scene import Body, DepthFrame, Pose, RestSurface, Scene, Shape, SurfaceMesh
 

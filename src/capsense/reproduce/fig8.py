@@ -22,9 +22,9 @@ import capsense as cs
 from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.bench import moving_bar, reference_bar, time_steps
 from capsense.field.background import BuildSettings
-from capsense.masked.planes import plan_axes
+from capsense.masked.mesh_sensor import plan_axes
+from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
 from capsense.simulator import Method, PresetName
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def _error(sim: cs.Simulator, gap: int) -> float:
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
-    """Carry the study out; see :class:`capsense.reproduce.study.Study`."""
+    """Carry the study out; see :class:`capsense.reproduce.harness.Study`."""
     store = Store(folder)
     meshes = REDUCED if reduced else REFINEMENTS
     todo: list[tuple[Method, str]] = [("surface", preset) for preset in PRESETS]

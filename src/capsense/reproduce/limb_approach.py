@@ -7,33 +7,38 @@ from pathlib import Path
 
 import numpy as np
 
+from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
 from capsense.reproduce.limb_curves import (
+    ARM,
     BACKINGS,
     BOX,
     BOXES,
     CHECK,
+    EDGES,
+    FAR,
     FITS,
     GROUNDINGS,
     MAIN,
     RADII,
     RANGES,
     SIZES,
+    WITHIN,
+    ArmFit,
     LimbCurves,
     LimbSetup,
     counts,
     distances,
+    fit_arm,
+    plot_approach,
     read_curves,
     slopes,
     zero_distance,
 )
-from capsense.reproduce.limb_fit import ARM, EDGES, FAR, WITHIN, ArmFit, fit_arm
-from capsense.reproduce.limb_plots import plot_approach
 from capsense.reproduce.store import Store
-from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
-    """Carry the study out; see :class:`capsense.reproduce.study.Study`."""
+    """Carry the study out; see :class:`capsense.reproduce.harness.Study`."""
     store = Store(folder)
     box = 1.0 if reduced else BOX
     setups = [LimbSetup(s, b, box) for s, b in product(SIZES[:1] if reduced else SIZES, BACKINGS)]

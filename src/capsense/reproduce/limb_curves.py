@@ -3,25 +3,37 @@
 The limb is a capsule that lies across the electrode's middle. Distance is that between the
 electrode's plane and the nearest skin. Readings are tared at a stated pose, as capacitive
 distance sensors are: :data:`RETREAT`, to the side of the limb and along it.
+
+One electrode is fitted to the slopes of public data above a human arm. The data's electrode, its
+mounting and the zero of its distance are not described. So three figures are fitted to four slopes:
+the electrode's edge, an offset of its distance, and the tare.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import product
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RectBivariateSpline
+from scipy.optimize import least_squares
 
 import capsense as cs
+from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.design.loader import parse_design
 from capsense.field.background import BuildSettings
 from capsense.reproduce.store import Store
-from capsense.scene.body import Grounding
+from capsense.scene.scene import Grounding
 
 if TYPE_CHECKING:
     from capsense.design.model import Design
     from capsense.simulator import PresetName
+
 
 Array = NDArray[np.float64]
 
@@ -213,3 +225,127 @@ def counts(values: Array, tare: float) -> Array:
     pose = pose[rests].astype(int)
     mean = np.bincount(pose, found.code[rests]) / np.bincount(pose)
     return mean[1:] - mean[0]
+
+
+ARM = (-0.87, -1.31, -1.88, -2.64)
+"""Slopes of the public human-arm data over the ranges of
+:data:`~capsense.reproduce.limb_curves.RANGES`; their uncertainties are not known."""
+WITHIN = 0.15
+"""How near each slope is to be."""
+EDGES = (0.02, 0.03, 0.06, 0.10, 0.15)
+"""Edges of the square electrodes [m] between which the fit interpolates."""
+FAR = (0.18, 0.21, 0.25)
+"""Distances [m] beyond the ranges, for the offset."""
+SPAN = ((EDGES[0], -0.005, -1.0), (EDGES[-1], 0.08, 0.95))
+"""Between which edge [m], offset [m] and tare, see :class:`ArmFit`, are sought; readings nearer
+than 5 mm, where large electrodes are less sure, are left out."""
+STEPS = (13, 30, 27)
+"""Of the search over these."""
+
+
+@dataclass(frozen=True)
+class ArmFit:
+    """What a fit to the arm found."""
+
+    figures: tuple[float, float, float]
+    """The electrode's edge [m], the offset [m] that is added to the data's distances, and the
+    tare, as a share of the reading at 15 cm."""
+    slopes: tuple[float, ...]
+    ranges: tuple[tuple[float, float], ...]
+    """Of each figure, where all slopes are near enough with some values of the others; empty if
+    nowhere."""
+
+    @property
+    def apart(self) -> float:
+        """The largest difference of a slope from the data's."""
+        return float(np.abs(np.subtract(self.slopes, ARM)).max())
+
+
+class _Model:
+    """Slopes over edge, offset and tare, by interpolation of curves."""
+
+    def __init__(self, edges: ArrayLike, distance: Array, change: Array) -> None:
+        self._spline = RectBivariateSpline(np.log(edges), np.log(distance), np.log(change))
+        self._nearest, self._farthest = distance[0], distance[-1]
+        self._z = distances(6)
+        self._z = self._z[self._z > 0.009]
+
+    def slopes(self, figures: ArrayLike) -> Array:
+        edge, offset, tare = np.asarray(figures, dtype=float)
+        z = np.clip(np.append(self._z, 0.15) + offset, self._nearest, self._farthest)
+        reading = np.exp(self._spline.ev(np.log(edge), np.log(z)))
+        return np.array(slopes(self._z, reading[:-1] - tare * reading[-1]))
+
+
+def fit_arm(edges: ArrayLike, distance: Array, change: Array) -> ArmFit:
+    """Fit edge, offset and tare by least squares, and look where else all slopes are near enough.
+
+    Args:
+        edges: Of the electrodes [m], shape (e,).
+        distance: From the electrode to the skin [m], rising, shape (n,).
+        change: Readings less those without a limb [F], shape (e, n).
+    """
+    model = _Model(edges, distance, np.asarray(change))
+    low, high = np.array(SPAN)
+    axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, STEPS, strict=True)]
+    tried = np.array(list(product(*axes)))
+    apart = np.abs([model.slopes(figures) - ARM for figures in tried])  # NaN where all is tared
+    near = tried[apart.max(axis=1) < WITHIN]
+    best = least_squares(
+        lambda figures: model.slopes(figures) - ARM,
+        tried[np.nanargmin((apart**2).sum(axis=1))],
+        x_scale=(0.02, 0.005, 0.1),
+        bounds=(low, high),
+    ).x
+    ranges = [(float(c.min()), float(c.max())) for c in near.T] if len(near) else []
+    a, b, c = (float(value) for value in best)
+    return ArmFit((a, b, c), tuple(model.slopes(best).tolist()), tuple(ranges))
+
+
+def plot_approach(
+    cases: Mapping[LimbSetup, LimbCurves], boxes: Mapping[LimbSetup, LimbCurves]
+) -> Figure:
+    """Curves against distance: by electrode, as counts and as capacitance; by grounding; by box."""
+    figure = Figure(figsize=(9.6, 8.0), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True).ravel()
+    for setup, found in cases.items():
+        style = {"ls": _line(setup), "color": COLOURS[SIZES.index(setup.size)]}
+        label = f"{setup.size * 1e3:.0f} mm, {setup.backing}"
+        code = counts(*found.readings())
+        axes[0].plot(1e2 * found.distance, np.where(code > 0, code, np.nan), label=label, **style)
+        axes[1].plot(1e2 * found.distance, 1e15 * found.change(), label=label, **style)
+    _groundings(axes[2], next(iter(cases.values())))
+    for setup, found in boxes.items():
+        axes[3].plot(
+            1e2 * found.distance, 1e15 * found.change(tared=False), ls=_line(setup),
+            color=COLOURS[BOXES.index(setup.box)], label=f"{setup.box:g} m, {setup.backing}",
+        )  # fmt: skip
+    titles = (
+        "counts of an AD7147; limb grounded, 40 mm", "electrode; limb grounded, 40 mm",
+        "path to ground; 30 mm free", "box; 30 mm, limb away as tare",
+    )  # fmt: skip
+    for k, (axis, title) in enumerate(zip(axes, titles, strict=True)):
+        axis.set(xscale="log", yscale="log", xlim=(0.1, 15))
+        upwards = "change of capacitance [fF]" if k else "tared counts"
+        dress(axis, "distance [cm]" if k > 1 else "", upwards, title)
+        axis.set_xticks([0.1, 0.3, 1, 3, 6, 15], labels=["0.1", "0.3", "1", "3", "6", "15"])
+        axis.minorticks_off()
+        axis.legend(loc="lower left", **LEGEND)
+    return figure
+
+
+def _groundings(axis: Axes, found: LimbCurves) -> None:
+    """Limbs tied to ground in several ways; the hardware's fits, laid on the grounded one."""
+    z, change = found.distance, found.change()
+    for name, colour in zip(GROUNDINGS, COLOURS, strict=False):
+        axis.plot(1e2 * z, 1e15 * found.change(MAIN, name), color=colour, label=name)
+    meet = 0.03  # where the hardware's curves are laid on ours
+    scale = float(np.interp(meet, z, change))
+    for (name, (k, b)), line in zip(FITS.items(), (":", "--", "-."), strict=True):
+        fit = k / z - b
+        seen = np.where((fit > 0) & (z > 0.009), fit * scale / (k / meet - b), np.nan)
+        axis.plot(1e2 * z, 1e15 * seen, color=INK, lw=1, ls=line, label=f"hardware, {name}")
+
+
+def _line(setup: LimbSetup) -> Any:
+    return DASHES[setup.backing != "free"]

@@ -18,14 +18,23 @@ from numpy.typing import NDArray
 import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.field.background import BuildSettings
-from capsense.mesh.settings import MeshSettings
-from capsense.reproduce.limb_rides import PARTICIPANTS, RIDES, SEED, Ride, course, rides
-from capsense.reproduce.limb_worlds import PIXELS, View, opened, read_poses
-from capsense.reproduce.metrics import cross_correlation, raw_correlation
-from capsense.reproduce.paper import correlations
-from capsense.reproduce.store import Store
-from capsense.reproduce.study import Cell, Outcome, Report, ReportTable, Row, judged
-from capsense.scene.body import Grounding
+from capsense.mesh.lattice import MeshSettings
+from capsense.readout.calibration import cross_correlation
+from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
+from capsense.reproduce.limb_worlds import (
+    PARTICIPANTS,
+    PIXELS,
+    RIDES,
+    SEED,
+    Ride,
+    View,
+    course,
+    opened,
+    read_poses,
+    rides,
+)
+from capsense.reproduce.store import Store, correlations, raw_correlation
+from capsense.scene.scene import Grounding
 from capsense.simulator import Method
 
 if TYPE_CHECKING:
@@ -44,7 +53,7 @@ authors give 107 ms a step."""
 
 
 @dataclass(frozen=True)
-class Run:
+class Variant:
     """How all rides are simulated."""
 
     title: str
@@ -66,20 +75,20 @@ LINES: tuple[dict[str, Any], ...] = (
 """Of reference, depth camera and the paper's scheme: the first two nearly coincide."""
 AGAIN = "again"
 """The reference read by a second chip: what its noise leaves of a correlation."""
-RUNS: dict[str, Run] = {
-    REFERENCE: Run("accurate, geometry, MuJoCo"),
-    DEPTH: Run("accurate, depth camera, MuJoCo", view="depth_camera"),
-    PAPER: Run(
+RUNS: dict[str, Variant] = {
+    REFERENCE: Variant("accurate, geometry, MuJoCo"),
+    DEPTH: Variant("accurate, depth camera, MuJoCo", view="depth_camera"),
+    PAPER: Variant(
         "the paper's scheme, depth camera, MuJoCo", view="depth_camera", method="fem_masked",
         resolution=COARSE,
     ),
-    "fine": Run(
+    "fine": Variant(
         "the paper's scheme, mesh seven times as fine", view="depth_camera", method="fem_masked",
         rides=1,
     ),
-    "person": Run("accurate, geometry, person on 100 pF", grounding=1e-10),
-    "bullet": Run("accurate, geometry, PyBullet", simulator="pybullet"),
-    "bullet_depth": Run(
+    "person": Variant("accurate, geometry, person on 100 pF", grounding=1e-10),
+    "bullet": Variant("accurate, geometry, PyBullet", simulator="pybullet"),
+    "bullet_depth": Variant(
         "accurate, depth camera, PyBullet", simulator="pybullet", view="depth_camera"
     ),
 }  # fmt: skip
@@ -89,7 +98,7 @@ Changes = dict[str, Array]
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
-    """Carry the study out; see :class:`capsense.reproduce.study.Study`."""
+    """Carry the study out; see :class:`capsense.reproduce.harness.Study`."""
     store = Store(folder)
     people = list(PARTICIPANTS)[: 2 if reduced else None]
     count = 2 if reduced else RIDES
@@ -114,7 +123,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
     )
 
 
-def _changes(store: Store, how: Run, person: str, ways: list[Ride]) -> Array:
+def _changes(store: Store, how: Variant, person: str, ways: list[Ride]) -> Array:
     """Change of the self-capacitances over a participant's rides [F]."""
     ways = ways[: how.rides]
 

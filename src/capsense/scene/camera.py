@@ -34,8 +34,8 @@ class OrthographicCamera:
     the default pose it sits at the sensor's origin and looks out of the sensor.
 
     Raises:
-        SceneError: A length is not a positive finite number, ``far`` does not exceed ``near``,
-            or a pixel order is unknown.
+        SceneError: A length is not a positive finite number, ``far`` does not exceed ``near``, or a
+            pixel order is unknown.
     """
 
     width: float = 0.5
@@ -76,7 +76,8 @@ class OrthographicCamera:
         """A camera as in OpenGL and MuJoCo: looks along −z, y up, first row of the image on top.
 
         Args:
-            width, height: Full extents of the image [m].
+            width: Full extent of the image along x [m].
+            height: Full extent of the image along y [m].
             pose: Frame of the OpenGL camera in the sensor frame.
             options: ``near``, ``far``, ``rows`` and ``columns``, as for the class.
 

@@ -10,13 +10,73 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from types import MappingProxyType
+from typing import Any
 
+from capsense._validate import as_number
 from capsense.constants import EPS0
 from capsense.errors import SceneError
-from capsense.scene.dispersion import GABRIEL, ColeCole
+
+
+@dataclass(frozen=True)
+class ColeCole:
+    """``ε(ω) = ε_∞ + Σ Δε/(1 + (jωτ)^(1−α)) + σ/(jωε₀)``.
+
+    Raises:
+        SceneError: A number is out of range.
+    """
+
+    eps_inf: float
+    """ε_∞, at least 1."""
+    terms: tuple[tuple[float, float, float], ...]
+    """(Δε, τ [s], α) of each dispersion, with Δε ≥ 0, τ > 0 and 0 ≤ α < 1."""
+    sigma: float = 0.0
+    """Ionic conductivity [S/m]."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= as_number(self.eps_inf) < math.inf:
+            raise SceneError(f"Cole-Cole: eps_inf is {self.eps_inf!r}; give at least 1")
+        if not 0 <= as_number(self.sigma) < math.inf:
+            raise SceneError(f"Cole-Cole: sigma is {self.sigma!r}; give at least 0 S/m")
+        for term in self.terms:
+            step, tau, alpha = (as_number(figure) for figure in term)
+            if not (0 <= step < math.inf and 0 < tau < math.inf and 0 <= alpha < 1):
+                raise SceneError(
+                    f"Cole-Cole: the term {term} must be (step >= 0, tau > 0 in "
+                    "seconds, 0 <= alpha < 1)"
+                )
+
+    def permittivity(self, frequency: float) -> complex:
+        """Complex relative permittivity at ``frequency`` [Hz], which must be above zero."""
+        omega = 2 * math.pi * frequency
+        total = self.eps_inf + self.sigma / (1j * omega * EPS0)
+        return total + sum(s / (1 + (1j * omega * tau) ** (1 - a)) for s, tau, a in self.terms)
+
+
+DATA: Mapping[str, Any] = tomllib.loads(
+    resources.files("capsense.scene").joinpath("materials.toml").read_text(encoding="utf-8")
+)
+"""The tables of ``materials.toml``: materials, aliases, tissues, paths to ground."""
+
+
+def _tissue(eps_inf: float, sigma: float, terms: Sequence[Sequence[float]]) -> ColeCole:
+    units = (1e-12, 1e-9, 1e-6, 1e-3)
+    return ColeCole(
+        eps_inf,
+        tuple((s, tau * unit, a) for (s, tau, a), unit in zip(terms, units, strict=True) if s > 0),
+        sigma,
+    )
+
+
+GABRIEL: Mapping[str, ColeCole] = MappingProxyType(
+    {name: _tissue(**figures) for name, figures in DATA["tissues"].items()}
+)
+"""Cole-Cole models of tissues, after Gabriel et al. 1996."""
+
 
 CONDUCTOR_PERMITTIVITY = 1000.0
 """Magnitude of the complex relative permittivity from which matter counts as a conductor."""
@@ -108,48 +168,6 @@ def _require_frequency(frequency: float) -> None:
         raise SceneError(f"frequency is {frequency!r} Hz; give a positive finite number")
 
 
-_METAL = "resistivity at 20 °C, common handbook value; any metal is an ideal conductor here"
-_PERMITTIVITY = "common range of datasheets and tables: "
-_GABRIEL = "Gabriel et al. 1996, four-term Cole-Cole model, evaluated at 250 kHz: "
-
-_TABLE = (
-    Material("air", 1.0, 0.0, "1.0006 at 1 bar, rounded to the vacuum the domain is made of"),
-    # Metals.
-    Material("steel", 1.0, 6.99e6, "carbon steel 1010, 1.43e-7 ohm m; " + _METAL),
-    Material("stainless steel", 1.0, 1.45e6, "grade 304, 6.9e-7 ohm m; " + _METAL),
-    Material("copper", 1.0, 5.96e7, "1.68e-8 ohm m; " + _METAL),
-    Material("aluminium", 1.0, 3.77e7, "2.65e-8 ohm m; " + _METAL),
-    # Insulators. Their losses are far below what capacitive readouts resolve: sigma = 0.
-    Material("polycarbonate", 2.9, 0.0, _PERMITTIVITY + "2.8-3.0"),
-    Material("FR4", 4.5, 0.0, _PERMITTIVITY + "4.3-5.0"),
-    Material("glass", 5.0, 0.0, _PERMITTIVITY + "4-10, borosilicate 4.3-5.0"),
-    Material("wood", 3.0, 0.0, _PERMITTIVITY + "dry 2-6, lower half; wet wood has 10-30"),
-    Material("silicone rubber", 3.5, 0.0, _PERMITTIVITY + "3.2-9.8, unfilled grades low"),
-    Material("PLA", 3.0, 0.0, _PERMITTIVITY + "PLA, PET-G and ABS 2.88-3.48 at 1-100 MHz"),
-    Material("cotton", 3.2, 0.0, _PERMITTIVITY + "dry fibre 3.2; fabric with air lower"),
-    # Water: 78.54 (1 - 4.579e-3 (T - 25) + 1.19e-5 (T - 25)^2 - 2.8e-8 (T - 25)^3), T in °C.
-    Material("water", 78.5, 0.05, "eps_r at 25 °C; sigma of tap water, common 0.005-0.08 S/m"),
-    Material("deionised water", 78.5, 5.5e-6, "eps_r and sigma of pure water at 25 °C"),
-    # Tissues, at 250 kHz. All count as conductors there; fat and cortical bone not at 1 MHz.
-    Material("skin", 1098.0, 1.46e-3, _GABRIEL + "dry skin", GABRIEL["skin dry"]),
-    Material("wet skin", 7180.0, 0.131, _GABRIEL + "wet skin", GABRIEL["skin wet"]),
-    Material("muscle", 5763.0, 0.396, _GABRIEL + "muscle", GABRIEL["muscle"]),
-    Material("fat", 67.79, 0.0436, _GABRIEL + "infiltrated fat", GABRIEL["fat"]),
-    Material("blood", 4813.0, 0.715, _GABRIEL + "blood", GABRIEL["blood"]),
-    Material("cortical bone", 197.0, 0.0212, _GABRIEL + "cortical bone", GABRIEL["bone cortical"]),
-    Material(
-        "cancellous bone", 366.4, 0.0850, _GABRIEL + "cancellous bone", GABRIEL["bone cancellous"]
-    ),
-    Material(
-        "human",
-        5763.0,
-        0.396,
-        _GABRIEL + "muscle, standing for a limb as a whole",
-        GABRIEL["muscle"],
-    ),
-)
-
-
 def water(temperature: float, sigma: float = 0.05) -> Material:
     """Water at a temperature; from below 1 GHz down its permittivity does not depend on frequency.
 
@@ -170,17 +188,17 @@ def water(temperature: float, sigma: float = 0.05) -> Material:
     return Material(f"water at {temperature:g} °C", eps_r, sigma, "permittivity: handbook series")
 
 
-MATERIALS: Mapping[str, Material] = MappingProxyType({m.name: m for m in _TABLE})
+MATERIALS: Mapping[str, Material] = MappingProxyType(
+    {
+        name: Material(
+            name, m["eps_r"], m.get("sigma", 0.0), m["source"], GABRIEL.get(m.get("tissue"))
+        )
+        for name, m in DATA["materials"].items()
+    }
+)
 """The known materials by name."""
 
-_ALIASES = {
-    **{name.lower(): name for name in MATERIALS},
-    "aluminum": "aluminium",
-    "dry wood": "wood",
-    "dry skin": "skin",
-    "tap water": "water",
-    "deionized water": "deionised water",
-}
+_ALIASES = {**{name.lower(): name for name in MATERIALS}, **DATA["aliases"]}
 
 
 def material(name: str) -> Material:

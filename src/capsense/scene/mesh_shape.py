@@ -10,14 +10,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
-from capsense.scene.shape import Shape, ShapeKind, as_points
-from capsense.scene.surface import clean_surface, connected_parts, enclosed_volume
+from capsense.scene.layers import checked_mesh, checked_vertices
+from capsense.scene.materials import Material
+from capsense.scene.materials import material as find_material
+from capsense.scene.pose import Pose
+from capsense.scene.scene import Body, Grounding, checked_grounding
+from capsense.scene.shapes import Shape, ShapeKind, as_points
+from capsense.scene.surface import clean_surface, connected_parts, enclosed_volume, is_closed
 
 if TYPE_CHECKING:
     import trimesh
 
-    from capsense.scene.distance_kernels import Boxes
+    from capsense.scene.geometry_kernels import Boxes
+
 
 Array = NDArray[np.float64]
 
@@ -70,7 +77,7 @@ class TriangleShape(Shape):
         """Whether the surface has an inside."""
 
     def _distances(self, points: ArrayLike) -> Array:
-        from capsense.scene.distance_kernels import signed_distances
+        from capsense.scene.geometry_kernels import signed_distances
 
         p = as_points(points)
         out = np.empty(len(p))
@@ -79,7 +86,7 @@ class TriangleShape(Shape):
 
     @cached_property
     def _boxes(self) -> Boxes:
-        from capsense.scene.distance_kernels import boxed
+        from capsense.scene.geometry_kernels import boxed
 
         return boxed(self.vertices[self.faces])
 
@@ -173,3 +180,161 @@ class TriMesh(TriangleShape):
                 "fill the holes (trimesh.repair.fill_holes) or pass the convex hull "
                 "(mesh.convex_hull)"
             )
+
+
+SHEET_THICKNESS = 1e-3
+"""Thickness of an open surface of a dielectric where none is given [m]."""
+
+
+@dataclass(frozen=True, init=False, eq=False)
+class RestSurface(Frozen):
+    """What a surface keeps while it deforms; shared by the shapes it takes on.
+
+    Args:
+        vertices: Points [m] in the form it had first, shape (n, 3).
+        faces: Vertex indices, shape (m, 3). Those of a closed surface should wind alike.
+        thickness: That of an open surface of a dielectric, such as cloth [m].
+
+    Raises:
+        SceneError: Wrong shapes or types, a number that is not finite, an index out of range.
+    """
+
+    vertices: Array
+    """Points [m] in the form it had first, shape (n, 3), read-only."""
+    faces: NDArray[np.int64]
+    """Vertex indices, shape (m, 3), read-only."""
+    thickness: float
+    """That of an open surface of a dielectric [m]."""
+
+    def __init__(
+        self, vertices: ArrayLike, faces: ArrayLike, thickness: float = SHEET_THICKNESS
+    ) -> None:
+        if not (np.isfinite(thickness) and thickness > 0):
+            raise SceneError(f"thickness is {thickness!r}; give a positive length in metres")
+        v, f = checked_mesh(vertices, faces)
+        f = f.copy()
+        v.setflags(write=False)
+        f.setflags(write=False)
+        self.__dict__.update(vertices=v, faces=f, thickness=float(thickness))
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether the surface has an inside: it has no rim, and its faces wind alike."""
+        return is_closed(self.faces, len(self.vertices))
+
+    @cached_property
+    def used(self) -> NDArray[np.int64]:
+        """Vertices that faces name, ascending."""
+        return np.unique(self.faces)
+
+
+@dataclass(frozen=True, init=False, eq=False, repr=False)
+class SurfaceMesh(TriangleShape):
+    """A surface at one instant, open or closed; an open one is a thin sheet.
+
+    Args:
+        vertices: Points [m] in the local frame, shape (n, 3).
+        rest: What stays while it deforms; of as many vertices.
+
+    Raises:
+        SceneError: Vertices of another shape, or one that is not finite.
+    """
+
+    vertices: Array
+    """Points [m] in the local frame, shape (n, 3), read-only."""
+    faces: NDArray[np.int64]
+    """Vertex indices, shape (m, 3), read-only; the same array at every instant."""
+    rest: RestSurface
+
+    kind = ShapeKind.SURFACE
+
+    def __init__(self, vertices: ArrayLike, rest: RestSurface) -> None:
+        v = checked_vertices(vertices)
+        if v.shape != rest.vertices.shape:
+            raise SceneError(
+                f"vertices have shape {v.shape}, but the surface was made with "
+                f"{rest.vertices.shape}; make a new one to change its faces"
+            )
+        v.setflags(write=False)
+        self.__dict__.update(vertices=v, faces=rest.faces, rest=rest)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the surface has an inside."""
+        return self.rest.closed
+
+    @cached_property
+    def volume(self) -> float:
+        self._require_inside("volume")
+        return abs(enclosed_volume(self.vertices, self.faces))
+
+    def bounds(self) -> Array:
+        used = self.rest.used
+        v = self.vertices if len(used) == len(self.vertices) else self.vertices[used]
+        return np.array([v.min(axis=0), v.max(axis=0)])
+
+    def _require_inside(self, what: str) -> None:
+        if not self.closed:
+            raise SceneError(
+                f"SurfaceMesh: the surface is open or its faces wind differently, so it has no "
+                f"inside, and no {what}; conductors need none; else close it (coinciding vertices "
+                "must be one) and wind its faces alike"
+            )
+
+
+class DeformableSurface:
+    """A triangle mesh whose vertices may be replaced at every step.
+
+    Its triangles carry the charge, so it may be open, which makes it a thin sheet. The first
+    vertices tell which triangles belong together; give a form without creases.
+
+    Args:
+        vertices: Points [m] in the sensor frame, shape (n, 3).
+        faces: Vertex indices, shape (m, 3). Those of a closed surface should wind alike.
+        thickness: That of an open surface of a dielectric, such as cloth [m]; conductors and
+            closed surfaces need none.
+        material: As for :class:`~capsense.scene.scene.Body`.
+        grounding: As for :class:`~capsense.scene.scene.Body`.
+        name: As for :class:`~capsense.scene.scene.Body`.
+
+    Raises:
+        SceneError: Wrong shapes or values.
+    """
+
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        *,
+        thickness: float = SHEET_THICKNESS,
+        material: Material | str = "human",
+        grounding: Grounding = "grounded",
+        name: str | None = None,
+    ) -> None:
+        self._rest = RestSurface(vertices, faces, thickness)
+        self._shape = SurfaceMesh(self._rest.vertices, self._rest)
+        self.material = material if isinstance(material, Material) else find_material(material)
+        self.grounding = checked_grounding(grounding)
+        self.name = name
+
+    @property
+    def faces(self) -> NDArray[np.int64]:
+        """Vertex indices, shape (m, 3)."""
+        return self._rest.faces
+
+    @property
+    def vertices(self) -> Array:
+        """The vertices [m] in the sensor frame, shape (n, 3); set them to deform the surface.
+
+        Raises:
+            SceneError: Set to another shape, or to numbers that are not finite.
+        """
+        return self._shape.vertices
+
+    @vertices.setter
+    def vertices(self, vertices: ArrayLike) -> None:
+        self._shape = SurfaceMesh(vertices, self._rest)
+
+    def body(self) -> Body:
+        """The surface as it is now, as a body of a scene in the sensor frame."""
+        return Body(self._shape, Pose(), self.material, self.grounding, self.name)

@@ -6,21 +6,103 @@ Full sizes, metres; capsule and cylinder lie along local z.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
 from capsense.scene.pose import Vec3, checked_floats
-from capsense.scene.shape import Shape, ShapeKind, as_points
 
 if TYPE_CHECKING:
     import trimesh
 
+
 Array = NDArray[np.float64]
+
+
+class ShapeKind(IntEnum):
+    """Kinds of shapes, and what their ``params`` mean."""
+
+    BOX = 0
+    """Half edge lengths."""
+    SPHERE = 1
+    """Radius, 0, 0."""
+    CAPSULE = 2
+    """Radius, half length without caps, 0."""
+    CYLINDER = 3
+    """Radius, half length, 0."""
+    ELLIPSOID = 4
+    """Three radii."""
+    MESH = 5
+    """Half edge lengths of the local bounding box."""
+    LAYERS = 6
+    """Half edge lengths of the local bounding box."""
+    SURFACE = 7
+    """Half edge lengths of the local bounding box."""
+
+
+class Shape(Frozen, ABC):
+    """A solid or a surface in its own frame."""
+
+    kind: ClassVar[ShapeKind]
+    """What sort of shape it is."""
+
+    @cached_property
+    def params(self) -> Array:
+        """Sizes [m], see :class:`ShapeKind`, shape (3,), read-only."""
+        half = 0.5 * np.ptp(self.bounds(), axis=0)
+        half.setflags(write=False)
+        return half
+
+    @cached_property
+    def packed(self) -> tuple[float, ...]:
+        """``params`` and the centre of the local bounding box [m], six numbers."""
+        return (*self.params.tolist(), *self.bounds().mean(axis=0).tolist())
+
+    @property
+    @abstractmethod
+    def volume(self) -> float:
+        """Volume [m³]."""
+
+    @abstractmethod
+    def bounds(self) -> Array:
+        """Lower and upper corner of the bounding box [m] in the local frame, shape (2, 3)."""
+
+    @abstractmethod
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Distance to the surface [m], negative inside.
+
+        Args:
+            points: Points [m] in the local frame, shape (n, 3).
+
+        Returns:
+            Shape (n,).
+
+        Raises:
+            SceneError: The points do not have shape (n, 3), or the shape has no inside.
+        """
+
+    @abstractmethod
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """A surface mesh of the shape in its local frame, for drawing and for checks."""
+
+
+def as_points(points: ArrayLike) -> Array:
+    """Check points of shape (n, 3) and return them as floats.
+
+    Raises:
+        SceneError: Another shape.
+    """
+    out = np.asarray(points, dtype=float)
+    if out.ndim != 2 or out.shape[1] != 3:
+        raise SceneError(f"points have shape {out.shape}; give (n, 3)")
+    return out
 
 
 def _size(shape: str, name: str, value: object) -> float:
@@ -46,11 +128,26 @@ def _frozen(*values: float) -> Array:
 
 
 class _Primitive(Shape):
-    """A shape whose bounding box is centred on its origin."""
+    """A shape that is a few lengths, its bounding box centred on its origin."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            check = _size if f.type == "float" else _sizes
+            checked = check(type(self).__name__, f.name, getattr(self, f.name))
+            object.__setattr__(self, f.name, checked)
 
     @cached_property
     def packed(self) -> tuple[float, ...]:
         return (*self.params.tolist(), 0.0, 0.0, 0.0)
+
+    @property
+    @abstractmethod
+    def _corner(self) -> ArrayLike:
+        """Upper corner of the bounding box [m], shape (3,)."""
+
+    def bounds(self) -> Array:
+        corner = np.asarray(self._corner)
+        return np.array([-corner, corner])
 
 
 @dataclass(frozen=True)
@@ -65,9 +162,6 @@ class Box(_Primitive):
 
     kind = ShapeKind.BOX
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "size", _sizes("Box", "size", self.size))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(*(0.5 * s for s in self.size))
@@ -76,8 +170,9 @@ class Box(_Primitive):
     def volume(self) -> float:
         return math.prod(self.size)
 
-    def bounds(self) -> Array:
-        return np.array([-self.params, self.params])
+    @property
+    def _corner(self) -> Array:
+        return self.params
 
     def signed_distance(self, points: ArrayLike) -> Array:
         q = np.abs(as_points(points)) - self.params
@@ -101,9 +196,6 @@ class Sphere(_Primitive):
 
     kind = ShapeKind.SPHERE
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _size("Sphere", "radius", self.radius))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(self.radius, 0.0, 0.0)
@@ -112,8 +204,9 @@ class Sphere(_Primitive):
     def volume(self) -> float:
         return 4 / 3 * math.pi * self.radius**3
 
-    def bounds(self) -> Array:
-        return np.array([[-self.radius] * 3, [self.radius] * 3])
+    @property
+    def _corner(self) -> tuple[float, ...]:
+        return (self.radius,) * 3
 
     def signed_distance(self, points: ArrayLike) -> Array:
         return np.linalg.norm(as_points(points), axis=1) - self.radius
@@ -137,10 +230,6 @@ class Capsule(_Primitive):
 
     kind = ShapeKind.CAPSULE
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _size("Capsule", "radius", self.radius))
-        object.__setattr__(self, "length", _size("Capsule", "length", self.length))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(self.radius, 0.5 * self.length, 0.0)
@@ -149,9 +238,9 @@ class Capsule(_Primitive):
     def volume(self) -> float:
         return math.pi * self.radius**2 * (self.length + 4 / 3 * self.radius)
 
-    def bounds(self) -> Array:
-        top = np.array([self.radius, self.radius, 0.5 * self.length + self.radius])
-        return np.array([-top, top])
+    @property
+    def _corner(self) -> tuple[float, ...]:
+        return self.radius, self.radius, 0.5 * self.length + self.radius
 
     def signed_distance(self, points: ArrayLike) -> Array:
         p = as_points(points).copy()
@@ -182,10 +271,6 @@ class Cylinder(_Primitive):
 
     kind = ShapeKind.CYLINDER
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _size("Cylinder", "radius", self.radius))
-        object.__setattr__(self, "length", _size("Cylinder", "length", self.length))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(self.radius, 0.5 * self.length, 0.0)
@@ -194,9 +279,9 @@ class Cylinder(_Primitive):
     def volume(self) -> float:
         return math.pi * self.radius**2 * self.length
 
-    def bounds(self) -> Array:
-        top = np.array([self.radius, self.radius, 0.5 * self.length])
-        return np.array([-top, top])
+    @property
+    def _corner(self) -> tuple[float, ...]:
+        return self.radius, self.radius, 0.5 * self.length
 
     def signed_distance(self, points: ArrayLike) -> Array:
         p = as_points(points)
@@ -225,9 +310,6 @@ class Ellipsoid(_Primitive):
 
     kind = ShapeKind.ELLIPSOID
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "radii", _sizes("Ellipsoid", "radii", self.radii))
-
     @cached_property
     def params(self) -> Array:
         return _frozen(*self.radii)
@@ -236,8 +318,9 @@ class Ellipsoid(_Primitive):
     def volume(self) -> float:
         return 4 / 3 * math.pi * math.prod(self.radii)
 
-    def bounds(self) -> Array:
-        return np.array([-self.params, self.params])
+    @property
+    def _corner(self) -> Array:
+        return self.params
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """Distance to the surface, exact to about 1e-9 of the smallest radius.

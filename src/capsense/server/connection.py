@@ -1,19 +1,144 @@
-"""Connections that bound what a client can make the event loop do beneath its session."""
+"""What a server serves and to whom, and connections that bound what a client can do."""
 
 from __future__ import annotations
 
 import asyncio
+import hmac
+import ipaddress
 import socket
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any, cast
 
-from websockets.asyncio.server import ServerConnection
-from websockets.frames import Frame, Opcode
+from capsense.errors import MissingDependencyError, ServerError
+from capsense.server.frames import HEADER
+from capsense.server.messages import MAX_TEXT
 
-from capsense.server.allowance import Allowance
+try:
+    from websockets.asyncio.server import ServerConnection, serve
+    from websockets.datastructures import Headers
+    from websockets.frames import Frame, Opcode
+    from websockets.http11 import Request, Response
+except ImportError as error:
+    raise MissingDependencyError(
+        'the server needs websockets; install it with: pip install "capsense[serve]"'
+    ) from error
+
+__all__ = ["Headers", "Request", "Response", "ServerConnection", "serve"]  # for the server
 
 POLICY, TRY_LATER = 1008, 1013
 """Codes with which connections are closed on errors, and when there are too many."""
+
+
+class Allowance:
+    """A token bucket that can be overdrawn.
+
+    Args:
+        most: What can be spent at once, after a rest.
+        rate: What comes back a second.
+        first: What can be spent at the start; by default ``most``.
+    """
+
+    def __init__(self, most: float, rate: float, first: float | None = None) -> None:
+        self.most, self.rate = most, rate
+        self._left = most if first is None else first
+        self._counted = time.monotonic()
+
+    def spend(self, cost: float) -> float:
+        """Spend some, and return what is left: below zero, more was spent than there was."""
+        now = time.monotonic()
+        regained = (now - self._counted) * self.rate
+        self._counted = now
+        self._left = min(self.most, self._left + regained) - cost
+        return self._left
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one client may use; all above zero.
+
+    Raises:
+        ServerError: One is not.
+    """
+
+    connections: int = 16
+    """Clients at once."""
+    sensors: int = 8
+    """Sensors of one client."""
+    pixels: int = 65536
+    """Pixels of an image."""
+    bodies: int = 64
+    """Bodies of a scene."""
+    hello_timeout: float = 5.0
+    """Time for the handshake, and again for the hello [s]."""
+    send_timeout: float = 10.0
+    """Time a client may take to receive a message before it is cut off [s]."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not value > 0:
+                raise ServerError(f"{item.name} is {value!r}; give a number above zero")
+
+    @property
+    def message(self) -> int:
+        """Largest message [bytes]."""
+        return max(MAX_TEXT, HEADER.size + 8 * self.pixels)
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """A server's options.
+
+    Raises:
+        ServerError: Nothing is served, a port is out of range, or others than this machine could
+            connect without a token.
+    """
+
+    designs: tuple[str | Path, ...]
+    """Packaged names or design files; the first is the default."""
+    readout: str | Path | None = None
+    """A chip's name, or a readout file; none: capacitances only."""
+    host: str = "127.0.0.1"
+    port: int = 8765
+    """0 for any free one."""
+    token: str | None = field(default=None, repr=False)
+    """What clients must say; None for no token."""
+    origins: tuple[str, ...] = ()
+    """Web pages that may connect, such as ``http://localhost:3000``; other programs always may."""
+    limits: Limits = field(default_factory=Limits)
+    watch: bool = False
+    """Whether clients may watch the sensors of others."""
+
+    def __post_init__(self) -> None:
+        if not self.designs:
+            raise ServerError("no design is given; name at least one")
+        if not 0 <= self.port <= 65535:
+            raise ServerError(f"port is {self.port}; give 0 to 65535")
+        if self.token is not None and len(self.token) < 8:
+            raise ServerError("the token has fewer than 8 characters; give a longer one")
+        if self.token is None and not _loopback(self.host):
+            raise ServerError(
+                f"host {self.host} lets other machines connect; give a token, or use 127.0.0.1"
+            )
+
+    def admits(self, token: str) -> bool:
+        """Whether a client that says ``token`` may come in; takes the same time for any."""
+        if self.token is None:
+            return True
+        return hmac.compare_digest(self.token.encode(), token.encode("utf-8", "surrogatepass"))
+
+
+def _loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 FLOOD = "flood"
 """Reason with which a client that talks idly is cut off."""
 READ_SIZE = 16384

@@ -19,12 +19,16 @@ from capsense.errors import (
     SceneError,
     SolveError,
 )
-from capsense.scenario.bodies import read_grounding, read_material, read_pose
-from capsense.scenario.loader import read_bodies
-from capsense.scenario.schema import ScenarioTable
+from capsense.scenario.loader import (
+    ScenarioTable,
+    read_bodies,
+    read_grounding,
+    read_material,
+    read_pose,
+)
 from capsense.scene import Body, Material, Pose
-from capsense.scene.body import Grounding
 from capsense.scene.camera import OrthographicCamera
+from capsense.scene.scene import Grounding
 from capsense.server.frames import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL
 
 MAX_TEXT = 65536

@@ -18,27 +18,27 @@ import numpy as np
 from capsense._validate import suggest
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.errors import MissingDependencyError, ProtocolError, ServerError
+from capsense.errors import ProtocolError, ServerError
 from capsense.readout.config import choose_readout, file_content, parse_readout
 from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene.depth import DepthFrame
+from capsense.server.connection import (
+    FLOOD,
+    TRY_LATER,
+    AdmissionControl,
+    Headers,
+    RateLimitedConnection,
+    Request,
+    Response,
+    ServerConnection,
+    ServerOptions,
+    serve,
+)
 from capsense.server.frames import PROTOCOL
 from capsense.server.messages import Open, Watch
-from capsense.server.options import ServerOptions
 from capsense.server.sensor import ServedSensor
-from capsense.simulator import Simulator
-
-try:
-    from websockets.asyncio.server import ServerConnection, serve
-    from websockets.datastructures import Headers
-    from websockets.http11 import Request, Response
-except ImportError as error:
-    raise MissingDependencyError(
-        'the server needs websockets; install it with: pip install "capsense[serve]"'
-    ) from error
-
-from capsense.server.connection import FLOOD, TRY_LATER, AdmissionControl, RateLimitedConnection
 from capsense.server.session import ClientSession
+from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
     from websockets.typing import Origin

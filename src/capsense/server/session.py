@@ -5,21 +5,21 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from websockets.exceptions import ConnectionClosed
 
+from capsense.codec import design_to_json
 from capsense.errors import CapSenseError, ProtocolError
-from capsense.recording.design_json import design_to_json
 from capsense.server import messages
-from capsense.server.allowance import Allowance
-from capsense.server.connection import POLICY
+from capsense.server.connection import POLICY, Allowance
 from capsense.server.frames import PROTOCOL, unpack_depth
-from capsense.server.options import ServerOptions
 from capsense.server.sensor import Frame, ServedSensor
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
+
+    from capsense.server.server import Server
 
 T = TypeVar("T")
 ALLOWANCE, ALL_ALLOWANCES = 5000.0, 10000.0
@@ -31,29 +31,6 @@ BINARY_UNIT, TEXT_UNIT = 16384, 512
 """Bytes that count as much as a message: JSON takes longer to read than pixels."""
 OPENING, MISTAKE = 250.0, 100.0
 """What it takes to open a sensor, and to answer an error."""
-
-
-class SessionServer(Protocol):
-    """What a session needs of its server."""
-
-    options: ServerOptions
-    version: str
-
-    @property
-    def clients(self) -> int: ...
-
-    @property
-    def design_names(self) -> tuple[str, ...]: ...
-
-    def make_sensor(self, wanted: messages.Open) -> ServedSensor: ...
-
-    def find(self, wanted: messages.Watch) -> tuple[int, ServedSensor]: ...
-
-    async def work(self, job: Callable[[], T]) -> T: ...
-
-    def log(self, event: str, **fields: Any) -> None: ...
-
-    def fault(self, event: str, **fields: Any) -> None: ...
 
 
 class ClientSession:
@@ -69,7 +46,7 @@ class ClientSession:
         server: Runs it.
     """
 
-    def __init__(self, number: int, connection: ServerConnection, server: SessionServer) -> None:
+    def __init__(self, number: int, connection: ServerConnection, server: Server) -> None:
         self.number = number
         self.sensors: dict[int, ServedSensor] = {}
         self.readings = 0

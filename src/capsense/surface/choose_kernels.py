@@ -13,15 +13,13 @@ from capsense.surface.place_kernels import (
     FAR_LEAST,
     NEAR_FACE,
     SHORE,
-    least_gap,
-    lift,
-    smooth,
-)
-from capsense.surface.vector_kernels import (
     doubles,
     integers,
+    least_gap,
+    lift,
     multiply_simd,
     point_potentials,
+    smooth,
 )
 
 _LINEAR = 0.45, 0.58

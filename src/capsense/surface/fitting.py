@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.surface import fit_kernels
+from capsense.surface import tree_kernels
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -54,7 +54,7 @@ def _step(vertices: Array, faces: Index, points: Array, normals: Array, weights:
     centers = corners.mean(axis=1)
     reach = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
     sums = np.zeros((len(faces), 2))
-    fit_kernels.add_offsets(points, normals, weights, corners, planes, centers, reach, sums)
+    tree_kernels.add_offsets(points, normals, weights, corners, planes, centers, reach, sums)
     height = sums[:, 1] / np.maximum(sums[:, 0], 1e-300)
     limit = _FARTHEST * np.sqrt(0.5 * double)
     height = np.clip(height, -limit, limit)

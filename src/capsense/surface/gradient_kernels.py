@@ -18,15 +18,14 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import compiled
-from capsense.surface.force_kernels import (
+from capsense.surface.leaf_kernels import (
     near_pairs,
     pair_line,
     source_lines,
     weigh,
     wide_moments,
 )
-from capsense.surface.place_kernels import distances, near_share
-from capsense.surface.vector_kernels import WIDTH, multiply, multiply_simd
+from capsense.surface.place_kernels import WIDTH, distances, multiply, multiply_simd, near_share
 
 _BLOCK = 32
 """Leaves taken at a time, whose tables stay in the cache."""
@@ -110,7 +109,7 @@ def _source_sums(points, charge, share, bounds, sources, floor):
 
     Returns:
         Shape (b, 6, lead, s), the six numbers of
-        :func:`capsense.surface.force_kernels.source_lines`; b = 0 where no weight is above zero.
+        :func:`capsense.surface.leaf_kernels.source_lines`; b = 0 where no weight is above zero.
     """
     count, lead, width = bounds.shape[0] - 1, charge.shape[1], sources.shape[1]
     some_count = 0

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from capsense.constants import EPS0
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
-from capsense.scene.body import Grounding
 from capsense.scene.materials import Material
-from capsense.scene.scene import PackedScene
-from capsense.surface.changing import ChangingBody
+from capsense.scene.scene import Grounding, PackedScene
+from capsense.surface.pieces import ChangingBody
 from capsense.surface.rigid import RigidShape
 
 Array = NDArray[np.float64]

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.scene.mesh_shape import TriMesh
-from capsense.scene.shape import Shape
-from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
+from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere
 from capsense.surface import grids
 from capsense.surface.triangles import reduced_triangles
 

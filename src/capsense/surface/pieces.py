@@ -1,16 +1,24 @@
-"""Pieces of surfaces that change from step to step: depth images and deforming meshes."""
+"""Surfaces without energies of their own: depth images, cloth, bodies that the box cuts off.
+
+Their clusters are fixed; charge, centres and second moments follow the pieces at every step, and
+clusters meet each other as rectangles of the same moments.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.scene import Layers, RestSurface, SurfaceMesh
+from capsense.scene import Box, Capsule, Cylinder, Layers, RestSurface, SurfaceMesh
+from capsense.scene.shapes import Shape
+from capsense.surface import tree_kernels
+from capsense.surface.place_kernels import BODY
 from capsense.surface.rigid import Clusters, split
 
 Array = NDArray[np.float64]
@@ -32,7 +40,7 @@ _LEAST_AREA = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PieceArrays:
-    """Pieces of a surface as arrays, see :class:`~capsense.surface.changing.Pieces`."""
+    """Pieces of a surface as arrays, see :class:`~capsense.surface.pieces.Pieces`."""
 
     centers: Array
     areas: Array
@@ -215,3 +223,108 @@ def _pixel_tree(views: int, sides: int, rows: int, columns: int, ratio: float) -
     features = np.zeros((len(view), 6))
     features[:, :3] = np.stack([column * ratio, row, far * view], axis=1)
     return split(features, np.ones(len(view)))
+
+
+_OWN = 4.0
+"""Energy of a charge function times the extent of its cluster, as far as scores need it."""
+
+
+class Pieces(Protocol):
+    """Small flat pieces of a surface, n of them, in the frame of their body."""
+
+    @property
+    def centers(self) -> Array:
+        """[m], shape (n, 3)."""
+
+    @property
+    def areas(self) -> Array:
+        """[m²], shape (n,)."""
+
+    @property
+    def moments(self) -> Array:
+        """Second central moments of area over the area [m²], shape (n, 3, 3)."""
+
+
+class ChangingBody:
+    """A surface as the step takes it; ``record`` points to arrays that are held here.
+
+    Args:
+        tree: Clusters of all pieces.
+        surface: The pieces as they are now.
+        wanted: Which of them count, at least one, shape (n,); all by default.
+        sheet: Thickness of an open sheet [m]; 0 for the surface of a solid.
+    """
+
+    def __init__(
+        self,
+        tree: Clusters,
+        surface: Pieces,
+        wanted: NDArray[np.bool_] | None = None,
+        sheet: float = 0.0,
+    ) -> None:
+        self.sheet = sheet
+        n = len(surface.areas)
+        self._kids, self._panel, self._function = tree.kids, tree.panel, tree.function
+        if wanted is not None and not wanted.all():
+            self._kids, self._panel, self._function = (
+                np.empty_like(a) for a in (tree.kids, tree.panel, tree.function)
+            )
+            n = tree_kernels.prune(
+                tree.kids, tree.panel, wanted, self._kids, self._panel, self._function,
+                np.empty((2, len(tree.kids)), np.int64),
+            )  # fmt: skip
+            self._kids, self._panel, self._function = (
+                np.ascontiguousarray(a[: 2 * n - 1])
+                for a in (self._kids, self._panel, self._function)
+            )
+        nodes = 2 * n - 1
+        single = self._panel >= 0
+        at = self._panel[single]
+        self._charge, self._center, self._spread = (
+            np.empty(nodes),
+            np.empty((nodes, 3)),
+            np.empty((nodes, 3, 3)),
+        )
+        self._charge[single] = surface.areas[at]
+        self._center[single], self._spread[single] = surface.centers[at], surface.moments[at]
+        tree_kernels.moments(self._kids, self._panel, self._charge, self._center, self._spread)
+        extent = np.sqrt(6.0 * np.trace(self._spread, axis1=1, axis2=2)) + 1e-9
+        self._extent = extent
+        self.capacitance = 0.35 * float(extent[0])
+        """About that in free space over 4π eps0 [m]."""
+        self._own = np.empty(n)
+        self._own[0] = 0.5 * _OWN / extent[0]
+        self._own[self._function[~single]] = _OWN / extent[~single]
+        record = np.zeros(1, BODY)[0]
+        record["n"], record["scale"] = n, 1.0
+        for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
+            record[name] = getattr(self, f"_{name}").ctypes.data
+        self.record = record
+
+
+def windowed(shape: Shape, middle: Array, reach: float) -> tuple[Shape, Array]:
+    """Cut a box, cylinder or capsule to a length that reaches through the domain.
+
+    The part keeps its size while the body moves, so that its charge functions are made once.
+
+    Args:
+        shape: Any shape.
+        middle: Centre of the domain in the shape's frame [m], shape (3,).
+        reach: Diagonal of the domain [m]. What is no longer along any axis stays whole.
+
+    Returns:
+        The part, and its centre in the shape's frame [m], shape (3,).
+    """
+    if isinstance(shape, Box):
+        size = np.array(shape.size)
+    elif isinstance(shape, Cylinder | Capsule):
+        size = np.array([0.0, 0.0, shape.length])
+    else:
+        return shape, np.zeros(3)
+    if size.max() <= reach:
+        return shape, np.zeros(3)
+    part = np.minimum(size, reach)
+    at = np.clip(middle, 0.5 * (part - size), 0.5 * (size - part))
+    if isinstance(shape, Box):
+        return Box(tuple(part.tolist())), at
+    return type(shape)(shape.radius, float(part[2])), at

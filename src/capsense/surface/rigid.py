@@ -22,8 +22,7 @@ from capsense.errors import SolveError
 from capsense.surface import tree_kernels
 from capsense.surface.blocks import free_block, impedance
 from capsense.surface.panels import SurfacePanels
-from capsense.surface.place_kernels import BODY
-from capsense.surface.vector_kernels import cholesky
+from capsense.surface.place_kernels import BODY, cholesky
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled
 from capsense._simd import at, madd, put_span, span
-from capsense.surface.vector_kernels import (
+from capsense.surface.place_kernels import (
     WIDTH,
     cholesky,
     integers,

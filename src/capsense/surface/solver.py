@@ -16,17 +16,13 @@ from capsense.field.change import Change
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.scene import PackedScene
-from capsense.scene.shape import Shape, ShapeKind
-from capsense.surface.changing import ChangingBody
+from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
-from capsense.surface.pieces import layer_pieces, mesh_pieces
-from capsense.surface.place_kernels import BODY, Green
-from capsense.surface.potentials import potential_change
+from capsense.surface.pieces import ChangingBody, layer_pieces, mesh_pieces, windowed
+from capsense.surface.place_kernels import BODY, WIDTH, Green
 from capsense.surface.rigid import RigidShape
-from capsense.surface.step import Solution, solve, solve_lossy
+from capsense.surface.step import Solution, potential_change, solve, solve_lossy
 from capsense.surface.store import rigid
-from capsense.surface.vector_kernels import WIDTH
-from capsense.surface.window import windowed
 
 Array = NDArray[np.float64]
 

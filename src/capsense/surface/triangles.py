@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from capsense.errors import SceneError
 from capsense.scene.surface import clean_surface, connected_parts
-from capsense.surface import collapse_kernels
+from capsense.surface import panel_kernels
 from capsense.surface.fitting import fitted
 
 Array = NDArray[np.float64]
@@ -243,7 +243,7 @@ def _collapsed(vertices: Array, faces: Index, count: int) -> tuple[Array, Index]
     middle, extent = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
     points = (vertices - middle) / extent
     reduced = np.ascontiguousarray(faces, dtype=np.int64).copy()
-    left = collapse_kernels.collapse(
+    left = panel_kernels.collapse(
         points, reduced, *_quadrics(points, reduced, _sharp(points, reduced)), count
     )
     used, local = np.unique(reduced[left], return_inverse=True)

@@ -13,7 +13,7 @@ from capsense.errors import CapSenseError
 from capsense.viewer.source import Frame, Seekable, Source
 
 if TYPE_CHECKING:
-    from capsense.viewer.plane import Plane
+    from capsense.viewer.charts import Plane
 
 Array = NDArray[np.float64]
 

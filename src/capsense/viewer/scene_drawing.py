@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from capsense._style import signal_colours
 from capsense.design import Design
-from capsense.design.draw import ROLE_COLOURS
 from capsense.design.geometry import Surface
+from capsense.plotting.designs import ROLE_COLOURS
 from capsense.scene import Body, Layers, Pose, Scene, Shape, ShapeKind
-from capsense.viewer.plane import Plane
+from capsense.viewer.charts import Plane
 from capsense.viewer.source import Charges
 
 if TYPE_CHECKING:

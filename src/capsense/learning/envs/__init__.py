@@ -8,7 +8,7 @@ from __future__ import annotations
 from capsense.errors import MissingDependencyError
 
 try:
-    import mujoco  # noqa: F401
+    import mujoco
     from gymnasium.envs.registration import register
 except ImportError:
     raise MissingDependencyError(

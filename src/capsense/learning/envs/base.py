@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from capsense.adapters import mujoco as adapter
 from capsense.design import load_design
 from capsense.errors import SceneError
-from capsense.humans import arm
+from capsense.humans import Limb, arm
 from capsense.learning.envs.randomisation import Randomisation
 from capsense.learning.envs.signals import LIMIT, Signals
 from capsense.scene import Material, Pose
@@ -147,7 +147,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     def _build(self, rng: np.random.Generator) -> None:
         """Make the model anew, with a limb of the size that was drawn, and attach the sensors."""
         self._rng = rng
-        self.limb = arm(self.drawn.build)
+        self.limb = self.make_limb()
         spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name(self.model_file)))
         angles = self.begin()
         self._add_limb(spec, angles)
@@ -165,6 +165,10 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         self.signals = Signals(
             skin, {site: self.drawn.readout(self._chip, names, rng) for site in self.sites}
         )
+
+    def make_limb(self) -> Limb:
+        """The limb of the person that was drawn."""
+        return arm(self.drawn.build)
 
     def start(self) -> None:
         """Set the state in which an episode begins."""

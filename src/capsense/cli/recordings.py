@@ -1,0 +1,342 @@
+"""``capsense replay``, ``export`` and ``readout``: what becomes of recorded capacitances."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from capsense.cli.console import (
+    DIFFERS,
+    OK,
+    PICTURES,
+    BuildProgress,
+    Command,
+    add_quiet,
+    check_picture,
+    facts,
+    grouped,
+    progress_shown,
+    say,
+    seconds,
+    table,
+)
+from capsense.errors import ReadoutError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from capsense.readout.chips import Chip
+    from capsense.readout.counts import Counts
+    from capsense.readout.readout import Readout
+    from capsense.readout.recording import CapacitanceRecord
+    from capsense.recording.reader import Replay
+
+
+def _replay_recording_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("recording", metavar="FILE.mcap", type=Path, help="the recording")
+    parser.add_argument(
+        "--tolerance", metavar="F", type=float, default=0.0,
+        help="difference of a capacitance that is allowed, in farads; default 0",
+    )  # fmt: skip
+    parser.add_argument(
+        "--method",
+        choices=("surface", "fem_masked"),
+        help="simulate with this method instead of the recorded one",
+    )
+    add_quiet(parser)
+
+
+def _replay_recording(args: argparse.Namespace) -> int:
+    """Replay the recording and return the exit code."""
+    from tqdm import tqdm
+
+    from capsense.recording.reader import open_recording, replay
+
+    recording = open_recording(args.recording)
+    if not recording.complete:
+        say(f"warning: {args.recording} was not closed; what was written until then is compared")
+    shown = progress_shown(args.quiet)
+    with (
+        tqdm(unit=" steps", file=sys.stderr, disable=not shown) as bar,
+        BuildProgress(shown=shown) as progress,
+    ):
+        found = replay(
+            recording,
+            method=args.method,
+            tolerance=args.tolerance,
+            progress=progress,
+            each=lambda _: bar.update(),
+        )
+    if not args.quiet:
+        print(_replay_report(found))
+    if found.same:
+        return OK
+    say(f"the readings differ; first, {found.first}")
+    for key, (then, now) in found.changed.items():
+        say(f"recorded with {key} {then}, replayed with {now}")
+    return DIFFERS
+
+
+def _replay_report(found: Replay) -> str:
+
+    lines = [("steps", grouped(found.steps))]
+    if found.counts is not None:
+        lines.append(("conversions", grouped(found.counts)))
+    verdict = "same to the last bit"
+    if found.largest > 0 or not found.same:
+        verdict = f"{found.differing} steps differ; " if not found.same else ""
+        verdict += f"capacitances by at most {found.largest:.3g} F"
+    lines.append(("readings", verdict))
+    return facts(lines)
+
+
+REPLAY = Command(
+    "replay",
+    "simulate a recording again and verify that every reading is the same",
+    """\
+Simulate a recording again, from the design, settings and bodies in it, and compare every reading
+bit for bit; and the counts of a readout given by a chip's name or a file. The first difference
+is printed.
+
+Exit code 0: all the same. 3: something differs. 2: the file is no recording, or damaged.
+
+Another processor, or another version of numba or NumPy, may change the last digits;
+--tolerance allows for that. A recording that was cut short is compared as far as it goes.
+""",
+    """\
+  capsense replay hand.mcap
+  capsense replay hand.mcap --tolerance 1e-19    differences up to 0.1 aF are allowed
+  capsense replay old.mcap --method surface      recorded by a version with other methods
+""",
+    _replay_recording_arguments,
+    _replay_recording,
+)
+
+
+def _export_recording_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("recording", metavar="FILE.mcap", type=Path, help="the recording")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", type=Path, required=True, help="what to write"
+    )
+    parser.add_argument(
+        "--counts", action="store_true",
+        help="the conversions of the readout in place of the readings (.csv, .parquet)",
+    )  # fmt: skip
+    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+
+
+def _export_recording(args: argparse.Namespace) -> int:
+    """Export the recording and return the exit code."""
+    from capsense.recording.export import export
+    from capsense.recording.files import check_target
+    from capsense.recording.reader import open_recording
+
+    recording = open_recording(args.recording)
+    check_target(args.output, overwrite=args.force)
+    if not recording.complete:
+        say(f"warning: {args.recording} was not closed; what was written until then is exported")
+    count = export(recording, args.output, counts=args.counts)
+    what = {".mcap": "messages", ".json": "layout"}.get(args.output.suffix.lower(), "rows")
+    print(f"{count} {what} in {args.output}")
+    return OK
+
+
+EXPORT = Command(
+    "export",
+    "turn a recording into .csv, .npz or .parquet, or make one whole that was cut short",
+    """\
+Turn a recording into another file. The ending chooses the format:
+  .csv, .parquet   the columns of readings.csv of capsense run, and the episode
+  .npz             the arrays of readings.npz, the episode, and the counts of a readout;
+                   capsense readout takes it
+  .mcap            the recording again; one whose recorder was killed gets its index
+  .json            a layout in which Foxglove shows the recording
+""",
+    """\
+  capsense export hand.mcap -o hand.parquet
+  capsense export hand.mcap -o counts.csv --counts
+  capsense export killed.mcap -o whole.mcap
+  capsense export hand.mcap -o layout.json
+""",
+    _export_recording_arguments,
+    _export_recording,
+)
+
+
+def _read_out_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("recording", metavar="REC", type=Path, nargs="?", help="the recording")
+    parser.add_argument(
+        "--list", action="store_true", help="list the chips; with --chip, that one's figures"
+    )
+    parser.add_argument(
+        "--chip", metavar="NAME", action="append", default=[],
+        help="a chip; may be repeated; 'all' for all of them",
+    )  # fmt: skip
+    parser.add_argument("--config", metavar="FILE.toml", type=Path, help="a readout file")
+    parser.add_argument(
+        "--rate", metavar="HZ", type=float, help="conversions per second, one of the chip's"
+    )
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the noise; default 0")
+    parser.add_argument("--no-noise", action="store_true", help="rounding and saturation only")
+    parser.add_argument("-o", "--output", metavar="DIR", type=Path, help="folder for the tables")
+    parser.add_argument("--force", action="store_true", help="replace tables that are there")
+    parser.add_argument(
+        "--plot", metavar="PICTURE", type=Path,
+        help=f"draw one channel instead of writing tables ({', '.join(PICTURES)})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--electrode", metavar="NAME", help="with --plot: the electrode; default the first"
+    )
+
+
+def _read_out(args: argparse.Namespace) -> int:
+    """Read out, write or draw, and return the exit code."""
+
+    if args.list:
+        print(_chips(args.chip))
+        return OK
+    _check_options(args)
+    from capsense.readout.recording import load_recording
+    from capsense.recording.tables import write_counts
+
+    recording = load_recording(args.recording)
+    readouts = _build(args, recording)
+    if args.plot is not None:
+        from capsense.plotting.chips import plot_chips
+
+        plot_chips(recording, readouts, args.electrode).savefig(args.plot, dpi=150)
+        print(f"drawn to {args.plot}")
+        return OK
+    folder = args.output or recording.path.parent
+    targets = {key: folder / f"counts_{key}.csv" for key in readouts}
+    _prepare(folder, targets.values(), args.force)
+    for key, readout in readouts.items():
+        counts = readout(recording.time, recording.channels(readout.bank))
+        write_counts(targets[key], counts)
+        print(_readout_report(readout, counts, targets[key]) + "\n")
+    return OK
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Refuse what does not go together before anything is computed."""
+    if args.recording is None:
+        raise ReadoutError("no recording given; name the output folder of capsense run, or --list")
+    if bool(args.chip) == (args.config is not None):
+        raise ReadoutError("give --chip NAME or --config FILE.toml, one of them")
+    if args.config is not None and (args.rate is not None or args.seed or args.no_noise):
+        raise ReadoutError("--rate, --seed and --no-noise go with --chip; write them in the file")
+    if args.seed < 0:
+        raise ReadoutError(f"--seed {args.seed} must be zero or more")
+    if args.electrode is not None and args.plot is None:
+        raise ReadoutError("--electrode goes with --plot; the tables hold all channels")
+    if args.plot is not None:
+        check_picture("--plot", args.plot, ReadoutError)
+
+
+def _build(args: argparse.Namespace, recording: CapacitanceRecord) -> dict[str, Readout]:
+    """The readouts asked for, by a name for files."""
+    from capsense.readout.channels import ChannelBank
+    from capsense.readout.config import load_readout
+    from capsense.readout.presets import (
+        ReadoutOptions,
+        build,
+        chip_of,
+        default_patterns,
+        expected_of,
+    )
+
+    if args.config is not None:
+        return {args.config.stem: load_readout(args.config, recording.electrodes)}
+    from capsense.readout.chips import CHIPS
+
+    names = list(CHIPS) if "all" in args.chip else args.chip
+    out = {}
+    for name in names:
+        chip = chip_of(name)
+        patterns = default_patterns(chip, recording.electrodes)
+        empty = recording.empty_channels(ChannelBank(patterns, recording.electrodes))
+        options = ReadoutOptions(
+            patterns=patterns, rate=args.rate, seed=args.seed, noise=not args.no_noise,
+            expected=expected_of(empty),
+        )  # fmt: skip
+        out[chip.name] = build(chip, recording.electrodes, options)
+    return out
+
+
+def _prepare(folder: Path, targets: Iterable[Path], force: bool) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for target in targets:
+        if target.exists() and not force:
+            raise ReadoutError(f"{target} is there already; give -o DIR, or --force to replace it")
+
+
+def _readout_report(readout: Readout, counts: Counts, path: Path) -> str:
+    """What came out, for people."""
+
+    plan = readout.schedule
+    head = [
+        ("readout", readout.name),
+        ("conversions", f"{len(counts)}, {seconds(plan.conversion)} each"),
+        ("a channel's period", seconds(plan.period)),
+    ]
+    rows = []
+    for name in counts.channel_names:
+        one = counts.of(name)
+        if not len(one):
+            continue
+        low, high = one.capacitance.min(), one.capacitance.max()
+        rows.append(
+            (name, f"{low * 1e12:.5f}", f"{high * 1e12:.5f}", str(one.code.min()),
+             str(one.code.max()), str(int(one.saturated.sum())))
+        )  # fmt: skip
+    header = ("channel", "least [pF]", "largest [pF]", "least code", "largest code", "saturated")
+    return "\n\n".join([facts(head), table(header, rows), f"wrote {path}"])
+
+
+def _chips(chosen: list[str]) -> str:
+    from capsense.readout.chips import CHIPS
+    from capsense.readout.presets import chip_of
+
+    if chosen and "all" not in chosen:
+        return "\n\n".join(_figures(chip_of(name)) for name in chosen)
+    rows = [
+        (chip.name, chip.mode, f"{chip.rates[0].per_second:.4g}", chip.title)
+        for chip in CHIPS.values()
+    ]
+    return table(("name", "mode", "conversions/s", "chip"), rows)
+
+
+def _figures(chip: Chip) -> str:
+
+    rows = [(f.quantity, f.status.value, f.value, f.source) for f in chip.facts]
+    return f"{chip.title}\n\n" + table(("figure", "status", "value", "source"), rows)
+
+
+READOUT = Command(
+    "readout",
+    "turn recorded capacitances into what a chip reports",
+    """\
+Turn the capacitances of a recording into what a chip reports: one channel after another, late,
+noisy, quantised, within its range.
+
+A recording is the output folder of capsense run, or readings.npz or readings.csv in it. Beside it,
+or in the folder given with -o, is written
+  counts_CHIP.csv   one row per conversion: time stamp, channel, code, capacitance, flags
+
+Between samples of the recording capacitances are interpolated linearly.
+""",
+    """\
+  capsense readout --list                               the chips, with sources of their figures
+  capsense readout out/ --chip fdc1004
+  capsense readout out/ --chip fdc1004 --rate 400 --seed 3 -o counts/
+  capsense readout out/ --config my_chip.toml           options from a file
+  capsense readout out/ --chip all --plot chips.png     all chips side by side, no tables
+""",
+    _read_out_arguments,
+    _read_out,
+)

@@ -1,0 +1,292 @@
+"""Where a limb is, by Gauss–Newton on the solver's own gradients, and how to follow it.
+
+The task is that of Z. Erickson, H. M. Clever, V. Gangaram, G. Turk, C. K. Liu and C. C. Kemp,
+"Multidimensional capacitive sensing for robot-assisted dressing and bathing", ICORR 2019 (arXiv
+1904.02111): lateral and vertical position, pitch and yaw of a limb from six electrodes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense.errors import SceneError
+from capsense.scene import Body, Capsule, Material, Pose, Scene
+from capsense.scene.scene import Grounding
+from capsense.simulator import Simulator
+
+Array = NDArray[np.float64]
+
+_PROPORTION = 8.0
+"""Length of the limb's model, in radii; always the same: new proportions take the solver long."""
+_LEAST_GAP = 0.004
+"""No estimate is nearer to the electrodes than this [m]."""
+_STEEPEST = math.radians(50.0)
+"""Angles of estimates are held within ± this [rad]."""
+_LARGEST_STEP = np.array([0.02, 0.015, 0.15, 0.2, 0.2])
+"""Of one iteration [m, m, rad, rad, 1]."""
+_PROBE = 0.02
+"""Relative change of the radius that its slope is found with."""
+
+
+class LimbPose(NamedTuple):
+    """Where a limb is before a sensor whose x axis is to lie along it, in the sensor frame."""
+
+    lateral: float = 0.0
+    """y of the limb's axis where it crosses the plane x = 0 [m]."""
+    vertical: float = 0.05
+    """z of the axis there, less the limb's radius: the gap to the skin [m]."""
+    pitch: float = 0.0
+    """Angle of the axis to the electrode plane, positive where +x is the farther end [rad]."""
+    yaw: float = 0.0
+    """Angle of the axis to x about the sensor's z, in the electrode plane [rad]."""
+
+    @property
+    def direction(self) -> Array:
+        """Unit vector along the axis, shape (3,)."""
+        p, y = self.pitch, self.yaw
+        return np.array([math.cos(p) * math.cos(y), math.cos(p) * math.sin(y), math.sin(p)])
+
+
+def limb_pose(bodies: Iterable[Body]) -> LimbPose:
+    """The pose of a limb made of capsules, by the one that is thickest where x = 0.
+
+    Args:
+        bodies: Capsules in the sensor frame.
+
+    Raises:
+        SceneError: None of them crosses the plane x = 0, or a body is no capsule.
+    """
+    thickest, found = 0.0, None
+    for body in bodies:
+        if not isinstance(body.shape, Capsule):
+            raise SceneError(f"{body.name}: a limb is made of capsules, not {body.shape!r}")
+        along = body.pose.rotation[:, 2]
+        if abs(along[0]) < 1e-3:
+            continue
+        along = along * math.copysign(1.0, along[0])
+        way = -body.pose.position[0] / along[0]
+        beyond = max(0.0, abs(way) - 0.5 * body.shape.length)
+        radius = math.sqrt(max(0.0, body.shape.radius**2 - beyond**2))
+        if radius > thickest:
+            _, y, z = np.array(body.pose.position) + way * along
+            pitch, yaw = math.asin(along[2]), math.atan2(along[1], along[0])
+            thickest, found = radius, LimbPose(float(y), float(z - radius), pitch, yaw)
+    if found is None:
+        raise SceneError("no capsule crosses the plane x = 0 of the sensor frame; move the limb")
+    return found
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is known of a limb before it is measured: means and standard deviations.
+
+    Raises:
+        SceneError: A spread is negative or not finite, or the radius is not positive.
+    """
+
+    pose: LimbPose = LimbPose()  # noqa: RUF009, it is immutable
+    spread: LimbPose = LimbPose(0.03, 0.03, 0.15, 0.2)  # noqa: RUF009
+    """Standard deviations of the pose; what has none is taken as known."""
+    radius: float = 0.042
+    """[m]"""
+    radius_spread: float = 0.25
+    """Standard deviation of the radius' logarithm; 0 where it is known."""
+    taper: float = 0.0
+    """Angle of the skin to the axis of a limb that gets thicker towards +x [rad]; some 0.06 of
+    forearms and shanks. The capsule that stands for the limb is turned by it, to lie along the
+    skin that the sensor faces."""
+    material: Material | str = "human"
+    grounding: Grounding = 100e-12
+    """As of a :class:`~capsense.Body`."""
+
+    def __post_init__(self) -> None:
+        for name, value in (*self.spread._asdict().items(), ("radius_spread", self.radius_spread)):
+            if not 0.0 <= value < math.inf:
+                raise SceneError(f"belief: spread of {name} is {value!r}; give 0 or more")
+        if not 0.0 < self.radius < math.inf:
+            raise SceneError(f"belief: radius is {self.radius!r}; give a length in metres")
+        if not abs(self.taper) < 1.0:
+            raise SceneError(f"belief: taper is {self.taper!r}; give an angle in radians")
+
+    @property
+    def mean(self) -> Array:
+        """Lateral, vertical, pitch, yaw and the radius' logarithm, shape (5,)."""
+        return np.array([*self.pose, math.log(self.radius)])
+
+    @property
+    def deviation(self) -> Array:
+        """Their standard deviations, shape (5,)."""
+        return np.array([*self.spread, self.radius_spread])
+
+
+class PoseEstimator:
+    """Finds the pose of a limb from capacitances, without any training.
+
+    The limb is a capsule of unknown radius. An estimate minimises
+    ``|(measured - model(x)) / s|² + |(x - mean) / deviation|²`` over ``x``, the pose and the
+    radius' logarithm: the most likely one under noise of the standard deviation ``s`` and under
+    the belief. Gauss–Newton steps begin at the estimate before. The model is the simulator, and
+    its Jacobian (closed adjoint) gives the slopes by the pose; that by the radius is a difference.
+
+    Args:
+        simulator: A sensor with gradients; ``preset="learning"`` will do.
+        belief: What is known beforehand.
+        noise: Standard deviation of every measured capacitance [F].
+        relative: A further part of it, proportional to the capacitance: gain, and what the limb is
+            unlike a capsule by; added in quadrature.
+        matrix: Whether whole matrices are measured, not self capacitances only.
+        iterations: Gauss–Newton steps of an estimate.
+
+    Raises:
+        SceneError: The simulator has no gradients, or a setting is out of range.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        belief: Belief = Belief(),
+        *,
+        noise: float = 0.5e-15,
+        relative: float = 0.05,
+        matrix: bool = False,
+        iterations: int = 3,
+    ) -> None:
+        if simulator.method != "surface":
+            raise SceneError(f'method "{simulator.method}" has no gradients; use "surface"')
+        if not (0 < noise < math.inf and 0 <= relative < math.inf and iterations >= 1):
+            raise SceneError(
+                f"noise = {noise!r}, relative = {relative!r}, iterations = {iterations!r}: give a "
+                "positive noise [F], a part from 0 on, and 1 iteration or more"
+            )
+        if not matrix and any(c.role == "shield" for c in simulator.design.conductors):
+            raise SceneError(
+                f"design {simulator.design.name!r} has a driven shield, and self capacitances no "
+                "gradients then; give matrix=True, and measure matrices"
+            )
+        self.simulator, self.belief, self.iterations = simulator, belief, iterations
+        self._noise, self._relative = noise, relative
+        m = len(simulator.electrode_names)
+        self._picked = np.triu_indices(m) if matrix else (np.arange(m), np.arange(m))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the estimate before."""
+        self._state = self.belief.mean
+
+    @property
+    def radius(self) -> float:
+        """Radius of the limb in the last estimate [m]."""
+        return math.exp(self._state[4])
+
+    @property
+    def pose(self) -> LimbPose:
+        """The last estimate."""
+        return LimbPose(*self._state[:4].tolist())
+
+    def model(self, pose: LimbPose, radius: float | None = None) -> tuple[Array, Array]:
+        """What would be measured, and how it changes.
+
+        Args:
+            pose: Of the limb.
+            radius: Of the limb [m]; by default that of the belief.
+
+        Returns:
+            Changes from the empty scene [F], shape (K,): K self capacitances, or the upper
+            triangle of the matrix row by row; and their derivatives by lateral, vertical [F/m],
+            pitch, yaw [F/rad] and the radius' logarithm [F], shape (K, 5).
+        """
+        radius = radius or self.belief.radius
+        reading = self.simulator.step(self.scene(pose, radius), jacobian=True)
+        assert reading.jacobian is not None
+        motion = reading.jacobian[0][self._picked]
+        tilt = np.array([math.sin(pose.yaw), -math.cos(pose.yaw), 0.0])
+        columns = [motion[:, 1], motion[:, 2], motion[:, 3:] @ tilt, motion[:, 5]]
+        values, thicker = reading.delta[self._picked], np.zeros(len(motion))
+        if self.belief.radius_spread:
+            probe = self.simulator.step(self.scene(pose, radius * (1 + _PROBE)))
+            thicker = (probe.delta[self._picked] - values) / math.log1p(_PROBE)
+        return values, np.stack([*columns, thicker], axis=1)
+
+    def scene(self, pose: LimbPose, radius: float) -> Scene:
+        """The model of the limb before the sensor."""
+        shape = Capsule(radius, _PROPORTION * radius)
+        skin = pose._replace(pitch=pose.pitch - self.belief.taper)
+        x, y, z = skin.direction  # turned there from z by the shortest way
+        where = Pose((0.0, pose.lateral, pose.vertical + radius), (-y, x, 0.0, 1.0 + z))
+        return Scene([Body(shape, where, self.belief.material, self.belief.grounding, "limb")])
+
+    def estimate(self, measured: ArrayLike) -> LimbPose:
+        """The most likely pose.
+
+        Args:
+            measured: Changes of the capacitances since nothing was near [F], shape (K,) as in
+                :meth:`model`.
+
+        Raises:
+            SceneError: It has another shape, or is not finite.
+        """
+        values = np.asarray(measured, dtype=float)
+        count = len(self._picked[0])
+        if values.shape != (count,) or not np.isfinite(values).all():
+            raise SceneError(f"measured is {measured!r}; give {count} finite capacitances in F")
+        for _ in range(self.iterations):
+            free, rows, scale, model = self._linearised(values)
+            pull = (self.belief.mean - self._state)[free] / self.belief.deviation[free]
+            rest = np.concatenate([(values - model) / scale, pull])
+            step = np.zeros(5)
+            step[free] = np.linalg.lstsq(rows, rest)[0] * self.belief.deviation[free]
+            state = self._state + step / max(1.0, float(np.abs(step / _LARGEST_STEP).max()))
+            state[1] = max(state[1], _LEAST_GAP)
+            state[2:4] = np.clip(state[2:4], -_STEEPEST, _STEEPEST)
+            self._state = state
+        return self.pose
+
+    def covariance(self, pose: LimbPose, radius: float | None = None) -> Array:
+        """The Cramér–Rao bound of the pose, with the belief as prior, shape (4, 4) [m, rad].
+
+        The inverse of the Fisher information of one measurement and of the belief (H. L. Van Trees,
+        "Detection, Estimation, and Modulation Theory", part I, 1968, section 2.4), the radius being
+        unknown as well.
+        """
+        self._state = np.array([*pose, math.log(radius or self.belief.radius)])
+        free, rows, _, _ = self._linearised(None)
+        out = np.zeros((5, 5))
+        spread = self.belief.deviation[free]
+        out[np.ix_(free, free)] = np.linalg.inv(rows.T @ rows) * np.outer(spread, spread)
+        return out[:4, :4]
+
+    def _linearised(self, measured: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:
+        """Which unknowns there are; rows of the least-squares problem in units of their spread, the
+        standard deviations of what is measured [F], and the model at the state [F]."""
+        values, slopes = self.model(LimbPose(*self._state[:4]), math.exp(self._state[4]))
+        seen = values if measured is None else measured
+        scale = np.hypot(self._noise, self._relative * seen)
+        free = np.flatnonzero(self.belief.deviation)
+        rows = slopes[:, free] * self.belief.deviation[free] / scale[:, None]
+        return free, np.concatenate([rows, np.eye(len(free))]), scale, values
+
+
+def follow(
+    pose: LimbPose, gap: float = 0.05, speed: float = 0.0, gain: float = 8.0, turning: float = 3.0
+) -> Array:
+    """The motion by which a sensor keeps over a limb and goes along it, shape (6,).
+
+    Args:
+        pose: Where the limb is.
+        gap: The gap to be kept [m].
+        speed: Along the limb, towards +x [m/s].
+        gain: Errors of place decay at this rate [1/s].
+        turning: Errors of angles, which are noisier, decay at this one [1/s].
+
+    Returns:
+        Velocity of the sensor [m/s] and its angular velocity [rad/s], in the sensor frame.
+    """
+    keep = gain * np.array([0.0, pose.lateral, pose.vertical - gap])
+    turn = turning * np.array([0.0, -pose.pitch, pose.yaw])
+    return np.concatenate([keep + speed * pose.direction, turn])

@@ -1,0 +1,1 @@
+"""Pictures of designs, runs and chips; :func:`capsense.plot` is the door to them."""

@@ -1,0 +1,214 @@
+"""Drawings of a design: a top view of the sensor with a side view of its stack under it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+import shapely.geometry
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from capsense._style import INK, LEGEND, dress
+from capsense.design.geometry import Surface, ring_vertices
+from capsense.design.model import Design, Role
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.patches import PathPatch
+
+Array = NDArray[np.float64]
+
+ELECTRODES = ("#d9822b", "#eab676")  # neighbours in matrix order differ
+ROLE_COLOURS = {Role.GROUND: "#8fa3ad", Role.SHIELD: "#7fb59a", Role.FLOATING: "#b59ac4"}
+LAYER_COLOUR = "#eef0e4"
+
+
+def draw_design(design: Design, ax: Axes | None = None) -> Axes:
+    """Draw a design seen from the world (along −z), in millimetres.
+
+    Without ``ax`` a figure is made with a side view under the top view, its heights stretched
+    and not to scale unless electrodes are curved; with ``ax`` only the top view is drawn into it.
+
+    Args:
+        design: The design to draw.
+        ax: Matplotlib axes to draw into; by default those of a new figure.
+
+    Returns:
+        The axes of the top view; ``axes.figure`` is the figure.
+    """
+    side: Axes | None = None
+    if ax is None:
+        from matplotlib.figure import Figure
+
+        ratios, tall = ([1.0, 1.0], 9.0) if _is_curved(design) else ([4.2, 1.0], 7.2)
+        figure = Figure(figsize=(7.0, tall), layout="constrained")
+        top_axes, side = figure.subplots(2, 1, height_ratios=ratios)
+        ax = top_axes
+    _top_view(design, ax)
+    if side is not None:
+        _side_view(design, side)
+    return ax
+
+
+def outlines(surface: Surface) -> list[Polygon]:
+    """Shadows [mm] of a surface on the xy plane; facets on edge leave none."""
+    shadows = []
+    for facet in surface.facets:
+        rings = [r[:, :2] * 1e3 for r in ring_vertices(facet)]
+        shadows.append(Polygon(rings[0], rings[1:]).buffer(0))
+    if len(shadows) > 1:  # without the seams between the strips of a bent sheet
+        shadows = [s.buffer(1e-6, join_style="mitre") for s in shadows]
+    parts = shapely.get_parts(shapely.union_all(shadows))
+    return [p for p in parts if isinstance(p, Polygon) and p.area > 1e-4]
+
+
+def outline_patch(polygon: Polygon, **style: Any) -> PathPatch:
+    """A Matplotlib patch of a polygon with its holes; ``style`` as ``PathPatch`` takes it."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    rings = [shapely.get_coordinates(r) for r in (polygon.exterior, *polygon.interiors)]
+    codes = [[Path.MOVETO, *[Path.LINETO] * (len(r) - 2), Path.CLOSEPOLY] for r in rings]
+    return PathPatch(Path(np.concatenate(rings), np.concatenate(codes)), **style)
+
+
+def add_surface(ax: Axes, surface: Surface, label: str = "", **style: Any) -> None:
+    """Draw a surface seen from above, in millimetres; ``style`` as ``PathPatch`` takes it."""
+    for number, outline in enumerate(outlines(surface)):
+        ax.add_patch(outline_patch(outline, label="" if number else label, **style))
+
+
+def _note(ax: Axes, text: str, at: tuple[float, float], **style: Any) -> None:
+    """A word in the picture, by default small and in the middle of its place."""
+    ax.annotate(text, at, **{"ha": "center", "va": "center", "fontsize": 8, "color": INK, **style})
+
+
+def _top_view(design: Design, ax: Axes) -> None:
+    reach: list[Array] = []
+    for layer in sorted(design.layers, key=lambda k: float(k.upper[2])):
+        low, high = layer.lower[:2] * 1e3, layer.upper[:2] * 1e3
+        matter = "" if layer.material == "custom" else f"{layer.material}, "
+        style: dict[str, Any] = {"fc": LAYER_COLOUR, "ec": "#9a9c86", "lw": 1.0, "ls": "--"}
+        label = f"{layer.name} ({matter}εr {layer.eps_r:g})"
+        plate = shapely.geometry.box(*low, *high)
+        ax.add_patch(outline_patch(plate, label=label, zorder=0, **style))
+        reach += [low, high]
+    conductors = sorted(design.conductors, key=lambda c: float(c.surface.bounds[1, 2]))
+    top = max(float(e.surface.bounds[1, 2]) for e in design.electrodes)
+    for order, conductor in enumerate(conductors, start=1):
+        buried = float(conductor.surface.bounds[1, 2]) < top - 1e-5 and bool(design.layers)
+        colour = ROLE_COLOURS[conductor.role]
+        style = {"fc": colour, "ec": "#5d6b73", "lw": 0.6, "ls": "-"}
+        if buried:
+            style = {"fc": "none", "ec": colour, "lw": 1.6, "ls": ":"}
+        label = f"{conductor.name} ({conductor.role.value}{', below' if buried else ''})"
+        add_surface(ax, conductor.surface, label, zorder=order / 100 + 1, **style)
+        reach += list(conductor.surface.bounds[:, :2] * 1e3)
+    for number, electrode in enumerate(design.electrodes):
+        label, style = "" if number else "electrodes", {"ec": "#7d4510", "lw": 0.8, "zorder": 2}
+        add_surface(ax, electrode.surface, label, fc=ELECTRODES[number % 2], **style)
+        reach += list(electrode.surface.bounds[:, :2] * 1e3)
+        x, y, room = _label_place(electrode.surface, outlines(electrode.surface))
+        back = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": room}
+        _note(ax, electrode.name, (x, y), fontsize=9, zorder=3, fontweight="bold", bbox=back)
+    points = np.array(reach)
+    margin = 0.06 * float(np.ptp(points, axis=0).max())
+    ax.set_xlim(points[:, 0].min() - margin, points[:, 0].max() + margin)
+    ax.set_ylim(points[:, 1].min() - margin, points[:, 1].max() + margin)
+    ax.set_aspect("equal")
+    dress(ax, "x [mm]", "y [mm]", design.name)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, **LEGEND)
+
+
+def _label_place(surface: Surface, parts: list[Polygon]) -> tuple[float, float, float]:
+    """Where a name goes [mm], and how opaque its background must be."""
+    if not parts:
+        x, y = surface.bounds.mean(axis=0)[:2] * 1e3
+        return float(x), float(y), 0.8
+    largest = max(parts, key=lambda p: p.area)
+    spot = largest.centroid if largest.contains(largest.centroid) else None
+    if spot is None or len(largest.exterior.coords) > 24:
+        spot = shapely.maximum_inscribed_circle(largest).interpolate(0.0)
+        spot = largest.centroid if largest.convex_hull.area < 1.1 * largest.area else spot
+    return float(spot.x), float(spot.y), 0.75
+
+
+def _is_curved(design: Design) -> bool:
+    """Whether some electrode is not flat and level."""
+    return any(np.ptp(e.surface.bounds[:, 2]) > 1e-6 for e in design.electrodes)
+
+
+def _profile(design: Design, ax: Axes) -> None:
+    """What is curved, seen along +y, to scale."""
+    for conductor in design.conductors:
+        _edge_on(ax, conductor.surface, lambda z: z * 1e3, ROLE_COLOURS[conductor.role], 0.8)
+    for number, electrode in enumerate(design.electrodes):
+        _edge_on(ax, electrode.surface, lambda z: z * 1e3, ELECTRODES[number % 2], 2.0, 2.0)
+    ax.set_aspect("equal")
+    ax.set_xlim(ax.figure.axes[0].get_xlim())
+    dress(ax, "x [mm]", "z [mm]", "side view")
+
+
+def _side_view(design: Design, ax: Axes) -> None:
+    """The stack seen along +y: every level of the design at equal steps, with its z in mm."""
+    if _is_curved(design):
+        _profile(design, ax)
+        return
+    backplane = -design.domain.backplane
+    values = [backplane]
+    for layer in design.layers:
+        values += [float(layer.lower[2]), float(layer.upper[2])]
+    sheets = [e.surface for e in design.electrodes] + [c.surface for c in design.conductors]
+    values += [float(z) for s in sheets for z in s.bounds[:, 2]]
+    levels = sorted({round(v * 1e3, 4) for v in values})
+
+    def height(z: float) -> float:
+        return float(np.interp(z * 1e3, levels, np.arange(len(levels))))
+
+    ax.axhline(height(backplane), color=INK, lw=1.5)
+    place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    floor = (0.01, height(backplane))
+    _note(ax, "grounded floor of the domain", floor, xytext=(0, 3), ha="left", va="bottom", **place)
+    for layer in design.layers:
+        x, width = layer.lower[0] * 1e3, (layer.upper[0] - layer.lower[0]) * 1e3
+        bottom, top = height(layer.lower[2]), height(layer.upper[2])
+        ax.bar(x, top - bottom, width, bottom, align="edge", fc=LAYER_COLOUR, ec="#9a9c86", lw=0.8)
+        thick = f"{layer.name}, {(layer.upper[2] - layer.lower[2]) * 1e3:g} mm"
+        _note(ax, thick, (x + width / 2, (bottom + top) / 2))
+    for conductor in design.conductors:
+        _edge_on(ax, conductor.surface, height, ROLE_COLOURS[conductor.role])
+    for number, electrode in enumerate(design.electrodes):
+        _edge_on(ax, electrode.surface, height, ELECTRODES[number % 2])
+    top_axes = ax.figure.axes[0]
+    ax.set_xlim(top_axes.get_xlim())
+    ax.set_ylim(-0.35, len(levels) - 0.4)
+    ax.set_yticks(np.arange(len(levels)), [f"{v:.4g}" for v in levels], fontsize=8)
+    dress(ax, "x [mm]", "z [mm]", "side view, heights not to scale")
+
+
+def _edge_on(
+    ax: Axes, surface: Surface, height: Any, colour: str, width: float = 4.0, upright: float = 0.8
+) -> None:
+    """Draw each facet's extent in x and z, with one line width for level facets, one for others."""
+    for facet in surface.facets:
+        points = ring_vertices(facet)[0]
+        x, z = points[:, 0] * 1e3, points[:, 2]
+        if np.ptp(z) < 1e-6:
+            for low, high in _runs(facet, float(points[:, 1].mean())):
+                ax.plot(
+                    [low, high], [height(z[0])] * 2, color=colour, lw=width, solid_capstyle="butt"
+                )
+        else:
+            ax.fill(x, [height(v) for v in z], color=colour, alpha=0.5, lw=upright)
+
+
+def _runs(facet: Any, y: float) -> list[tuple[float, float]]:
+    """Where a horizontal line at y [m] through a horizontal facet meets it: x [mm] from, to."""
+    rings = ring_vertices(facet)
+    outline = Polygon(rings[0][:, :2], [r[:, :2] for r in rings[1:]])
+    x0, _, x1, _ = outline.bounds
+    cut = outline.intersection(shapely.geometry.LineString([(x0 - 1, y), (x1 + 1, y)]))
+    parts = [p.bounds for p in shapely.get_parts(cut) if p.length > 0]
+    return [(b[0] * 1e3, b[2] * 1e3) for b in parts]

@@ -1,0 +1,74 @@
+"""Pictures of readings and recordings: what they show, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capsense as cs
+
+HEIGHTS = np.linspace(0.15, 0.03, 5)
+
+
+@pytest.fixture
+def sim(simulators: Callable[..., cs.Simulator]) -> cs.Simulator:
+    return simulators("six_patch")
+
+
+@pytest.fixture
+def scenes() -> list[cs.Scene]:
+    """A ball that comes down, and a box that is there at the end only."""
+    ball = [cs.Body(cs.Sphere(0.03), cs.Pose((0.02, 0, z)), "human", name="ball") for z in HEIGHTS]
+    box = cs.Body(cs.Box((0.02, 0.02, 0.02)), cs.Pose((-0.05, 0.0, 0.05)), name="box")
+    return [cs.Scene([b]) for b in ball[:-1]] + [cs.Scene([ball[-1], box])]
+
+
+def lines_of(figure: object, title: str) -> dict[str, np.ndarray]:
+    """Data of the lines of the axes above which a legend has a title, by label."""
+    for axes in figure.axes:  # type: ignore[attr-defined]
+        legend = axes.get_legend()
+        if legend is not None and legend.get_title().get_text() == title:
+            lines = [line for line in axes.get_lines() if not line.get_label().startswith("_")]
+            return {line.get_label(): line.get_ydata() for line in lines}
+    raise AssertionError(f"no axes named {title}")
+
+
+def test_readings(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
+    """Self capacitances over that of the empty scene; the ball's way beside them."""
+    readings = [sim.step(scene) for scene in scenes]
+    figure = cs.plot(readings, sim, scenes=scenes, excitation="self")
+    drawn = lines_of(figure, "self capacitance")
+    assert list(drawn) == ["E6", "E5", "E4", "E3", "E2", "E1"]
+    wanted = [r.self_capacitance[2] / sim.empty.self_capacitance[2] for r in readings]
+    np.testing.assert_allclose(drawn["E3"], wanted, rtol=1e-12)
+    texts = [t.get_text() for axes in figure.axes for t in axes.texts]
+    assert texts.count("ball") == texts.count("box") == 2
+
+
+def test_a_recording(sim: cs.Simulator, scenes: list[cs.Scene], tmp_path: Path) -> None:
+    """It shows what its readings show."""
+    with cs.record(tmp_path / "a.mcap", sim) as run:
+        readings = [run.step(s, time=0.1 * k) for k, s in enumerate(scenes)]
+    recorded = lines_of(cs.plot(cs.open_recording(tmp_path / "a.mcap")), "mutual capacitance")
+    direct = lines_of(cs.plot(readings, sim), "mutual capacitance")
+    assert recorded.keys() == direct.keys()
+    for label, values in direct.items():
+        np.testing.assert_array_equal(recorded[label], values)
+
+
+def test_a_design() -> None:
+    assert cs.plot(cs.load_design("stripe")).axes[0].get_title(loc="left") == "stripe"
+
+
+def test_refusals(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
+    """Readings come with their simulator, and as many times and scenes."""
+    readings = [sim.step(scene) for scene in scenes]
+    with pytest.raises(cs.CapSenseError, match="give plot"):
+        cs.plot(readings)
+    with pytest.raises(cs.CapSenseError, match="no reading"):
+        cs.plot([], sim)
+    with pytest.raises(cs.CapSenseError, match="5 readings, times of shape"):
+        cs.plot(readings, sim, times=[0.0, 1.0])
