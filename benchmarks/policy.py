@@ -28,7 +28,7 @@ from capsense.learning.servo import Belief, LimbPose, PoseEstimator
 
 STEPS = 250
 """Of an episode."""
-SEEDS = range(10_000, 10_030)
+SEEDS = range(10_000, 10_020)
 """Of the episodes that policies are judged on; training does not see them."""
 
 
@@ -151,7 +151,7 @@ def main() -> None:
     """Train, judge, and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--steps", type=int, default=60_000)
+    parser.add_argument("--steps", type=int, default=40_000)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     import torch

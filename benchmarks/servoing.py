@@ -158,11 +158,13 @@ def controllers(made: dict[str, Array]) -> dict[str, Callable[[float], Estimator
 # -- rides ---------------------------------------------------------------------------------------
 
 
-def carry_out(made: dict[str, Array], count: int, file: Path) -> list[dict[str, Any]]:
+def carry_out(
+    made: dict[str, Array], count: int, file: Path, only: str | None, **chip: Any
+) -> list[dict[str, Any]]:
     """All rides as rows of figures; those that are in the file are not made again."""
     rows = [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
     done = {(r["controller"], r["limb"], r["group"], r["seed"]) for r in rows}
-    every = controllers(made)
+    every = {n: make for n, make in controllers(made).items() if only in (None, n)}
     with file.open("a") as out:
         for seed in range(count):
             gap = GAPS[seed % len(GAPS)]
@@ -172,7 +174,7 @@ def carry_out(made: dict[str, Array], count: int, file: Path) -> list[dict[str, 
                     for name, make in every.items():
                         if (name, which, group, seed) in done:
                             continue
-                        env = env or LimbRide(which, gap, Randomisation(**sizes))  # type: ignore[arg-type]
+                        env = env or LimbRide(which, gap, Randomisation(**sizes, **chip))  # type: ignore[arg-type]
                         found = ride(env, make(gap), episode)
                         row = {"controller": name, "limb": which, "group": group, "seed": seed,
                                "gap": gap, **figures(found)}  # fmt: skip
@@ -278,7 +280,10 @@ def plot(rows: list[dict[str, Any]], file: Path) -> None:
                     axis.plot(x, np.mean(some), "_", color=COLOURS[n], ms=12, mew=2, label=label)
         axis.set_xticks(range(len(GAPS)), [f"{100 * g:.0f} cm" for g in sorted(GAPS)], color=INK)
         axis.set_yscale("log")
-        dress(axis, title=f"{ERRORS[k]}, rms")
+        for ticks in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+            ticks(lambda value, _: f"{value:g}" if f"{value:g}".strip("0.")[0] in "125" else "")
+        dress(axis, "set distance", title=f"{ERRORS[k]}, rms")
+        axis.tick_params(axis="y", which="minor", labelsize=8)
     figure.legend(loc="outside lower center", ncols=4, **LEGEND)
     figure.savefig(file, dpi=130)
 
@@ -294,15 +299,20 @@ def main() -> None:
         default=6,
         help="rides along each limb, each size, by turns at each distance",
     )
+    parser.add_argument("--only", help="one controller")
+    parser.add_argument("--no-drift", action="store_true", help="chips without drift")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     made = samples(options.scenes, options.folder / "samples.npz")
     print(f"{len(made['pose'])} samples")
-    rows = carry_out(made, options.rides, options.folder / "rides.jsonl")
+    name = "servoing_no_drift" if options.no_drift else "servoing"
+    file = options.folder / name
+    chip = {"drift": (0.0, 0.0)} if options.no_drift else {}
+    rows = carry_out(made, options.rides, file.with_suffix(".jsonl"), options.only, **chip)
     text = tables(rows)
-    (options.folder / "servoing.json").write_text(json.dumps(rows, indent=1))
-    (options.folder / "servoing.md").write_text(text)
-    plot(rows, options.folder / "servoing.png")
+    file.with_suffix(".json").write_text(json.dumps(rows, indent=1))
+    file.with_suffix(".md").write_text(text)
+    plot(rows, file.with_suffix(".png"))
     print(text)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import tomllib
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -91,3 +93,12 @@ def test_conventions_of_an_asymmetric_pose() -> None:
     rz = np.array([[c(yaw), -s(yaw), 0], [s(yaw), c(yaw), 0], [0, 0, 1]])
     assert pose.rotation == pytest.approx(rz @ ry @ rx, abs=1e-12)
     assert pose.apply((0, 0, 0)) == pytest.approx((0.1, 0.2, 0.3))
+
+
+def test_the_reference_names_what_is_there() -> None:
+    """Every object of the API pages imports."""
+    for page in (ROOT / "docs" / "api").glob("*.md"):
+        for target in re.findall(r"^::: (\S+)", page.read_text(encoding="utf-8"), re.MULTILINE):
+            module, _, name = target.rpartition(".")
+            there = hasattr(import_module(module), name) or find_spec(target) is not None
+            assert there, (page.name, target)

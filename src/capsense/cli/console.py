@@ -122,12 +122,9 @@ class BuildProgress:
 
     The bar appears at the first call, so that a field from the cache shows none.
 
-    Parameters
-    ----------
-    shown
-        Whether there is a terminal to draw on.
-    prefix
-        What stands before the stage's name.
+    Args:
+        shown: Whether there is a terminal to draw on.
+        prefix: What stands before the stage's name.
     """
 
     def __init__(self, *, shown: bool, prefix: str = "building the field: ") -> None:

@@ -179,11 +179,9 @@ def cut_clearance(table: DesignTable, surface: Surface, electrodes: Sequence[Ele
     pieces with holes; they stay one conductor, as a pour stitched by vias is. A pour in another
     plane than the electrodes' keeps its outline.
 
-    Raises
-    ------
-    DesignError
-        If ``clearance`` is no positive length, if the conductor is not flat, or if nothing of it
-        remains.
+    Raises:
+        DesignError: If ``clearance`` is no positive length, if the conductor is not flat, or if
+            nothing of it remains.
     """
     clearance = table.length("clearance")
     facets: list[Facet] = []

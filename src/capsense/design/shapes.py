@@ -284,10 +284,9 @@ def bend_sheet(item: str, surface: Surface, radius: float) -> Surface:
     The cylinder's axis runs along y, ``radius`` [m] under the electrode plane. A sheet at height z
     comes to the radius ``radius + z``; along x it keeps the angle that x / ``radius`` is.
 
-    Raises
-    ------
-    DesignError
-        If the sheet would lie on the axis or reach all the way round; ``item`` names it.
+    Raises:
+        DesignError: If the sheet would lie on the axis or reach all the way round; ``item`` names
+            it.
     """
     low, high = surface.bounds
     own = radius + float(low[2])

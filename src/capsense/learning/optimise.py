@@ -27,7 +27,7 @@ from capsense.design.loader import parse_design
 from capsense.errors import DesignError, FieldError, ScenarioError
 from capsense.field.background import BuildSettings, build_background
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator
-from capsense.scenario.bodies import ScenarioTable as Table
+from capsense.scenario.loader import ScenarioTable as Table
 from capsense.simulator import PresetName, Simulator
 
 Array = NDArray[np.float64]

@@ -115,7 +115,7 @@ class MaskedSolver:
         )
         self._background = check_eps_r(mesh, eps_background)
         self._map = StiffnessMap(mesh)
-        self._stats = MaskedStats(0, 0, 0, 0.0, 0.0, 0.0)
+        self._stats = MaskedStats(0, 0, 0, 0.0)
         self.reset()
 
     def reset(self) -> None:

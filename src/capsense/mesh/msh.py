@@ -294,10 +294,8 @@ class _Block:
 def write_msh(mesh: TetMesh, path: Path, version: MshVersion = "4.1") -> None:
     """Write `mesh` to `path` in metres.
 
-    Raises
-    ------
-    MeshError
-        If the version is unknown.
+    Raises:
+        MeshError: If the version is unknown.
     """
     if version not in ("4.1", "2.2"):
         raise MeshError(f"unknown .msh version {version!r}; known: 4.1, 2.2")
