@@ -65,7 +65,7 @@ def read_toml(
     except OSError as cause:
         raise error(f"{path} cannot be read: {cause.strerror}; give a .toml file") from None
     except (ValueError, RecursionError) as cause:
-        raise error(f"{path} is not valid TOML: {cause}; mend the line it names") from None
+        raise error(f"{path} is not valid TOML: {cause}; correct the line it names") from None
 
 
 class Table:

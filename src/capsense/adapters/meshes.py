@@ -83,7 +83,9 @@ def load_triangles(path: str | Path, scale: ArrayLike, label: str) -> tuple[Arra
 
     file = Path(path)
     if not file.is_file():
-        raise SceneError(f"{label!r}: there is no mesh file {file}; exclude it, or mend its path")
+        raise SceneError(
+            f"{label!r}: there is no mesh file {file}; exclude it, or correct its path"
+        )
     try:
         mesh = trimesh.load_mesh(file, process=False)
         if isinstance(mesh, trimesh.Scene):

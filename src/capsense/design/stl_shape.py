@@ -145,7 +145,7 @@ def imprinted_parts(table: DesignTable, folder: Path, domain: Domain) -> list[Su
         text = "[" + ", ".join(f"{s:.6g}" for s in size) + "]"
         raise table.error(
             f'file = "{file}" holds a box of {text} m, but the domain is {list(domain.size)} m; '
-            f"set domain size = {text}, or mend unit"
+            f"set domain size = {text}, or correct unit"
         )
     shift = np.array([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2] - domain.backplane])
     parts = []

@@ -190,7 +190,9 @@ class ChannelBank:
             out[..., k] += self._induced(matrix, shield_coupling, k)
         out = self._sign * out
         if not np.isfinite(out).all():
-            raise ReadoutError("capacitance holds a number that is not finite; mend the readings")
+            raise ReadoutError(
+                "capacitance holds a number that is not finite; correct the readings"
+            )
         return out
 
     def _induced(self, matrix: Array, coupling: Array | None, k: int) -> Array:
@@ -204,7 +206,7 @@ class ChannelBank:
             volts = -np.linalg.solve(own, charge[..., None])[..., 0]
         except np.linalg.LinAlgError:
             raise ReadoutError(
-                f"channel {self.names[k]!r}: its open electrodes have no capacitance; mend the "
+                f"channel {self.names[k]!r}: its open electrodes have no capacitance; correct the "
                 "readings"
             ) from None
         return (matrix[..., self._sense[k], open_] * volts).sum(axis=-1)

@@ -57,7 +57,7 @@ def finite(what: str, values: object) -> Array:
     """
     array = real(what, values)
     if not np.isfinite(array).all():
-        raise ReadoutError(f"{what}: a number is not finite; leave it out, or mend it")
+        raise ReadoutError(f"{what}: a number is not finite; leave it out, or correct it")
     return array
 
 

@@ -199,7 +199,7 @@ class Readout:
         if values.shape[-1:] != (k,):
             raise ReadoutError(f"channel values have shape {values.shape}; give {k} per instant")
         if not np.isfinite(values).all():
-            raise ReadoutError("a channel value is not finite; mend the readings")
+            raise ReadoutError("a channel value is not finite; correct the readings")
         return values
 
     def sample(self, time: float, capacitance: ReadingLike | ArrayLike) -> Counts:
@@ -357,7 +357,7 @@ class Readout:
         for process in self._processes:
             value = process(counts.channel, instant, value)
         if not np.isfinite(value).all():
-            raise ReadoutError("a stage made a number that is not finite; mend its figures")
+            raise ReadoutError("a stage made a number that is not finite; correct its figures")
         counts.code[:], counts.capacitance[:], counts.flags[:] = self._convert(
             counts.channel, value
         )

@@ -391,6 +391,6 @@ def _unit(n: Array) -> Array:
     bad = np.flatnonzero(length < 1e-12)
     if len(bad):
         raise SceneError(
-            f"the normal of point {bad[0]} has no length; leave normals out, or mend it"
+            f"the normal of point {bad[0]} has no length; leave normals out, or correct it"
         )
     return n / length
