@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from capsense.mesh.settings import MeshSettings
 from distance_model import DistanceModel
 from machine import on_one_core
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from capsense.learning.envs.randomisation import Randomisation
 from capsense.learning.network import PoseNetwork
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator, limb_pose
 from capsense.learning.spec import load_spec
+from capsense.mesh.lattice import MeshSettings
 
 Array = NDArray[np.float64]
 

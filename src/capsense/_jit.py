@@ -1,4 +1,4 @@
-"""How the kernels of the online solver are compiled.
+"""How the kernels of the online solver are compiled, and a word to whoever waits for that.
 
 None may reorder sums (``fastmath``): Numba puts a kernel that others call into each of them, and
 which of its versions runs depends on what was loaded first. With sums reordered they differ in the
@@ -9,13 +9,19 @@ last bits, and a recording would not replay. What is worth doing eight at a time
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from numba import njit
 from numba.core.caching import FunctionCache
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("capsense")
+
+WAIT = 2.0
+"""A first use that takes longer than this [s] is explained."""
+_done = False
 
 
 class _Cache(FunctionCache):
@@ -49,3 +55,26 @@ inlined = _jit(_nrt=False, inline="always")
 """The same, for what is written into the kernel that calls it."""
 pasted = njit(inline="always")
 """What is written into the kernel that calls it, and may allocate."""
+
+
+@contextmanager
+def first_use() -> Iterator[None]:
+    """Say, if the first use in a process takes long, that kernels are compiled and then kept.
+
+    It is a warning of the logger ``capsense``, which goes to standard error unless told otherwise.
+    """
+    global _done
+    if _done:
+        yield
+        return
+    timer = threading.Timer(
+        WAIT, _log.warning,
+        ["compiling the solver for this processor; it takes half a minute once, and is then kept"],
+    )  # fmt: skip
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+        _done = True
+    finally:
+        timer.cancel()

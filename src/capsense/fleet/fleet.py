@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._patience import first_use
+from capsense._jit import first_use
 from capsense._thread_pool import in_parts
 from capsense.design import load_design
 from capsense.design.model import Design, Role

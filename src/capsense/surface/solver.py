@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._patience import first_use
+from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.errors import SceneError, SolveError
 from capsense.field.change import Change
