@@ -1,7 +1,7 @@
 """The tutorials, run as they stand on their pages.
 
-A line such as ``EPISODES = 20  # the tests use 2`` is run with the smaller number. Pages without
-one must print what they show.
+A line such as ``EPISODES = 20  # the tests use 2`` is run with the smaller number. Pages whose code
+has none must print what they show.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def test_a_page_runs(
     reduced = REDUCED.sub(r"\1\2", code)
     with chdir(tmp_path):
         for name, text in files(page).items():
-            Path(name).write_text(text, encoding="utf-8")
+            Path(name).write_text(REDUCED.sub(r"\1\2", text), encoding="utf-8")
         exec(compile(reduced, page.name, "exec"), {"__name__": "tutorial"})
     if reduced == code:
         found, shown = capsys.readouterr().out, blocks(page, "text")
