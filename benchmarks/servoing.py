@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -140,15 +141,21 @@ def controllers(made: dict[str, Array]) -> dict[str, Callable[[float], Estimator
         "paper": right / (paper.step(grounded).self_capacitance - nothing).sum(),
     }
     print("factors 5 cm over a limb:", {k: round(float(v), 4) for k, v in scales.items()})
-    nets = {"network": network(made["field"], made["pose"])}
+    readings = {"network": ("field", 1.0)}
     for name, title in (("distance", "distance"), ("paper", "paper's scheme")):
-        nets[f"network of {title}"] = network(made[name], made["pose"])
-        nets[f"{title}, scaled"] = network(scales[name] * made[name], made["pose"])
+        readings[f"network of {title}"] = (name, 1.0)
+        readings[f"{title}, scaled"] = (name, scales[name])
+
+    @cache
+    def trained(title: str) -> PoseNetwork:
+        name, scale = readings[title]
+        return network(scale * made[name], made["pose"])
+
     plates = DistanceModel(sim.design, scales["distance"])
     return {
         "true pose": lambda gap: None,
         "gradients": lambda gap: PoseEstimator(sim, belief(gap), **options),
-        **{name: (lambda gap, net=net: net) for name, net in nets.items()},
+        **{title: (lambda gap, title=title: trained(title)) for title in readings},
         "distance, scaled, least squares": lambda gap: DistanceEstimator(
             sim, plates, belief=belief(gap), **options
         ),
@@ -300,14 +307,13 @@ def main() -> None:
         help="rides along each limb, each size, by turns at each distance",
     )
     parser.add_argument("--only", help="one controller")
-    parser.add_argument("--no-drift", action="store_true", help="chips without drift")
+    parser.add_argument("--quiet", action="store_true", help="chips with no white noise or drift")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     made = samples(options.scenes, options.folder / "samples.npz")
     print(f"{len(made['pose'])} samples")
-    name = "servoing_no_drift" if options.no_drift else "servoing"
-    file = options.folder / name
-    chip = {"drift": (0.0, 0.0)} if options.no_drift else {}
+    file = options.folder / ("servoing_quiet" if options.quiet else "servoing")
+    chip = {"noise": (0.0, 0.0), "drift": (0.0, 0.0)} if options.quiet else {}
     rows = carry_out(made, options.rides, file.with_suffix(".jsonl"), options.only, **chip)
     text = tables(rows)
     file.with_suffix(".json").write_text(json.dumps(rows, indent=1))

@@ -64,9 +64,10 @@ def test_grounded_bar_over_bare_patches(simulators, gap):
     check(simulators("six_patch_bare"), "six_patch_bare", f"bar {gap}", 0.03, 0.05)
 
 
-@pytest.mark.parametrize(("gap", "bound"), [(1, 0.12), (2, 0.07)])
+@pytest.mark.parametrize(("gap", "bound"), [(1, 0.17), (2, 0.07)])
 def test_grounded_bar_nearly_touching(simulators, gap, bound):
-    """Measured against boundary elements: 10.7 % at 1 mm, where panels are wider than the gap."""
+    """Measured against boundary elements: 16 % at 1 mm, less than half the distance that fields are
+    fitted at."""
     check(simulators("six_patch_bare"), "six_patch_bare", f"bar {gap}", bound, 0.1)
 
 

@@ -122,7 +122,9 @@ def test_errors_reach_the_bound(sim: cs.Simulator) -> None:
 def test_bound_without_information_is_the_belief(sim: cs.Simulator) -> None:
     """Noise far above the signals leaves what was known before; what is known stays known."""
     belief = Belief(spread=LimbPose(0.03, 0.02, 0.1, 0.0))
-    bound = PoseEstimator(sim, belief, noise=1e-10).covariance(LimbPose())
+    estimator = PoseEstimator(sim, belief, noise=1e-10)
+    bound = estimator.covariance(LimbPose(0.01))
+    assert estimator.pose == belief.pose, "a bound is no estimate"
     assert bound == pytest.approx(np.diag(np.square(belief.spread)), abs=1e-7)
 
 

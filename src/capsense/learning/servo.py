@@ -236,7 +236,7 @@ class PoseEstimator:
         if values.shape != (count,) or not np.isfinite(values).all():
             raise SceneError(f"measured is {measured!r}; give {count} finite capacitances in F")
         for _ in range(self.iterations):
-            free, rows, scale, model = self._linearised(values)
+            free, rows, scale, model = self._linearised(self._state, values)
             pull = (self.belief.mean - self._state)[free] / self.belief.deviation[free]
             rest = np.concatenate([(values - model) / scale, pull])
             step = np.zeros(5)
@@ -254,17 +254,19 @@ class PoseEstimator:
         "Detection, Estimation, and Modulation Theory", part I, 1968, section 2.4), the radius being
         unknown as well.
         """
-        self._state = np.array([*pose, math.log(radius or self.belief.radius)])
-        free, rows, _, _ = self._linearised(None)
+        state = np.array([*pose, math.log(radius or self.belief.radius)])
+        free, rows, _, _ = self._linearised(state)
         out = np.zeros((5, 5))
         spread = self.belief.deviation[free]
         out[np.ix_(free, free)] = np.linalg.inv(rows.T @ rows) * np.outer(spread, spread)
         return out[:4, :4]
 
-    def _linearised(self, measured: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:
+    def _linearised(
+        self, state: Array, measured: Array | None = None
+    ) -> tuple[NDArray[np.intp], Array, Array, Array]:
         """Which unknowns there are; rows of the least-squares problem in units of their spread, the
-        standard deviations of what is measured [F], and the model at the state [F]."""
-        values, slopes = self.model(LimbPose(*self._state[:4]), math.exp(self._state[4]))
+        standard deviations of what is measured [F], and the model at a state [F]."""
+        values, slopes = self.model(LimbPose(*state[:4]), math.exp(state[4]))
         seen = values if measured is None else measured
         scale = np.hypot(self._noise, self._relative * seen)
         free = np.flatnonzero(self.belief.deviation)
