@@ -1,4 +1,4 @@
-"""Scenario files: what they mean, and that a wrong one is refused with its mend."""
+"""Scenario files: what they mean, and that a wrong one is refused with its fix."""
 
 from __future__ import annotations
 
@@ -356,7 +356,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("change", "message"), REFUSED, ids=[m for _, m in REFUSED])
 def test_refused(change: tuple[str, Any], message: str) -> None:
-    """A wrong value is refused with the file, the item, the value and the mend."""
+    """A wrong value is refused with the file, the item, the value and the fix."""
     with pytest.raises(ScenarioError, match=message) as caught:
         parse_scenario(changed(change), source="my.toml")
     assert str(caught.value).startswith("my.toml: ")

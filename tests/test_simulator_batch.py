@@ -87,7 +87,7 @@ def test_a_failing_scene_does_not_lose_the_others(
 
 
 def test_refused_before_any_work(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By name, with the mend."""
+    """By name, with the fix."""
     monkeypatch.setattr(cs.Simulator, "step", lambda *_: pytest.fail("worked"))
     with pytest.raises(SceneError, match=r"scenes\[2\]: a batch holds a Scene .*, not list"):
         tiny.step_batch([cs.Scene(), cs.Scene(), []])  # type: ignore[list-item]

@@ -142,7 +142,7 @@ def test_a_failing_sensor_does_not_lose_the_others(tiny: cs.Simulator) -> None:
 
 
 def test_refused(tiny: cs.Simulator) -> None:
-    """Refused by name, with the mend."""
+    """Refused by name, with the fix."""
     ball = cs.Body(cs.Sphere(0.02))
     skin = skin_of(tiny)
     with pytest.raises(SceneError, match="give at least one"):

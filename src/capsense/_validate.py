@@ -53,7 +53,7 @@ def read_toml(
         path: The file.
         what: What it is, for messages, such as ``design``.
         error: The exception to raise.
-        hint: A further mend for a file that is not there.
+        hint: A further fix for a file that is not there.
 
     Raises:
         CapSenseError: An ``error`` that names the path, if it is missing, unreadable or not TOML.

@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 _LONGEST, _HEAD, _TAIL = 1000, 600, 300
-"""Longer messages are cut in the middle: the head names the thing, the tail the mend."""
+"""Longer messages are cut in the middle: the head names the thing, the tail the fix."""
 
 
 class CapSenseError(Exception):
@@ -21,7 +21,7 @@ class CapSenseError(Exception):
 
 
 class DesignError(CapSenseError, ValueError):
-    """A sensor design is wrong; the message names the item, the value and the mend."""
+    """A sensor design is wrong; the message names the item, the value and the fix."""
 
 
 class SceneError(CapSenseError, ValueError):

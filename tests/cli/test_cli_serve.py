@@ -149,7 +149,7 @@ def test_bad_input(arguments: list[str], words: str, capsys: pytest.CaptureFixtu
 
 
 def test_without_websockets() -> None:
-    """The message names the install that mends it."""
+    """The message names the install that fixes it."""
     code = (
         "import sys; sys.modules['websockets'] = None; from capsense.cli.main import main; "
         "sys.exit(main(['serve', '--design', 'patch']))"

@@ -154,7 +154,7 @@ RECTANGLE = {"shape": "rectangle", "size": [0.02, 0.02]}
     ],
 )  # fmt: skip
 def test_refused(keys: dict[str, Any], rest: dict[str, Any], words: list[str]) -> None:
-    """Refused by name, with the mend."""
+    """Refused by name, with the fix."""
     with pytest.raises(DesignError) as caught:
         design(RECTANGLE | keys, **rest)
     for word in words:

@@ -1,4 +1,4 @@
-"""Designs with one thing wrong: each must be refused with its name, its value and a mend."""
+"""Designs with one thing wrong: each must be refused with its name, its value and a fix."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ COMB = (
 )
 STRIPES = (A + "shape", "stripes"), (A + "size", [0.004, 0.03]), (A + "count", 3)
 
-# what is changed; what the message must contain: the item, the value, the mend
+# what is changed; what the message must contain: the item, the value, the fix
 BAD: dict[str, tuple[tuple[tuple[str, Any], ...], tuple[str, ...]]] = {
     "unknown top key": ((("electrodes", []),), ("design", "'electrodes'", "'electrode'")),
     "unknown key": (((A + "centre", [0, 0]),), ('electrode "A"', "'centre'", "'center'")),
@@ -278,7 +278,7 @@ def test_base_is_good() -> None:
 
 @pytest.mark.parametrize("case", BAD)
 def test_refused_with_name_value_and_mend(case: str) -> None:
-    """Every wrong input is refused, and the message says which, what and how to mend it."""
+    """Every wrong input is refused, and the message says which, what and how to fix it."""
     changes, parts = BAD[case]
     with pytest.raises(DesignError) as error:
         parse_design(changed(*changes), source="bad.toml")

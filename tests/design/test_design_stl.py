@@ -218,7 +218,7 @@ def refused(call: Any, *parts: str) -> None:
 
 
 def test_bad_meshes_are_refused(tmp_path: Path) -> None:
-    """Non-manifold, one-sided, degenerate, double and open meshes name electrode and mend."""
+    """Non-manifold, one-sided, degenerate, double and open meshes name electrode and fix."""
     e = ('electrode "E"', "part.stl")
     fin = [[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, -10, 0], [0, 0, 10]]
     save(tmp_path, fin, [[0, 1, 2], [1, 0, 3], [0, 1, 4]])
@@ -254,7 +254,7 @@ def test_bad_meshes_are_refused(tmp_path: Path) -> None:
 
 
 def test_bad_files_are_refused(tmp_path: Path) -> None:
-    """Missing, empty, foreign, cut-off and huge files name electrode and mend."""
+    """Missing, empty, foreign, cut-off and huge files name electrode and fix."""
     refused(lambda: stl(tmp_path), 'electrode "E"', "part.stl", "relative to the design")
     for content in (b"", b"PK\x03\x04 not a mesh", b"solid x\nvertex 0 0 0\nvertex 1 0 0\n"):
         (tmp_path / "part.stl").write_bytes(content)

@@ -278,7 +278,7 @@ def test_a_session_of_the_caller_survives():
 
 
 @pytest.mark.parametrize(
-    ("failure", "mend"),
+    ("failure", "fix"),
     [
         (ModuleNotFoundError("No module named 'gmsh'"), r'pip install "capsense\[mesh\]"'),
         (
@@ -287,12 +287,12 @@ def test_a_session_of_the_caller_survives():
         ),
     ],
 )
-def test_a_missing_gmsh_names_the_mend(monkeypatch, failure, mend):
+def test_a_missing_gmsh_names_the_mend(monkeypatch, failure, fix):
     def missing(name: str) -> None:
         raise failure
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    with pytest.raises(MissingDependencyError, match=mend):
+    with pytest.raises(MissingDependencyError, match=fix):
         mesh_design(small())
 
 

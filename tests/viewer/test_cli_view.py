@@ -140,7 +140,7 @@ def test_port_that_is_taken(scenario: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_without_viser(scenario: Path) -> None:
-    """The message names the install that mends it."""
+    """The message names the install that fixes it."""
     code = (
         "import sys; sys.modules['viser'] = None; from capsense.cli.main import main; "
         f"sys.exit(main(['view', {str(scenario)!r}]))"

@@ -115,7 +115,7 @@ class Remote:
 
 
 def translated(what: str, error: Exception) -> AdapterError:
-    """What the client raised at a call, as an error that names the mend."""
+    """What the client raised at a call, as an error that names the fix."""
     import zmq
 
     if isinstance(error, zmq.Again):

@@ -35,7 +35,7 @@ def check_design(design: Design, *, source: str = "design") -> None:
         DesignError: If there is no electrode; if a name is used twice; if an electrode touches
             another, or a conductor; if anything leaves the domain; if layers overlap; if a sheet
             crosses a layer's surface. The message names ``source``, the item, the value and the
-            mend.
+            fix.
     """
     if not design.electrodes:
         raise DesignError(f"{source}: design has no electrode; add an [[electrode]] table")
@@ -145,12 +145,12 @@ def _no_short(one: Electrode | Conductor, other: Electrode | Conductor, source: 
                 f"at {_at(point)}; cut one of them back, they may only share edges"
             )
         return
-    mend = "move them apart (center, z) or reduce their size"
+    fix = "move them apart (center, z) or reduce their size"
     if isinstance(one, Electrode) and isinstance(other, Conductor):
-        mend = f"set clearance = 0.0005 on {_label(other)} or move it to another z"
+        fix = f"set clearance = 0.0005 on {_label(other)} or move it to another z"
     raise DesignError(
         f"{source}: {_label(one)}: touches or overlaps {_label(other)} at {_at(point)}, a short "
-        f"circuit; {mend}"
+        f"circuit; {fix}"
     )
 
 

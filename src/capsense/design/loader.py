@@ -60,7 +60,7 @@ def load_design(name_or_path: str | Path) -> Design:
 
     Raises:
         DesignError: If there is no such design, or if anything in its file is wrong; the message
-            names the file, the item, the value and the mend.
+            names the file, the item, the value and the fix.
     """
     text = str(name_or_path)
     if isinstance(name_or_path, str) and not text.endswith(".toml") and not set("/\\") & set(text):
@@ -94,7 +94,7 @@ def parse_design(
         folder: Folder that STL files are relative to; the current one by default.
 
     Raises:
-        DesignError: If anything is wrong; the message names the item, the value and the mend.
+        DesignError: If anything is wrong; the message names the item, the value and the fix.
     """
     top = DesignTable(data, source, "design")
     top.only(TOP_KEYS)

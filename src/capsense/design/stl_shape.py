@@ -35,17 +35,17 @@ def _read_triangles(table: DesignTable, folder: Path) -> Array:
     extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
     if extent > table.limit * (1 + 1e-6):
         smaller = [f'"{u}"' for u, f in UNITS.items() if f < UNITS[unit]]
-        mend = f"did you mean unit = {' or '.join(smaller)}?" if smaller else "give a smaller scale"
+        fix = f"did you mean unit = {' or '.join(smaller)}?" if smaller else "give a smaller scale"
         raise table.error(
             f'file = "{file}" is {extent:g} m across with unit = "{unit}", larger than '
-            f"{table.limit:g} m; {mend}"
+            f"{table.limit:g} m; {fix}"
         )
     if extent < SMALLEST:
         larger = [f'"{u}"' for u, f in UNITS.items() if SMALLEST / extent < f / UNITS[unit]]
-        mend = f"did you mean unit = {' or '.join(larger)}?" if larger else "give a larger scale"
+        fix = f"did you mean unit = {' or '.join(larger)}?" if larger else "give a larger scale"
         raise table.error(
             f'file = "{file}" is {extent * 1e3:g} mm across with unit = "{unit}", smaller than '
-            f"{SMALLEST * 1e3:g} mm; {mend}"
+            f"{SMALLEST * 1e3:g} mm; {fix}"
         )
     return triangles
 

@@ -45,7 +45,7 @@ def load_readout(path: str | Path, electrodes: Sequence[str]) -> Readout:
 
     Raises:
         ReadoutError: There is no such file, or anything in it is wrong; the message names the
-            file, the item, the value and the mend.
+            file, the item, the value and the fix.
     """
     file = Path(path)
     return parse_readout(read_toml(file, "readout", ReadoutError), electrodes, source=file.name)

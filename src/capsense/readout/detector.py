@@ -89,7 +89,7 @@ class SteppingTracker:
     away: Filter = Filter(1, 1, 255, 2)
     """Against a growing capacitance: a hand that comes must not be taken into the baseline."""
     back: Filter = Filter(1, 1, 0, 0)
-    """Against a falling capacitance: quick, so that a wrong baseline mends itself."""
+    """Against a falling capacitance: quick, so that a wrong baseline fixes itself."""
     touched: Filter = Filter(0, 0, 255, 255)
 
     def start(self, channels: int) -> TrackerProcess:

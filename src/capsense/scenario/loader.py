@@ -243,7 +243,7 @@ def load_scenario(path: str | Path) -> Scenario:
 
     Raises:
         ScenarioError: There is no such file, or anything in it is wrong; the message names the
-            file, the item, the value and the mend.
+            file, the item, the value and the fix.
         DesignError: Something is wrong in the design file it names.
     """
     file = Path(path)
@@ -262,7 +262,7 @@ def parse_scenario(
         folder: Folder that designs and meshes are relative to; the current one by default.
 
     Raises:
-        ScenarioError: Anything is wrong; the message names the item, the value and the mend.
+        ScenarioError: Anything is wrong; the message names the item, the value and the fix.
         DesignError: Something is wrong in the design file it names.
     """
     where = folder if folder is not None else Path()

@@ -111,7 +111,7 @@ class TriMesh(TriangleShape):
 
     Args:
         vertices: Points [m], shape (n, 3). Coinciding ones are merged.
-        faces: Indices of the corners of every triangle, shape (m, 3). The winding is mended.
+        faces: Indices of the corners of every triangle, shape (m, 3). The winding is fixed.
 
     Raises:
         SceneError: The mesh is longer than 10 m, holds a bad number or index, or has no triangle.

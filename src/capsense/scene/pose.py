@@ -21,17 +21,17 @@ _MIN_NORM = 1e-9
 _ORTHONORMAL_TOLERANCE = 1e-6
 
 
-def checked_floats(values: object, count: int, what: str, mend: str) -> tuple[float, ...]:
+def checked_floats(values: object, count: int, what: str, fix: str) -> tuple[float, ...]:
     """Turn ``values`` into ``count`` finite floats, or raise :class:`SceneError`."""
     try:
         out = tuple([float(v) for v in values])  # type: ignore[attr-defined]
     except (TypeError, ValueError, OverflowError):
-        raise SceneError(f"{what} is {values!r}; {mend}") from None
+        raise SceneError(f"{what} is {values!r}; {fix}") from None
     if len(out) != count:
-        raise SceneError(f"{what} has {len(out)} entries; {mend}")
+        raise SceneError(f"{what} has {len(out)} entries; {fix}")
     for v in out:
         if not math.isfinite(v):
-            raise SceneError(f"{what} is {out}, which is not finite; {mend}")
+            raise SceneError(f"{what} is {out}, which is not finite; {fix}")
     return out
 
 

@@ -149,21 +149,21 @@ def checked_grounding(grounding: object) -> Grounding:
     Raises:
         SceneError: Neither one of the two words nor a positive capacitance up to 1 mF.
     """
-    mend = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
+    fix = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
     if isinstance(grounding, str):
         if grounding == "grounded":
             return "grounded"
         if grounding == "floating":
             return "floating"
-        raise SceneError(f"grounding is {grounding!r}; {mend}")
+        raise SceneError(f"grounding is {grounding!r}; {fix}")
     if isinstance(grounding, bool):
-        raise SceneError(f"grounding is {grounding!r}; {mend}")
+        raise SceneError(f"grounding is {grounding!r}; {fix}")
     try:
         farads = float(grounding)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
-        raise SceneError(f"grounding is {grounding!r}; {mend}") from None
+        raise SceneError(f"grounding is {grounding!r}; {fix}") from None
     if not (math.isfinite(farads) and farads > 0):
-        raise SceneError(f"grounding is {farads} F, not a positive finite capacitance; {mend}")
+        raise SceneError(f"grounding is {farads} F, not a positive finite capacitance; {fix}")
     if farads > _LARGEST:
         raise SceneError(
             f"grounding is {farads:g} farads, more than anything has; 100 pF are 100e-12, and a "
@@ -223,8 +223,8 @@ class Scene:
         names: set[str] = set()
         for i, body in enumerate(items):
             if not isinstance(body, Body):
-                mend = f"; write Body({body!r}, ...)" if isinstance(body, Shape) else ""
-                raise SceneError(f"bodies[{i}] is {body!r}, not a Body{mend}")
+                fix = f"; write Body({body!r}, ...)" if isinstance(body, Shape) else ""
+                raise SceneError(f"bodies[{i}] is {body!r}, not a Body{fix}")
             if body.name is not None:
                 if body.name in names:
                     raise SceneError(f"two bodies are named {body.name!r}; names must differ")
