@@ -111,7 +111,7 @@ def samples(count: int, file: Path) -> dict[str, Array]:
 def paper_scheme() -> cs.Simulator:
     """The scheme of Schöffmann et al. 2022, on a mesh of their size."""
     settings = BuildSettings(mesh=MeshSettings().refined(COARSE))
-    return cs.Simulator("six_patch", method="masked", settings=settings)
+    return cs.Simulator("six_patch", method="fem_masked", settings=settings)
 
 
 def network(values: Array, poses: Array, seed: int = 0) -> PoseNetwork:

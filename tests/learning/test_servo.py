@@ -159,7 +159,7 @@ def test_refusals(sim: cs.Simulator) -> None:
         with pytest.raises(SceneError, match="6 finite"):
             estimator.estimate(wrong)
     with pytest.raises(SceneError, match="gradients"):
-        PoseEstimator(cs.Simulator("six_patch_bare", method="masked"))
+        PoseEstimator(cs.Simulator("six_patch_bare", method="fem_masked"))
     with pytest.raises(SceneError, match="noise"):
         PoseEstimator(sim, noise=0.0)
     with pytest.raises(SceneError, match="driven shield"):
