@@ -81,7 +81,7 @@ def test_references(validation: ModuleType) -> None:
     errors = {tuple(cells(x)[:2]): numbers(cells(x)[2])[0] for x in lines[2:]}
     near = {case for case in errors if case[1] in ("bar 1", "bar 2")}
     assert len(near) == 2
-    assert max(errors[case] for case in near) < 12
+    assert max(errors[case] for case in near) < 17
     assert max(error for case, error in errors.items() if case not in near) < 3
     by_case = {tuple(cells(x)[:2]): x for x in PAGE.splitlines() if x.startswith("|")}
     for line in lines[2:]:
@@ -94,24 +94,25 @@ def test_maps(validation: ModuleType) -> None:
     text = validation.presets(["standard"])
     found = [cells(line) for line in text.splitlines()[2:]]
     assert [int(row[2]) for row in found] == [89, 60, 9]
-    for row, (rms, worst) in zip(found, ((0.6, 2.5), (1.1, 4.5), (2.0, 7.0)), strict=True):
+    for row, (rms, worst) in zip(found, ((0.55, 2.5), (1.0, 4.7), (2.0, 7.0)), strict=True):
         assert float(row[3]) < rms
         assert float(row[5]) < worst
     assert_on_page(text, 0.05)
 
 
 def test_designs(validation: ModuleType) -> None:
-    """Eleven cases; what self mode reads is right where the reference is, and the page says so."""
+    """Eleven cases, each reference good to 0.5 %; what self mode reads, and the page says so."""
     found = rows(validation.designs())
     assert len(found) == 11
     for name, (_, _, own, error) in found.items():
-        assert abs(numbers(own)[1]) < max(3.0, numbers(error)[0]), name
+        assert abs(numbers(own)[1]) < 3.3, name
+        assert numbers(error)[0] < 0.5, name
     assert_on_page(validation.designs(), 0.05)
 
 
 @pytest.mark.parametrize(
     ("part", "columns", "bound"),
-    [("contact", 4, 110), ("images", 4, 20), ("cloth", 4, 35), ("inside", 4, 30)],
+    [("contact", 4, 350), ("images", 4, 20), ("cloth", 4, 35), ("inside", 4, 45)],
 )
 def test_limits(validation: ModuleType, part: str, columns: int, bound: float) -> None:
     """Limits are those on the page."""

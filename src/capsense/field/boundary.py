@@ -48,6 +48,8 @@ class Accuracy:
 
     scale: float = 1.0
     """Larger is coarser and faster."""
+    fitted: bool = True
+    """Whether designs of few panels are cut finer, and those of many coarser."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +96,12 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
     Raises:
         FieldError: The design needs more panels than fit in memory.
     """
-    scale = (accuracy or Accuracy()).scale
-    fitted = _fitted(design)
-    model = _cut(design, scale * (fitted if scale <= 1.0 else max(fitted, 1.0)))
+    accuracy = accuracy or Accuracy()
+    scale = accuracy.scale
+    if accuracy.fitted:
+        fitted = _fitted(design)
+        scale *= fitted if scale <= 1.0 else max(fitted, 1.0)
+    model = _cut(design, scale)
     if len(model.panels) > _MAX_PANELS:
         raise FieldError(
             f"design {design.name!r} needs {len(model.panels)} boundary panels, more than the "

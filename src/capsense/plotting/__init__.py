@@ -1,1 +1,1 @@
-"""Pictures of designs, runs and chips; :func:`capsense.plot` is the door to them."""
+"""Pictures of designs, runs and chips; :func:`capsense.plot` draws any of them."""
