@@ -105,7 +105,8 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
     if len(model.panels) > _MAX_PANELS:
         raise FieldError(
             f"design {design.name!r} needs {len(model.panels)} boundary panels, more than the "
-            f"{_MAX_PANELS} that fit in memory; simplify its outlines or coarsen its STL files"
+            f"{_MAX_PANELS} that fit in memory; lower [build] resolution, simplify its outlines or "
+            "coarsen its STL files"
         )
     return model
 
