@@ -21,6 +21,7 @@ from capsense.design.model import Design
 from capsense.errors import ProtocolError, ServerError
 from capsense.readout.config import choose_readout, file_content, parse_readout
 from capsense.readout.readout import SEED_STRIDE, Readout
+from capsense.scene import Body, Pose, Scene, Sphere
 from capsense.scene.depth import DepthFrame
 from capsense.server.connection import (
     FLOOD,
@@ -47,6 +48,13 @@ T = TypeVar("T")
 CLOSING = 2.0
 """Longest time for answers to frames at hand, and again for connections to close [s]."""
 Progress = Callable[[str, float], None]
+
+
+_FIRST_VIEWS = (
+    DepthFrame(np.full((8, 8), 0.1)),
+    Scene([Body(Sphere(0.03), Pose((0.0, 0.0, 0.1)), material) for material in ("steel", "water")]),
+)
+"""Solved before the server listens: no client waits for kernels to be compiled."""
 
 
 class Server:
@@ -80,7 +88,8 @@ class Server:
         for design in self._load_designs():
             simulator = Simulator(design, progress=progress)
             self._templates[design.name] = simulator
-            simulator.step(DepthFrame(np.full((8, 8), 0.1)))
+            for view in _FIRST_VIEWS:
+                simulator.step(view)
             self._make_readout(simulator, 0)
         self._sessions: dict[int, ClientSession] = {}
         self._counter = 0
