@@ -102,7 +102,8 @@ def array() -> None:
         error = np.diag(sim.step(cs.Scene([body])).delta) - wanted
         worst = 100 * np.abs(error).max() / wanted.max()
         below = 100 * error[wanted.argmax()] / wanted.max()
-        print(f"  cube {1e3 * gap:3.0f} mm above a pad: {below:+.1f} %; worst of all {worst:.1f} % of it")
+        place = f"cube {1e3 * gap:3.0f} mm above a pad"
+        print(f"  {place}: {below:+.1f} % there, worst of all {worst:.1f} % of it")
 
 
 def main() -> None:
