@@ -112,7 +112,7 @@ class Rules:
         put(self, "hull", _patterns("hull", self.hull))
 
     def check(self, known: Sequence[Names]) -> None:
-        """Refuse patterns that fit nothing, which are slips of the pen.
+        """Refuse patterns that fit nothing, most likely typing errors.
 
         Args:
             known: The names of everything in the model.
