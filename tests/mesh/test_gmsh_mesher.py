@@ -287,7 +287,7 @@ def test_a_session_of_the_caller_survives():
         ),
     ],
 )
-def test_a_missing_gmsh_names_the_mend(monkeypatch, failure, fix):
+def test_a_missing_gmsh_names_the_fix(monkeypatch, failure, fix):
     def missing(name: str) -> None:
         raise failure
 
