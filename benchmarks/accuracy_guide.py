@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from accuracy_map import DESIGN, MAP, MORE, diagonal_errors, reference_scenes
+from sizes import write_between
 
 import capsense as cs
 
@@ -72,10 +73,7 @@ def main() -> None:
     if options.write is None:
         print(text)
         return
-    page = options.write.read_text(encoding="utf-8")
-    start, end = (page.index(marker) for marker in MARKERS)
-    page = f"{page[:start]}{MARKERS[0]}\n\n{text}\n\n{page[end:]}"
-    options.write.write_text(page, encoding="utf-8")
+    write_between(options.write, MARKERS, f"\n{text}\n")
 
 
 if __name__ == "__main__":

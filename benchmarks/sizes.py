@@ -89,6 +89,13 @@ def table(now: dict[str, tuple[int, int]], before: dict[str, tuple[int, int]] | 
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
+def write_between(path: Path, markers: tuple[str, str], text: str) -> None:
+    """Replace what stands between two markers of a page."""
+    page = path.read_text(encoding="utf-8")
+    start, end = (page.index(marker) for marker in markers)
+    path.write_text(f"{page[:start]}{markers[0]}\n{text}\n{page[end:]}", encoding="utf-8")
+
+
 def main() -> None:
     """Print the table, or write it into a page."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -99,10 +106,7 @@ def main() -> None:
     if options.write is None:
         print(text)
         return
-    page = options.write.read_text(encoding="utf-8")
-    start, end = (page.index(marker) for marker in MARKERS)
-    page = f"{page[:start]}{MARKERS[0]}\n{text}\n{page[end:]}"
-    options.write.write_text(page, encoding="utf-8")
+    write_between(options.write, MARKERS, text)
 
 
 if __name__ == "__main__":
