@@ -215,3 +215,19 @@ def rsqrt(typing: Any, value: Any) -> Any:
         return y
 
     return value(value), code
+
+
+def _pointer(kind: Any) -> Any:
+    @intrinsic
+    def pointer(typing: Any, address: Any) -> Any:
+        """A pointer to the numbers that stand at an address."""
+
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+        return types.CPointer(kind)(types.intp), code
+
+    return pointer
+
+
+singles, doubles, integers = _pointer(types.float32), _pointer(types.float64), _pointer(types.int64)

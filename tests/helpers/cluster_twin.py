@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
+from capsense.elements.matter import UNIT
+from capsense.elements.rigid import INSIDE
 from capsense.surface.choose_kernels import Cut
 from capsense.surface.leaf_kernels import leaf_rows, placed
-from capsense.surface.matter import UNIT
 from capsense.surface.pair_kernels import leaf_pairs
-from capsense.surface.rigid import INSIDE
 from capsense.surface.solve_kernels import assembled, functions_of, reduced
 from capsense.surface.solver import SurfaceSolver
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from capsense.field.green_kernels import Green
 from capsense.surface.pair_kernels import FAR, SOFT
-from capsense.surface.place_kernels import Green
 from capsense.surface.step import Solution
 
 Array = np.ndarray

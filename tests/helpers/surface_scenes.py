@@ -9,10 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import capsense as cs
-from capsense.surface.panels import panels_of
-from capsense.surface.place_kernels import BODY, Green
-from capsense.surface.rigid import RigidShape, rigid_shape
-from capsense.surface.solver import pack_green
+from capsense.elements.panels import panels_of
+from capsense.elements.rigid import BODY, RigidShape, rigid_shape
+from capsense.field.green_kernels import Green, pack_green
 
 Array = np.ndarray
 

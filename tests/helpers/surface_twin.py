@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from capsense.elements.blocks import free_block, impedance
+from capsense.elements.panels import SurfacePanels
 from capsense.field.green import GreenFunction
-from capsense.surface.blocks import free_block, impedance
-from capsense.surface.panels import SurfacePanels
 
 Array = np.ndarray
 SOFT = 0.15

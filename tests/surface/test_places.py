@@ -7,10 +7,10 @@ import pytest
 from surface_scenes import Placed, green_of, pack
 
 import capsense as cs
+from capsense.field.green_kernels import beyond, least_gap, lift
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import Leaves, placed
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
-from capsense.surface.place_kernels import beyond, least_gap, lift
 
 Array = np.ndarray
 BOX = np.array([[-0.05, -0.04, -0.001], [0.05, 0.04, 0.0]])

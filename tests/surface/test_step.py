@@ -16,28 +16,20 @@ from scipy.spatial.transform import Rotation
 from surface_twin import Piece
 
 import capsense as cs
+from capsense._dense import cholesky, multiply, multiply_simd, substitute
+from capsense._simd import rsqrt
+from capsense.elements import tree_kernels
+from capsense.elements.blocks import free_block
+from capsense.elements.matter import CONDUCTING, UNIT
+from capsense.elements.panels import panels_of
+from capsense.elements.pieces import ChangingBody
+from capsense.elements.rigid import BODY, Clusters, RigidShape, rigid_shape, split
 from capsense.field.green import GreenFunction
-from capsense.surface import tree_kernels
-from capsense.surface.blocks import free_block
+from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
-from capsense.surface.matter import CONDUCTING, UNIT
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
-from capsense.surface.panels import panels_of
-from capsense.surface.pieces import ChangingBody
-from capsense.surface.place_kernels import (
-    BODY,
-    Green,
-    cholesky,
-    multiply,
-    multiply_simd,
-    point_potentials,
-    rsqrt,
-    source_potentials,
-    substitute,
-)
-from capsense.surface.rigid import Clusters, RigidShape, rigid_shape, split
-from capsense.surface.solver import Preset, SurfaceSolver, pack_green
+from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import Solution, prepared, solve, solve_lossy
 
 Array = np.ndarray

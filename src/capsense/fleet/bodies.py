@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from capsense.elements.matter import matter_of
+from capsense.elements.rigid import BODY, RigidShape
 from capsense.errors import SceneError
 from capsense.fleet.step_kernels import Bodies
 from capsense.scene import Body
-from capsense.surface.matter import matter_of
-from capsense.surface.place_kernels import BODY
-from capsense.surface.rigid import RigidShape
 from capsense.surface.solver import SurfaceSolver
 
 

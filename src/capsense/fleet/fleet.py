@@ -14,6 +14,7 @@ from capsense._jit import first_use
 from capsense._thread_pool import in_parts
 from capsense.design import load_design
 from capsense.design.model import Design, Role
+from capsense.elements.matter import UNIT
 from capsense.errors import (
     DesignError,
     MissingDependencyError,
@@ -30,7 +31,6 @@ from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
-from capsense.surface.matter import UNIT
 from capsense.surface.solver import DOUBTFUL, PRESETS, SurfaceSolver
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled
+from capsense.field.green_kernels import Green
 from capsense.surface.gradient_kernels import jacobian
-from capsense.surface.place_kernels import Green
 from capsense.surface.step import solve
 
 
@@ -17,7 +17,7 @@ class Bodies(NamedTuple):
     """What stands in every environment; e environments, b places for bodies."""
 
     shapes: NDArray[Any]
-    """Shapes, of size 1, as records of ``place_kernels.BODY``, shape (u,)."""
+    """Shapes, of size 1, as records of ``elements.rigid.BODY``, shape (u,)."""
     radius: NDArray[Any]
     """Radius of a ball about each shape's origin that holds it [m], shape (u,)."""
     choice: NDArray[Any]

@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from capsense.elements.matter import UNIT
+from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
+from capsense.field.green_kernels import Green
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
 from capsense.fleet.step_kernels import Bodies
-from capsense.surface.matter import UNIT
-from capsense.surface.place_kernels import Green
-from capsense.surface.rigid import RigidShape
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.surface.place_kernels import DEEP, GAP, SHORE, STEEP
+from capsense.field.green_kernels import DEEP, GAP, SHORE, STEEP
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -174,7 +174,7 @@ def choose(
 
 @wp.func
 def _lift(p: wp.vec3, gap: float, green: Response):
-    """Keep a point off a flat design, as ``place_kernels.lift``."""
+    """Keep a point off a flat design, as ``green_kernels.lift``."""
     away = _off(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
     way = wp.length(away)
     if way >= 2.0 * gap:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
 from capsense.fleet.warp_cut import WIDTH, Places, Response, Shapes, WarpCut, row
 from capsense.surface.pair_kernels import BARRIER, FAR, SOFT
-from capsense.surface.place_kernels import FAR_LEAST, NEAR_LEAST
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

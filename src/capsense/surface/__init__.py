@@ -1,1 +1,1 @@
-"""Charge on the surfaces of bodies: panels of a rigid shape, and what they need of it once."""
+"""The surface core: charges on bodies against the Green's function of a design, step by step."""

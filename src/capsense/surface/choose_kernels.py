@@ -8,16 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._dense import multiply_simd
 from capsense._jit import compiled, pasted
-from capsense.surface.place_kernels import (
+from capsense._simd import doubles, integers
+from capsense.field.green_kernels import (
     FAR_LEAST,
     NEAR_FACE,
     SHORE,
-    doubles,
-    integers,
     least_gap,
     lift,
-    multiply_simd,
     point_potentials,
     smooth,
 )

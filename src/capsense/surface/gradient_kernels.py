@@ -17,7 +17,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from capsense._dense import WIDTH, multiply, multiply_simd
 from capsense._jit import compiled
+from capsense.field.green_kernels import distances, near_share
 from capsense.surface.leaf_kernels import (
     near_pairs,
     pair_line,
@@ -25,7 +27,6 @@ from capsense.surface.leaf_kernels import (
     weigh,
     wide_moments,
 )
-from capsense.surface.place_kernels import WIDTH, distances, multiply, multiply_simd, near_share
 
 _BLOCK = 32
 """Leaves taken at a time, whose tables stay in the cache."""

@@ -13,21 +13,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._dense import multiply
 from capsense._jit import compiled, pasted
-from capsense._simd import SIMD_WIDTH, at, madd, put_span, rsqrt, span, splat, vadd, vmadd
-from capsense.surface.pair_kernels import SOFT, cluster_moments
-from capsense.surface.place_kernels import (
+from capsense._simd import SIMD_WIDTH, at, doubles, madd, put_span, rsqrt, span, splat, vadd, vmadd
+from capsense.field.green_kernels import (
     FAR_LEAST,
     NEAR_LEAST,
     beyond,
     distances,
-    doubles,
     least_gap,
     lift,
-    multiply,
     near_share,
     source_potentials,
 )
+from capsense.surface.pair_kernels import SOFT, cluster_moments
 
 
 class Leaves(NamedTuple):
@@ -40,7 +39,7 @@ class Leaves(NamedTuple):
     extent: NDArray[Any]
     """Extents [m], shape (l,)."""
     beyond: NDArray[Any]
-    """How far each is out of reach, 0 to 1, see ``place_kernels.beyond``, shape (l,)."""
+    """How far each is out of reach, 0 to 1, see ``green_kernels.beyond``, shape (l,)."""
     owner: NDArray[Any]
     """Body of each, ascending, shape (l,)."""
     within: NDArray[Any]

@@ -8,16 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._dense import WIDTH, cholesky, multiply_part, substitute
 from capsense._jit import compiled
-from capsense._simd import at, madd, put_span, span
-from capsense.surface.place_kernels import (
-    WIDTH,
-    cholesky,
-    integers,
-    multiply_part,
-    singles,
-    substitute,
-)
+from capsense._simd import at, integers, madd, put_span, singles, span
 
 SHEET = 6.0
 """Impedance of a thin sheet to charge that moves from one part of a cluster to the other, times its

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,18 +10,18 @@ from numpy.typing import NDArray
 
 from capsense._jit import first_use
 from capsense.design.model import Design
+from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
+from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces, windowed
+from capsense.elements.rigid import BODY, RigidShape
+from capsense.elements.store import rigid
 from capsense.errors import SceneError, SolveError
 from capsense.field.change import Change
 from capsense.field.green import GreenFunction
+from capsense.field.green_kernels import pack_green
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
-from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
-from capsense.surface.pieces import ChangingBody, layer_pieces, mesh_pieces, windowed
-from capsense.surface.place_kernels import BODY, WIDTH, Green
-from capsense.surface.rigid import RigidShape
 from capsense.surface.step import Solution, potential_change, solve, solve_lossy
-from capsense.surface.store import rigid
 
 Array = NDArray[np.float64]
 
@@ -33,11 +32,6 @@ _OF_MANY = 0.4
 """Panels of one part of a large mesh, over those of a body."""
 _LARGE = 0.4
 """Meshes that are longer than this [m] are solved for part by part."""
-_FLAT = 1e-4
-"""Sheets of a flat design rise by less than this [m]."""
-MARGIN = 0.015
-"""What lies nearer than this [m] to the ceiling and the side walls is left out: at ground, the
-walls take nearly all of what would meet it."""
 
 
 @dataclass(frozen=True)
@@ -285,36 +279,3 @@ class SurfaceSolver:
             return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
         edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
         return rigid(shape, round(share * self.preset.panels) * (2 if edged else 1))
-
-
-def cover_of(design: Design) -> float:
-    """Thickness of what covers the sheets of a flat design [m]; infinite for other designs."""
-    heights = np.concatenate([body.surface.bounds[:, 2] for body in design.sheets])
-    floors = [np.ptp(body.surface.bounds[:, 2]) for body in design.sheets]
-    if max(floors) > _FLAT:
-        return math.inf
-    top = max([float(heights.max()), *(float(layer.upper[2]) for layer in design.layers)])
-    return top - float(heights.max())
-
-
-def pack_green(green: GreenFunction, design: Design) -> Green:
-    """Lay the Green's function of a design out for the kernels."""
-    walls = np.array([design.domain.lower, design.domain.upper])
-    room = walls + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
-    terminals = green.near_phi.shape[1]
-    lead = 8 * -(-terminals // 8)
-
-    def table(phi: NDArray, modes: NDArray) -> NDArray:
-        width = WIDTH * -(-(lead + modes.shape[1]) // WIDTH)
-        out = np.zeros((len(phi), width), np.float32)
-        out[:, :terminals] = phi
-        out[:, lead : lead + modes.shape[1]] = modes
-        return out
-
-    far = table(green.far_phi, green.far_modes)
-    return Green(
-        np.ascontiguousarray(green.near_sources.T), table(green.near_phi, green.near_modes),
-        np.ascontiguousarray(green.far_sources.T), far, np.ascontiguousarray(far[:, :lead]),
-        lead, terminals, float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blend, float), room, cover_of(design),
-    )  # fmt: skip

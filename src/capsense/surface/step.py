@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, pasted
+from capsense.elements.rigid import INSIDE
 from capsense.field.green import GreenFunction
+from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, chosen
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import leaf_pairs
-from capsense.surface.place_kernels import Green
-from capsense.surface.rigid import INSIDE
 from capsense.surface.solve_kernels import (
     GAIN,
     Functions,
@@ -57,7 +57,7 @@ def prepared(
     """Choose charge functions, and set up their system.
 
     Args:
-        bodies: Records of :data:`~capsense.surface.place_kernels.BODY`, shape (b,).
+        bodies: Records of :data:`~capsense.elements.rigid.BODY`, shape (b,).
         green: Green's function of the design.
         threshold: Functions count that take up this part of an electrode's energy alone.
         width: They fade in up to so many times that.

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 import capsense as cs
-from capsense.surface.matter import _distance, _touch
+from capsense.elements.matter import _distance, _touch
 
 
 def test_distance_of_segments() -> None:

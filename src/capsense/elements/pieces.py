@@ -15,11 +15,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.elements import tree_kernels
+from capsense.elements.rigid import BODY, Clusters, split
 from capsense.scene import Box, Capsule, Cylinder, Layers, RestSurface, SurfaceMesh
 from capsense.scene.shapes import Shape
-from capsense.surface import tree_kernels
-from capsense.surface.place_kernels import BODY
-from capsense.surface.rigid import Clusters, split
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -40,7 +39,7 @@ _LEAST_AREA = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PieceArrays:
-    """Pieces of a surface as arrays, see :class:`~capsense.surface.pieces.Pieces`."""
+    """Pieces of a surface as arrays, see :class:`~capsense.elements.pieces.Pieces`."""
 
     centers: Array
     areas: Array

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 import capsense as cs
-from capsense.surface import store
-from capsense.surface.store import standing
+from capsense.elements import store
+from capsense.elements.store import standing
 
 Array = np.ndarray
 

@@ -12,9 +12,9 @@ import numpy as np
 import scipy.linalg as sl
 from numpy.typing import NDArray
 
+from capsense.elements import panel_kernels as kernels
+from capsense.elements.panels import SurfacePanels
 from capsense.errors import SceneError
-from capsense.surface import panel_kernels as kernels
-from capsense.surface.panels import SurfacePanels
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from capsense.elements import store
+from capsense.elements.panels import SurfacePanels, panels_of
+from capsense.elements.rigid import RigidShape, rigid_shape
+from capsense.elements.triangles import reduced_triangles
 from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
-from capsense.surface import store
-from capsense.surface.panels import SurfacePanels, panels_of
-from capsense.surface.rigid import RigidShape, rigid_shape
-from capsense.surface.triangles import reduced_triangles
 
 BALL = trimesh.creation.icosphere(5, radius=0.05)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from capsense.elements.panels import SurfacePanels, panels_of
+from capsense.elements.reference import polygon_points
 from capsense.errors import SceneError
 from capsense.scene.mesh_shape import TriMesh
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
-from capsense.surface.panels import SurfacePanels, panels_of
-from capsense.surface.reference import polygon_points
 
 PRIMITIVES = [
     Box((0.1, 0.08, 0.05)),

@@ -1,4 +1,4 @@
-"""The blocks of :mod:`capsense.surface.blocks` again: slow, readable, by quadrature on fine grids.
+"""The blocks of :mod:`capsense.elements.blocks` again: slow, readable, by quadrature on fine grids.
 
 Lengths in metres, 4π eps0 = 1.
 """

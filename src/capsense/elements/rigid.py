@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from capsense._dense import cholesky
 from capsense._frozen import Frozen
 from capsense._jit import compiled
+from capsense.elements import tree_kernels
+from capsense.elements.blocks import free_block, impedance
+from capsense.elements.panels import SurfacePanels
 from capsense.errors import SolveError
-from capsense.surface import tree_kernels
-from capsense.surface.blocks import free_block, impedance
-from capsense.surface.panels import SurfacePanels
-from capsense.surface.place_kernels import BODY, cholesky
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -41,6 +41,23 @@ _LEFT, _MOST_STEPS = 1e-8, 1000
 """Conjugate gradients end when so little of the residual is left, or after so many steps."""
 _LEAST_CHARGE = 1e-6
 """Smallest charge of a panel, as a part of the largest: those within a cavity have none."""
+BODY = np.dtype(
+    [
+        ("n", np.int64),  # panels; there are 2 n - 1 clusters
+        ("kids", np.int64), ("function", np.int64), ("charge", np.int64), ("center", np.int64),
+        ("points", np.int64), ("extent", np.int64), ("own", np.int64), ("energy", np.int64),
+        ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
+        ("spread", np.int64),  # second moments of a changing surface, else 0: it has no energies
+        ("scale", np.float64),  # the body is so many times as large as the shape
+        ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
+        ("neutral", np.int64),  # whether it carries no net charge
+        ("group", np.int64),  # bodies that touch are one conductor, named by its first body
+        ("tie", np.float64),  # energy of a group's net charge beyond that of its field [1/m]
+        ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
+        ("softness", np.float64),  # 1 / (eps - 1), 0 for a conductor
+    ]
+)  # fmt: skip
+"""One body, as the kernels take it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense.elements import grids
+from capsense.elements.triangles import reduced_triangles
 from capsense.errors import SceneError
 from capsense.scene.mesh_shape import TriMesh
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere
-from capsense.surface import grids
-from capsense.surface.triangles import reduced_triangles
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
     """Cover a rigid shape with about ``count`` flat panels.
 
     Panels of boxes and cylinders shrink towards edges. Triangle meshes are reduced, or their
-    triangles halved, to about ``count``, see :mod:`capsense.surface.triangles`.
+    triangles halved, to about ``count``, see :mod:`capsense.elements.triangles`.
 
     Args:
         shape: A primitive or a mesh, or the corners of triangles [m], shape (m, 3, 3), of an open

@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.elements.simplify import collapse, fitted
 from capsense.errors import SceneError
 from capsense.scene.surface import clean_surface, connected_parts
-from capsense.surface import panel_kernels
-from capsense.surface.fitting import fitted
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -243,7 +242,7 @@ def _collapsed(vertices: Array, faces: Index, count: int) -> tuple[Array, Index]
     middle, extent = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
     points = (vertices - middle) / extent
     reduced = np.ascontiguousarray(faces, dtype=np.int64).copy()
-    left = panel_kernels.collapse(
+    left = collapse(
         points, reduced, *_quadrics(points, reduced, _sharp(points, reduced)), count
     )
     used, local = np.unique(reduced[left], return_inverse=True)

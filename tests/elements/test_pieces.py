@@ -12,9 +12,9 @@ import trimesh
 from layered_views import view
 
 import capsense as cs
+from capsense.elements import pieces as module
+from capsense.elements.pieces import layer_pieces, mesh_pieces
 from capsense.scene import RestSurface, SurfaceMesh
-from capsense.surface import pieces as module
-from capsense.surface.pieces import layer_pieces, mesh_pieces
 
 Array = np.ndarray
 

@@ -10,12 +10,12 @@ import trimesh
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
+from capsense.elements import panel_kernels as kernels
+from capsense.elements import reference
+from capsense.elements.blocks import _frames, flux_block, free_block, impedance
+from capsense.elements.panels import SurfacePanels, panels_of
 from capsense.errors import SceneError
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
-from capsense.surface import panel_kernels as kernels
-from capsense.surface import reference
-from capsense.surface.blocks import _frames, flux_block, free_block, impedance
-from capsense.surface.panels import SurfacePanels, panels_of
 
 SQUARE = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.constants import EPS0
+from capsense.elements.pieces import ChangingBody
+from capsense.elements.rigid import RigidShape
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
 from capsense.scene.materials import Material
 from capsense.scene.scene import Grounding, PackedScene
-from capsense.surface.pieces import ChangingBody
-from capsense.surface.rigid import RigidShape
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -215,7 +215,7 @@ def _distance(first: Array, second: Array) -> float:
 def _surface_points(body: Body) -> Array:
     found = body.shape.__dict__.get("_surface_points")
     if found is None:
-        from capsense.surface.panels import panels_of
+        from capsense.elements.panels import panels_of
 
         panels = panels_of(body.shape, 80)
         found = np.concatenate([panels.centers, panels.corners.reshape(-1, 3)])

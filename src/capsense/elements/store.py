@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.elements.panels import panels_of, polygon_panels
+from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir
 from capsense.field.store import read_arrays, write_arrays
 from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
 from capsense.scene.shapes import ShapeKind
-from capsense.surface.panels import panels_of, polygon_panels
-from capsense.surface.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,179 @@
+"""Compiled kernels: mutual potentials and fluxes of flat panels that carry even charge.
+
+Lengths in metres, 4π eps0 = 1. A panel is a row of ``frames``: its centre, the two axes of its
+plane and its normal (twelve numbers), then for each of its four edges the start (u, v) in its
+plane, the unit direction and the length (twenty), then twice the areas of the triangles (0, 1, 2)
+and (0, 2, 3) of its corners. ``flat`` (10, n) holds centre, second moments xx, yy, zz, xy, xz, yz
+and reach of all panels, ``coarse`` and ``fine`` (n, q, 4) points and weights on them.
+"""
+
+from __future__ import annotations
+
+import math
+
+from capsense._jit import inlined, kernel
+
+NEAR = 2.2
+"""Pairs nearer than this many sums of their reaches are integrated in closed form."""
+TOUCHING = 1.25
+"""Pairs nearer than this many sums of their reaches take the fine points."""
+_TINY = 1e-300
+
+
+@kernel
+def polygon_potential(frame, x, y, z):
+    """Return ∫ dS' / |r − r'| [m] over one panel.
+
+    Sum over edges of distance times logarithm, less height times solid angle (Wilton et al.,
+    *Potential integrals for uniform and linear source distributions on polygonal and polyhedral
+    domains*, IEEE Trans. Antennas Propag. 32, 1984). The solid angle is that of two triangles
+    (van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983).
+    """
+    x -= frame[0]
+    y -= frame[1]
+    z -= frame[2]
+    u = x * frame[3] + y * frame[4] + z * frame[5]
+    v = x * frame[6] + y * frame[7] + z * frame[8]
+    w = abs(x * frame[9] + y * frame[10] + z * frame[11])
+    w2 = w * w
+    ax, ay = frame[12] - u, frame[13] - v
+    bx, by = frame[17] - u, frame[18] - v
+    cx, cy = frame[22] - u, frame[23] - v
+    dx, dy = frame[27] - u, frame[28] - v
+    a = math.sqrt(ax * ax + ay * ay + w2)
+    b = math.sqrt(bx * bx + by * by + w2)
+    c = math.sqrt(cx * cx + cy * cy + w2)
+    d = math.sqrt(dx * dx + dy * dy + w2)
+    total = _edge(ax, ay, frame[14], frame[15], frame[16], a + b)
+    total += _edge(bx, by, frame[19], frame[20], frame[21], b + c)
+    total += _edge(cx, cy, frame[24], frame[25], frame[26], c + d)
+    total += _edge(dx, dy, frame[29], frame[30], frame[31], d + a)
+    ac = ax * cx + ay * cy + w2
+    p = c * (a * b + ax * bx + ay * by + w2) + a * (bx * cx + by * cy + w2) + ac * b
+    q = d * (a * c + ac) + a * (cx * dx + cy * dy + w2) + c * (ax * dx + ay * dy + w2)
+    s, t = w * frame[32], w * frame[33]
+    return total - 2.0 * w * math.atan2(s * q + t * p, p * q - s * t)
+
+
+@inlined
+def _edge(x, y, ex, ey, length, ends):
+    """Distance of an edge in the plane times ∫ dl / r along it; (x, y) is its start."""
+    return (x * ey - y * ex) * math.log((ends + length + _TINY) / (abs(ends - length) + _TINY))
+
+
+@kernel
+def solid_angle(frame, x, y, z):
+    """Return the angle [sr] under which a point sees one panel, positive from its normal's side."""
+    x -= frame[0]
+    y -= frame[1]
+    z -= frame[2]
+    u = x * frame[3] + y * frame[4] + z * frame[5]
+    v = x * frame[6] + y * frame[7] + z * frame[8]
+    w = x * frame[9] + y * frame[10] + z * frame[11]
+    w2 = w * w
+    ax, ay = frame[12] - u, frame[13] - v
+    bx, by = frame[17] - u, frame[18] - v
+    cx, cy = frame[22] - u, frame[23] - v
+    dx, dy = frame[27] - u, frame[28] - v
+    a = math.sqrt(ax * ax + ay * ay + w2)
+    b = math.sqrt(bx * bx + by * by + w2)
+    c = math.sqrt(cx * cx + cy * cy + w2)
+    d = math.sqrt(dx * dx + dy * dy + w2)
+    ac = ax * cx + ay * cy + w2
+    p = c * (a * b + ax * bx + ay * by + w2) + a * (bx * cx + by * cy + w2) + ac * b
+    q = d * (a * c + ac) + a * (cx * dx + cy * dy + w2) + c * (ax * dx + ay * dy + w2)
+    s, t = w * frame[32], w * frame[33]
+    return 2.0 * math.atan2(s * q + t * p, p * q - s * t)
+
+
+@kernel
+def _mean_potential(points, frame):
+    """Mean of the potential of one panel over weighted points (q, 4), times the panel's area."""
+    total = 0.0
+    for k in range(points.shape[0]):
+        if points[k, 3] != 0.0:
+            total += points[k, 3] * polygon_potential(
+                frame, points[k, 0], points[k, 1], points[k, 2]
+            )
+    return total
+
+
+@kernel
+def fill_free(panels, out):
+    """Write the free-space block: F_kl [1/m], mean over panel k of the potential of panel l.
+
+    Far pairs: point charges and second moments. Near pairs: closed form of one panel, averaged
+    over points of the other, both ways, weighted with the fourth power of the other's reach. The
+    diagonal stays as it is.
+    """
+    flat, frames, areas = panels.flat, panels.frames, panels.areas
+    coarse, fine, rim = panels.coarse, panels.fine, panels.rim
+    n = areas.shape[0]
+    for i in range(n):
+        x0, y0, z0 = flat[0, i], flat[1, i], flat[2, i]
+        xx, yy, zz = flat[3, i], flat[4, i], flat[5, i]
+        xy, xz, yz = flat[6, i], flat[7, i], flat[8, i]
+        for j in range(i):
+            x, y, z = flat[0, j] - x0, flat[1, j] - y0, flat[2, j] - z0
+            r2 = x * x + y * y + z * z + _TINY
+            axx, ayy, azz = flat[3, j] + xx, flat[4, j] + yy, flat[5, j] + zz
+            mix = x * y * (flat[6, j] + xy) + x * z * (flat[7, j] + xz) + y * z * (flat[8, j] + yz)
+            second = 3.0 * (x * x * axx + y * y * ayy + z * z * azz + 2.0 * mix) / r2
+            out[i, j] = (1.0 + (second - axx - ayy - azz) / (2.0 * r2)) / math.sqrt(r2)
+        reach = flat[9, i]
+        for j in range(i):
+            x, y, z = flat[0, j] - x0, flat[1, j] - y0, flat[2, j] - z0
+            span = reach + flat[9, j]
+            r2 = x * x + y * y + z * z
+            if r2 < NEAR * NEAR * span * span:
+                small, large = (i, j) if reach < (1.0 + 1e-6) * flat[9, j] else (j, i)
+                rule = fine if r2 < TOUCHING * TOUCHING * span * span else coarse
+                out[i, j] = _mean_potential(rule[small], frames[large]) / areas[large]
+        out[i, i] = _mean_potential(rim[i], frames[i]) / areas[i]
+        for j in range(i):
+            out[j, i] = out[i, j]
+
+
+@kernel
+def fill_flux(panels, out):
+    """Write the flux block: flux through panel k from unit charge spread evenly on panel l.
+
+    The flux from a point is the solid angle under which it sees the panel, so that the fluxes
+    through a closed surface add up to 2π for every point on it. Near pairs average that over
+    points of l, far pairs take the field of point charges and second moments.
+    """
+    flat, frames, areas = panels.flat, panels.frames, panels.areas
+    coarse, fine = panels.coarse, panels.fine
+    n = areas.shape[0]
+    for k in range(n):
+        x0, y0, z0 = flat[0, k], flat[1, k], flat[2, k]
+        xx, yy, zz = flat[3, k], flat[4, k], flat[5, k]
+        xy, xz, yz = flat[6, k], flat[7, k], flat[8, k]
+        nx, ny, nz = frames[k, 9], frames[k, 10], frames[k, 11]
+        area = areas[k]
+        for j in range(n):
+            x, y, z = x0 - flat[0, j], y0 - flat[1, j], z0 - flat[2, j]
+            r2 = x * x + y * y + z * z + _TINY
+            axx, ayy, azz = flat[3, j] + xx, flat[4, j] + yy, flat[5, j] + zz
+            axy, axz, ayz = flat[6, j] + xy, flat[7, j] + xz, flat[8, j] + yz
+            mx, my, mz = (
+                axx * x + axy * y + axz * z,
+                axy * x + ayy * y + ayz * z,
+                axz * x + ayz * y + azz * z,
+            )
+            along = nx * x + ny * y + nz * z
+            second = 7.5 * (mx * x + my * y + mz * z) / r2 - 1.5 * (axx + ayy + azz)
+            value = along * (1.0 + second / r2) - 3.0 * (nx * mx + ny * my + nz * mz) / r2
+            out[k, j] = area * value / (r2 * math.sqrt(r2))
+        for j in range(n):
+            x, y, z = x0 - flat[0, j], y0 - flat[1, j], z0 - flat[2, j]
+            span = flat[9, k] + flat[9, j]
+            r2 = x * x + y * y + z * z
+            if r2 < NEAR * NEAR * span * span:
+                rule = fine if r2 < TOUCHING * TOUCHING * span * span else coarse
+                value = 0.0
+                for q in range(rule.shape[1]):
+                    p = rule[j, q]
+                    value -= p[3] * solid_angle(frames[k], p[0], p[1], p[2])
+                out[k, j] = value
+        out[k, k] = 0.0
