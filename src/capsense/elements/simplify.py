@@ -4,6 +4,7 @@ moved to the mean place of the surface that it stands for."""
 from __future__ import annotations
 
 from heapq import heapify, heappop, heappush
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,21 @@ _MORE = 2
 """More than so many times the triangles wanted are not left."""
 _TURN = 0.25
 """Least cosine between the normals of a triangle before and after."""
+
+
+class _Corners(NamedTuple):
+    """Which corners of triangles are at a vertex, as lists; corner c is that of face c // 3."""
+
+    head: Index
+    """The first corner at each vertex, shape (n,)."""
+    tail: Index
+    """The last, shape (n,)."""
+    follow: Index
+    """The corner after each, -1 after the last, shape (3 m,)."""
+    alive: NDArray[np.bool_]
+    """Which faces are left, shape (m,)."""
+    mark: Index
+    """Numbers that say whether a vertex has been met, shape (n,)."""
 
 
 @compiled
@@ -58,6 +74,7 @@ def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count
         tail[v] = c
     alive, gone = np.ones(m, np.bool_), np.zeros(n, np.bool_)
     version, mark = np.zeros(n, np.int64), np.full(n, -1)
+    corners = _Corners(head, tail, follow, alive, mark)
     place, number, left = np.empty(3), 0, m
     care, before_pass = 2, m + 1
     while True:
@@ -88,9 +105,8 @@ def collapse(vertices: Array, faces: Index, quadrics: Array, edges: Index, count
                 continue
             _cost(vertices, quadrics, u, v, place)
             number += 2
-            if care > 0 and not _allowed(
-                vertices, faces, alive, head, follow, mark, number, u, v, place, care == 2
-            ):
+            facing = care == 2
+            if care > 0 and not _allowed(vertices, faces, corners, number, (u, v), place, facing):
                 continue
             vertices[u] = place
             quadrics[u] += quadrics[v]
@@ -165,10 +181,12 @@ def _cost(vertices: Array, quadrics: Array, u: int, v: int, place: Array) -> flo
 
 @compiled
 def _allowed(
-    vertices: Array, faces: Index, alive: NDArray[np.bool_], head: Index, follow: Index,
-    mark: Index, number: int, u: int, v: int, place: Array, facing: bool,
+    vertices: Array, faces: Index, corners: _Corners, number: int, pair: tuple[int, int],
+    place: Array, facing: bool,
 ) -> bool:  # fmt: skip
     """Whether joining two vertices leaves the surface as connected, and triangles facing alike."""
+    u, v = pair
+    head, _, follow, alive, mark = corners
     shared = common = 0
     for side in range(2):
         own, other = (u, v) if side == 0 else (v, u)

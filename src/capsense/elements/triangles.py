@@ -242,9 +242,7 @@ def _collapsed(vertices: Array, faces: Index, count: int) -> tuple[Array, Index]
     middle, extent = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
     points = (vertices - middle) / extent
     reduced = np.ascontiguousarray(faces, dtype=np.int64).copy()
-    left = collapse(
-        points, reduced, *_quadrics(points, reduced, _sharp(points, reduced)), count
-    )
+    left = collapse(points, reduced, *_quadrics(points, reduced, _sharp(points, reduced)), count)
     used, local = np.unique(reduced[left], return_inverse=True)
     return middle + extent * points[used], local.reshape(-1, 3)
 

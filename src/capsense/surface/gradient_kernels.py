@@ -240,15 +240,14 @@ def _add_pairs(points, extent, charge, bounds, floor, work):
                 left[k, i - start] = charge[i, k]
             weigh(shapes, i, mirrored, n, 1.0, weight)
             pair_line(shapes, i, mirrored, weight, lines, i - start)
-            near_pairs(points, image, extent, i, 0, 0, n, weight, near, lines, i - start)
+            near_pairs(points, image, extent, i, (0, 0), weight, near, lines[:, i - start])
             if stop - start < n:
                 weigh(shapes, i, shapes, n, -1.0, weight)
                 for j in range(start, stop):
                     weight[j] = 0.0
                 pair_line(shapes, i, shapes, weight, lines, i - start)
-                near_pairs(
-                    points, points, extent, i, start, stop, n, weight, near, lines, i - start
-                )
+                own = (start, stop)
+                near_pairs(points, points, extent, i, own, weight, near, lines[:, i - start])
         for r in range(6):
             multiply(left, lines[r], sums[r])
         _add_contracted(sums, coefficients, work[b])

@@ -231,11 +231,12 @@ def source_lines(points, sources, floor, out):
                 fz = vmadd(dz, a, vmadd(ez, b, fz))
                 gx, gy = vmadd(dx, arm, gx), vmadd(dy, arm, gy)
             o = i * width + s
-            _put_six(out, o, layer, value, fx, fy, fz, gx, gy)
+            _put_six(out, o, layer, (value, fx, fy, fz, gx, gy))
 
 
 @compiled
-def _put_six(out, place, layer, a, b, c, d, e, f):
+def _put_six(out, place, layer, six):
+    a, b, c, d, e, f = six
     put_span(out, place, a)
     put_span(out, place + layer, b)
     put_span(out, place + 2 * layer, c)
@@ -311,11 +312,11 @@ def pair_line(shapes, i, others, weight, out, row):
         ty = madd(z, fx, madd(-x, fz, _cross(uz, ux, dz, dx)))
         tz = madd(x, fy, madd(-y, fx, _cross(ux, uy, dx, dy)))
         o = row * width + j
-        _put_six(
-            out, o, layer, vadd(fx, span(out, o)), vadd(fy, span(out, o + layer)),
+        _put_six(out, o, layer, (
+            vadd(fx, span(out, o)), vadd(fy, span(out, o + layer)),
             vadd(fz, span(out, o + 2 * layer)), vadd(tx, span(out, o + 3 * layer)),
             vadd(ty, span(out, o + 4 * layer)), vadd(tz, span(out, o + 5 * layer)),
-        )  # fmt: skip
+        ))  # fmt: skip
 
 
 @pasted
@@ -331,14 +332,15 @@ def _cross(x, y, u, v):
 
 
 @compiled
-def near_pairs(points, others, extent, i, start, stop, n, weight, near, out, row):
-    """The same for clusters without weight, point by point, but those from start to stop.
+def near_pairs(points, others, extent, i, own, weight, near, line):
+    """The same for clusters without weight, point by point, but those from own[0] to own[1].
 
-    ``near`` (14, l) is room for their points, bounds and numbers.
+    ``near`` (14, l) is room for their points, bounds and numbers; ``line`` has shape (6, l).
     """
+    start, stop = own
     sign = np.float32(-1.0 if stop > start else 1.0)
     count = 0
-    for j in range(n):
+    for j in range(others.shape[0]):
         if weight[j] != 0.0 or start <= j < stop:
             continue
         for q in range(4):
@@ -373,8 +375,8 @@ def near_pairs(points, others, extent, i, start, stop, n, weight, near, out, row
             tx = madd(y, fz, madd(-z, fy, tx))
             ty = madd(z, fx, madd(-x, fz, ty))
             tz = madd(x, fy, madd(-y, fx, tz))
-        _put_six(near, k, width, gx, gy, gz, tx, ty, tz)  # the points are needed no more
+        _put_six(near, k, width, (gx, gy, gz, tx, ty, tz))  # the points are needed no more
     factor = np.float32(-0.0625) * sign
     for k in range(count):
         for r in range(6):
-            out[r, row, int(near[13, k])] += factor * near[r, k]
+            line[r, int(near[13, k])] += factor * near[r, k]
