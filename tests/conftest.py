@@ -57,10 +57,40 @@ def simulators(field_cache: Path) -> Simulators:
     return get
 
 
+LAYERS = {
+    "unit": "design elements humans mesh plotting readout scene surface field/test_panels.py "
+    "test_public_api.py test_reading.py test_scenario.py test_shared.py test_simd.py "
+    "test_thread_pool.py",
+    "physics": "",  # all that is not named
+    "e2e": "adapters benchmarks cli learning recording reproduce server unity viewer "
+    "field/test_cache.py field/test_shipped.py fleet/test_autograd.py "
+    "fleet/test_parallel_simulators.py mesh/test_gmsh_mesher.py test_assistive_gym_patch.py "
+    "test_contributing.py test_copies.py test_damaged.py test_examples.py test_from_the_paper.py "
+    "test_kernel_cache.py test_pages.py test_simulator_estimate.py test_simulator_examples.py "
+    "test_troubleshooting.py test_tutorials.py test_validation_page.py",
+}
+"""Folders and files of each layer; single tests may be marked otherwise where they stand."""
+_PLACES = {place: layer for layer, places in LAYERS.items() for place in places.split()}
+
+
+def _layer(path: str) -> str:
+    return _PLACES.get(path) or _PLACES.get(path.split("/")[0]) or "physics"
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave slow tests out unless a marker expression or a single test asks for them."""
+    """Give each test its layer, and leave out what was not asked for.
+
+    Without a marker expression slow tests are left out, and of the whole suite the end-to-end tests
+    as well: ``pytest tests/cli`` runs all but slow ones.
+    """
+    here = Path(__file__).parent
+    for item in items:
+        if not any(item.get_closest_marker(m) for m in (*LAYERS, "slow")):
+            item.add_marker(_layer(item.path.relative_to(here).as_posix()))
     if config.option.markexpr or any("::" in a for a in config.args):
         return
-    for item in items:
-        if item.get_closest_marker("slow"):
-            item.add_marker(pytest.mark.skip(reason="slow; run with -m slow"))
+    whole = [config.rootpath / a for a in config.args] in ([here], [config.rootpath])
+    left = {"slow", "e2e"} if whole else {"slow"}
+    out = [i for i in items if any(i.get_closest_marker(m) for m in left)]
+    config.hook.pytest_deselected(items=out)
+    items[:] = [i for i in items if i not in set(out)]

@@ -121,6 +121,7 @@ def _capsule_errors() -> dict:
         if c != "none"
     ],
 )
+@pytest.mark.e2e
 def test_patches_far_from_the_floor(simulators, case):
     """Measured: the same patches and plate in the middle of the box.
 

@@ -43,6 +43,7 @@ def test_a_conductor_in_matter_that_pierces_a_board(simulators):
 
 
 @pytest.mark.parametrize("seed", range(6))
+@pytest.mark.e2e
 def test_random_scenes(simulators, seed):
     """Invariant: 25 random scenes a seed."""
     rng, sim = np.random.default_rng(seed), simulators("six_patch_bare")
@@ -149,6 +150,7 @@ EXTREMES = {
 @pytest.mark.parametrize("case", EXTREMES)
 @pytest.mark.parametrize("grounding", GROUNDINGS[:3])
 @pytest.mark.parametrize("material", ["steel", "glass"])
+@pytest.mark.e2e
 def test_extremes(simulators, case, grounding, material):
     """Invariant: degenerate sizes and places are defined, finite and physical."""
     if material == "glass" and grounding != "grounded":

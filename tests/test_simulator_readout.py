@@ -47,6 +47,7 @@ def same(found: list[cs.Counts], expected: list[cs.Counts]) -> bool:
 
 
 @pytest.mark.parametrize("method", ["surface", "fem_masked"])
+@pytest.mark.e2e
 def test_counts_are_those_of_the_chip(make: Make, method: str) -> None:
     """Differential: a chip's name, or a readout; and again after a reset, or with other noise."""
     plain = make(method=method)

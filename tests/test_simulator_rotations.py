@@ -33,6 +33,7 @@ RADIUS = 0.048
     ],
     ids=["bar", "limb", "ball", "tilted box"],
 )
+@pytest.mark.e2e
 def test_turning_the_scene_over_a_disc(
     shape: cs.Box, pose: cs.Pose, bound: float, simulators: Simulators
 ) -> None:

@@ -98,6 +98,7 @@ def test_spheres(sim, kind):
 
 
 @pytest.mark.parametrize("seed", range(6))
+@pytest.mark.e2e
 def test_random_scenes(sim, seed):
     """Invariant: symmetric matrices with physical signs, anywhere, contact included."""
     rng = np.random.default_rng(seed)

@@ -66,6 +66,7 @@ def longest(panels: SurfacePanels) -> float:
     ids=["ball", "capsule", "finger", "cylinder"],
 )
 @pytest.mark.parametrize("count", [700, 1120])
+@pytest.mark.e2e
 def test_reduced_round_bodies_keep_their_capacitance(mesh, shape, count):
     """Differential: a primitive of 900 panels, to 0.2 %; some meshes are shorter by 0.1 %."""
     expected = rigid_shape(panels_of(shape, 900)).capacitance
@@ -103,6 +104,7 @@ def test_small_parts_have_triangles_of_their_own():
     assert len(many.corners) <= 200 * 16
 
 
+@pytest.mark.e2e
 def test_long_triangles_are_divided():
     """A cylinder's mantle of slivers from end to end is covered evenly."""
     for mesh in (cylinder(0.02, 0.4, 32), cylinder(0.02, 0.4, 400), capsule(0.02, 0.4)):

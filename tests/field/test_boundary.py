@@ -46,6 +46,7 @@ charges that a point charge q there draws to the walls is −NACL q / (4π eps0 
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
+@pytest.mark.e2e
 def test_unit_square_plate(scale):
     """Analytic: a square plate's 0.366787 · 4π eps0 a, in series with the grounded cube's images.
 

@@ -23,7 +23,7 @@ from tiny_field import SETTINGS, digest, tiny_data, tiny_design
 
 from capsense.design.loader import parse_design
 from capsense.field import background, cache, lock
-from capsense.field.background import BuildSettings
+from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import BoundarySolution
 from capsense.field.cache import cache_key, default_cache_dir, default_settings, load_or_build
 from capsense.field.lock import exclusive
@@ -36,9 +36,21 @@ KEY = cache_key(tiny_design(), SETTINGS)
 
 
 @pytest.fixture(scope="module")
-def reference() -> str:
-    """Digest of the field built without a cache."""
-    return digest(background.build_background(tiny_design(), SETTINGS))
+def tiny() -> BackgroundField:
+    """The field built without a cache."""
+    return background.build_background(tiny_design(), SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def reference(tiny: BackgroundField) -> str:
+    """Its digest."""
+    return digest(tiny)
+
+
+@pytest.fixture
+def no_wait(tiny: BackgroundField, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Builds of the tiny field take no time: what they return has been built before."""
+    monkeypatch.setattr(cache, "build_background", lambda *_: tiny)
 
 
 @pytest.fixture(scope="module")
@@ -392,6 +404,7 @@ def _one_warning(caplog: pytest.LogCaptureFixture, folder: Path) -> None:
     assert "CAPSENSE_CACHE_DIR" in text
 
 
+@pytest.mark.usefixtures("no_wait")
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT])
 @pytest.mark.parametrize("call", ["write", "rename", "mkdir"])
 def test_a_field_that_cannot_be_kept_is_built_and_returned(
@@ -419,6 +432,7 @@ def test_a_field_that_cannot_be_kept_is_built_and_returned(
     assert files(tmp_path) in ([], ["cache"])
 
 
+@pytest.mark.usefixtures("no_wait")
 @pytest.mark.parametrize("place", ["below a file", "read-only"])
 def test_a_folder_that_cannot_be_written(
     place: str, tmp_path: Path, reference: str, caplog: pytest.LogCaptureFixture

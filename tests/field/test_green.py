@@ -141,6 +141,7 @@ def somewhere(case: Case, n: int = 200) -> Array:
     ("name", "allowed"), [("flat", 0.008), ("guarded", 0.004), ("curved", 0.006)]
 )
 @pytest.mark.parametrize("gap", [0.002, 0.005, 0.013, 0.03])
+@pytest.mark.e2e
 def test_a_grounded_ball_changes_c_as_with_boundary_elements(
     name: str, allowed: float, gap: float
 ) -> None:
@@ -276,11 +277,11 @@ def test_stored_to_the_last_bit(tmp_path: Path) -> None:
     assert to_arrays(again).keys() == to_arrays(field.green).keys()
 
 
-@pytest.mark.parametrize("name", [*TABLES, "box"])
-def test_what_is_not_finite_is_never_stored(tmp_path: Path, name: str) -> None:
+def test_what_is_not_finite_is_never_stored(tmp_path: Path) -> None:
     field = build_background(parse_design(tiny_data(electrode=[square("A", 0.0)])), SETTINGS)
-    bad = getattr(field.green, name).copy()
-    bad.flat[0] = np.nan
-    wrong = replace(field, green=replace(field.green, **{name: bad}))
-    with pytest.raises(FieldError, match="not finite"):
-        save_background(wrong, tmp_path / "a.npz", compact=True)
+    for name in (*TABLES, "box"):
+        bad = getattr(field.green, name).copy()
+        bad.flat[0] = np.nan
+        wrong = replace(field, green=replace(field.green, **{name: bad}))
+        with pytest.raises(FieldError, match="not finite"):
+            save_background(wrong, tmp_path / f"{name}.npz", compact=True)

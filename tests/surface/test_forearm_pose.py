@@ -11,6 +11,7 @@ import pytest
 EXAMPLE = Path(__file__).parents[2] / "examples" / "forearm_pose.py"
 
 
+@pytest.mark.e2e
 def test_follows_the_arm(capsys: pytest.CaptureFixture[str]) -> None:
     """Measured: what the example prints last, with twenty samples."""
     runpy.run_path(str(EXAMPLE))["main"](20)

@@ -64,6 +64,7 @@ def _apart(found: Array, wanted: Array) -> float:
 
 
 @pytest.mark.parametrize("name", SCENES)
+@pytest.mark.e2e
 def test_agrees_with_energies_of_moved_charges(name: str) -> None:
     bodies, solution, found = _solved(name, 0.015)
     wanted = gradient_twin.jacobian(solution, bodies["position"], green_of())

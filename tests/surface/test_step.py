@@ -857,6 +857,7 @@ def test_lossy_without_losses(name: str, threshold: float) -> None:
 
 @pytest.mark.parametrize("shape", [BALL, BOX, FINGER], ids=repr)
 @pytest.mark.parametrize("eps", [3 - 2j, 60 - 300j, 1 - 40j])
+@pytest.mark.e2e
 def test_lossy_functions_together_are_the_panels(shape: cs.Shape, eps: complex) -> None:
     """Differential: complex energies, one unknown a panel, with and without a tie."""
     for tie in (NONE, 8.0 - 20.0j):
