@@ -43,7 +43,7 @@ def test_readme_commands() -> None:
     assert (ROOT / example).is_file()
     for line in re.findall(r"^\$ capsense (.*?)(?:#.*)?$", README, flags=re.MULTILINE):
         build_parser().parse_args(line.split())
-    assert tests == '.venv/bin/pip install ".[test]" && .venv/bin/python -m pytest'
+    assert tests == '.venv/bin/pip install ".[test]" && .venv/bin/python -m pytest -n 2'
 
 
 def test_readme_snippets() -> None:
