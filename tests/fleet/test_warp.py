@@ -54,7 +54,7 @@ def test_errors_over_the_reference_map(scenes, budget, single, every):
 
 def test_twin(scenes):
     """Differential: the same clusters in double precision; where two are equally large against
-    their distance either may be split, and clusters in contact are met a little differently."""
+    their distance either may be split."""
     fleet, where = fleet_of(scenes, 64)
     delta = fleet.step(where).delta.numpy()[:, 0]
     errors, twin = [], twin_of(fleet)
@@ -62,9 +62,8 @@ def test_twin(scenes):
         for d, s in zip(delta, scenes, strict=True):
             truth = twin.step(s.scene).delta
             errors.append(np.abs(d - truth).max() / np.abs(truth).max())
-    print(np.sort(errors)[-12:])
-    assert np.quantile(errors, 0.9) < 1e-4
-    assert max(errors) < 0.03
+    assert np.quantile(errors, 0.98) < 1e-4
+    assert max(errors) < 2e-3
 
 
 def test_several_sensors_places_and_matter():
@@ -103,8 +102,6 @@ def test_refused():
     where = poses(np.random.default_rng(14), 2, 3)
     with pytest.raises(SceneError, match=r"of shape \(2, 2, 7\).*of shape \(2, 3, 7\)"):
         fleet.step(wp.array(where[:, :2], dtype=wp.float32, device="cpu"))
-    with pytest.raises(ValueError, match="Jacobian"):
-        fleet.step(where, jacobian=True)
     with pytest.raises(ValueError, match="device is 'cuda:77'"):
         Fleet("six_patch", BODIES, 1, device="cuda:77")
     with pytest.raises(ValueError, match="budget is 50"):

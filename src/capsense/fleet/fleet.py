@@ -281,7 +281,7 @@ class Fleet:
         core.solve(where, at)
         return FleetReading(
             core.capacitance, core.delta, shield_coupling=core.shields,
-            conductance=core.conductance,
+            conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
         )  # fmt: skip
 
     def check(

@@ -13,6 +13,7 @@ from capsense.errors import SceneError
 from capsense.field.change import Terminals
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
+from capsense.fleet import warp_slope as slope
 from capsense.fleet import warp_solve as solution
 from capsense.fleet.step_kernels import Bodies
 from capsense.surface.matter import UNIT
@@ -40,6 +41,7 @@ class WarpCore:
     ) -> None:  # fmt: skip
         self.device, self.counts, self.clusters, self._omega = device, counts, clusters, omega
         self._taken = 0
+        self._slopes: list[Any] | None = None
         self.green, self.circuit = _response(green, device), _circuit(terminals, device)
         environments, places, sensors = counts
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
@@ -132,6 +134,35 @@ class WarpCore:
         self.launch(
             solution.report, (circuit.electrodes, views), circuit, self._omega, whole,
             self.capacitance, self.delta, self.conductance, self.shields,
+        )  # fmt: skip
+
+    def differentiate(self) -> Any:
+        """Derivatives of the last matrices [F/m], [F/rad], shape (e, s, b, n, n, 6)."""
+        environments, places, sensors = self.counts
+        n, views = self.cut.node.shape[:2]
+        circuit, green, cut, k = self.circuit, self.green, self.cut, self.clusters
+        m, t, width = circuit.electrodes, circuit.rest.shape[0], self.rows.shape[1] - green.lead
+        if self._slopes is None:
+            near, far = green.near.shape[0], green.far.shape[0]
+            shapes = (t, m, views), (width, m, views), (near, m, views), (far, m, views)
+            self._slopes = [
+                *(self.room(*shape) for shape in shapes),
+                self.room(n, m, views, dtype=wp.spatial_vector),
+                self.room(views, places, m, m, dtype=wp.spatial_vector),
+            ]
+        turn, sums, near, far, pull, out = self._slopes
+        launch, rows = self.launch, self.rows
+        launch(slope.follow, (m, views), circuit, self.whole, turn)
+        launch(slope.charges, (m, views), circuit, self.matrix, turn, rows)
+        launch(slope.modes, (width, m, views), green.lead, rows, sums)
+        for table, to in ((green.near_table, near), (green.far_table, far)):
+            launch(slope.strengths, to.shape, table, green.lead, turn, sums, to)
+        launch(slope.to_clusters, (m, views), cut, k, rows)
+        launch(slope.forces, (n, m, views), green, cut, k, rows, near, far, pull)
+        launch(slope.slopes, (places, m, views), circuit, cut, k, rows, pull, out)
+        return wp.array(
+            ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
+            shape=(environments, sensors, places, m), device=self.device,
         )  # fmt: skip
 
     def launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:
