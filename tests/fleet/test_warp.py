@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+import re
+
 import numpy as np
 import pytest
 from cluster_twin import same_functions, twin_of
@@ -108,10 +111,80 @@ def test_refused():
         Fleet("six_patch", BODIES, 1, device="warp:cpu", budget=50)
 
 
-def test_kernels_compile_for_a_gpu(tmp_path):
-    """Compiled ahead for compute capability 9.0, which needs no GPU."""
-    from capsense.fleet import warp_kernels
+def test_a_step_allocates_nothing_and_waits_for_nothing(monkeypatch):
+    """Invariant: what a CUDA graph needs, counted on the CPU after a first step.
 
-    (file,) = wp.compile_aot_module(warp_kernels, arch=90, module_dir=tmp_path)
-    assert file.suffix in (".cubin", ".ptx")
-    assert file.stat().st_size > 10_000
+    No memory is taken, nothing is copied to the host, and kernels find all arrays where the last
+    step left them, also after bodies were changed and chips attached.
+    """
+    fleet = Fleet("six_patch", BODIES, 3, sensors=2, device="warp:cpu", budget=32)
+    fleet.use_readout("fdc1004")
+    where, frame = (
+        wp.array(poses(np.random.default_rng(15), 3, k), dtype=wp.float32, device="cpu")
+        for k in (3, 2)
+    )
+    time = wp.zeros(1, dtype=wp.float64, device="cpu")
+    counts = {"allocations": 0, "copies": 0}
+    seen: list[list[int]] = [[], []]
+    run = 0
+
+    def counted(name, function):
+        def call(*args, **options):
+            counts[name] += 1
+            return function(*args, **options)
+
+        return call
+
+    launch = wp.launch
+
+    def launched(kernel, *args, **options):
+        arrays = [x.ptr for x in options["inputs"] if isinstance(x, wp.array)]
+        seen[run].extend(arrays)
+        return launch(kernel, *args, **options)
+
+    fleet.step(where, frame, time=time, jacobian=True)
+    monkeypatch.setattr(wp, "launch", launched)
+    allocator = wp.get_device("cpu").get_allocator()
+    monkeypatch.setattr(allocator, "alloc", counted("allocations", allocator.alloc), raising=False)
+    monkeypatch.setattr(wp.array, "numpy", counted("copies", wp.array.numpy))
+    for name in ("synchronize", "synchronize_device", "synchronize_stream"):
+        monkeypatch.setattr(wp, name, counted("copies", getattr(wp, name)))
+    fleet.step(where, frame, time=time, jacobian=True)
+    assert counts == {"allocations": 0, "copies": 0}
+    wp.zeros(1, device="cpu").numpy()
+    assert min(counts.values()) > 0  # it counts
+    fleet.change(0, BODIES[1], [1])
+    run = 1
+    fleet.step(where, frame, time=time, jacobian=True)
+    assert seen[0] == seen[1]
+    assert len(seen[0]) > 10
+
+
+def test_bodies_that_coincide():
+    """Limit: two balls in one place read as one; functions that add nothing are left out."""
+    ball = cs.Body(cs.Sphere(0.03), material="steel")
+    where = np.array([[[0.0, 0.0, 0.08, 0.0, 0.0, 0.0, 1.0]] * 2])
+    one = Fleet("six_patch", [ball], 1, device="warp:cpu", budget=64)
+    two = Fleet("six_patch", [ball, ball], 1, device="warp:cpu", budget=64)
+    truth, found = one.step(where[:, :1]).delta.numpy(), two.step(where).delta.numpy()
+    assert two._warp.dropped.numpy()[0] > 0
+    np.testing.assert_allclose(found, truth, rtol=0, atol=0.02 * np.abs(truth).max())
+
+
+MODULES = ["warp_cut", "warp_kernels", "warp_solve", "warp_slope", "warp_chips"]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_kernels_compile_for_a_gpu(name, tmp_path):
+    """Compiled ahead for compute capability 9.0, which needs no GPU; no kernel asks for more
+    shared memory than the 48 kB that every launch may have."""
+    module = importlib.import_module(f"capsense.fleet.{name}")
+    (file,) = wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+    text = file.read_text(encoding="utf-8")
+    assert ".target sm_90" in text
+    sizes = [
+        int(count) * int(bits) // 8
+        for bits, count in re.findall(r"\.shared [^;]*\.b(\d+) \S+\[(\d+)\]", text)
+    ]
+    assert sum(sizes) <= 48 * 1024
+    assert text.count(".entry") >= 2

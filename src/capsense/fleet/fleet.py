@@ -109,7 +109,7 @@ class Fleet:
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self._table = BodyTable(self._solver, count, len(bodies), sensors)
-        self._chips: SideBySide | None = None
+        self._chips: Any = None
         self._cpu = CpuCore(self._solver, self._terminals, self._table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
@@ -198,8 +198,8 @@ class Fleet:
             seed: Of all random numbers.
 
         Raises:
-            ReadoutError: There is no such chip, or the readout is of other electrodes; or the
-                design has shields, and the fleet is on Warp, where these are not looked at.
+            ReadoutError: There is no such chip, or the readout is of other electrodes; or it has
+                open electrodes or parts of the user's own, and the fleet is on Warp.
         """
         self._chips = None
         if readout is None:
@@ -211,46 +211,45 @@ class Fleet:
                 f"the readout is of electrodes {readout.bank.electrodes}, the fleet of "
                 f"{self.electrode_names}"
             )
-        if self._warp is not None and self._terminals.driven > len(self.electrode_names):
-            raise ReadoutError('a design with shields is read through chips on device "cpu" only')
-        self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
+        if self._warp is None:
+            self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
+        else:
+            self._chips = self._warp.chips(readout, self.baseline, seed)
 
     def step(
         self,
         poses: ArrayLike,
         sensors: ArrayLike | None = None,
         *,
-        time: float | None = None,
+        time: Any = None,
         jacobian: bool = False,
     ) -> FleetReading:
         """Return the readings of all environments.
 
         On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
-        not looked at; nothing waits for the device, so that a step can go into a CUDA graph. Chips
-        are on the host: with a readout, matrices are copied there.
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph.
 
         Args:
             poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
                 shape (e, b, 7).
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
-            time: Time of the scenes [s], not before that of the last step; a readout needs it.
-            jacobian: Whether to work out ``reading.jacobian`` as well, on the CPU only.
+            time: Time of the scenes [s], not before that of the last step; a readout needs it. On
+                Warp it may be an array of shape (1,) and double precision, for CUDA graphs.
+            jacobian: Whether to work out ``reading.jacobian`` as well.
 
         Raises:
             SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long.
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
-            ValueError: A Jacobian is asked for on Warp.
         """
         if self._chips is None:
             return self.solved(poses, sensors, jacobian=jacobian)
         if time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
         reading = self.solved(poses, sensors, jacobian=jacobian)
-        matrix = reading.capacitance
-        host = matrix if isinstance(matrix, np.ndarray) else matrix.numpy()
-        return replace(reading, held=self._chips.sample(time, host, reading.shield_coupling))
+        matrix = reading.capacitance if self._warp is None else reading.delta
+        return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False

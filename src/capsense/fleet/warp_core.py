@@ -16,6 +16,8 @@ from capsense.fleet import warp_kernels as kernels
 from capsense.fleet import warp_slope as slope
 from capsense.fleet import warp_solve as solution
 from capsense.fleet.step_kernels import Bodies
+from capsense.fleet.warp_chips import WarpChips
+from capsense.readout.readout import Readout
 from capsense.surface.matter import UNIT
 from capsense.surface.place_kernels import Green
 from capsense.surface.rigid import RigidShape
@@ -164,6 +166,10 @@ class WarpCore:
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
         )  # fmt: skip
+
+    def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
+        """Chips for all sensors, see :class:`WarpChips`."""
+        return WarpChips(readout, (self.counts[0], self.counts[2]), empty, seed, self.device)
 
     def launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:
         """Launch a kernel on the device."""
