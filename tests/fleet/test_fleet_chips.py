@@ -9,6 +9,10 @@ from test_fleet import BODIES, poses
 import capsense as cs
 from capsense.errors import ReadoutError
 from capsense.fleet import Fleet
+from capsense.readout.channels import self_patterns
+from capsense.readout.chips import CHIPS
+from capsense.readout.front_end import Wiring
+from capsense.readout.noise import allan_deviation
 from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 
@@ -100,3 +104,110 @@ def test_refused():
     many = SideBySide(without_noise(), COUNT)
     with pytest.raises(ReadoutError, match=r"shape \(4, 6, 6\); give matrices of 5 sensors"):
         many.sample(0.0, matrices(np.random.default_rng(7), 4))
+
+
+def on_warp(readout, count=COUNT, seed=0, empty=None):
+    """Chips on Warp of ``count`` environments, and a function that samples their deltas."""
+    wp = pytest.importorskip("warp")
+    from capsense.fleet.warp_chips import WarpChips
+
+    empty = np.zeros((6, 6)) if empty is None else empty
+    chips = WarpChips(readout, (count, 1), empty, seed, wp.get_device("cpu"))
+    shields = wp.zeros((count, 1, 6), dtype=wp.float64, device="cpu")
+
+    def sample(time, matrix):
+        delta = np.ascontiguousarray(matrix[:, None], np.float32)
+        held = chips.sample(time, wp.array(delta, dtype=wp.float32, device="cpu"), shields)
+        return [getattr(held, x).numpy()[:, 0].copy() for x in ("code", "capacitance", "age")]
+
+    return sample
+
+
+@pytest.mark.parametrize("chip", sorted(CHIPS))
+def test_chips_on_warp_are_those_of_the_cpu(chip):
+    """Differential: all chips by name without noise; saturation, late results, large steps."""
+    rng = np.random.default_rng(6)
+    one = without_noise(chip)
+    wiring = Wiring(trace=1e-12, crosstalk=0.01)
+    one = Readout(one.bank, one.schedule, one.law, dac=one.dac, wiring=wiring)
+    many, sample = SideBySide(one, COUNT), on_warp(one)
+    step = 0.37 * one.schedule.period
+    times = np.cumsum(np.concatenate([[step] * 40, [5 * step] * 20]))
+    for k, time in enumerate(times):
+        size = 30e-12 if k % 10 == 9 else 1e-12  # beyond the range of some
+        matrix = (size * rng.uniform(1, 3, (COUNT, 6, 6))).astype(np.float32).astype(float)
+        matrix = matrix + matrix.transpose(0, 2, 1)
+        truth, (code, capacitance, age) = many.sample(time, matrix), sample(time, matrix)
+        np.testing.assert_allclose(code, truth.code, rtol=0, atol=1)
+        assert (code == truth.code).mean() > 0.9
+        near = np.maximum(np.abs(truth.capacitance), 1e-12)
+        assert (np.abs(capacitance - truth.capacitance) / near).max() < 0.02
+        np.testing.assert_allclose(age, truth.age, rtol=0, atol=1e-9)
+
+
+def test_drift_on_warp_is_that_of_the_cpu():
+    """Differential: mains and a temperature that changes, which have no other random numbers."""
+    whole = Readout.preset(
+        "fdc1004", NAMES, noise=False, mains=1e-15, temperature=[[0.0, 25.0], [1.0, 45.0]]
+    )  # fmt: skip
+    assert len(whole.stages) == 2
+    many, sample = SideBySide(whole, COUNT, seed=5), on_warp(whole, seed=5)
+    matrix = matrices(np.random.default_rng(7)).astype(np.float32).astype(float)
+    for k in range(30):
+        truth, found = many.sample(0.05 * k, matrix), sample(0.05 * k, matrix)
+        np.testing.assert_allclose(found[0], truth.code, rtol=0, atol=1)
+
+
+@pytest.mark.parametrize("walk", [0.0, 2e-15])
+def test_noise_on_warp_is_that_of_the_chip(walk):
+    """Measured: deviations and Allan deviations of 400 chips are those of the CPU's 400."""
+    whole = Readout.preset("fdc1004", NAMES, walk=walk)
+    matrix = np.broadcast_to(
+        matrices(np.random.default_rng(8), 1).astype(np.float32).astype(float), (400, 6, 6)
+    )
+    many, sample = SideBySide(whole, 400, seed=1), on_warp(whole, 400, seed=1)
+    period = whole.schedule.period
+    rows = []
+    for k in range(1, 66):
+        time = 1.001 * period * k
+        rows.append([many.sample(time, matrix).capacitance, sample(time, matrix)[1]])
+    both = np.array(rows)[1:]  # (times, 2, chips, channels)
+    both = both.transpose(1, 0, 2, 3).reshape(2, 64, -1)
+    for m in (1, 8):
+        truth, found = (np.sqrt((allan_deviation(x, [m])[0] ** 2).mean()) for x in both)
+        assert found == pytest.approx(truth, rel=0.05)
+    spread = both[:, -1].std(axis=1)
+    assert spread[1] == pytest.approx(spread[0], rel=0.1)
+    together = np.corrcoef(both[1][:, :200].T)
+    np.fill_diagonal(together, 0.0)
+    assert np.abs(together).mean() < (0.15 if walk == 0.0 else 0.5)
+
+
+def test_a_fleet_on_warp_reads_through_chips_on_the_device():
+    """Differential: against chips on the CPU of the same matrices, shields driven along."""
+    pytest.importorskip("warp")
+    fleet = Fleet("six_patch", BODIES[:1], COUNT, device="warp:cpu", budget=32)
+    fleet.use_readout(without_noise())
+    many = SideBySide(without_noise(), COUNT)
+    rng = np.random.default_rng(9)
+    for k in range(4):
+        reading = fleet.step(poses(rng, COUNT, 1), time=0.05 * k)
+        matrix = fleet.baseline + reading.delta.numpy().astype(float)
+        truth = many.sample(0.05 * k, matrix, reading.shield_coupling.numpy())
+        np.testing.assert_allclose(reading.held.code.numpy(), truth.code, rtol=0, atol=1)
+    with pytest.raises(ReadoutError, match="time must not go back"):
+        fleet.step(poses(rng, COUNT, 1), time=0.0)
+
+
+def test_refused_on_warp():
+    """Errors name the thing and the fix."""
+
+    class Own:
+        def start(self, context):
+            return lambda channel, time, value: value
+
+    whole = without_noise()
+    with pytest.raises(ReadoutError, match='device "cpu" only'):
+        on_warp(Readout(whole.bank, whole.schedule, whole.law, stages=[Own()]))
+    with pytest.raises(ReadoutError, match="leaves electrodes open"):
+        on_warp(Readout.preset("fdc1004", NAMES, patterns=self_patterns(NAMES, rest="floating")))

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.elements.matter import UNIT
 from capsense.elements.rigid import INSIDE
+from capsense.field.green_kernels import Green
+from capsense.surface import step
 from capsense.surface.choose_kernels import Cut
 from capsense.surface.leaf_kernels import leaf_rows, placed
 from capsense.surface.pair_kernels import leaf_pairs
-from capsense.surface.solve_kernels import assembled, functions_of, reduced
-from capsense.surface.solver import SurfaceSolver
+from capsense.surface.solve_kernels import assembled, functions_of, leaf_charges, reduced
+from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 
 Array = NDArray[np.float64]
 
 
-def cut_of(solver: SurfaceSolver, bodies: NDArray[np.void], trees: list, count: int) -> Cut:
+def cut_of(green: Green, bodies: NDArray[np.void], trees: list, count: int) -> Cut:
     """Clusters by what is largest against its distance from the design, ``count`` for each body."""
     rows: list[tuple] = []
     leaves: list[int] = []
     for b, (body, tree) in enumerate(zip(bodies, trees, strict=True)):
         center = body["position"] + body["scale"] * tree.center @ body["rotation"].T
-        low, high = solver.green.box
+        low, high = green.box
         away = np.linalg.norm(np.maximum(np.maximum(low - center, center - high), 0.0), axis=1)
         size = body["scale"] * tree.extent
         need = np.where(tree.kids[:, 0] < 0, 0.0, size / (np.maximum(away, 0.5 * size) + 1e-3))
@@ -50,15 +54,45 @@ def cut_of(solver: SurfaceSolver, bodies: NDArray[np.void], trees: list, count: 
     return Cut(body, node, kids, share, leaf, whole, whole.copy(), np.array(leaves))
 
 
-def change_by_clusters(solver: SurfaceSolver, scene: cs.Scene, count: int) -> Array:
-    """Change of the matrix of all terminals [F]."""
-    packed, green = solver.pack(solver.look(scene)), solver.green
-    if not len(packed.records):
-        return np.zeros((green.terminals, green.terminals))
-    cut = cut_of(solver, packed.records, [s.tree for s in packed.shapes], count)
-    leaves = placed(packed.records, cut, green, INSIDE)
-    rows = leaf_rows(leaves.points, leaves.beyond, green)
-    pairs = leaf_pairs(leaves, green.floor)
-    functions = functions_of(packed.records, cut)
-    system = assembled(packed.records, cut, functions, rows, pairs, green.lead)
-    return UNIT * reduced(cut, functions, system, False)[0][: green.terminals, : green.terminals]
+@contextmanager
+def same_functions(count: int) -> Iterator[None]:
+    """Let solvers take the charge functions that a fleet on Warp takes, ``count`` for each body."""
+    trees: list = []
+    pack = SurfaceSolver.pack
+
+    def packed(solver: SurfaceSolver, view: View) -> PackedBodies:
+        out = pack(solver, view)
+        trees[:] = [shape.tree for shape in out.shapes]
+        return out
+
+    def prepared(bodies: NDArray[np.void], green: Green, *_: float) -> tuple:
+        cut = cut_of(green, bodies, trees, count)
+        leaves = placed(bodies, cut, green, INSIDE)
+        rows = leaf_rows(leaves.points, leaves.beyond, green)
+        functions = functions_of(bodies, cut)
+        pairs = leaf_pairs(leaves, green.floor)
+        return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
+
+    def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
+        cut, leaves, functions, system = prepared(bodies, green)
+        delta, left, x, shift = reduced(cut, functions, system, others[2])
+        charge = leaf_charges(cut, functions, x, len(leaves.points))
+        m = green.terminals
+        return step.Solution(
+            delta[:m, :m], left[:m, :m], charge, leaves.points, leaves.extent, leaves.owner,
+            functions.solved, shift,
+        )  # fmt: skip
+
+    with (
+        patch.object(SurfaceSolver, "pack", packed),
+        patch("capsense.surface.solver.solve", solve),
+        patch.object(step, "prepared", prepared),
+    ):
+        yield
+
+
+def twin_of(fleet: cs.Fleet) -> cs.Simulator:
+    """A simulator with the shapes of a fleet; use it within :func:`same_functions`."""
+    simulator = cs.Simulator(fleet.design)
+    simulator._solver = fleet._solver
+    return simulator

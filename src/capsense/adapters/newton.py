@@ -15,8 +15,6 @@ from capsense.adapters.parallel import (
     FleetOptions,
     ParallelSensors,
     WorldShape,
-    as_numbers,
-    compose,
     matching,
     warn_left_out,
 )
@@ -82,14 +80,7 @@ class SensorCapacitance(ParallelSensors):
         super().__init__(parts, carriers, len(table), design, rules, device, other)
         local = model.shape_transform.numpy()
         seen = np.array([columns[k] for k in self.chosen])
-        self._fixed = [
-            (
-                as_numbers(carrier[table[:, which]], device),
-                wp.array(local[table[:, which]], dtype=wp.transform, device=device),
-                out,
-            )
-            for which, out in ((seen, self._poses), (chosen, self._frames))
-        ]
+        self._fix(*((carrier[table[:, k]], local[table[:, k]]) for k in (seen, chosen)))
         self.capacitance: Any = None
         self.delta: Any = None
         """Maxwell matrices of the last update and their change by the bodies [F], shape (worlds,
@@ -107,13 +98,13 @@ class SensorCapacitance(ParallelSensors):
             SolveError: As by :meth:`Fleet.step`.
         """
         bodies = state.body_q
-        for number, local, out in self._fixed:
-            # bodies of all worlds stand in one row, which every world is shown
-            rows = wp.array(
-                ptr=bodies.ptr, dtype=wp.transform, shape=(out.shape[0], bodies.shape[0]),
-                strides=(0, bodies.strides[0]), device=out.device,
-            )  # fmt: skip
-            wp.launch(compose, dim=out.shape, inputs=[rows, number, local, out], device=out.device)
+        # bodies of all worlds stand in one row, which every world is shown
+        self._follow(
+            wp.array(
+                ptr=bodies.ptr, dtype=wp.transform, shape=(self.fleet.count, bodies.shape[0]),
+                strides=(0, bodies.strides[0]), device=bodies.device,
+            )
+        )  # fmt: skip
         self.reading = self._read(time)
         self.capacitance, self.delta = self.reading.capacitance, self.reading.delta
 

@@ -10,6 +10,7 @@ from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
@@ -18,6 +19,9 @@ from capsense.fleet import Fleet, FleetReading
 from capsense.fleet.fleet import Preset
 from capsense.scene import Body
 
+Fixed = tuple[NDArray[np.integer], NDArray[np.floating]]
+"""Numbers of bodies, -1 for the world itself, and poses on them (x, y, z [m]; quaternion x, y, z,
+w), shapes (worlds, n) and (worlds, n, 7)."""
 _SHOWN = 6
 """Names that are listed in a message."""
 
@@ -40,8 +44,8 @@ class WorldShape:
     """The names it answers to."""
     body: int
     """The simulator's body that carries it, in the first world; -1 for the world itself."""
-    bodies: Body | Sequence[Body]
-    """What it is: one for all worlds, or one for each."""
+    bodies: Body | Sequence[Body | None]
+    """What it is: one for all worlds, or one for each, None where there is none."""
 
 
 class ParallelSensors:
@@ -76,7 +80,7 @@ class ParallelSensors:
         if not self.chosen:
             raise SceneError("there is nothing to see: all shapes are left out")
         seen = [parts[k] for k in self.chosen]
-        first = [p.bodies if isinstance(p.bodies, Body) else p.bodies[0] for p in seen]
+        first = [_some_body(part) for part in seen]
         where = options.get("device") or ("cpu" if device.is_cpu else str(device))
         self.fleet = Fleet(
             design, first, worlds, sensors=len(sites), **{**options, "device": where}
@@ -95,12 +99,33 @@ class ParallelSensors:
         self._poses = wp.zeros((worlds, len(seen)), dtype=wp.transform, device=device)
         self._frames = wp.zeros((worlds, len(sites)), dtype=wp.transform, device=device)
 
+    def _fix(self, places: Fixed, sites: Fixed) -> None:
+        """Say where the shapes that are seen, and the sites, are on the simulator's bodies."""
+        device = self._poses.device
+        self._fixed = [
+            (as_numbers(number, device), wp.array(local, dtype=wp.transform, device=device), out)
+            for (number, local), out in ((places, self._poses), (sites, self._frames))
+        ]
+
+    def _follow(self, parents: Any) -> None:
+        """Take over the poses of the simulator's bodies, transforms of shape (worlds, bodies)."""
+        for number, local, out in self._fixed:
+            inputs = [parents, number, local, out]
+            wp.launch(compose, dim=out.shape, inputs=inputs, device=out.device)
+
     def _read(self, time: float | None) -> FleetReading:
         """The reading at the poses that stand in the two arrays."""
         poses, frames = self._poses, self._frames
         if self.fleet.device == "cpu":
             poses, frames = poses.numpy(), frames.numpy()
         return self.fleet.step(poses, frames, time=time)
+
+
+def _some_body(part: WorldShape) -> Body:
+    """A body that stands in a part's place in some world."""
+    if isinstance(part.bodies, Body):
+        return part.bodies
+    return next(body for body in part.bodies if body is not None)
 
 
 def warn_left_out(names: Sequence[str], why: str) -> None:

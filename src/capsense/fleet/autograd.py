@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from capsense.fleet.fleet import Fleet
-
-Array = NDArray[np.float64]
 
 
 def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = None) -> torch.Tensor:
     """Change of the matrices by the bodies, with gradients by the poses of the bodies.
 
     Gradients are those of the solver's own adjoint, not of differences. That by a quaternion is
-    within the unit sphere: a step along it turns the body and nothing else.
+    within the unit sphere: a step along it turns the body and nothing else. With a fleet on Warp
+    nothing leaves the device.
 
     Args:
-        fleet: A fleet on the CPU.
-        poses: As :meth:`Fleet.step` takes them, shape (e, b, 7).
+        fleet: A fleet.
+        poses: As :meth:`Fleet.step` takes them, shape (e, b, 7); on the fleet's device.
         sensors: The same; no gradients are worked out by these.
 
     Returns:
@@ -30,7 +27,7 @@ def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = Non
     Raises:
         SceneError: As by :meth:`Fleet.step`.
         SolveError: As by :meth:`Fleet.step`.
-        ValueError: The fleet is on Warp, or gradients by the sensors' poses are asked for.
+        ValueError: Gradients by the sensors' poses are asked for.
     """
     if sensors is not None and sensors.requires_grad:
         raise ValueError("gradients by the poses of sensors are not known; move the bodies instead")
@@ -43,39 +40,47 @@ class _Change(torch.autograd.Function):
     def forward(
         context: Any, poses: torch.Tensor, sensors: torch.Tensor | None, fleet: Fleet
     ) -> torch.Tensor:
-        host = poses.detach().cpu().numpy()
-        at = None if sensors is None else sensors.detach().cpu().numpy()
-        wanted = poses.requires_grad
-        reading = fleet.solved(host, at, jacobian=wanted)
-        context.slope = reading.jacobian
-        context.turn = None if at is None else _matrices(at)
-        context.save_for_backward(poses)
-        return torch.as_tensor(reading.delta, dtype=poses.dtype, device=poses.device)
+        def given(values: torch.Tensor | None) -> Any:
+            if values is None:
+                return None
+            values = values.detach()
+            return values.cpu().numpy() if fleet.device == "cpu" else values.float().contiguous()
+
+        reading = fleet.solved(given(poses), given(sensors), jacobian=poses.requires_grad)
+
+        def kept(values: Any) -> torch.Tensor:
+            # the fleet writes its arrays anew
+            return torch.from_dlpack(values).to(poses.device, poses.dtype, copy=True)
+
+        context.slope = kept(reading.jacobian) if poses.requires_grad else None
+        context.save_for_backward(poses, sensors)
+        return kept(reading.delta)
 
     @staticmethod
     def backward(context: Any, *outer: Any) -> tuple[torch.Tensor, None, None]:
-        (poses,) = context.saved_tensors
-        weights = outer[0].detach().cpu().numpy().astype(float)
+        poses, sensors = context.saved_tensors
         # along and about the axes of each sensor, then of the world
-        slope = np.einsum("esij,esbijr->esbr", weights, context.slope)
+        slope = torch.einsum("esij,esbijr->esbr", outer[0], context.slope)
         slope = slope.reshape(*slope.shape[:3], 2, 3)
-        if context.turn is not None:
-            slope = np.einsum("eskr,esbqr->esbqk", context.turn, slope)
-        along, about = np.moveaxis(slope.sum(axis=1), 2, 0)
-        quaternion = poses.detach().cpu().numpy().astype(float)[..., 3:]
-        quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+        if sensors is not None:
+            turn = _matrices(sensors.to(slope))
+            slope = torch.einsum("eskr,esbqr->esbqk", turn, slope)
+        along, about = slope.sum(dim=1).unbind(dim=2)
+        quaternion = torch.nn.functional.normalize(poses.detach()[..., 3:], dim=-1)
         v, w = quaternion[..., :3], quaternion[..., 3:]
         # a turn by a small vector t takes q to q + (t, 0) q / 2
-        turned = np.concatenate(
-            [w * about + np.cross(about, v), -(about * v).sum(axis=-1, keepdims=True)], axis=-1
+        turned = torch.cat(
+            [w * about + torch.linalg.cross(about, v), -(about * v).sum(dim=-1, keepdim=True)], -1
         )
-        gradient = np.concatenate([along, 2.0 * turned], axis=-1)
-        return torch.as_tensor(gradient, dtype=poses.dtype, device=poses.device), None, None
+        return torch.cat([along, 2.0 * turned], dim=-1), None, None
 
 
-def _matrices(poses: NDArray[Any]) -> Array:
+def _matrices(poses: torch.Tensor) -> torch.Tensor:
     """Rotation matrices, shape (..., 7) -> (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    flat = poses.reshape(-1, 7)[:, 3:]
-    return Rotation.from_quat(flat).as_matrix().reshape(*poses.shape[:-1], 3, 3)
+    x, y, z, w = torch.nn.functional.normalize(poses[..., 3:], dim=-1).unbind(dim=-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

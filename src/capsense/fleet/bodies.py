@@ -31,8 +31,9 @@ class BodyTable:
         self._kinds: dict[tuple[int, bool], int] = {}
         shape = count, places
         self.bodies = Bodies(
-            np.zeros(0, BODY), np.zeros(0), np.full(shape, -1), np.ones(shape), np.zeros(shape),
-            np.zeros(shape), np.zeros(shape, np.int64), np.zeros((sensors, places), np.bool_),
+            np.zeros(0, BODY), np.zeros(0), np.full(shape, -1), np.ones(shape),
+            np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, np.int64),
+            np.zeros((sensors, places), np.bool_), np.arange(places),
         )  # fmt: skip
         self.given = np.full(shape, None, object)
         """The bodies themselves, shape (e, b)."""
@@ -60,7 +61,9 @@ class BodyTable:
         known = {key: self._row(body) for key, body in alike.items()}
         table = self.bodies
         values = [known[id(body)] for body in each]
-        for column, part in zip(table[2:-1], zip(*values, strict=True), strict=True):
+        if (table.group == table.group[place]).sum() > 1:
+            _require_conductors(each, self._solver.excitation_frequency)
+        for column, part in zip(table[2:-2], zip(*values, strict=True), strict=True):
             column[rows, place] = part
         self.given[rows, place] = each
 
@@ -74,27 +77,37 @@ class BodyTable:
                     raise SceneError(f"hide: {number!r} is none of the {what} 0 to {known - 1}")
         self.bodies.hidden[sensor] = np.isin(np.arange(self.places), places)
 
-    def _row(self, body: Body | None) -> tuple[int, float, float, float, int]:
+    def join(self, places: Sequence[int]) -> None:
+        """See :meth:`Fleet.join`."""
+        group = self.bodies.group
+        for number in places:
+            if number not in range(self.places):
+                raise SceneError(f"join: {number!r} is none of the places 0 to {self.places - 1}")
+            _require_conductors(self.given[:, number], self._solver.excitation_frequency)
+        for number in places:
+            group[group == group[number]] = group[places[0]]
+
+    @property
+    def lossy(self) -> bool:
+        """Whether any matter has losses."""
+        table = self.bodies
+        return bool((table.softness.imag != 0).any() or (table.tie.imag != 0).any())
+
+    def _row(self, body: Body | None) -> tuple[int, float, complex, complex, int]:
         """Shape, scale, softness, tie and neutrality of a body."""
         if body is None:
             return -1, 1.0, 0.0, 0.0, 1
         if not isinstance(body, Body):
             raise SceneError(f"{body!r} is not a Body")
         matter = matter_of([body], self._solver.excitation_frequency)
-        if matter.lossy:
-            hertz = self._solver.excitation_frequency
-            raise SceneError(
-                f"{body.material.name!r} has losses at {hertz:g} Hz, which a "
-                "fleet does not know; give the body a conductor's or a lossless material"
-            )
         shape, size = self._solver.functions_of(body.shape)
         if not isinstance(shape, RigidShape):
             raise SceneError(
                 f"{type(body.shape).__name__} is not rigid; a fleet takes primitives and TriMesh"
             )
-        tie = complex(matter.ties(np.array([size * shape.capacitance]))[0]).real
-        neutral = int(np.isinf(tie))
-        soft = float(matter.softness[0].real)
+        tie = complex(matter.ties(np.array([size * shape.capacitance]))[0])
+        neutral = int(np.isinf(tie.real))
+        soft = complex(matter.softness[0])
         number = self._number(shape, soft != 0.0)
         return number, size, soft, 0.0 if neutral else tie, neutral
 
@@ -112,3 +125,13 @@ class BodyTable:
                 radius=np.append(self.bodies.radius, radius),
             )
         return found
+
+
+def _require_conductors(bodies: Sequence[Body | None], frequency: float) -> None:
+    known = {id(body): body for body in bodies if body is not None}.values()
+    for body in known:
+        if not matter_of([body], frequency).conducting[0]:
+            raise SceneError(
+                f"a body of {body.material.name!r} stands in a place that is joined with others; "
+                "only conductors can be joined"
+            )

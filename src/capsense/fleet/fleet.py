@@ -3,35 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._jit import first_use
-from capsense._thread_pool import in_parts
 from capsense.design import load_design
-from capsense.design.model import Design, Role
-from capsense.elements.matter import UNIT
-from capsense.errors import (
-    DesignError,
-    MissingDependencyError,
-    ReadoutError,
-    SceneError,
-    SolveError,
-)
+from capsense.design.model import Design
+from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.cache import default_settings, load_or_build
 from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
-from capsense.fleet.step_kernels import Found, Poses, Sensor, step_rows
-from capsense.readout.counts import Held
+from capsense.fleet.cpu_core import CpuCore
+from capsense.fleet.reading import FleetCheck, FleetReading
 from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
-from capsense.surface.solver import DOUBTFUL, PRESETS, SurfaceSolver
+from capsense.surface.solver import PRESETS, SurfaceSolver
 
 if TYPE_CHECKING:
     from capsense.fleet.warp_core import WarpCore
@@ -48,44 +39,6 @@ _PANELS = 5
 Preset = Literal["standard", "learning", "fine"]
 
 
-@dataclass(frozen=True, eq=False)
-class FleetReading:
-    """What the sensors of all environments see; e environments, s sensors, n electrodes.
-
-    Arrays of NumPy on the CPU, else of Warp, in single precision, which PyTorch and JAX take by
-    DLPack; those are written anew by the next step.
-    """
-
-    capacitance: Any
-    """Maxwell capacitance matrices [F], shape (e, s, n, n)."""
-    delta: Any
-    """Their change by the bodies [F], shape (e, s, n, n)."""
-    error: Array | None = None
-    """Estimated error of the largest entry [F], shape (e, s); None on Warp."""
-    shield_coupling: Array | None = None
-    """Charge on each electrode per volt on all shields together [F], shape (e, s, n); None on
-    Warp."""
-    held: Held | None = None
-    """What the chips' registers hold, where there is a readout, each of shape (e, s, channels)."""
-    jacobian: Array | None = None
-    """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
-    about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
-
-
-@dataclass(frozen=True)
-class FleetCheck:
-    """Errors of some environments against :class:`Simulator`, over each one's largest entry."""
-
-    environments: tuple[int, ...]
-    """Which environments."""
-    rms: float
-    """Root of the mean square over all entries."""
-    worst: float
-    """The largest."""
-    where: tuple[int, int]
-    """Environment and sensor that have it."""
-
-
 class Fleet:
     """Sensors of one design in many environments, with the same places for bodies in each.
 
@@ -100,7 +53,7 @@ class Fleet:
     Args:
         design: A design, its name, or the path of its file.
         bodies: What stands in every environment, one body for each place; their poses are not used.
-            Rigid shapes, of matter without losses.
+            Rigid shapes.
         count: How many environments, e.
         sensors: How many sensors of the design each has, s.
         device: ``"cpu"`` for the compiled core on all processors, or a device of Warp:
@@ -110,7 +63,7 @@ class Fleet:
         excitation_frequency: Excitation frequency [Hz].
 
     Raises:
-        DesignError: The design is wrong, or has floating conductors, on Warp.
+        DesignError: The design is wrong.
         SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have;
             or a count is not a positive whole number.
         ValueError: There is no such preset, budget or device.
@@ -156,7 +109,8 @@ class Fleet:
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self._table = BodyTable(self._solver, count, len(bodies), sensors)
-        self._chips: SideBySide | None = None
+        self._chips: Any = None
+        self._cpu = CpuCore(self._solver, self._terminals, self._table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
             self.change(place, body)
@@ -168,17 +122,9 @@ class Fleet:
             raise MissingDependencyError(
                 f"device {self.device!r} needs Warp; install it with: pip install 'capsense[warp]'"
             ) from error
-        device = known_device(self.device)
-        floating = [c.name for c in self.design.conductors if c.role == Role.FLOATING]
-        if floating:
-            raise DesignError(
-                f"design {self.design.name!r} has floating conductors, {', '.join(floating)}, "
-                'which fleets know on device "cpu" only'
-            )
-        n = self._terminals.electrodes
         return WarpCore(
-            self._solver.green, self.baseline, self._terminals.bound[:n, :n],
-            (self.count, self.places, self.sensors), budget, device,
+            self._solver.green, self._terminals, (self.count, self.places, self.sensors), budget,
+            2 * np.pi * self._solver.excitation_frequency, known_device(self.device),
         )  # fmt: skip
 
     @property
@@ -204,7 +150,7 @@ class Fleet:
 
         Raises:
             SceneError: There is no such place or environment, the numbers do not match, or a body
-                is of matter with losses or of a shape that is not rigid.
+                is of a shape that is not rigid, or no conductor in a place that is joined.
         """
         self._table.change(place, bodies, environments)
         self._take_over()
@@ -222,6 +168,22 @@ class Fleet:
         self._table.hide(sensor, places)
         self._take_over()
 
+    def join(self, places: Sequence[int]) -> None:
+        """Make the conductors in some places one, in all environments, as if a wire joined them.
+
+        A fleet does not look for contact. Conductors that are joined share their net charge, and
+        are tied to ground by the sum of their capacitances; with one that is grounded all are.
+        Members that a sensor does not see, or that are out of its sight, do not count.
+
+        Args:
+            places: Numbers of the places; what they are joined with already joins in.
+
+        Raises:
+            SceneError: There is no such place, or something else than a conductor stands there.
+        """
+        self._table.join(places)
+        self._take_over()
+
     def _take_over(self) -> None:
         if self._warp is not None:
             self._warp.take(self._table.bodies, self._table.shapes)
@@ -236,8 +198,8 @@ class Fleet:
             seed: Of all random numbers.
 
         Raises:
-            ReadoutError: There is no such chip, or the readout is of other electrodes; or the
-                design has shields, and the fleet is on Warp, where these are not looked at.
+            ReadoutError: There is no such chip, or the readout is of other electrodes; or it has
+                open electrodes or parts of the user's own, and the fleet is on Warp.
         """
         self._chips = None
         if readout is None:
@@ -249,93 +211,77 @@ class Fleet:
                 f"the readout is of electrodes {readout.bank.electrodes}, the fleet of "
                 f"{self.electrode_names}"
             )
-        if self._warp is not None and self._terminals.driven > len(self.electrode_names):
-            raise ReadoutError('a design with shields is read through chips on device "cpu" only')
-        self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
+        if self._warp is None:
+            self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
+        else:
+            self._chips = self._warp.chips(readout, self.baseline, seed)
 
     def step(
         self,
         poses: ArrayLike,
         sensors: ArrayLike | None = None,
         *,
-        time: float | None = None,
+        time: Any = None,
         jacobian: bool = False,
     ) -> FleetReading:
         """Return the readings of all environments.
 
         On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
-        not looked at; nothing waits for the device, so that a step can go into a CUDA graph. Chips
-        are on the host: with a readout, matrices are copied there.
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph.
 
         Args:
             poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
                 shape (e, b, 7).
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
-            time: Time of the scenes [s], not before that of the last step; a readout needs it.
-            jacobian: Whether to work out ``reading.jacobian`` as well, on the CPU only.
+            time: Time of the scenes [s], not before that of the last step; a readout needs it. On
+                Warp it may be an array of shape (1,) and double precision, for CUDA graphs.
+            jacobian: Whether to work out ``reading.jacobian`` as well.
 
         Raises:
             SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long.
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
-            ValueError: A Jacobian is asked for on Warp.
         """
         if self._chips is None:
             return self.solved(poses, sensors, jacobian=jacobian)
         if time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
         reading = self.solved(poses, sensors, jacobian=jacobian)
-        matrix = reading.capacitance
-        host = matrix if isinstance(matrix, np.ndarray) else matrix.numpy()
-        return replace(reading, held=self._chips.sample(time, host, reading.shield_coupling))
+        matrix = reading.capacitance if self._warp is None else reading.delta
+        return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
     ) -> FleetReading:
         """The same as :meth:`step`, without chips and their time."""
-        e, s, b = self.count, self.sensors, self.places
-        if sensors is None:
-            sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7))
-        wanted = (("poses", poses, (e, b, 7)), ("sensors", sensors, (e, s, 7)))
+        if jacobian and self._table.lossy:
+            raise SceneError(
+                "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
+                "them a conductor's or a lossless material"
+            )
+        shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
         if self._warp is None:
-            return self._step(Poses(*(_checked(*each) for each in wanted)), jacobian)
-        if jacobian:
-            raise ValueError('a Jacobian is worked out on device "cpu" only')
-        self._warp.solve(
-            *(
-                each[1]
-                if hasattr(each[1], "__dlpack__") and not isinstance(each[1], np.ndarray)
-                else _checked(*each)
-                for each in wanted
+            if sensors is None:
+                sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), shapes[1])
+            return self._cpu.step(
+                _checked("poses", poses, shapes[0]), _checked("sensors", sensors, shapes[1]),
+                jacobian,
+            )  # fmt: skip
+        where, at = (
+            each
+            if each is None or (hasattr(each, "__dlpack__") and not isinstance(each, np.ndarray))
+            else _checked(name, each, shape)
+            for name, each, shape in zip(
+                ("poses", "sensors"), (poses, sensors), shapes, strict=True
             )
         )
-        return FleetReading(self._warp.capacitance, self._warp.delta)
-
-    def _step(self, where: Poses, jacobian: bool) -> FleetReading:
-        """A step on the CPU."""
-        e, s, b = self.count, self.sensors, self.places
-        solver = self._solver
-        m = solver.green.terminals
-        slope = np.zeros((e if jacobian else 0, s, b, m, m, 6))
-        found = Found(np.zeros((e, s, m, m)), np.zeros((e, s)), slope)
-        sensor = Sensor(solver.green, solver.preset.threshold, solver.preset.width, DOUBTFUL)
-        with first_use():
-            in_parts(step_rows, e, self._table.bodies, where, sensor, found)
-        failed = np.flatnonzero(~np.isfinite(found.delta).all(axis=(1, 2, 3)))
-        if len(failed):
-            raise SolveError(
-                f"{len(failed)} of {e} environments have no solution, the first is {failed[0]}: "
-                "look for bodies that coincide"
-            )
-        n, change = self._terminals.electrodes, self._terminals.screened(UNIT * found.delta)
-        slopes = self._terminals.slope(change, UNIT * slope) if jacobian else None
-        change = self._terminals.change(change)
-        shields = (self._terminals.empty + change)[..., :n, n:].sum(axis=-1)
-        change = change[..., :n, :n]
+        core = self._warp
+        core.solve(where, at)
         return FleetReading(
-            self.baseline + change, change, UNIT * found.error, shields, jacobian=slopes
-        )
+            core.capacitance, core.delta, shield_coupling=core.shields,
+            conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
+        )  # fmt: skip
 
     def check(
         self,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled
+from capsense.elements.matter import SHUT
 from capsense.field.green_kernels import Green
 from capsense.surface.gradient_kernels import jacobian
 from capsense.surface.step import solve
@@ -25,13 +26,15 @@ class Bodies(NamedTuple):
     scale: NDArray[Any]
     """How many times as large it is, shape (e, b)."""
     softness: NDArray[Any]
-    """1 / (eps - 1), 0 for conductors, shape (e, b)."""
+    """1 / (eps - 1), complex, 0 for conductors, shape (e, b)."""
     tie: NDArray[Any]
-    """Energy that ties it to ground [1/m], shape (e, b)."""
+    """Energy that ties it to ground [1/m], complex, shape (e, b)."""
     neutral: NDArray[Any]
     """Whether it has no net charge, shape (e, b)."""
     hidden: NDArray[Any]
     """Whether a sensor does not see a place, shape (s, b)."""
+    group: NDArray[Any]
+    """Places that are joined to one conductor have the same number, shape (b,)."""
 
 
 class Sensor(NamedTuple):
@@ -66,39 +69,77 @@ class Found(NamedTuple):
     slope: NDArray[Any]
     """Change with the poses of the bodies in the sensor's frame, see ``gradient_kernels.jacobian``,
     shape (e, s, b, m, m, 6); no environments where it is not asked for."""
+    lossy: NDArray[Any]
+    """Where nothing was solved, as matter has losses, shape (e, s)."""
 
 
 @compiled
 def step_rows(start, stop, bodies, poses, sensor, found):
-    """Solve environments ``start`` to ``stop``."""
+    """Solve environments ``start`` to ``stop``, but for those with losses."""
     sensors, places = poses.sensors.shape[1], bodies.choice.shape[1]
     green, slopes = sensor.green, found.slope.shape[0] > 0
     m = green.terminals
-    seen, place = np.empty(places, bodies.shapes.dtype), np.empty(places, np.int64)
-    turns = np.empty((3, 3)), np.empty((3, 3))
+    room, place = np.empty(places, bodies.shapes.dtype), np.empty(places, np.int64)
     for e in range(start, stop):
         for s in range(sensors):
-            _matrix(poses.sensors[e, s], turns[0])
-            count = 0
-            for b in range(places):
-                if bodies.choice[e, b] >= 0 and not bodies.hidden[s, b]:
-                    record = seen[count : count + 1]
-                    if _placed(bodies, e, b, poses, s, turns, green.room, record):
-                        seen[count].group = count
-                        place[count] = b
-                        count += 1
-            if count == 0:
+            count = seen(bodies, poses, e, s, green.room, room, place)
+            for c in range(count):
+                b = place[c]
+                if bodies.softness[e, b].imag != 0.0 or bodies.tie[e, b].imag != 0.0:
+                    found.lossy[e, s] = True
+            if count == 0 or found.lossy[e, s]:
                 continue
-            out = solve(seen[:count], green, sensor.threshold, sensor.width, slopes)
+            out = solve(room[:count], green, sensor.threshold, sensor.width, slopes)
             doubt = out.delta if out.shift > sensor.doubtful else out.left
             for i in range(m):
                 found.error[e, s] = max(found.error[e, s], abs(doubt[i, i]))
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.size > 0 else np.nan
             if slopes and out.size > 0:
-                slope = jacobian(out, seen[:count], green)
+                slope = jacobian(out, room[:count], green)
                 for c in range(count):
                     found.slope[e, s, place[c]] = slope[c]
+
+
+@compiled
+def seen(bodies, poses, e, s, room, records, place):
+    """Fill the records and places of what a sensor sees, (b,) each.
+
+    Returns:
+        How many it sees.
+    """
+    turns = np.empty((3, 3)), np.empty((3, 3))
+    _matrix(poses.sensors[e, s], turns[0])
+    count = 0
+    for b in range(bodies.choice.shape[1]):
+        if bodies.choice[e, b] >= 0 and not bodies.hidden[s, b]:
+            record = records[count : count + 1]
+            if _placed(bodies, e, b, poses, s, turns, room, record):
+                place[count] = b
+                count += 1
+    for c in range(count):
+        _connect(bodies.group, records[:count], place, c)
+    return count
+
+
+@compiled
+def _connect(groups, records, place, c):
+    """Make a body one conductor with those that it is joined with, as ``Matter.write`` does."""
+    leader, members, grounded, ground = c, 0, False, 0.0
+    for d in range(records.shape[0]):
+        if groups[place[d]] == groups[place[c]]:
+            leader, members = min(leader, d), members + 1
+            if d < c:  # which has the tie of all by now
+                records[c].group = leader
+                records[c].tie, records[c].neutral = records[d].tie, 0
+                return
+            if not records[d].neutral:
+                grounded = grounded or records[d].tie == 0.0
+                ground += 1.0 / records[d].tie if records[d].tie > 0.0 else 0.0
+    records[c].group = leader
+    if members > 1:
+        records[c].neutral = 0
+        records[c].tie = 0.0 if grounded else 1.0 / ground if ground > 0.0 else SHUT
 
 
 @compiled
@@ -136,8 +177,8 @@ def _placed(bodies, e, b, poses, s, turns, room, record):
             for k in range(3):
                 total += turn[k, i] * own[k, j]
             body.rotation[i, j] = total
-    body.scale, body.tie = scale, bodies.tie[e, b]
-    body.neutral, body.softness = bodies.neutral[e, b], bodies.softness[e, b]
-    if body.softness == 0.0:
+    body.scale, body.tie = scale, bodies.tie[e, b].real
+    body.neutral, body.softness = bodies.neutral[e, b], bodies.softness[e, b].real
+    if bodies.softness[e, b] == 0.0:
         body.impedance = 0
     return True

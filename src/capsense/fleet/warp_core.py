@@ -12,10 +12,15 @@ from numpy.typing import NDArray
 from capsense.elements.matter import UNIT
 from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
+from capsense.field.change import Terminals
 from capsense.field.green_kernels import Green
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
+from capsense.fleet import warp_slope as slope
+from capsense.fleet import warp_solve as solution
 from capsense.fleet.step_kernels import Bodies
+from capsense.fleet.warp_chips import WarpChips
+from capsense.readout.readout import Readout
 
 Array = NDArray[np.float64]
 
@@ -25,47 +30,69 @@ class WarpCore:
 
     Args:
         green: Green's function of the design.
-        empty: Maxwell matrix of the m electrodes in the empty domain [F], shape (m, m).
-        screened: Bound of the change of each entry [F], the same shape.
+        terminals: Of the design.
         counts: How many environments, places for bodies, and sensors.
         clusters: Into how many clusters a body is cut.
+        omega: Angular frequency of the excitation [1/s].
         device: Warp's device.
     """
 
     def __init__(
-        self, green: Green, empty: Array, screened: Array, counts: tuple[int, int, int],
-        clusters: int, device: Any,
+        self, green: Green, terminals: Terminals, counts: tuple[int, int, int], clusters: int,
+        omega: float, device: Any,
     ) -> None:  # fmt: skip
-        self.device, self._taken = device, 0
-        self.counts, self.clusters = counts, clusters
-        self.green = _response(green, empty, screened, self.device)
+        self.device, self.counts, self.clusters, self._omega = device, counts, clusters, omega
+        self._taken = 0
+        self._slopes: list[Any] | None = None
+        self.green, self.circuit = _response(green, device), _circuit(terminals, device)
         environments, places, sensors = counts
-        views, n, m = environments * sensors, places * clusters, len(empty)
-
-        def room(*shape: int, dtype: Any = wp.float32) -> Any:
-            return wp.zeros(shape, dtype=dtype, device=self.device)
-
+        views, n, m = environments * sensors, places * clusters, terminals.electrodes
+        room = self.room
         cut = warp_cut.WarpCut()
         cut.pose = room(places, views, dtype=wp.transform)
-        for name in ("node", "split", "number"):
+        for name in ("node", "split", "number", "lifted"):
             setattr(cut, name, room(n, views, dtype=wp.int32))
         for name in ("score", "part", "extent", "beyond", "near"):
             setattr(cut, name, room(n, views))
-        cut.points = room(n, 4, views, dtype=wp.vec3)
+        cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
+        cut.leader = room(places, views, dtype=wp.int32)
+        cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
         self.cut = cut
-        passes = self.green.near_table.shape[1]
+        passes, t = self.green.near_table.shape[1], green.terminals
         self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
-        self.capacitance, self.delta = (room(environments, sensors, m, m) for _ in range(2))
-        self.dropped = room(environments, sensors, dtype=wp.int32)
+        self.loss, self.quadrature = room(n, views), room(n, t, views)
+        self.whole = room(t, t, views, dtype=wp.vec2d)
+        self.capacitance, self.delta, self.conductance = (
+            room(environments, sensors, m, m) for _ in range(3)
+        )
+        self.shields = room(environments, sensors, m, dtype=wp.float64)
+        self.dropped = room(views, dtype=wp.int32)
+        self.poses = room(environments, places, dtype=wp.transform)
+        self.frames = room(environments, sensors, dtype=wp.transform)
+        self.worlds = wp.clone(self.frames)
+        """Frames of sensors that are those of the worlds."""
+        self.worlds.fill_(wp.transform_identity())
+        self.places = warp_cut.Places()
+        for name in ("choice", "neutral"):
+            setattr(self.places, name, room(environments, places, dtype=wp.int32))
+        for name in ("softness", "tie"):
+            setattr(self.places, name, room(environments, places, dtype=wp.vec2))
+        self.places.scale = room(environments, places)
+        self.places.hidden = room(sensors, places, dtype=wp.int32)
+        self.places.group = room(places, dtype=wp.int32)
+
+    def room(self, *shape: int, dtype: Any = wp.float32) -> Any:
+        """An array of zeros on the device."""
+        return wp.zeros(shape, dtype=dtype, device=self.device)
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
-        """Take over what stands where."""
-        places = warp_cut.Places()
-        for name in ("choice", "neutral", "hidden"):
-            setattr(places, name, self._array(getattr(bodies, name), wp.int32))
-        for name in ("scale", "softness", "tie"):
-            setattr(places, name, self._array(getattr(bodies, name), wp.float32))
-        self.places = places
+        """Take over what stands where, in the memory that there is; new shapes take new memory."""
+        for name in ("choice", "neutral", "hidden", "group"):
+            getattr(self.places, name).assign(getattr(bodies, name).astype(np.int32))
+        self.places.scale.assign(bodies.scale.astype(np.float32))
+        for name in ("softness", "tie"):
+            both = getattr(bodies, name).astype(np.complex64).view(np.float32)
+            getattr(self.places, name).assign(both.reshape(*bodies.scale.shape, 2))
         if len(bodies.shapes) != self._taken:
             self.shapes, self._taken = _shapes(shapes, bodies, self._array), len(bodies.shapes)
 
@@ -73,43 +100,80 @@ class WarpCore:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
     def solve(self, bodies: Any, sensors: Any) -> None:
-        """Fill :attr:`capacitance`, :attr:`delta` [F] and :attr:`dropped`; nothing is waited for.
+        """Fill :attr:`capacitance`, :attr:`delta` [F] and what else there is; waits for nothing.
 
         Args:
             bodies: Poses, see :func:`as_transforms`, shape (e, b, 7).
-            sensors: The same of the sensors, shape (e, s, 7).
+            sensors: The same of the sensors, shape (e, s, 7); None for the frames of the worlds.
 
         Raises:
             SceneError: They are of another shape or precision, or on another device.
         """
-        environments, places, count = self.counts
-        bodies = as_transforms(bodies, (environments, places, 7), self.device)
-        sensors = as_transforms(sensors, (environments, count, 7), self.device)
-        views, n, k = self.dropped.size, self.cut.node.shape[0], self.clusters
-        green, cut, at = self.green, self.cut, (self.shapes, self.places)
-        width = self.rows.shape[1]
-        for kernel, dim, arguments in (
-            (warp_cut.choose, (places, views), [*at, green, bodies, sensors, k, cut]),
-            (warp_cut.place, (n, views), [*at, green, count, k, cut]),
-            (kernels.rows, (n, width // warp_cut.WIDTH, views), [green, cut, self.rows]),
-            (kernels.pairs, (n, n, views), [green, cut, k, self.matrix]),
-            (kernels.to_functions, (places, width, views), [cut, k, self.rows]),
-            (kernels.to_functions, (places, n, views), [cut, k, self.matrix]),
-            (kernels.to_functions, (places, n, views), [cut, k, self.matrix.transpose((1, 0, 2))]),
-            (
-                kernels.assemble, (n, n, views),
-                [*at, cut, count, k, green.lead, self.rows, self.matrix],
-            ),
-            (
-                kernels.factorise, views,
-                [cut, self.matrix, green.terminals, self.rows, self.dropped.flatten()],
-            ),
-            (
-                kernels.change, (green.terminals, green.terminals, views),
-                [green, n, self.rows, self.capacitance, self.delta],
-            ),
-        ):  # fmt: skip
-            wp.launch(kernel, dim=dim, inputs=arguments, device=self.device)
+        count, k, places = self.counts[2], self.clusters, self.counts[1]
+        bodies = as_transforms(bodies, self.poses)
+        sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
+        views, n, t = self.dropped.size, self.cut.node.shape[0], self.circuit.rest.shape[0]
+        green, cut, circuit = self.green, self.cut, self.circuit
+        at = (self.shapes, self.places)
+        rows, matrix, whole = self.rows, self.matrix, self.whole
+        width = rows.shape[1]
+        self.launch(warp_cut.choose, (places, views), *at, green, bodies, sensors, k, cut)
+        self.launch(warp_cut.connect, views, self.places, count, k, cut)
+        self.launch(warp_cut.place, (n, views), *at, green, count, k, cut)
+        self.launch(kernels.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
+        self.launch(kernels.pairs, (n, n, views), green, cut, k, matrix)
+        self.launch(kernels.to_functions, (width, views), cut, k, rows)
+        self.launch(kernels.to_functions, (n, views), cut, k, matrix)
+        self.launch(kernels.to_functions, (n, views), cut, k, matrix.transpose((1, 0, 2)))
+        self.launch(
+            kernels.assemble, (n, n, views), *at, cut, count, k, green.lead, rows, matrix, self.loss
+        )
+        self.launch(solution.factorise, views, cut, matrix, self.dropped)
+        self.launch(solution.factorise_lossy, views, cut, matrix, self.loss, self.dropped)
+        self.launch(solution.forward, (t, views), cut, matrix, self.loss, rows, self.quadrature)
+        self.launch(solution.change, (t, t, views), circuit, rows, self.quadrature, whole)
+        self.launch(solution.eliminate, views, circuit, whole)
+        self.launch(
+            solution.report, (circuit.electrodes, views), circuit, self._omega, whole,
+            self.capacitance, self.delta, self.conductance, self.shields,
+        )  # fmt: skip
+
+    def differentiate(self) -> Any:
+        """Derivatives of the last matrices [F/m], [F/rad], shape (e, s, b, n, n, 6)."""
+        environments, places, sensors = self.counts
+        n, views = self.cut.node.shape[:2]
+        circuit, green, cut, k = self.circuit, self.green, self.cut, self.clusters
+        m, t, width = circuit.electrodes, circuit.rest.shape[0], self.rows.shape[1] - green.lead
+        if self._slopes is None:
+            near, far = green.near.shape[0], green.far.shape[0]
+            shapes = (t, m, views), (width, m, views), (near, m, views), (far, m, views)
+            self._slopes = [
+                *(self.room(*shape) for shape in shapes),
+                self.room(n, m, views, dtype=wp.spatial_vector),
+                self.room(views, places, m, m, dtype=wp.spatial_vector),
+            ]
+        turn, sums, near, far, pull, out = self._slopes
+        launch, rows = self.launch, self.rows
+        launch(slope.follow, (m, views), circuit, self.whole, turn)
+        launch(slope.charges, (m, views), circuit, self.matrix, turn, rows)
+        launch(slope.modes, (width, m, views), green.lead, rows, sums)
+        for table, to in ((green.near_table, near), (green.far_table, far)):
+            launch(slope.strengths, to.shape, table, green.lead, turn, sums, to)
+        launch(slope.to_clusters, (m, views), cut, k, rows)
+        launch(slope.forces, (n, m, views), green, cut, k, rows, near, far, pull)
+        launch(slope.slopes, (places, m, views), circuit, cut, k, rows, pull, out)
+        return wp.array(
+            ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
+            shape=(environments, sensors, places, m), device=self.device,
+        )  # fmt: skip
+
+    def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
+        """Chips for all sensors, see :class:`WarpChips`."""
+        return WarpChips(readout, (self.counts[0], self.counts[2]), empty, seed, self.device)
+
+    def launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:
+        """Launch a kernel on the device."""
+        wp.launch(kernel, dim=dim, inputs=list(arguments), device=self.device)
 
 
 def known_device(name: str) -> Any:
@@ -127,31 +191,35 @@ def known_device(name: str) -> Any:
         raise ValueError(f"device is {name!r}; there are {known}") from error
 
 
-def as_transforms(poses: Any, shape: tuple[int, ...], device: Any) -> Any:
-    """Poses, shape (..., 7), as a Warp array of transforms on a device, without a copy if it can.
+def as_transforms(poses: Any, room: Any) -> Any:
+    """Poses, shape (..., 7), as an array of transforms, without a copy if they are on the device.
+
+    Those on the host are copied into ``room``, an array of the shape and device that are wanted.
 
     Raises:
         SceneError: They are of another shape or precision, on another device, or not contiguous.
     """
     if not hasattr(poses, "__dlpack__") or isinstance(poses, np.ndarray):
-        return wp.array(np.ascontiguousarray(poses, np.float32), dtype=wp.transform, device=device)
+        room.assign(np.ascontiguousarray(poses, np.float32))
+        return room
     if not isinstance(poses, wp.array):
         poses = wp.from_dlpack(poses)
-    if (poses.dtype, poses.shape, poses.device) == (wp.transformf, shape[:-1], device):
+    if (poses.dtype, poses.shape, poses.device) == (wp.transformf, room.shape, room.device):
         return poses
-    if (poses.shape, poses.dtype, poses.device) != (shape, wp.float32, device) or (
+    shape = (*room.shape, 7)
+    if (poses.shape, poses.dtype, poses.device) != (shape, wp.float32, room.device) or (
         not poses.is_contiguous
     ):
         raise SceneError(
             f"poses are {poses.dtype.__name__} of shape {poses.shape} on {poses.device}; give "
-            f"contiguous float32 of shape {shape} on {device}"
+            f"contiguous float32 of shape {shape} on {room.device}"
         )
-    out = wp.array(ptr=poses.ptr, dtype=wp.transform, shape=shape[:-1], device=device)
+    out = wp.array(ptr=poses.ptr, dtype=wp.transform, shape=room.shape, device=room.device)
     out.owner = poses  # whose memory it is
     return out
 
 
-def _response(green: Green, empty: Array, screened: Array, device: Any) -> Any:
+def _response(green: Green, device: Any) -> Any:
     out = warp_cut.Response()
     for name in ("near", "far"):
         sources = np.ascontiguousarray(getattr(green, name).T, np.float32)
@@ -159,15 +227,22 @@ def _response(green: Green, empty: Array, screened: Array, device: Any) -> Any:
         parts = np.ascontiguousarray(table.reshape(len(table), -1, warp_cut.WIDTH))
         setattr(out, name, wp.array(sources, dtype=wp.vec3, device=device))
         setattr(out, f"{name}_table", wp.array(parts, dtype=warp_cut.row, device=device))
-    out.lead, out.terminals, out.unit = green.lead, len(empty), UNIT
+    out.lead, out.terminals = green.lead, green.terminals
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blend.tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (
         (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.room)
     )
-    bound = np.minimum(screened, np.finfo(np.float32).max)
-    for name, values in (("empty", empty), ("screened", bound)):
-        setattr(out, name, wp.array(values.astype(np.float32), dtype=wp.float32, device=device))
+    return out
+
+
+def _circuit(terminals: Terminals, device: Any) -> Any:
+    out = solution.Circuit()
+    out.electrodes, out.driven, out.unit = terminals.electrodes, terminals.driven, UNIT
+    for name in ("rest", "empty"):
+        setattr(out, name, wp.array(getattr(terminals, name), dtype=wp.float64, device=device))
+    bound = np.minimum(terminals.bound, np.finfo(np.float32).max).astype(np.float32)
+    out.screened = wp.array(bound, dtype=wp.float32, device=device)
     return out
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import DEEP, GAP, SHORE, STEEP
+from capsense.surface.pair_kernels import LIFTED
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -24,6 +25,7 @@ row = wp.types.vector(length=WIDTH, dtype=wp.float32)
 _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
 _GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in GAP)
+_LIFTED = wp.constant(LIFTED)
 _DEEP, _STEEP, _SHORE = wp.constant(DEEP), wp.constant(STEEP), wp.constant(SHORE)
 
 
@@ -51,9 +53,10 @@ class Places:
 
     choice: wp.array2d(dtype=wp.int32)
     scale: wp.array2d(dtype=wp.float32)
-    softness: wp.array2d(dtype=wp.float32)
-    tie: wp.array2d(dtype=wp.float32)
+    softness: wp.array2d(dtype=wp.vec2)  # complex, as ties are
+    tie: wp.array2d(dtype=wp.vec2)
     neutral: wp.array2d(dtype=wp.int32)
+    group: wp.array(dtype=wp.int32)  # joined places have the same number, (b,)
     hidden: wp.array2d(dtype=wp.int32)  # whether a sensor does not see a place, (s, b)
 
 
@@ -75,9 +78,6 @@ class Response:
     box1: wp.vec3
     room0: wp.vec3
     room1: wp.vec3
-    unit: wp.float32  # 4π eps0 [F/m]
-    empty: wp.array2d(dtype=wp.float32)  # matrix in the empty domain [F]
-    screened: wp.array2d(dtype=wp.float32)  # bound of what it changes by [F]
 
 
 @wp.struct
@@ -91,9 +91,14 @@ class WarpCut:
     part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
     points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
+    unlifted: wp.array3d(dtype=wp.vec3)  # the same before they were lifted off the design
+    lifted: wp.array2d(dtype=wp.int32)  # whether they were, (n, v)
     extent: wp.array2d(dtype=wp.float32)
     beyond: wp.array2d(dtype=wp.float32)
     near: wp.array2d(dtype=wp.float32)  # share of the near sources, (n, v)
+    leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
+    tie: wp.array2d(dtype=wp.vec2)  # energy of the net charge of the leader and all others, (b, v)
+    lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
 
 
 @wp.func
@@ -148,8 +153,6 @@ def choose(
     first = shapes.first[u]
     cut.node[o, v] = first
     cut.score[o, v] = _need(shapes, green, at, scale, first)
-    if places.neutral[e, b] == 0:
-        cut.number[o, v] = 0
     for j in range(1, clusters):
         best = int(0)
         most = float(0.0)
@@ -170,6 +173,45 @@ def choose(
             cut.score[o + j, v] = _need(shapes, green, at, scale, y)
         else:
             cut.score[o + j, v] = 0.0
+
+
+@wp.kernel
+def connect(places: Places, sensors: int, clusters: int, cut: WarpCut):
+    """What ties the bodies of a view to ground; places that are joined are one conductor.
+
+    The leader of a group has the function of its net charge. That of each other member is its own
+    equilibrium charge less the leader's, which is neutral.
+    """
+    v = wp.tid()
+    e = v // sensors
+    lossy = int(0)
+    for b in range(places.group.shape[0]):
+        o = b * clusters
+        leader = int(b)
+        tie = places.tie[e, b]
+        neutral = places.neutral[e, b]
+        if cut.node[o, v] >= 0:
+            members = int(0)
+            grounded = int(0)
+            ground = float(0.0)
+            for c in range(places.group.shape[0]):
+                if places.group[c] == places.group[b] and cut.node[c * clusters, v] >= 0:
+                    leader = wp.min(leader, c)
+                    members += 1
+                    if places.neutral[e, c] == 0:
+                        if places.tie[e, c][0] == 0.0:
+                            grounded = 1
+                        else:
+                            ground += 1.0 / places.tie[e, c][0]
+            if members > 1:
+                neutral = wp.where(grounded == 0 and ground == 0.0, 1, 0)
+                tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
+            cut.number[o, v] = wp.where(leader == b and neutral != 0, -1, 0)
+            if tie[1] != 0.0 or places.softness[e, b][1] != 0.0:
+                lossy = 1
+        cut.leader[b, v] = leader
+        cut.tie[b, v] = tie
+    cut.lossy[v] = lossy
 
 
 @wp.func
@@ -230,11 +272,17 @@ def place(
         deep = depth - _DEEP
     cut.beyond[i, v] = _smooth(wp.max(out, deep) / _SHORE)
     gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
+    lifted = int(0)
     for q in range(4):
         p = wp.transform_point(at, scale * shapes.points[k, q])
+        cut.unlifted[i, q, v] = p
         if green.cover < 1.0:
-            p = _lift(p, gap, green)
+            to = _lift(p, gap, green)
+            if wp.length(to - p) > _LIFTED:
+                lifted = 1
+            p = to
         cut.points[i, q, v] = p
+    cut.lifted[i, v] = lifted
     cut.extent[i, v] = size
     middle = 0.5 * (cut.points[i, 0, v] + cut.points[i, 3, v])
     away = wp.length(_off(middle, green.box0, green.box1))

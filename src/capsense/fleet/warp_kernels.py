@@ -1,4 +1,4 @@
-"""The step of many environments as Warp kernels: potentials, pairs, and the solution.
+"""The step of many environments as Warp kernels: potentials, pairs, and the matrix.
 
 The twin of these kernels is :mod:`capsense.surface.step` with the same cut; see
 :mod:`capsense.fleet.warp_cut` for what they work with. Lengths in metres, 4π eps0 = 1.
@@ -14,8 +14,6 @@ from capsense.surface.pair_kernels import BARRIER, FAR, SOFT
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-_DROPPED = wp.constant(1e-5)
-"""Functions whose pivot is so small against their own energy are left out."""
 _SOFT, _FAR, _BARRIER = wp.constant(SOFT), wp.constant(FAR), wp.constant(BARRIER)
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
 _WIDTH = wp.constant(WIDTH)
@@ -95,13 +93,31 @@ def _mean(cut: WarpCut, i: int, j: int, v: int, mirrored: float, floor: float):
         aw = wp.dot(w, d)
         along = 3.0 * (ax * ax + ay * ay + az * az + aw * aw) * second
         return inverse * (1.0 + 0.5 * (along - whole) * second)
-    bound = _SOFT * wp.max(cut.extent[i, v], cut.extent[j, v])
-    fourth = bound * bound * bound * bound + 1.0e-24
+    fourth = bound(cut, i, j, v)
     total = float(0.0)
     for p in range(4):
         a = cut.points[i, p, v]
         total += _soft(a - b0, fourth) + _soft(a - b1, fourth)
         total += _soft(a - b2, fourth) + _soft(a - b3, fourth)
+    return total / 16.0
+
+
+@wp.func
+def bound(cut: WarpCut, i: int, j: int, v: int):
+    """Fourth power of the distance below which 1/r of two clusters is bounded."""
+    near = _SOFT * wp.max(cut.extent[i, v], cut.extent[j, v])
+    return near * near * near * near + 1.0e-24
+
+
+@wp.func
+def _more(cut: WarpCut, i: int, j: int, v: int):
+    """What two clusters of a body meet each other more for being lifted off the design."""
+    fourth = bound(cut, i, j, v)
+    total = float(0.0)
+    for p in range(4):
+        for q in range(4):
+            total += _soft(cut.points[i, p, v] - cut.points[j, q, v], fourth)
+            total -= _soft(cut.unlifted[i, p, v] - cut.unlifted[j, q, v], fourth)
     return total / 16.0
 
 
@@ -122,6 +138,8 @@ def pairs(green: Response, cut: WarpCut, clusters: int, out: wp.array3d(dtype=wp
         value = -_mean(cut, i, j, v, 1.0, green.floor)
         if i // clusters != j // clusters:
             value += _mean(cut, i, j, v, 0.0, green.floor)
+        elif i != j and cut.lifted[i, v] + cut.lifted[j, v] > 0:
+            value += _more(cut, i, j, v)
         if i == j:
             x = cut.beyond[i, v]
             value += _BARRIER * x * x * x
@@ -132,103 +150,74 @@ def pairs(green: Response, cut: WarpCut, clusters: int, out: wp.array3d(dtype=wp
 @wp.kernel
 def to_functions(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.float32)):
     """Integrate what clusters have in the first index with the charge functions, in place."""
-    b, c, v = wp.tid()
-    o = b * clusters
-    for k in range(clusters - 1):
-        j = clusters - 1 - k
-        if cut.number[o + j, v] >= 0:
-            i = o + cut.split[o + j, v]
-            x = values[i, c, v]
-            y = values[o + j, c, v]
-            p = cut.part[o + j, v]
-            values[i, c, v] = p * x + (1.0 - p) * y
-            values[o + j, c, v] = x - y
+    c, v = wp.tid()
+    for b in range(cut.leader.shape[0]):
+        o = b * clusters
+        for k in range(clusters - 1):
+            j = clusters - 1 - k
+            if cut.number[o + j, v] >= 0:
+                i = o + cut.split[o + j, v]
+                x = values[i, c, v]
+                y = values[o + j, c, v]
+                p = cut.part[o + j, v]
+                values[i, c, v] = p * x + (1.0 - p) * y
+                values[o + j, c, v] = x - y
+        leader = cut.leader[b, v]
+        if leader != b:
+            values[o, c, v] -= values[leader * clusters, c, v]
+
+
+@wp.func
+def _own(shapes: Shapes, places: Places, e: int, b: int, x: int, y: int):
+    """Energy of two functions of a body, complex."""
+    u = places.choice[e, b]
+    place = shapes.block[u] + wp.int64(x * shapes.functions[u] + y)
+    out = wp.vec2(shapes.energy[place], 0.0)
+    inside = places.softness[e, b]
+    if inside[0] != 0.0 or inside[1] != 0.0:
+        out += inside * shapes.impedance[place]
+    return out / places.scale[e, b]
 
 
 @wp.kernel
 def assemble(
     shapes: Shapes, places: Places, cut: WarpCut, sensors: int, clusters: int, lead: int,
     potentials: wp.array3d(dtype=wp.float32), matrix: wp.array3d(dtype=wp.float32),
+    loss: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """The matrix of all functions, its lower half, from their pairs; in place."""
+    """The matrix of all functions from their pairs, in place: its real part in the lower half.
+
+    The imaginary part is in the upper half, and that of the diagonal in ``loss``.
+    """
     f, g, v = wp.tid()
     if g > f:
         return
     e = v // sensors
     x = cut.number[f, v]
     y = cut.number[g, v]
-    if x < 0 or y < 0:
-        matrix[f, g, v] = wp.where(f == g, 1.0, 0.0)
-        return
-    value = matrix[f, g, v]
-    for k in range(lead, potentials.shape[1]):
-        value -= potentials[f, k, v] * potentials[g, k, v]
-    b = f // clusters
-    if b == g // clusters:
-        u = places.choice[e, b]
-        place = shapes.block[u] + wp.int64(x * shapes.functions[u] + y)
-        inside = places.softness[e, b]
-        own = shapes.energy[place]
-        if inside != 0.0:
-            own += inside * shapes.impedance[place]
-        value += own / places.scale[e, b]
-        if x == 0 and y == 0:
-            value += places.tie[e, b]
-    matrix[f, g, v] = value
-
-
-@wp.kernel
-def factorise(
-    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), terminals: int,
-    potentials: wp.array3d(dtype=wp.float32), dropped: wp.array(dtype=wp.int32),
-):  # fmt: skip
-    """Cholesky factor L of every matrix; φ⁰ of the functions is replaced by L⁻¹ φ⁰."""
-    v = wp.tid()
-    n = matrix.shape[0]
-    lost = int(0)
-    for i in range(n):
-        if cut.number[i, v] < 0:
-            for t in range(terminals):
-                potentials[i, t, v] = 0.0
-        else:
-            for j in range(i):
-                total = matrix[i, j, v]
-                for k in range(j):
-                    total -= matrix[i, k, v] * matrix[j, k, v]
-                matrix[i, j, v] = total / matrix[j, j, v]
-            own = matrix[i, i, v]
-            total = own
-            for k in range(i):
-                total -= matrix[i, k, v] * matrix[i, k, v]
-            keep = float(1.0)
-            if total > _DROPPED * wp.abs(own):
-                matrix[i, i, v] = wp.sqrt(total)
-            else:
-                lost += 1
-                keep = 0.0
-                matrix[i, i, v] = 1.0
-                for k in range(i):
-                    matrix[i, k, v] = 0.0
-            for t in range(terminals):
-                right = keep * potentials[i, t, v]
-                for k in range(i):
-                    right -= matrix[i, k, v] * potentials[k, t, v]
-                potentials[i, t, v] = right / matrix[i, i, v]
-    dropped[v] = lost
-
-
-@wp.kernel
-def change(
-    green: Response, functions: int, potentials: wp.array3d(dtype=wp.float32),
-    capacitance: wp.array4d(dtype=wp.float32), delta: wp.array4d(dtype=wp.float32),
-):  # fmt: skip
-    """Maxwell matrices of the electrodes and their change [F], (e, s, m, m)."""
-    i, j, v = wp.tid()
-    e = v // delta.shape[1]
-    s = v % delta.shape[1]
-    total = float(0.0)
-    for f in range(functions):
-        total += potentials[f, i, v] * potentials[f, j, v]
-    total = wp.min(green.unit * total, green.screened[i, j])
-    delta[e, s, i, j] = total
-    capacitance[e, s, i, j] = green.empty[i, j] + total
+    value = wp.vec2(wp.where(f == g, 1.0, 0.0), 0.0)
+    if x >= 0 and y >= 0:
+        value = wp.vec2(matrix[f, g, v], 0.0)
+        for k in range(lead, potentials.shape[1]):
+            value[0] -= potentials[f, k, v] * potentials[g, k, v]
+        b = f // clusters
+        c = g // clusters
+        first = cut.leader[b, v]
+        other = cut.leader[c, v]
+        joined = f == b * clusters and first != b
+        another = g == c * clusters and other != c
+        if b == c:
+            value += _own(shapes, places, e, b, x, y)
+            if x == 0 and y == 0 and not joined:
+                value += cut.tie[b, v]
+        if joined and first == c:
+            value -= _own(shapes, places, e, c, 0, y)
+        if another and other == b:
+            value -= _own(shapes, places, e, b, x, 0)
+        if joined and another and first == other:
+            value += _own(shapes, places, e, first, 0, 0)
+    matrix[f, g, v] = value[0]
+    if f == g:
+        loss[f, v] = value[1]
+    else:
+        matrix[g, f, v] = value[1]

@@ -275,6 +275,11 @@ class CapDac:
         """Code nominally nearest to capacitances [F]."""
         return np.clip(np.rint(capacitance / self.step), 0, self.codes - 1).astype(np.int64)
 
+    def stride(self, law: Law) -> int:
+        """Steps to a new code after a saturated sample: half a converter's range, at least one."""
+        span = abs(float(law.capacitance(np.array(law.high)) - law.capacitance(np.array(law.low))))
+        return max(1, round(0.5 * span / self.step))
+
 
 class Conversion:
     """A converter at work: holds the codes of its offset DAC.
@@ -343,10 +348,8 @@ class Conversion:
 
 def _next_code(dac: CapDac, law: Law, used: Ints, flags: Flags) -> Ints:
     """Half a converter's range up or down, at least one step."""
-    span = abs(float(law.capacitance(np.array(law.high)) - law.capacitance(np.array(law.low))))
-    stride = max(1, round(0.5 * span / dac.step))
     direction = np.where(flags & Range.ABOVE, 1, -1)
-    return np.clip(used + direction * stride, 0, dac.codes - 1)
+    return np.clip(used + direction * dac.stride(law), 0, dac.codes - 1)
 
 
 def quantise(law: Law, capacitance: ArrayLike) -> tuple[Ints, Flags]:

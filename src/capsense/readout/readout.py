@@ -222,13 +222,8 @@ class Readout:
         if values.ndim != 1:
             raise ReadoutError("sample takes one instant; call the readout for a recording")
         now = as_number(time) - self._start
-        if not math.isfinite(now):
-            raise ReadoutError(f"sample at {time!r} s; give a finite time")
-        if self._last is not None and now < self._last[0]:
-            raise ReadoutError(
-                f"sample at {time!r} s, after one at {self._last[0] + self._start:g} s; time must "
-                "not go back: call reset() to begin anew"
-            )
+        last = -math.inf if self._last is None else self._last[0] + self._start
+        self.require_forward(time, last)
         self._require_patience(now)
         before = self._last or (now, values)
         self._last = (now, values)
@@ -282,6 +277,21 @@ class Readout:
         counts = self._report(float(relative[-1]))
         self.reset()
         return counts
+
+    @staticmethod
+    def require_forward(time: float, last: float) -> None:
+        """Refuse a time [s] that is not finite, or before the last one.
+
+        Raises:
+            ReadoutError: It is.
+        """
+        if not math.isfinite(as_number(time)):
+            raise ReadoutError(f"sample at {time!r} s; give a finite time")
+        if time < last:
+            raise ReadoutError(
+                f"sample at {time!r} s, after one at {last:g} s; time must not go back: call "
+                "reset() to begin anew"
+            )
 
     def _require_patience(self, now: float) -> None:
         """Refuse a leap over more conversions than anybody wants at once."""

@@ -15,7 +15,7 @@ _CLOSE = 0.6
 """Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
 BARRIER = 1e6
 """Energy of charge that is out of reach [1/m]."""
-_LIFTED = 1e-5
+LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
 SOFT = 0.15
 """Distance, as a part of the larger extent, below which 1/r of two points is bounded: flat clusters
@@ -80,7 +80,7 @@ def _add_lifted(leaves, out):
     for i in range(n):
         for q in range(4):
             for k in range(3):
-                if abs(points[i, q, k] - true[i, q, k]) > _LIFTED:
+                if abs(points[i, q, k] - true[i, q, k]) > LIFTED:
                     lifted[i] = leaves.within[i] == 0.0
     for i in range(n):
         for j in range(i):

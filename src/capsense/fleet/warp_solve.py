@@ -1,0 +1,206 @@
+"""The step of many environments as Warp kernels: the solution, and what electrodes see of it.
+
+What has losses is complex: a factor has its real part in the lower half of ``matrix`` and its
+imaginary part in the upper one, but for the diagonal's, which is in ``loss``. Functions that are
+dropped have zeros on the diagonal. Lengths in metres, 4π eps0 = 1.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from capsense.fleet.warp_cut import WarpCut
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+_DROPPED = wp.constant(1e-5)
+"""Functions whose pivot is so small against their own energy are left out."""
+
+
+@wp.struct
+class Circuit:
+    """The t terminals of a design, of which k are driven, n of these electrodes."""
+
+    electrodes: wp.int32
+    driven: wp.int32
+    unit: wp.float32  # 4π eps0 [F/m]
+    rest: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
+    empty: wp.array2d(dtype=wp.float64)  # that of the driven ones, the others eliminated, (k, k)
+    screened: wp.array2d(dtype=wp.float32)  # bound of what an entry changes by [F], (t, t)
+
+
+@wp.func
+def times(x: wp.vec2, y: wp.vec2):
+    """Product of complex numbers."""
+    return wp.vec2(x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0])
+
+
+@wp.func
+def over(x: wp.vec2, y: wp.vec2):
+    """Quotient of complex numbers."""
+    return times(x, wp.vec2(y[0], -y[1])) / wp.dot(y, y)
+
+
+@wp.func
+def _root(x: wp.vec2):
+    """Square root of a complex number with a positive real part."""
+    real = wp.sqrt(0.5 * (wp.length(x) + x[0]))
+    return wp.vec2(real, 0.5 * x[1] / real)
+
+
+@wp.kernel
+def factorise(
+    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), dropped: wp.array(dtype=wp.int32)
+):
+    """Cholesky factor L of every real matrix."""
+    v = wp.tid()
+    lost = int(0)
+    if cut.lossy[v] == 0:
+        for i in range(matrix.shape[0]):
+            if cut.number[i, v] >= 0:
+                total = matrix[i, i, v]
+                own = total
+                for j in range(i):
+                    value = matrix[i, j, v]
+                    for k in range(j):
+                        value -= matrix[i, k, v] * matrix[j, k, v]
+                    pivot = matrix[j, j, v]
+                    value = wp.where(pivot > 0.0, value / pivot, 0.0)
+                    matrix[i, j, v] = value
+                    total -= value * value
+                lost += wp.where(total > _DROPPED * wp.abs(own), 0, 1)
+                matrix[i, i, v] = wp.where(total > _DROPPED * wp.abs(own), wp.sqrt(total), 0.0)
+    dropped[v] = lost
+
+
+@wp.kernel
+def factorise_lossy(
+    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
+    dropped: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """Factor L of every complex symmetric matrix L Lᵀ, without pivots: see ``step.eliminate``."""
+    v = wp.tid()
+    if cut.lossy[v] == 0:
+        return
+    lost = int(0)
+    for i in range(matrix.shape[0]):
+        if cut.number[i, v] >= 0:
+            total = wp.vec2(matrix[i, i, v], loss[i, v])
+            own = wp.length(total)
+            for j in range(i):
+                value = wp.vec2(matrix[i, j, v], matrix[j, i, v])
+                for k in range(j):
+                    value -= times(
+                        wp.vec2(matrix[i, k, v], matrix[k, i, v]),
+                        wp.vec2(matrix[j, k, v], matrix[k, j, v]),
+                    )
+                pivot = wp.vec2(matrix[j, j, v], loss[j, v])
+                if pivot[0] > 0.0:
+                    value = over(value, pivot)
+                else:
+                    value = wp.vec2()
+                matrix[i, j, v] = value[0]
+                matrix[j, i, v] = value[1]
+                total -= times(value, value)
+            if total[0] > _DROPPED * own:
+                total = _root(total)
+            else:
+                lost += 1
+                total = wp.vec2()
+            matrix[i, i, v] = total[0]
+            loss[i, v] = total[1]
+    dropped[v] = lost
+
+
+@wp.kernel
+def forward(
+    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
+    potentials: wp.array3d(dtype=wp.float32), quadrature: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Replace φ⁰ of the functions by L⁻¹ φ⁰, whose imaginary part is in ``quadrature``."""
+    t, v = wp.tid()
+    lossy = cut.lossy[v] != 0
+    for i in range(matrix.shape[0]):
+        right = wp.vec2()
+        if cut.number[i, v] >= 0:
+            right[0] = potentials[i, t, v]
+            if lossy:
+                for k in range(i):
+                    right -= times(
+                        wp.vec2(matrix[i, k, v], matrix[k, i, v]),
+                        wp.vec2(potentials[k, t, v], quadrature[k, t, v]),
+                    )
+                pivot = wp.vec2(matrix[i, i, v], loss[i, v])
+                if pivot[0] > 0.0:
+                    right = over(right, pivot)
+                else:
+                    right = wp.vec2()
+            else:
+                for k in range(i):
+                    right[0] -= matrix[i, k, v] * potentials[k, t, v]
+                if matrix[i, i, v] > 0.0:
+                    right[0] = right[0] / matrix[i, i, v]
+                else:
+                    right[0] = 0.0
+        potentials[i, t, v] = right[0]
+        quadrature[i, t, v] = right[1]
+
+
+@wp.kernel
+def change(
+    circuit: Circuit, potentials: wp.array3d(dtype=wp.float32),
+    quadrature: wp.array3d(dtype=wp.float32), whole: wp.array3d(dtype=wp.vec2d),
+):  # fmt: skip
+    """Complex Maxwell matrices of all terminals [F], (t, t, v)."""
+    i, j, v = wp.tid()
+    total = wp.vec2()
+    for f in range(potentials.shape[0]):
+        total += times(
+            wp.vec2(potentials[f, i, v], quadrature[f, i, v]),
+            wp.vec2(potentials[f, j, v], quadrature[f, j, v]),
+        )
+    real = wp.min(circuit.unit * total[0], circuit.screened[i, j])
+    whole[i, j, v] = wp.vec2d(
+        circuit.rest[i, j] + wp.float64(real), wp.float64(circuit.unit * total[1])
+    )
+
+
+@wp.func
+def _times(x: wp.vec2d, y: wp.vec2d):
+    return wp.vec2d(x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0])
+
+
+@wp.kernel
+def eliminate(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d)):
+    """Take floating conductors of the design out of the matrices, the last one first."""
+    v = wp.tid()
+    terminals = whole.shape[0]
+    for step in range(terminals - circuit.driven):
+        p = terminals - 1 - step
+        pivot = whole[p, p, v]
+        inverse = wp.vec2d(pivot[0], -pivot[1]) / wp.dot(pivot, pivot)
+        for i in range(p):
+            share = _times(whole[i, p, v], inverse)
+            for j in range(p):
+                whole[i, j, v] -= _times(share, whole[p, j, v])
+
+
+@wp.kernel
+def report(
+    circuit: Circuit, omega: float, whole: wp.array3d(dtype=wp.vec2d),
+    capacitance: wp.array4d(dtype=wp.float32), delta: wp.array4d(dtype=wp.float32),
+    conductance: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
+):  # fmt: skip
+    """Matrices of the electrodes [F], [S], and what shields couple to them [F]."""
+    i, v = wp.tid()
+    e = v // delta.shape[1]
+    s = v % delta.shape[1]
+    for j in range(circuit.electrodes):
+        value = whole[i, j, v]
+        capacitance[e, s, i, j] = wp.float32(value[0])
+        delta[e, s, i, j] = wp.float32(value[0] - circuit.empty[i, j])
+        conductance[e, s, i, j] = -omega * wp.float32(value[1])
+    total = wp.float64(0.0)
+    for j in range(circuit.electrodes, circuit.driven):
+        total += whole[i, j, v][0]
+    shields[e, s, i] = total

@@ -1,0 +1,85 @@
+"""Gradients on Warp, against simulators with the same functions and central differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cluster_twin import same_functions, twin_of
+from test_fleet import BODIES, frames, poses, scene
+
+from capsense.design import Role, load_design
+from capsense.design.model import Conductor
+from capsense.errors import SceneError
+from capsense.field.cache import default_settings, load_or_build
+from capsense.fleet import Fleet
+
+pytest.importorskip("warp")
+COUNT = 3
+
+
+def against_twin(fleet, where, sensors):
+    """Largest difference of a Jacobian to ``Simulator.step``, over each one's largest entry."""
+    found = fleet.step(where, sensors, jacobian=True).jacobian.numpy()
+    assert found.shape == (*sensors.shape[:2], 3, *fleet.baseline.shape, 6)
+    worst, twin = 0.0, twin_of(fleet)
+    with same_functions(64):
+        for e, s in np.ndindex(sensors.shape[:2]):
+            truth = twin.step(scene(BODIES, where[e], sensors[e, s]), jacobian=True).jacobian
+            for half in (slice(3), slice(3, 6)):
+                miss = np.abs(found[e, s] - truth)[..., half].max()
+                worst = max(worst, miss / np.abs(truth[..., half]).max())
+    return worst
+
+
+def some_poses(seed):
+    rng = np.random.default_rng(seed)
+    where = poses(rng, COUNT, 3)
+    where[..., :3] = [[-0.09, 0.0, 0.06], [0.0, 0.0, 0.055], [0.08, 0.0, 0.06]]
+    where[..., :3] += rng.uniform(-0.01, 0.01, (COUNT, 3, 3))
+    return where, frames(rng, COUNT, 2)
+
+
+def test_jacobians():
+    """Differential: conductors, dielectrics, floating bodies and ties, all of them near."""
+    fleet = Fleet("six_patch", BODIES, COUNT, sensors=2, device="warp:cpu", budget=64)
+    assert against_twin(fleet, *some_poses(1)) < 1e-4
+
+
+def test_jacobian_with_floating_conductors_of_the_design(monkeypatch):
+    """Differential: two electrodes of the design are cut off and float."""
+    whole = load_design("six_patch")
+    field = load_or_build(whole, default_settings(whole))
+    for module in ("capsense.fleet.fleet", "capsense.simulator"):
+        monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: field)
+    loose = [Conductor(x.name, Role.FLOATING, x.surface) for x in whole.electrodes[4:]]
+    design = replace(whole, electrodes=whole.electrodes[:4], conductors=(*whole.conductors, *loose))
+    fleet = Fleet(design, BODIES, COUNT, sensors=2, device="warp:cpu", budget=64)
+    assert against_twin(fleet, *some_poses(2)) < 1e-4
+
+
+def test_jacobian_of_joined_conductors():
+    """Measured: central differences, of two conductors that are one."""
+    bodies = [BODIES[0], BODIES[2]]
+    fleet = Fleet("six_patch", bodies, 1, device="warp:cpu", budget=32)
+    fleet.join([0, 1])
+    where = some_poses(3)[0][:1, [0, 2]]
+    found = fleet.step(where, jacobian=True).jacobian.numpy()[0, 0]
+    scale = np.abs(found[..., :3]).max()
+    for b, k in np.ndindex(2, 3):
+        ends = []
+        for sign in (1, -1):
+            moved = where.copy()
+            moved[0, b, k] += sign * 2e-4
+            ends.append(fleet.step(moved).delta.numpy()[0, 0].astype(float))
+        difference = (ends[0] - ends[1]) / 4e-4
+        np.testing.assert_allclose(found[b, ..., k], difference, rtol=0, atol=0.02 * scale)
+
+
+def test_refused():
+    """Errors name the thing and the fix."""
+    fleet = Fleet("six_patch", BODIES, 1, device="warp:cpu", budget=32)
+    fleet.change(0, replace(BODIES[0], material="water"))
+    with pytest.raises(SceneError, match="lossy matter, which have none yet"):
+        fleet.step(poses(np.random.default_rng(4), 1, 3), jacobian=True)
