@@ -160,3 +160,25 @@ def test_refused(fleet):
         Fleet("six_patch", BODIES, 0)
     with pytest.raises(ValueError, match="preset is 'fast'"):
         Fleet("six_patch", BODIES, 1, preset="fast")
+
+
+@pytest.mark.parametrize("tie", [20e-12, "floating"])
+def test_joined_bodies_are_one_conductor(simulator, tie):
+    """A limb of two capsules that overlap, its capacitance that of both; and a body beside it."""
+    parts = [cs.Body(cs.Capsule(r, 0.05), material="human", grounding=tie) for r in (0.02, 0.025)]
+    fleet = Fleet("six_patch", [BODIES[1], *parts], 2)
+    where = np.zeros((2, 3, 7))
+    where[..., 6] = 1.0
+    where[:, :, 2] = 0.15, 0.07, 0.07
+    where[:, 1:, 3:] = 0.0, 0.5**0.5, 0.0, 0.5**0.5
+    where[:, 1:, 0] = -0.02, 0.03
+    apart = fleet.step(where).delta[0, 0]
+    fleet.join([1, 2])
+    found = fleet.step(where).delta[1, 0]
+    shared = tie if tie == "floating" else tie / 2
+    bodies = [BODIES[1], *(cs.Body(p.shape, material="human", grounding=shared) for p in parts)]
+    truth = simulator.step(scene(bodies, where[0], where[0, 0] * 0 + [0, 0, 0, 0, 0, 0, 1])).delta
+    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-12 * np.abs(truth).max())
+    assert np.abs(apart - truth).max() > 1e-4 * np.abs(truth).max()
+    with pytest.raises(SceneError, match="join: 7 is none of the places 0 to 2"):
+        fleet.join([1, 7])

@@ -19,7 +19,8 @@ import capsense as cs
 from capsense.cli.main import main
 from capsense.errors import MissingDependencyError
 from capsense.learning.labels import Outline
-from capsense.learning.shards import COLUMNS, missing, run, shard_path
+from capsense.learning.scenes import COLUMNS
+from capsense.learning.shards import missing, run
 from capsense.learning.spec import Spec, load_spec
 
 pa = pytest.importorskip("pyarrow")
@@ -59,7 +60,7 @@ def spec_of(folder: Path, text: str = SPEC) -> Spec:
 
 
 def contents(spec: Spec, folder: Path) -> list[bytes]:
-    return [shard_path(spec, folder, k).read_bytes() for k in range(spec.shards)]
+    return [(folder / spec.file(k)).read_bytes() for k in range(spec.shards)]
 
 
 def poses(spec: Spec, number: int) -> list[object]:
@@ -163,8 +164,8 @@ def test_shards_are_the_same_wherever_they_are_made(tmp_path: Path) -> None:
     assert missing(spec, parts) == [0, 2, 3]
     assert run(spec, parts, workers=1) == 8
     assert contents(spec, parts) == expected
-    shard_path(spec, parts, 2).write_bytes(expected[2][:1000])
-    shard_path(spec, parts, 0).unlink()
+    (parts / spec.file(2)).write_bytes(expected[2][:1000])
+    (parts / spec.file(0)).unlink()
     assert run(spec, parts, workers=2) == 6
     assert contents(spec, parts) == expected
     told = json.loads((parts / "manifest.json").read_text())

@@ -34,6 +34,7 @@ class BodyTable:
         self.bodies = Bodies(
             np.zeros(0, BODY), np.zeros(0), np.full(shape, -1), np.ones(shape), np.zeros(shape),
             np.zeros(shape), np.zeros(shape, np.int64), np.zeros((sensors, places), np.bool_),
+            np.arange(places),
         )  # fmt: skip
         self.given = np.full(shape, None, object)
         """The bodies themselves, shape (e, b)."""
@@ -61,19 +62,20 @@ class BodyTable:
         known = {key: self._row(body) for key, body in alike.items()}
         table = self.bodies
         values = [known[id(body)] for body in each]
-        for column, part in zip(table[2:-1], zip(*values, strict=True), strict=True):
+        for column, part in zip(table[2:-2], zip(*values, strict=True), strict=True):
             column[rows, place] = part
         self.given[rows, place] = each
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """See :meth:`Fleet.hide`."""
-        for what, known, given in (
-            ("sensors", self.sensors, [sensor]), ("places", self.places, places),
-        ):  # fmt: skip
-            for number in given:
-                if number not in range(known):
-                    raise SceneError(f"hide: {number!r} is none of the {what} 0 to {known - 1}")
+        _known("hide", "sensors", [sensor], self.sensors)
+        _known("hide", "places", places, self.places)
         self.bodies.hidden[sensor] = np.isin(np.arange(self.places), places)
+
+    def join(self, places: Sequence[int]) -> None:
+        """See :meth:`Fleet.join`."""
+        _known("join", "places", places, self.places)
+        self.bodies.group[list(places)] = min(places, default=0)
 
     def _row(self, body: Body | None) -> tuple[int, float, float, float, int]:
         """Shape, scale, softness, tie and neutrality of a body."""
@@ -113,3 +115,9 @@ class BodyTable:
                 radius=np.append(self.bodies.radius, radius),
             )
         return found
+
+
+def _known(task: str, what: str, given: Sequence[int], count: int) -> None:
+    for number in given:
+        if number not in range(count):
+            raise SceneError(f"{task}: {number!r} is none of the {what} 0 to {count - 1}")

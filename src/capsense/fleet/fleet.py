@@ -93,8 +93,8 @@ class Fleet:
     :meth:`change`. Bodies out of a sensor's sight cost nothing on the CPU.
 
     On the CPU, readings are those of :meth:`Simulator.step` of the same preset; but bodies that
-    touch each other are not joined to one conductor, and bodies longer than the diagonal of the
-    sensor's box are not cut. On Warp every body is cut into as many clusters as ``budget`` says,
+    touch each other are one conductor only where :meth:`join` says so, and bodies longer than the
+    diagonal of the sensor's box are not cut. On Warp every body is cut into as many clusters as ``budget`` says,
     in single precision: the fewer, the faster and the less exact, see :meth:`check`.
 
     Args:
@@ -221,6 +221,23 @@ class Fleet:
         """
         self._table.hide(sensor, places)
         self._take_over()
+
+    def join(self, places: Sequence[int]) -> None:
+        """Take the conductors in some places for one from now on, such as the parts of a limb.
+
+        They are to touch each other. A capacitance to ground that they are given is that of all of
+        them together, and the same for each.
+
+        Args:
+            places: Numbers of the places.
+
+        Raises:
+            SceneError: There is no such place.
+            ValueError: The fleet is on Warp, which knows no joined bodies.
+        """
+        if self._warp is not None:
+            raise ValueError('bodies are joined on device "cpu" only')
+        self._table.join(places)
 
     def _take_over(self) -> None:
         if self._warp is not None:

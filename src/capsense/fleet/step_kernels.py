@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled
 from capsense.surface.gradient_kernels import jacobian
+from capsense.surface.matter import SHUT
 from capsense.surface.place_kernels import Green
 from capsense.surface.step import solve
 
@@ -32,6 +33,8 @@ class Bodies(NamedTuple):
     """Whether it has no net charge, shape (e, b)."""
     hidden: NDArray[Any]
     """Whether a sensor does not see a place, shape (s, b)."""
+    group: NDArray[Any]
+    """First of the places whose conductors are one with that of a place, else itself, shape (b,)."""
 
 
 class Sensor(NamedTuple):
@@ -89,6 +92,7 @@ def step_rows(start, stop, bodies, poses, sensor, found):
                         count += 1
             if count == 0:
                 continue
+            _join(seen[:count], place, bodies.group)
             out = solve(seen[:count], green, sensor.threshold, sensor.width, slopes)
             doubt = out.delta if out.shift > sensor.doubtful else out.left
             for i in range(m):
@@ -99,6 +103,19 @@ def step_rows(start, stop, bodies, poses, sensor, found):
                 slope = jacobian(out, seen[:count], green)
                 for c in range(count):
                     found.slope[e, s, place[c]] = slope[c]
+
+
+@compiled
+def _join(seen, place, group):
+    """Make one conductor of those in places of one group; it holds its charge if it floats."""
+    for i in range(seen.shape[0]):
+        for j in range(i):
+            alike = group[place[i]] == group[place[j]] and seen[j].group == j
+            if alike and seen[i].softness == 0.0 and seen[j].softness == 0.0:
+                seen[i].group = j
+                for k in (i, j):
+                    if seen[k].neutral:
+                        seen[k].neutral, seen[k].tie = False, SHUT
 
 
 @compiled

@@ -29,7 +29,7 @@ _BOUND = 300.0, 3000.0
 """Real permittivities between which displacement current comes to tie a body to ground."""
 _CONTACT = 6.0
 """Size of a body over that of the contact that ties it to ground."""
-_SHUT = 1e8
+SHUT = 1e8
 """Energy [1/m] of the net charge of conductors that touch each other and float together."""
 _UNSEEN = TriMesh | Layers | SurfaceMesh
 """Shapes that are not looked at when it is asked which conductors touch."""
@@ -138,7 +138,7 @@ class Matter:
         none = np.isinf(ties.real)
         shared = none & (members > 1) & self.conducting
         records["neutral"] = none & ~shared
-        records["tie"] = np.where(shared, _SHUT, np.where(none, 0.0, ties.real))
+        records["tie"] = np.where(shared, SHUT, np.where(none, 0.0, ties.real))
         records["group"], records["softness"] = self.group, softness.real
         for record, shape, soft in zip(records, shapes, softness, strict=True):
             if soft == 0:
