@@ -51,12 +51,12 @@ class DistanceSkin:
 class DistanceFollow(LimbFollow):
     """LimbFollow as it is without a field: eps A / d, scaled to be right at the set distance."""
 
-    def _build(self, rng: np.random.Generator) -> None:
-        super()._build(rng)
+    def attach(self) -> None:
+        super().attach()
         usual = PoseEstimator(self.simulator).scene(LimbPose(), Belief().radius)
         right = self.simulator.step(usual).delta.trace()
         scale = float(right / DistanceModel(self.simulator.design).read(usual).sum())
-        self.signals.skin = DistanceSkin(self.signals.skin, scale)  # type: ignore[assignment]
+        self.skin = DistanceSkin(self.skin, scale)  # type: ignore[assignment]
 
 
 def train(kind: str, steps: int, folder: Path) -> dict[str, Any]:

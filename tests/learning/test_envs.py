@@ -150,8 +150,8 @@ def test_latency_and_noise_are_as_set() -> None:
     shape = dataclasses.replace(middle, noise=(0.0, 0.0), drift=(0.0, 0.0), gain=(0.0, 0.0))
     env = gymnasium.make(FOLLOW, randomisation=shape, chip="fdc2214").unwrapped
     observation, _ = env.reset(seed=0)
-    truth = np.diag(env.signals.skin.read()["pad"].delta) * 1e14
-    tare = 1e14 * env.signals._tare["pad"] - 1e14 * np.diag(env.simulator.baseline)
+    truth = np.diag(env.skin.read()["pad"].delta) * 1e14
+    tare = 1e14 * env.signals.tare["pad"] - 1e14 * np.diag(env.simulator.baseline)
     assert observation[:6] == pytest.approx(truth - tare, abs=0.15)
 
 

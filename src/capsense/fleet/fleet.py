@@ -94,8 +94,9 @@ class Fleet:
 
     On the CPU, readings are those of :meth:`Simulator.step` of the same preset; but bodies that
     touch each other are one conductor only where :meth:`join` says so, and bodies longer than the
-    diagonal of the sensor's box are not cut. On Warp every body is cut into as many clusters as ``budget`` says,
-    in single precision: the fewer, the faster and the less exact, see :meth:`check`.
+    diagonal of the sensor's box are not cut. On Warp every body is cut into as many clusters as
+    ``budget`` says, in single precision: the fewer, the faster and the less exact, see
+    :meth:`check`.
 
     Args:
         design: A design, its name, or the path of its file.

@@ -34,7 +34,7 @@ class Bodies(NamedTuple):
     hidden: NDArray[Any]
     """Whether a sensor does not see a place, shape (s, b)."""
     group: NDArray[Any]
-    """First of the places whose conductors are one with that of a place, else itself, shape (b,)."""
+    """First of the places that are one conductor with a place, else itself, shape (b,)."""
 
 
 class Sensor(NamedTuple):

@@ -83,9 +83,7 @@ class Episodes(DataSet):
         """Number the frames through, and write LeRobot's ``meta/``."""
         told = self.about()
         lerobot.numbered(folder, self.shards)
-        lerobot.write_meta(
-            folder, self.name, told["features"], told["fps"], self.task, self.shards
-        )
+        lerobot.write_meta(folder, self.name, told["features"], told["fps"], self.task, self.shards)
 
     def make(self) -> Any:
         """The environment.
@@ -95,8 +93,9 @@ class Episodes(DataSet):
                 boxes, or its episodes need not end.
             MissingDependencyError: Gymnasium or MuJoCo is not installed.
         """
-        import capsense.learning.envs  # noqa: F401, it registers them
         import gymnasium
+
+        import capsense.learning.envs  # noqa: F401, it registers them
 
         limit = {} if self.steps is None else {"max_episode_steps": self.steps}
         try:
@@ -172,8 +171,8 @@ def described(env: Any) -> tuple[lerobot.Features, int]:
     world = env.unwrapped
     names = [getattr(world, f"{what}_names", None) for what in ("observation", "action")]
     out = {
-        "observation.state": lerobot.feature("float32", *env.observation_space.shape, names[0]),
-        "action": lerobot.feature("float32", *env.action_space.shape, names[1]),
+        "observation.state": lerobot.feature("float32", env.observation_space.shape[0], names[0]),
+        "action": lerobot.feature("float32", env.action_space.shape[0], names[1]),
         "next.reward": lerobot.feature("float32"), "next.done": lerobot.feature("bool"),
     }  # fmt: skip
     for name, value in facts.items():

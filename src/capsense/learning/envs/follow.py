@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,10 @@ NEAR, TURN = 0.05, math.radians(20.0)
 """Errors [m], [rad] that each lower the reward to 1/e."""
 LOST = 0.15
 """The episode ends where the pad is further away than this from where it should be [m]."""
+CLEAR = 0.02
+"""The pad begins no nearer to the arm than this [m]: it is raised where it would."""
+_RAISES = 3
+"""So often, as the nearest points of both move meanwhile."""
 EFFORT = 0.01
 """What the square of an action costs."""
 
@@ -52,6 +57,9 @@ class LimbFollow(CapacitiveEnv):
     def start(self) -> None:
         yaw, pitch, _ = self.astray(turned=True)
         self.data.qpos[:] = 0.0, 0.0, self.radius + GAP, yaw, pitch
+        for _ in range(_RAISES):
+            mujoco.mj_forward(self.model, self.data)
+            self.data.qpos[2] += max(0.0, CLEAR - self.clearance())
 
     def limb_pose(self, time: float) -> Pose:
         y, z, yaw, pitch = (
