@@ -179,6 +179,27 @@ def test_shards_are_the_same_wherever_they_are_made(tmp_path: Path) -> None:
     assert not [p for p in parts.rglob("*") if p.name.endswith(".part")]
 
 
+def test_a_late_start_leaves_a_complete_manifest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A job that finds no manifest, and dies after others have completed the set meanwhile."""
+    spec, out, about = spec_of(tmp_path), tmp_path / "out", Spec.about
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def late(self: Spec) -> dict[str, Any]:
+        monkeypatch.setattr(Spec, "about", about)
+        assert run(spec_of(tmp_path), out, workers=1) == 11
+        monkeypatch.setattr(Spec, "finish", die)
+        return about(self)
+
+    monkeypatch.setattr(Spec, "about", late)
+    with pytest.raises(KeyboardInterrupt):
+        run(spec, out, workers=1)
+    assert json.loads((out / "manifest.json").read_text())["complete"]
+
+
 def test_a_shard_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = spec_of(tmp_path)
 

@@ -26,6 +26,7 @@ _RAISES = 3
 """So often, as the nearest points of both move meanwhile."""
 EFFORT = 0.01
 """What the square of an action costs."""
+_TO_X = Pose.from_euler((0, 0, 0), (0, math.pi / 2, 0))
 
 
 class LimbFollow(CapacitiveEnv):
@@ -52,6 +53,7 @@ class LimbFollow(CapacitiveEnv):
         self.radius = 0.5 * (build.radius("forearm") + build.radius("wrist"))
         """Of the middle of the forearm [m]."""
         self._middle = build.length("upper arm") + 0.5 * build.length("forearm")
+        self._hang = _TO_X @ Pose((0, 0, self._middle))
         return {}
 
     def start(self) -> None:
@@ -68,7 +70,7 @@ class LimbFollow(CapacitiveEnv):
         )
         x0, y0, z0 = self._rest
         middle = Pose.from_euler((x0, y + y0, z + 0.5 * z0), (0.0, pitch, yaw))
-        return middle @ Pose.from_euler((0, 0, 0), (0, math.pi / 2, 0)) @ Pose((0, 0, self._middle))
+        return middle @ self._hang
 
     def judge(self, action: Array, force: float) -> tuple[float, bool, dict[str, Any]]:
         pose = Pose(self.data.mocap_pos[0], self.data.mocap_quat[0][[1, 2, 3, 0]])

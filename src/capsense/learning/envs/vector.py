@@ -96,12 +96,15 @@ class FleetSkin:
         """
         poses = self._local.copy()
         poses[..., 2] += _FAR
-        for n in numbers:
-            data = self._worlds[n].data
-            poses[n] = _moved(data.xpos[self._frames], data.xquat[self._frames][:, _LAST],
-                              self._local[n])  # fmt: skip
+        rows = list(numbers)
+        data = [self._worlds[n].data for n in rows]
+        position = np.array([d.xpos for d in data])[:, self._frames]
+        quaternion = np.array([d.xquat for d in data])[:, self._frames][..., _LAST]
+        poses[rows] = _moved(position, quaternion, self._local[rows])
         sensors = poses[:, self._places :].copy()
-        sensors[[n for n in range(len(poses)) if n not in set(numbers)], :, 2] -= 2 * _FAR
+        others = np.ones(len(poses), np.bool_)
+        others[rows] = False
+        sensors[others, :, 2] -= 2 * _FAR
         found = self._fleet.step(poses[:, : self._places], sensors)
         matrix, delta = (
             a if isinstance(a, np.ndarray) else a.numpy().astype(float)
@@ -286,11 +289,11 @@ def _seven(pose: Pose) -> list[float]:
 
 
 def _moved(position: Array, quaternion: Array, local: Array) -> Array:
-    """Poses in the world of what is fixed to moving frames, shape (n, 7)."""
-    u, w = quaternion[:, :3], quaternion[:, 3:]
-    v, s = local[:, 3:6], local[:, 6:]
-    arm = local[:, :3]
+    """Poses in the world of what is fixed to moving frames, shape (..., 7)."""
+    u, w = quaternion[..., :3], quaternion[..., 3:]
+    v, s = local[..., 3:6], local[..., 6:]
+    arm = local[..., :3]
     turned = arm + 2.0 * np.cross(u, np.cross(u, arm) + w * arm)
     vector = w * v + s * u + np.cross(u, v)
-    scalar = w * s - (u * v).sum(axis=1, keepdims=True)
-    return np.hstack([position + turned, vector, scalar])
+    scalar = w * s - (u * v).sum(axis=-1, keepdims=True)
+    return np.concatenate([position + turned, vector, scalar], axis=-1)
