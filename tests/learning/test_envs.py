@@ -254,7 +254,7 @@ def test_side_by_side_refuses() -> None:
 
 
 def test_follower_begins_clear_of_the_arm() -> None:
-    """Whatever is drawn: seeds 10004 and 10013 began in touch when nothing raised the pad."""
+    """Whatever is drawn: seeds 10014 and 10018 began in touch when nothing raised the pad."""
     env = gymnasium.make(FOLLOW).unwrapped
     for seed in range(10_000, 10_020):
         env.prepare(seed)
