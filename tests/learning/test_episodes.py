@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ seed = 5
 [options.randomisation]
 girth = [0.9, 1.1]
 """
+ROOT = Path(__file__).parents[2]
 AWAY = "def act(observation):\n    return [0.0, 0.2, 1.0, 0.0, 0.0]\n"
 """Some episodes end early, as the pad is lost."""
 
@@ -175,6 +177,18 @@ def test_a_policy_that_changed_is_another_data_set(tmp_path: Path) -> None:
     before = spec_of(tmp_path).identity
     (tmp_path / "away.py").write_text(AWAY.replace("1.0", "0.9"))
     assert load_episodes(tmp_path / "spec.toml").identity != before
+
+
+def test_the_page_s_file_and_the_example_hold(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "learning.md").read_text(encoding="utf-8")
+    text = page.partition("### Episodes for LeRobot")[2].partition("```toml\n")[2]
+    shutil.copy(ROOT / "examples" / "policies.py", tmp_path)
+    shown = spec_of(tmp_path, text.partition("```")[0])
+    example = load_episodes(ROOT / "examples" / "datasets" / "follow.toml")
+    assert shown.count == example.count == 1000
+    assert {**shown.settings, "policy": "", "files": {}} == {
+        **example.settings, "policy": "", "files": {},
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
