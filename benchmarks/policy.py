@@ -178,7 +178,7 @@ def main() -> None:
     """Train, judge, and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--steps", type=int, default=25_000)
+    parser.add_argument("--steps", type=int, default=14_000)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     import torch

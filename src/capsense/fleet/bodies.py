@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.fleet.step_kernels import Bodies
@@ -14,6 +14,9 @@ from capsense.surface.matter import matter_of
 from capsense.surface.place_kernels import BODY
 from capsense.surface.rigid import RigidShape
 from capsense.surface.solver import SurfaceSolver
+
+_QUATERNION = 1e-3
+"""Quaternions may be longer or shorter than 1 by so much; they are made 1 long."""
 
 
 class BodyTable:
@@ -121,3 +124,26 @@ def _known(task: str, what: str, given: Sequence[int], count: int) -> None:
     for number in given:
         if number not in range(count):
             raise SceneError(f"{task}: {number!r} is none of the {what} 0 to {count - 1}")
+
+
+def checked_poses(what: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Poses of a shape, finite, with quaternions of length 1.
+
+    Raises:
+        SceneError: They are not.
+    """
+    poses = np.array(values, float)
+    if poses.shape != shape:
+        raise SceneError(f"{what} has shape {poses.shape}; give {shape}")
+    if not np.isfinite(poses).all():
+        place = tuple(np.argwhere(~np.isfinite(poses))[0].tolist())
+        raise SceneError(f"{what}{list(place)} is {poses[place]}; poses must be finite")
+    length = np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
+    if (np.abs(length - 1.0) > _QUATERNION).any():
+        place = tuple(np.argwhere(np.abs(length - 1.0) > _QUATERNION)[0].tolist())
+        raise SceneError(
+            f"the quaternion of {what}{list(place[:-1])} is {length[place]:g} long; give (x, y, z, "
+            "w) of length 1"
+        )
+    poses[..., 3:] /= length
+    return poses

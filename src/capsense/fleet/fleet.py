@@ -23,7 +23,7 @@ from capsense.errors import (
 )
 from capsense.field.cache import default_settings, load_or_build
 from capsense.field.change import Terminals
-from capsense.fleet.bodies import BodyTable
+from capsense.fleet.bodies import BodyTable, checked_poses
 from capsense.fleet.step_kernels import Found, Poses, Sensor, step_rows
 from capsense.readout.counts import Held
 from capsense.readout.readout import Readout
@@ -37,10 +37,6 @@ if TYPE_CHECKING:
     from capsense.fleet.warp_core import WarpCore
 
 Array = NDArray[np.float64]
-
-_QUATERNION = 1e-3
-"""Quaternions may be longer or shorter than 1 by so much; they are made 1 long."""
-
 
 _PANELS = 5
 """Panels of a shape for each cluster that a body is cut into on Warp."""
@@ -317,14 +313,14 @@ class Fleet:
             sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7))
         wanted = (("poses", poses, (e, b, 7)), ("sensors", sensors, (e, s, 7)))
         if self._warp is None:
-            return self._step(Poses(*(_checked(*each) for each in wanted)), jacobian)
+            return self._step(Poses(*(checked_poses(*each) for each in wanted)), jacobian)
         if jacobian:
             raise ValueError('a Jacobian is worked out on device "cpu" only')
         self._warp.solve(
             *(
                 each[1]
                 if hasattr(each[1], "__dlpack__") and not isinstance(each[1], np.ndarray)
-                else _checked(*each)
+                else checked_poses(*each)
                 for each in wanted
             )
         )
@@ -376,8 +372,8 @@ class Fleet:
             SolveError: As by :meth:`step`.
         """
         e, s, b = self.count, self.sensors, self.places
-        where = _checked("poses", poses, (e, b, 7))
-        at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
+        where = checked_poses("poses", poses, (e, b, 7))
+        at = None if sensors is None else checked_poses("sensors", sensors, (e, s, 7))
         delta = self.solved(where, at).delta
         found = delta if self._warp is None else delta.numpy()
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
@@ -399,21 +395,3 @@ class Fleet:
             tuple(drawn.tolist()), float(np.sqrt((errors**2).mean())), float(np.abs(errors).max()),
             (int(drawn[row]), int(j)),
         )  # fmt: skip
-
-
-def _checked(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    poses = np.array(values, float)
-    if poses.shape != shape:
-        raise SceneError(f"{what} has shape {poses.shape}; give {shape}")
-    if not np.isfinite(poses).all():
-        place = tuple(np.argwhere(~np.isfinite(poses))[0].tolist())
-        raise SceneError(f"{what}{list(place)} is {poses[place]}; poses must be finite")
-    length = np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
-    if (np.abs(length - 1.0) > _QUATERNION).any():
-        place = tuple(np.argwhere(np.abs(length - 1.0) > _QUATERNION)[0].tolist())
-        raise SceneError(
-            f"the quaternion of {what}{list(place[:-1])} is {length[place]:g} long; give (x, y, z, "
-            "w) of length 1"
-        )
-    poses[..., 3:] /= length
-    return poses
