@@ -1,9 +1,10 @@
-"""A policy for LimbFollow-v0, trained on the field or on the distance model, judged on the field.
+"""Policies for LimbFollow-v0, trained on the field or on the distance model, judged on the field.
 
-``python benchmarks/policy.py OUT`` trains two policies by soft actor-critic (SAC of
-Stable-Baselines3), one after the other, each for so many steps of the environment, on one core,
-and writes ``policy.json``, ``policy.md`` and ``policy.png``. A policy that is there already is not
-trained again. Needs ``pip install "capsense[train]"``.
+``python benchmarks/policy.py OUT`` trains by soft actor-critic (SAC of Stable-Baselines3), one
+training after the other, each for so many steps of the environment, on one core: three on the field
+and three on the distance model, which differ in their seeds. It writes ``policy.json``,
+``policy.md`` and ``policy.png``. What was trained already is not trained again. Needs
+``pip install "capsense[train]"``.
 """
 
 from __future__ import annotations
@@ -13,21 +14,25 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
 from distance_model import DistanceModel
 from machine import describe_machine, on_one_core
-from servoing import mean
 
 import capsense as cs
 from capsense._style import COLOURS, LEGEND, dress
 from capsense.learning.envs.follow import LimbFollow
+from capsense.learning.envs.vector import LimbFollowVector
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator
 
 STEPS = 250
 """Of an episode."""
+KINDS, TRAININGS = ("field", "distance"), (1, 2, 3)
+"""What policies are trained on, and the seeds of trainings."""
+DRAWS = 4000
+"""Of the bootstrap."""
 SEEDS = range(10_000, 10_020)
 """Of the episodes that policies are judged on; training does not see them."""
 
@@ -51,59 +56,61 @@ class DistanceSkin:
 class DistanceFollow(LimbFollow):
     """LimbFollow as it is without a field: eps A / d, scaled to be right at the set distance."""
 
-    def _build(self, rng: np.random.Generator) -> None:
-        super()._build(rng)
+    def attach(self) -> None:
+        super().attach()
         usual = PoseEstimator(self.simulator).scene(LimbPose(), Belief().radius)
         right = self.simulator.step(usual).delta.trace()
         scale = float(right / DistanceModel(self.simulator.design).read(usual).sum())
-        self.signals.skin = DistanceSkin(self.signals.skin, scale)  # type: ignore[assignment]
+        self.skin = DistanceSkin(self.skin, scale)  # type: ignore[assignment]
 
 
-def train(kind: str, steps: int, folder: Path) -> dict[str, Any]:
+def train(kind: str, seed: int, steps: int, folder: Path) -> dict[str, Any]:
     """Train one policy; its learning curve: steps made and the return at each episode's end."""
     from gymnasium.wrappers import TimeLimit
     from stable_baselines3 import SAC
     from stable_baselines3.common.monitor import Monitor
 
-    curve = folder / f"{kind}.json"
+    curve = folder / f"{kind}-{seed}.json"
     if curve.is_file():
         return json.loads(curve.read_text())
     world = {"field": LimbFollow, "distance": DistanceFollow}[kind]
     env = Monitor(TimeLimit(world(), STEPS))
     model = SAC(
-        "MlpPolicy", env, seed=1, policy_kwargs={"net_arch": [64, 64]}, learning_starts=1000,
+        "MlpPolicy", env, seed=seed, policy_kwargs={"net_arch": [64, 64]}, learning_starts=1000,
         batch_size=128, gamma=0.98, learning_rate=1e-3, train_freq=2, gradient_steps=1,
     )  # fmt: skip
-    start = perf_counter()
+    start, begun = perf_counter(), process_time()
     model.learn(steps)
     out = {"steps": np.cumsum(env.get_episode_lengths()).tolist(),
-           "returns": env.get_episode_rewards(), "seconds": perf_counter() - start}  # fmt: skip
-    model.save(folder / f"{kind}.zip")
+           "returns": env.get_episode_rewards(), "seconds": perf_counter() - start,
+           "processor": process_time() - begun}  # fmt: skip
+    model.save(folder / f"{kind}-{seed}.zip")
     curve.write_text(json.dumps(out))
     return out
 
 
-def judged(policy: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
-    """Return and errors of a policy on the field, of every episode."""
-    env, rows = LimbFollow(), []
-    for seed in SEEDS:
-        observation, _ = env.reset(seed=seed)
-        total, errors, angles, touched = 0.0, [], [], False
-        for _ in range(STEPS):
-            observation, reward, over, _, facts = env.step(policy(observation))
-            total += float(reward)
-            errors.append(100 * facts["error"])
-            angles.append(np.degrees(facts["angle"]))
-            touched |= facts["force"] > 0
-            if over:
-                break
-        rows.append((total, np.mean(errors), np.mean(angles), over, touched))
-    names = ("return", "error", "angle", "lost", "touched")
-    return dict(zip(names, np.array(rows, dtype=float).T.tolist(), strict=True))
+def judged(policy: Callable[[np.ndarray], np.ndarray]) -> dict[str, list[float]]:
+    """Return and errors of a policy on the field, of every episode; all go side by side."""
+    n = len(SEEDS)
+    envs = LimbFollowVector(n)
+    observation, _ = envs.reset(seed=list(SEEDS))
+    going, steps = np.ones(n, bool), np.zeros(n)
+    sums = {name: np.zeros(n) for name in ("return", "error", "angle", "lost", "touched")}
+    for _ in range(STEPS):
+        observation, reward, over, _, facts = envs.step(policy(observation))
+        steps += going
+        for name, value in (("return", reward), ("error", 100 * facts["error"]),
+                            ("angle", np.degrees(facts["angle"])), ("lost", over)):  # fmt: skip
+            sums[name] += np.where(going, value, 0.0)
+        sums["touched"] = np.where(going & (facts["force"] > 0), 1.0, sums["touched"])
+        going &= ~over
+    for name in ("error", "angle"):
+        sums[name] /= steps
+    return {name: values.tolist() for name, values in sums.items()}
 
 
-def policies(folder: Path) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
-    """Those that were trained, one by hand-set gains, and none."""
+def policies(folder: Path) -> dict[str, list[Callable[[np.ndarray], np.ndarray]]]:
+    """Those that were trained, one by hand-set gains, and none; of batches of observations."""
     import sys
 
     from stable_baselines3 import SAC
@@ -111,37 +118,57 @@ def policies(folder: Path) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
     sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
     from policies import follow
 
-    out: dict[str, Callable[[np.ndarray], np.ndarray]] = {}
-    for kind in ("field", "distance"):
-        model = SAC.load(folder / f"{kind}.zip")
-        out[f"trained on the {kind}"] = lambda x, m=model: m.predict(x, deterministic=True)[0]
-    return {**out, "hand-set gains": follow, "idle": lambda _: np.zeros(5, np.float32)}
+    out: dict[str, list[Callable[[np.ndarray], np.ndarray]]] = {}
+    for kind in KINDS:
+        models = [SAC.load(folder / f"{kind}-{seed}.zip") for seed in TRAININGS]
+        out[f"trained on the {kind}"] = [
+            lambda x, m=model: m.predict(x, deterministic=True)[0] for model in models
+        ]
+    return {
+        **out,
+        "hand-set gains": [lambda x: np.array([follow(one) for one in x])],
+        "idle": [lambda x: np.zeros((len(x), 5), np.float32)],
+    }
 
 
-def table(results: Mapping[str, Mapping[str, list[float]]]) -> str:
-    """Markdown: means with 95 % intervals by the bootstrap over episodes."""
-    lines = ["| | return | error of place [cm] | angle [°] | lost | touched |",
-             "|---|---|---|---|---|---|"]  # fmt: skip
+def interval(values: list[list[float]]) -> tuple[float, float, float]:
+    """Mean and its 95 % interval, by the bootstrap over trainings and over episodes in each."""
+    data, rng = np.array(values), np.random.default_rng(0)
+    trainings, episodes = data.shape
+    rows = rng.integers(trainings, size=(DRAWS, trainings, 1))
+    columns = rng.integers(episodes, size=(DRAWS, trainings, episodes))
+    low, high = np.percentile(data[rows, columns].mean(axis=(1, 2)), (2.5, 97.5))
+    return float(data.mean()), float(low), float(high)
+
+
+def table(results: Mapping[str, list[Mapping[str, list[float]]]]) -> str:
+    """Markdown: means with 95 % intervals, and the return of each training."""
+    lines = ["| | return | of each training | error of place [cm] | angle [°] | lost | touched |",
+             "|---|---|---|---|---|---|---|"]  # fmt: skip
     for name, found in results.items():
-        cells = ["{:.1f} ({:.1f}–{:.1f})".format(*mean(found[k])) for k in
-                 ("return", "error", "angle")]  # fmt: skip
-        counts = [f"{sum(found[k]):.0f} of {len(found[k])}" for k in ("lost", "touched")]
-        lines.append(f"| {name} | {' | '.join(cells + counts)} |")
+        cells = {k: "{:.1f} ({:.1f}–{:.1f})".format(*interval([f[k] for f in found]))
+                 for k in ("return", "error", "angle")}  # fmt: skip
+        each = ", ".join(f"{np.mean(f['return']):.0f}" for f in found) if len(found) > 1 else ""
+        counts = [f"{sum(sum(f[k]) for f in found):.0f} of {sum(len(f[k]) for f in found)}"
+                  for k in ("lost", "touched")]  # fmt: skip
+        told = [cells["return"], each, cells["error"], cells["angle"], *counts]
+        lines.append(f"| {name} | {' | '.join(told)} |")
     return "\n".join(lines) + "\n"
 
 
-def plot(curves: Mapping[str, Mapping[str, Any]], file: Path) -> None:
+def plot(curves: Mapping[str, list[Mapping[str, Any]]], file: Path) -> None:
     """Return of the training episodes against steps, mean of ten."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 3.2), layout="constrained")
     axis = figure.subplots()
-    for n, (kind, curve) in enumerate(curves.items()):
-        steps, returns = np.array(curve["steps"]), np.array(curve["returns"])
-        axis.plot(steps, returns, ".", color=COLOURS[n], ms=3, alpha=0.3)
-        smooth = np.convolve(returns, np.ones(10) / 10, "valid")
-        label = f"trained and read on the {kind}"
-        axis.plot(steps[9:], smooth, color=COLOURS[n], label=label)
+    for n, (kind, trainings) in enumerate(curves.items()):
+        for k, curve in enumerate(trainings):
+            steps, returns = np.array(curve["steps"]), np.array(curve["returns"])
+            axis.plot(steps, returns, ".", color=COLOURS[n], ms=3, alpha=0.2)
+            smooth = np.convolve(returns, np.ones(10) / 10, "valid")
+            label = None if k else f"trained and read on the {kind}"
+            axis.plot(steps[9:], smooth, color=COLOURS[n], label=label)
     dress(axis, "steps of the environment", "return of an episode")
     axis.legend(**LEGEND)
     figure.savefig(file, dpi=130)
@@ -151,20 +178,25 @@ def main() -> None:
     """Train, judge, and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--steps", type=int, default=32_000)
+    parser.add_argument("--steps", type=int, default=14_000)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     import torch
 
     torch.set_num_threads(1)
-    curves = {k: train(k, options.steps, options.folder) for k in ("field", "distance")}
-    for kind, curve in curves.items():
-        print(f"{kind}: {curve['steps'][-1]} steps in {curve['seconds']:.0f} s")
-    results = {name: judged(policy) for name, policy in policies(options.folder).items()}
+    curves: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
+    for seed in TRAININGS:
+        for kind, trained in curves.items():
+            trained.append(train(kind, seed, options.steps, options.folder))
+            one = trained[-1]
+            print(f"{kind}, seed {seed}: {one['steps'][-1]} steps in {one['seconds']:.0f} s, "
+                  f"{one['processor']:.0f} s of the processor", flush=True)  # fmt: skip
+    found = policies(options.folder)
+    results = {name: [judged(policy) for policy in some] for name, some in found.items()}
     text = table(results)
-    seconds = {kind: curve["seconds"] for kind, curve in curves.items()}
+    times = {k: [(c["seconds"], c["processor"]) for c in some] for k, some in curves.items()}
     machine = describe_machine(("capsense", "stable-baselines3", "torch"))
-    facts = {"machine": machine, "results": results, "seconds": seconds}
+    facts = {"machine": machine, "results": results, "seconds": times}
     (options.folder / "policy.json").write_text(json.dumps(facts, indent=1))
     (options.folder / "policy.md").write_text(text)
     plot(curves, options.folder / "policy.png")

@@ -95,7 +95,7 @@ class LimbRide(CapacitiveEnv):
     def judge(self, action: Array, force: float) -> tuple[float, bool, dict[str, Any]]:
         """No reward; facts: the limb's ``pose`` before the sensor, ``way`` made along it [m]."""
         names = (f"_{self.lower}_", f"_{self.upper}_")
-        seen = [b for b in self.signals.skin.sensors["pad"].scene()
+        seen = [b for b in self.skin.sensors["pad"].scene()
                 if any(n in str(b.name) for n in names)]  # fmt: skip
         place = self.site_frame("pad")[0]
         way = self._sways(self.data.time).inverse().apply(place)[0] + 0.5 * self.length - FIRST

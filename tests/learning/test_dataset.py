@@ -19,7 +19,8 @@ import capsense as cs
 from capsense.cli.main import main
 from capsense.errors import MissingDependencyError
 from capsense.learning.labels import Outline
-from capsense.learning.shards import COLUMNS, missing, run, shard_path
+from capsense.learning.scenes import COLUMNS
+from capsense.learning.shards import missing, run
 from capsense.learning.spec import Spec, load_spec
 
 pa = pytest.importorskip("pyarrow")
@@ -59,7 +60,7 @@ def spec_of(folder: Path, text: str = SPEC) -> Spec:
 
 
 def contents(spec: Spec, folder: Path) -> list[bytes]:
-    return [shard_path(spec, folder, k).read_bytes() for k in range(spec.shards)]
+    return [(folder / spec.file(k)).read_bytes() for k in range(spec.shards)]
 
 
 def poses(spec: Spec, number: int) -> list[object]:
@@ -163,8 +164,8 @@ def test_shards_are_the_same_wherever_they_are_made(tmp_path: Path) -> None:
     assert missing(spec, parts) == [0, 2, 3]
     assert run(spec, parts, workers=1) == 8
     assert contents(spec, parts) == expected
-    shard_path(spec, parts, 2).write_bytes(expected[2][:1000])
-    shard_path(spec, parts, 0).unlink()
+    (parts / spec.file(2)).write_bytes(expected[2][:1000])
+    (parts / spec.file(0)).unlink()
     assert run(spec, parts, workers=2) == 6
     assert contents(spec, parts) == expected
     told = json.loads((parts / "manifest.json").read_text())
@@ -176,6 +177,27 @@ def test_shards_are_the_same_wherever_they_are_made(tmp_path: Path) -> None:
     assert told["settings"]["seed"] == 5
     assert len(told["versions"]) == 1
     assert not [p for p in parts.rglob("*") if p.name.endswith(".part")]
+
+
+def test_a_late_start_leaves_a_complete_manifest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A job that finds no manifest, and dies after others have completed the set meanwhile."""
+    spec, out, about = spec_of(tmp_path), tmp_path / "out", Spec.about
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def late(self: Spec) -> dict[str, Any]:
+        monkeypatch.setattr(Spec, "about", about)
+        assert run(spec_of(tmp_path), out, workers=1) == 11
+        monkeypatch.setattr(Spec, "finish", die)
+        return about(self)
+
+    monkeypatch.setattr(Spec, "about", late)
+    with pytest.raises(KeyboardInterrupt):
+        run(spec, out, workers=1)
+    assert json.loads((out / "manifest.json").read_text())["complete"]
 
 
 def test_a_shard_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

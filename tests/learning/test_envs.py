@@ -150,9 +150,16 @@ def test_latency_and_noise_are_as_set() -> None:
     shape = dataclasses.replace(middle, noise=(0.0, 0.0), drift=(0.0, 0.0), gain=(0.0, 0.0))
     env = gymnasium.make(FOLLOW, randomisation=shape, chip="fdc2214").unwrapped
     observation, _ = env.reset(seed=0)
-    truth = np.diag(env.signals.skin.read()["pad"].delta) * 1e14
-    tare = 1e14 * env.signals._tare["pad"] - 1e14 * np.diag(env.simulator.baseline)
+    truth = np.diag(env.skin.read()["pad"].delta) * 1e14
+    tare = 1e14 * env.signals.tare["pad"] - 1e14 * np.diag(env.simulator.baseline)
     assert observation[:6] == pytest.approx(truth - tare, abs=0.15)
+
+
+def test_ranges_by_name() -> None:
+    env = gymnasium.make(FOLLOW, randomisation={"girth": [0.9, 1.0]}).unwrapped
+    assert env.randomisation == Randomisation(girth=(0.9, 1.0))
+    with pytest.raises(cs.SceneError, match="no range 'grith'; did you mean 'girth'"):
+        gymnasium.make(FOLLOW, randomisation={"grith": [0.9, 1.0]})
 
 
 def test_ranges_that_are_not() -> None:
@@ -176,6 +183,98 @@ def test_vectorised() -> None:
     single = gymnasium.make(f"capsense.learning.envs:{FOLLOW}")
     np.testing.assert_array_equal(observation[1], single.reset(seed=2)[0])
     assert envs.step(envs.action_space.sample())[0].shape == (2, *single.observation_space.shape)
+
+
+def together(name: str, count: int, **options: Any) -> Any:
+    return gymnasium.make_vec(
+        name, num_envs=count, vectorization_mode="vector_entry_point", **options
+    )
+
+
+@pytest.mark.parametrize(("name", "near"), [(FOLLOW, 0.0), (DRESS, 0.05), (STOP, 0.005)])
+def test_side_by_side_as_alone(name: str, near: float) -> None:
+    """Seeds and actions of single environments; a fleet does not cut the long upper arm."""
+    envs, alone = together(name, 2), [gymnasium.make(name) for _ in range(2)]
+    assert envs.single_observation_space == alone[0].observation_space
+    observation, facts = envs.reset(seed=5)
+    one = [env.reset(seed=5 + k) for k, env in enumerate(alone)]
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        np.testing.assert_allclose(observation, [o[0] for o in one], rtol=0, atol=near)
+        actions = rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
+        observation, rewards, over, cut, facts = envs.step(actions)
+        one = [env.step(a) for env, a in zip(alone, actions, strict=True)]
+        assert rewards.tolist() == [o[1] for o in one]
+        assert not (over | cut).any()
+        for key, values in facts.items():
+            if not key.startswith("_"):
+                assert values.tolist() == [o[4][key] for o in one]
+
+
+def test_side_by_side_begin_again() -> None:
+    """At the step after an episode's end, with the numbers that a single environment would draw."""
+    envs, env = together(FOLLOW, 2, max_episode_steps=3), gymnasium.make(FOLLOW).unwrapped
+    assert envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
+    envs.reset(seed=[1, 2])
+    still = np.zeros((2, 5), np.float32)
+    cuts = [envs.step(still)[3].tolist() for _ in range(3)]
+    assert cuts == [[False, False], [False, False], [True, True]]
+    observation, rewards, over, cut, _ = envs.step(still)
+    assert rewards.tolist() == [0.0, 0.0]
+    assert not (over | cut).any()
+    env.reset(seed=2)
+    np.testing.assert_array_equal(observation[1], env.reset()[0])
+    before = observation
+    observation, _ = envs.reset(seed=7, options={"reset_mask": np.array([True, False])})
+    np.testing.assert_array_equal(observation[0], env.reset(seed=7)[0])
+    np.testing.assert_array_equal(observation[1], before[1])
+    lost = np.zeros((2, 5), np.float32)
+    lost[0, 2] = 1.0
+    over = []
+    envs = together(FOLLOW, 2)
+    envs.reset(seed=1)
+    while not over or not over[-1].any():
+        over.append(envs.step(lost)[2])
+    assert over[-1].tolist() == [True, False]
+    _, rewards, *_ = envs.step(lost)
+    assert rewards[0] == 0.0
+    assert rewards[1] > 0.0
+
+
+def test_side_by_side_refuses() -> None:
+    for count in (0, True):
+        with pytest.raises(cs.SceneError, match="num_envs is"):
+            together(FOLLOW, count)
+    envs = together(FOLLOW, 2)
+    with pytest.raises(cs.SceneError, match="give 2 seeds"):
+        envs.reset(seed=[1, 2, 3])
+    envs.reset(seed=1)
+    with pytest.raises(cs.SceneError, match=r"actions have shape \(2, 4\); give \(2, 5\)"):
+        envs.step(np.zeros((2, 4)))
+
+
+def test_follower_begins_clear_of_the_arm() -> None:
+    """Whatever is drawn: seeds 10014 and 10018 began in touch when nothing raised the pad."""
+    env = gymnasium.make(FOLLOW).unwrapped
+    for seed in range(10_000, 10_020):
+        env.prepare(seed)
+        env.present()
+        assert env.clearance() > 0.015
+        assert env.data.ncon == 0
+
+
+def test_tare_is_a_mean() -> None:
+    """Of sixteen conversions: its rms error is a quarter of the noise of one."""
+    middle = Randomisation().held()
+    rough = dataclasses.replace(middle, noise=(2e-15, 2e-15), drift=(0.0, 0.0), gain=(0.0, 0.0))
+    env = gymnasium.make(FOLLOW, randomisation=rough).unwrapped
+    env.prepare(0)
+    env.attach()
+    tare, errors = env.skin.read(), []
+    for seed in range(40):
+        env.signals.reset(0.0, seed, tare, tare)
+        errors.append(env.signals.tare["pad"] - np.diag(tare["pad"].capacitance))
+    assert np.std(errors) == pytest.approx(0.5e-15, rel=0.15)
 
 
 def test_wrapper_adds_and_changes_nothing(tmp_path: Path) -> None:

@@ -210,7 +210,7 @@ def test_distance_model() -> None:
     assert plates.read([]) == pytest.approx(np.zeros(6))
     env = policy.DistanceFollow()
     env.reset(seed=1)
-    felt, solved = env.signals.skin.read()["pad"], env.signals.skin.skin.read()["pad"]
+    felt, solved = env.skin.read()["pad"], env.skin.skin.read()["pad"]
     assert np.diag(felt.delta) == pytest.approx(np.diag(solved.delta), rel=1.0)
     assert felt.delta[0, 1] == 0.0
     observation, *_ = env.step(np.zeros(5, np.float32))

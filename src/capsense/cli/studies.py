@@ -61,15 +61,14 @@ def _dataset(args: argparse.Namespace) -> int:
     """Make the data set and return the exit code."""
     from tqdm import tqdm
 
-    from capsense.learning.shards import missing, require_pyarrow, run
-    from capsense.learning.spec import load_spec
+    from capsense.learning.shards import load_data_set, missing, require_pyarrow, run
 
     require_pyarrow()
-    spec = load_spec(args.spec)
+    spec = load_data_set(args.spec)
     todo = sum(len(spec.numbers(k)) for k in missing(spec, args.output, args.shard))
     start = perf_counter()
     with tqdm(
-        total=todo, unit=" scenes", file=sys.stderr, disable=not progress_shown(args.quiet)
+        total=todo, unit=f" {spec.unit}", file=sys.stderr, disable=not progress_shown(args.quiet)
     ) as bar:
         made = run(
             spec, args.output, part=args.shard, workers=args.workers, scheduler=args.scheduler,
@@ -78,25 +77,27 @@ def _dataset(args: argparse.Namespace) -> int:
     if not args.quiet:
         seconds = perf_counter() - start
         left = sum(len(spec.numbers(k)) for k in missing(spec, args.output))
-        state = "complete" if not left else f"{left} of {spec.scenes} scenes are missing"
-        print(f"{made} scenes in {seconds:.1f} s, {made / seconds:.0f} a second; {args.output}: "
-              f"{state}")  # fmt: skip
+        state = "complete" if not left else f"{left} of {spec.count} {spec.unit} are missing"
+        rate = f"{made / seconds:.1f}" if made < 10 * seconds else f"{made / seconds:.0f}"
+        print(f"{made} {spec.unit} in {seconds:.1f} s, {rate} a second; {args.output}: {state}")
     return OK
 
 
 DATASET = Command(
     "dataset",
-    "make a data set of random scenes for learning",
+    "make a data set of random scenes or episodes for learning",
     """\
 Draw random scenes as a file describes them, and write capacitance matrices, the counts of a
-readout and labels as Parquet files with a manifest.
+readout and labels as Parquet files with a manifest. A file that names an environment is of
+episodes, which become a LeRobot data set.
 
-A scene depends on the file, its seed and the scene's number alone, so that any shard can be made
-on any machine. A shard appears once it is complete, and what is complete is not made again: after
-an interruption, run the same command.
+A scene depends on the file, its seed and the scene's number alone, and so does an episode, so that
+any shard can be made on any machine. A shard appears once it is complete, and what is complete is
+not made again: after an interruption, run the same command.
 """,
     """\
   capsense dataset examples/datasets/forearms.toml -o forearms/
+  capsense dataset examples/datasets/follow.toml -o follow/
   capsense dataset spec.toml -o /shared/set --shard 17/1000
   capsense dataset spec.toml -o /shared/set --scheduler tcp://10.0.0.1:8786
 """,

@@ -4,50 +4,105 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from secrets import token_hex
+from typing import Any, ClassVar
 
 from capsense._thread_pool import processors
-from capsense.errors import (
-    AdapterError,
-    MissingDependencyError,
-    ScenarioError,
-    SceneError,
-    SolveError,
-)
-from capsense.learning.settle import settled, settling
-from capsense.learning.spec import Spec
-from capsense.readout.readout import Readout
+from capsense.errors import AdapterError, MissingDependencyError, ScenarioError
 from capsense.recording.session import versions
 from capsense.recording.tables import replacing
-from capsense.simulator import Simulator, make_readout
 
 MANIFEST = "manifest.json"
-COLUMNS = {
-    "scene": "number of the scene",
-    "capacitance": "Maxwell capacitance matrix, row by row, M × M, F",
-    "delta": "its change from the empty scene, row by row, M × M, F",
-    "self_delta": "change of the self capacitances, the design's shields driven along, M, F",
-    "code": "what the converter of each channel holds, K, codes",
-    "code_delta": "what its user makes of it, change from the empty scene, K, F",
-    "distance": "from the nearest electrode to the nearest body, m",
-    "closest_point": "the point of that body's surface nearest to the electrodes, x, y, z, m",
-    "normal": "unit normal of its surface there, out of the body, x, y, z",
-    "axis": "unit vector along it, where it is a capsule or a cylinder, x, y, z",
-    "body": "its name",
-    "material": "its material",
-    "eps_r": "relative permittivity of that",
-    "sigma": "conductivity of that, S/m",
-    "bodies": "how many bodies the scene holds",
-}
-"""Columns, and what they are; those of a readout only where one is given."""
-_KEY = b"capsense"
+KEY = b"capsense"
 """Of what a shard says of itself, in its file's metadata."""
+
+
+@dataclass(frozen=True, eq=False)
+class DataSet(ABC):
+    """A data set as its file describes it: numbered items, each the same wherever it is made."""
+
+    unit: ClassVar[str]
+    """What its items are called."""
+    name: str
+    count: int
+    """How many items there are."""
+    shard_size: int
+    """Items of a shard; the last one may hold fewer."""
+    seed: int
+    source: str
+    """Name of the file, for messages."""
+    folder: Path
+    """Files are named relative to this folder."""
+
+    @property
+    def shards(self) -> int:
+        """How many shards there are."""
+        return math.ceil(self.count / self.shard_size)
+
+    def numbers(self, shard: int) -> range:
+        """The items of a shard."""
+        return range(shard * self.shard_size, min(self.count, (shard + 1) * self.shard_size))
+
+    @property
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """All that the numbers depend on, but for versions; contents of files by their SHA-256."""
+
+    @cached_property
+    def identity(self) -> str:
+        """SHA-256 (hex) of :attr:`settings`."""
+        text = json.dumps(self.settings, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @abstractmethod
+    def file(self, shard: int) -> str:
+        """Where a shard lies in the folder of the data set."""
+
+    @abstractmethod
+    def table(self, shard: int) -> Any:
+        """The rows of a shard, a table of pyarrow."""
+
+    @abstractmethod
+    def about(self) -> dict[str, Any]:
+        """What the manifest says beside settings, versions and shards."""
+
+    def finish(self, folder: Path) -> None:  # noqa: B027, most have nothing to add
+        """Write what else there is, once all shards are there."""
+
+
+def load_data_set(path: str | Path) -> DataSet:
+    """Load the file of a data set: of episodes if it names an ``environment``, else of scenes.
+
+    Raises:
+        ScenarioError: There is no such file, or anything in it is wrong.
+        DesignError: Something is wrong in the design file it names.
+        MissingDependencyError: Episodes need Gymnasium and MuJoCo.
+    """
+    from capsense._validate import read_toml
+    from capsense.learning import episodes, spec
+
+    kind = read_toml(Path(path), "data set", ScenarioError)
+    return episodes.load_episodes(path) if "environment" in kind else spec.load_spec(path)
+
+
+def files_named(texts: Iterable[str], folder: Path) -> dict[str, str]:
+    """SHA-256 (hex) of the files among some texts, relative to a folder."""
+    return {
+        text: hashlib.sha256((folder / text).read_bytes()).hexdigest()
+        for text in sorted({t for t in texts if t})
+        if (folder / text).is_file()
+    }
 
 
 def require_pyarrow() -> None:
@@ -60,98 +115,39 @@ def require_pyarrow() -> None:
         ) from None
 
 
-def shard_path(spec: Spec, folder: Path, shard: int) -> Path:
-    """Where a shard lies: the names that Hugging Face's ``datasets`` knows."""
-    return folder / "data" / f"train-{shard:05d}-of-{spec.shards:05d}.parquet"
-
-
-def make_shard(spec: Spec, folder: Path, shard: int) -> int:
+def make_shard(spec: DataSet, folder: Path, shard: int) -> int:
     """Make a shard, and rename it into its place once it is complete.
 
     Returns:
         Its number.
 
     Raises:
-        ScenarioError: A scene cannot be drawn.
-        SceneError: A scene is none that can be solved; the message names it.
-        SolveError: A scene was not solved; the message names it.
+        CapSenseError: What :meth:`DataSet.table` raises.
     """
-    import pyarrow.parquet as pq
-
-    path = shard_path(spec, folder, shard)
-    simulator = Simulator(spec.design, preset=spec.preset)
-    readout = make_spec_readout(spec, simulator)
-    rows = [_row(spec, number, simulator, readout) for number in spec.numbers(shard)]
-    with replacing(path) as part:
-        pq.write_table(_table(spec, rows, readout, len(simulator.electrode_names)), part)
+    table = spec.table(shard)
+    said = json.dumps({"identity": spec.identity, "versions": versions()})
+    write_table(table.replace_schema_metadata({KEY: said}), folder / spec.file(shard))
     return shard
 
 
-def make_spec_readout(spec: Spec, simulator: Simulator) -> Readout | None:
-    """The readout of a data set, if it has one.
+def write_table(table: Any, path: Path) -> None:
+    """Write a table as a Parquet file, whole or not at all."""
+    import pyarrow.parquet as pq
 
-    Raises:
-        ReadoutError: There is no such chip or file, or the file is wrong.
-    """
-    choice = spec.readout
-    if isinstance(choice, str) and choice.endswith(".toml"):
-        choice = spec.folder / choice
-    return make_readout(choice, simulator)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
+        pq.write_table(table, part)
 
 
-def _row(spec: Spec, number: int, simulator: Simulator, readout: Readout | None) -> dict[str, Any]:
-    scene, near, rng = spec.scene(number)
-    try:
-        reading = simulator.step(scene)
-    except (SceneError, SolveError) as error:
-        raise type(error)(f"scene {number}: {error}") from None
-    row: dict[str, Any] = {
-        "scene": number,
-        "capacitance": reading.capacitance.ravel(),
-        "delta": reading.delta.ravel(),
-        "self_delta": reading.self_capacitance - simulator.empty.self_capacitance,
-        "bodies": len(scene),
-    }
-    if readout is not None:
-        readout.reset(seed=int(rng.integers(2**63)))
-        empty = settled(readout, simulator.empty, 0.0)
-        held = settled(readout, reading, settling(readout))
-        row |= {"code": held.code, "code_delta": held.capacitance - empty.capacitance}
-    if near is not None:
-        row |= {
-            "distance": near.distance, "closest_point": near.point, "normal": near.normal,
-            "axis": near.axis, "body": near.body.name, "material": near.body.material.name,
-            "eps_r": near.body.material.eps_r, "sigma": near.body.material.sigma,
-        }  # fmt: skip
-    return row
-
-
-def _table(spec: Spec, rows: list[dict[str, Any]], readout: Readout | None, electrodes: int) -> Any:
-    """The rows as a table of plain columns and lists of fixed size."""
-    import pyarrow as pa
-
-    channels = 0 if readout is None else len(readout.channel_names)
-    number, three = pa.float64(), pa.list_(pa.float64(), 3)
-    matrix = pa.list_(number, electrodes**2)
-    kinds = {
-        "scene": pa.int64(), "capacitance": matrix, "delta": matrix,
-        "self_delta": pa.list_(number, electrodes),
-        "code": pa.list_(pa.int64(), channels), "code_delta": pa.list_(number, channels),
-        "distance": number, "closest_point": three, "normal": three, "axis": three,
-        "body": pa.string(), "material": pa.string(), "eps_r": number, "sigma": number,
-        "bodies": pa.int64(),
-    }  # fmt: skip
-    names = [name for name in COLUMNS if channels or not name.startswith("code")]
-    fields = [pa.field(n, kinds[n], metadata={"meaning": COLUMNS[n]}) for n in names]
-    about = json.dumps({"identity": spec.identity, "versions": versions()})
-    return pa.Table.from_arrays(
-        [pa.array([row.get(n) for row in rows], kinds[n]) for n in names],
-        schema=pa.schema(fields, metadata={_KEY: about}),
-    )
+def write_json(data: Mapping[str, Any], path: Path) -> None:
+    """Write a JSON file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
+        part.write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
 def run(
-    spec: Spec,
+    spec: DataSet,
     folder: Path,
     *,
     part: tuple[int, int] = (0, 1),
@@ -167,13 +163,13 @@ def run(
         part: ``(k, n)``: every n-th shard only, from shard k on.
         workers: Processes on this machine, by default as many as the process may use processors.
         scheduler: Address of a Dask scheduler, whose workers make the shards instead.
-        each: Called with the number of scenes of every shard that is complete.
+        each: Called with the number of items of every shard that is complete.
 
     Returns:
-        How many scenes were made.
+        How many items were made.
 
     Raises:
-        ScenarioError: The folder holds another data set, or a scene cannot be drawn.
+        ScenarioError: The folder holds another data set, or an item cannot be made.
         AdapterError: The scheduler does not answer.
         ChildProcessError: Worker processes were killed.
         SolveError: A scene was not solved.
@@ -181,19 +177,21 @@ def run(
     """
     require_pyarrow()
     folder = folder.resolve()
-    (folder / "data").mkdir(parents=True, exist_ok=True)
-    _write_manifest(spec, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    _begin_manifest(spec, folder)
     todo = missing(spec, folder, part)
     count, job = 0, partial(make_shard, spec, folder)
     for shard in _made(job, todo, min(workers or processors(), len(todo)), scheduler):
         size = len(spec.numbers(shard))
         count += size
         each(size)
-    _write_manifest(spec, folder)
+    if not missing(spec, folder):
+        spec.finish(folder)
+        _end_manifest(spec, folder)
     return count
 
 
-def missing(spec: Spec, folder: Path, part: tuple[int, int] = (0, 1)) -> list[int]:
+def missing(spec: DataSet, folder: Path, part: tuple[int, int] = (0, 1)) -> list[int]:
     """The shards of a part, as of :func:`run`, that are not there.
 
     Raises:
@@ -252,7 +250,7 @@ def _killed(who: str) -> ChildProcessError:
     )
 
 
-def _about(spec: Spec, folder: Path, shard: int) -> dict[str, Any] | None:
+def _about(spec: DataSet, folder: Path, shard: int) -> dict[str, Any] | None:
     """What a shard says of itself; None where it is missing or cut off.
 
     Raises:
@@ -261,9 +259,9 @@ def _about(spec: Spec, folder: Path, shard: int) -> dict[str, Any] | None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    path = shard_path(spec, folder, shard)
+    path = folder / spec.file(shard)
     try:
-        about = json.loads((pq.read_schema(path).metadata or {}).get(_KEY, b"{}"))
+        about = json.loads((pq.read_schema(path).metadata or {}).get(KEY, b"{}"))
     except (FileNotFoundError, pa.ArrowInvalid):
         return None
     if about.get("identity") != spec.identity:
@@ -271,43 +269,54 @@ def _about(spec: Spec, folder: Path, shard: int) -> dict[str, Any] | None:
     return about
 
 
-def _other(spec: Spec, path: Path) -> ScenarioError:
+def _other(spec: DataSet, path: Path) -> ScenarioError:
     return ScenarioError(
         f"{path} is of other settings than {spec.source} has now; give another folder (-o), or "
         "remove this one"
     )
 
 
-def _write_manifest(spec: Spec, folder: Path) -> None:
-    """Write ``manifest.json``; once all shards are there, with their hashes.
+def _begin_manifest(spec: DataSet, folder: Path) -> None:
+    """Say what the folder will hold, unless somebody has said it already.
+
+    It never takes the place of another manifest: that may be complete by now.
 
     Raises:
-        ScenarioError: The one that is there is of another data set.
+        ScenarioError: The folder holds another data set.
     """
     path = folder / MANIFEST
-    told = json.loads(path.read_text()) if path.exists() else None
-    if told is not None and told["identity"] != spec.identity:
-        raise _other(spec, path)
-    paths = [shard_path(spec, folder, k) for k in range(spec.shards)]
-    about = [_about(spec, folder, k) for k in range(spec.shards) if paths[k].exists()]
-    complete = None not in about and len(about) == spec.shards
-    if told is not None and not complete and not told["complete"]:
-        return  # so that it never takes the place of one that somebody else has just completed
-    simulator = Simulator(spec.design, preset=spec.preset)
-    readout = make_spec_readout(spec, simulator)
-    made_by = {json.dumps(a["versions"], sort_keys=True) for a in about if a is not None}
-    data = {
-        "name": spec.name, "complete": complete, "identity": spec.identity,
-        "design": spec.design.name, "electrodes": simulator.electrode_names,
-        "baseline_F": simulator.baseline.tolist(),
-        "channels": () if readout is None else readout.channel_names,
-        "columns": COLUMNS, "settings": spec.settings,
-        "versions": [json.loads(v) for v in sorted(made_by)] or [versions()],
-        "shards": [
-            {"file": str(p.relative_to(folder)), "scenes": len(spec.numbers(k)),
-             "sha256": hashlib.sha256(p.read_bytes()).hexdigest()}
-            for k, p in enumerate(paths)
-        ] if complete else [],
+    if path.exists():
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if told["identity"] != spec.identity:
+            raise _other(spec, path)
+        if not told["complete"] or not missing(spec, folder):
+            return
+        path.unlink(missing_ok=True)  # shards have been removed since
+    missing(spec, folder)  # raises where a shard is of another data set
+    first = path.with_name(f".{path.name}.{token_hex(4)}.part")
+    try:
+        first.write_text(json.dumps(_manifest(spec, [versions()], []), indent=1), encoding="utf-8")
+        with suppress(OSError):  # somebody was first, or there are no links on this file system
+            os.link(first, path)
+    finally:
+        first.unlink(missing_ok=True)
+
+
+def _end_manifest(spec: DataSet, folder: Path) -> None:
+    """Write the manifest of a data set whose shards are all there, with their hashes."""
+    said = [_about(spec, folder, k) or {} for k in range(spec.shards)]
+    made_by = {json.dumps(a["versions"], sort_keys=True) for a in said}
+    shards = [
+        {"file": spec.file(k), spec.unit: len(spec.numbers(k)),
+         "sha256": hashlib.sha256((folder / spec.file(k)).read_bytes()).hexdigest()}
+        for k in range(spec.shards)
+    ]  # fmt: skip
+    data = _manifest(spec, [json.loads(v) for v in sorted(made_by)], shards)
+    write_json(data, folder / MANIFEST)
+
+
+def _manifest(spec: DataSet, made_by: list[Any], shards: list[Any]) -> dict[str, Any]:
+    return {
+        "name": spec.name, "complete": bool(shards), "identity": spec.identity,
+        **spec.about(), "settings": spec.settings, "versions": made_by, "shards": shards,
     }  # fmt: skip
-    with replacing(path) as part, part.open("w", encoding="utf-8") as file:
-        json.dump(data, file, indent=1)

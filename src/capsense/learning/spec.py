@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +16,7 @@ from capsense.design import Design
 from capsense.errors import MeshError, ScenarioError, SceneError
 from capsense.humans import Build, arm, leg
 from capsense.learning.labels import Near, Outline
+from capsense.learning.shards import DataSet, files_named
 from capsense.scenario.loader import (
     ScenarioTable,
     read_body,
@@ -47,16 +45,11 @@ _TRIES = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Spec:
-    """A data set as its file describes it; made by :func:`load_spec`."""
+class Spec(DataSet):
+    """A data set of scenes as its file describes it; made by :func:`load_spec`."""
 
-    name: str
+    unit = "scenes"
     design: Design
-    scenes: int
-    """How many scenes there are."""
-    shard_size: int
-    """Scenes of a shard; the last one may hold fewer."""
-    seed: int
     preset: PresetName
     readout: str | Path | None
     """Name of a chip, or a file."""
@@ -64,41 +57,33 @@ class Spec:
     """No body comes nearer to the sensor than this [m]."""
     bodies: tuple[Mapping[str, Any], ...]
     """The tables ``[[body]]`` as they stand in the file."""
-    source: str
-    """Name of the file, for messages."""
-    folder: Path
-    """Files are named relative to this folder."""
-
-    @property
-    def shards(self) -> int:
-        """How many shards there are."""
-        return math.ceil(self.scenes / self.shard_size)
-
-    def numbers(self, shard: int) -> range:
-        """The scenes of a shard."""
-        return range(shard * self.shard_size, min(self.scenes, (shard + 1) * self.shard_size))
 
     @cached_property
     def settings(self) -> dict[str, Any]:
         """All that the numbers depend on, but for versions; contents of files by their SHA-256."""
         readout = None if self.readout is None else str(self.readout)
-        files = {
-            text: hashlib.sha256((self.folder / text).read_bytes()).hexdigest()
-            for text in sorted({t for t in _texts([*self.bodies, readout]) if t})
-            if (self.folder / text).is_file()
-        }
         return {
-            "format": _FORMAT, "design": self.design.content_hash(), "scenes": self.scenes,
+            "format": _FORMAT, "design": self.design.content_hash(), "scenes": self.count,
             "shard_size": self.shard_size, "seed": self.seed, "preset": self.preset,
             "readout": readout, "clearance": self.clearance, "bodies": list(self.bodies),
-            "files": files,
+            "files": files_named(_texts([*self.bodies, readout]), self.folder),
         }  # fmt: skip
 
-    @cached_property
-    def identity(self) -> str:
-        """SHA-256 (hex) of :attr:`settings`."""
-        text = json.dumps(self.settings, sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
+    def file(self, shard: int) -> str:
+        """The names that Hugging Face's ``datasets`` knows."""
+        return f"data/train-{shard:05d}-of-{self.shards:05d}.parquet"
+
+    def table(self, shard: int) -> Any:
+        """See :func:`capsense.learning.scenes.table`."""
+        from capsense.learning import scenes
+
+        return scenes.table(self, shard)
+
+    def about(self) -> dict[str, Any]:
+        """Sensor and columns."""
+        from capsense.learning import scenes
+
+        return scenes.about(self)
 
     @cached_property
     def outline(self) -> Outline:
@@ -168,14 +153,14 @@ def load_spec(path: str | Path) -> Spec:
     readout: str | Path | None = top.string("readout") if "readout" in top else None
     spec = Spec(
         name=top.string("name"), design=read_design(top, folder),
-        scenes=top.integer("scenes", 1, 10**9),
+        count=top.integer("scenes", 1, 10**9),
         shard_size=top.integer("shard_size", 1, 10**6, 1000),
         seed=top.integer("seed", 0, 2**63 - 1, 0),
         preset=cast("PresetName", top.choice("preset", get_args(PresetName), "standard")),
         readout=readout, clearance=top.length("clearance", 1e-3), bodies=bodies,
         source=file.name, folder=folder,
     )  # fmt: skip
-    for number in range(min(10, spec.scenes)):
+    for number in range(min(10, spec.count)):
         spec.scene(number)
     return spec
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,7 +44,7 @@ class ApproachStop(CapacitiveEnv):
     own_design = "arm_segment"
     speeds = (0.6, 0.3, 0.3)
     parts = ("upper_arm", "forearm", "hand")
-    extra = 1
+    extra = ("left",)
 
     def begin(self) -> dict[str, float]:
         build = self.drawn.build
@@ -69,7 +68,7 @@ class ApproachStop(CapacitiveEnv):
         return line @ turned @ hang
 
     def judge(self, action: Array, force: float) -> tuple[float, bool, dict[str, Any]]:
-        left, gap = float(self.data.qpos[0]) - GOAL, self._gap()
+        left, gap = float(self.data.qpos[0]) - GOAL, self.clearance()
         success = abs(left) < THERE
         reward = WAY * (abs(self._left) - abs(left)) / (START - GOAL) + DONE * success
         reward -= CLOSE * min(1.0, max(0.0, 1.0 - gap / SAFE))
@@ -78,14 +77,3 @@ class ApproachStop(CapacitiveEnv):
 
     def also(self) -> Array:
         return np.array([self._left])
-
-    def _gap(self) -> float:
-        """Distance between robot and person [m], up to 0.5."""
-        limb = self.model.body("limb").id
-        person = [g for g in range(self.model.ngeom) if self.model.geom_bodyid[g] == limb]
-        robot = [g for g in range(self.model.ngeom) if self.model.geom_conaffinity[g]
-                 and self.model.geom_bodyid[g] != limb]  # fmt: skip
-        return min(
-            mujoco.mj_geomDistance(self.model, self.data, a, b, 0.5, None)
-            for a in robot for b in person
-        )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,13 +14,15 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from capsense.adapters import mujoco as adapter
-from capsense.design import load_design
+from capsense.adapters.rules import AttachOptions
 from capsense.errors import SceneError
 from capsense.humans import Limb, arm
 from capsense.learning.envs.randomisation import Randomisation
 from capsense.learning.envs.signals import LIMIT, Signals
+from capsense.reading import Reading
 from capsense.scene import Material, Pose
 from capsense.simulator import PresetName, Simulator
+from capsense.skin import AnyDesign
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
@@ -41,17 +44,18 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     adds. The same seed gives the same episode, to the last bit.
 
     Args:
-        randomisation: What episodes draw from.
+        randomisation: What episodes draw from, or some of its ranges by name.
         chip: Name of the chip behind every sensor.
         preset: How finely the solver resolves surfaces.
-        design: Sensor design, instead of the task's own.
+        design: Sensor design, instead of the task's own; or a simulator, whose field is shared.
 
     Raises:
+        SceneError: A range of the randomisation is wrong.
         ReadoutError: There is no such chip.
         DesignError: The design is wrong.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, as in Gymnasium
+    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 25}  # noqa: RUF012, as in Gymnasium
     model_file: ClassVar[str]
     """The MJCF file beside this module; its body ``limb`` is moved by the task."""
     sites: ClassVar[tuple[str, ...]]
@@ -62,24 +66,25 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
     """Of the actuators, in their order [m/s or rad/s]."""
     parts: ClassVar[tuple[str, ...]]
     """Segments of the arm that are there."""
-    extra: ClassVar[int] = 0
-    """How many numbers :meth:`also` adds to observations."""
+    extra: ClassVar[tuple[str, ...]] = ()
+    """Names of the numbers that :meth:`also` adds to observations."""
 
     def __init__(
         self,
-        randomisation: Randomisation | None = None,
+        randomisation: Randomisation | Mapping[str, Sequence[float]] | None = None,
         chip: str = "fdc1004",
         preset: PresetName = "learning",
-        design: str | Path | None = None,
+        design: AnyDesign | None = None,
     ) -> None:
-        self.randomisation = randomisation or Randomisation()
+        self.randomisation = Randomisation.of(randomisation)
         self._chip = chip
-        self.simulator = Simulator(load_design(design or self.own_design), preset=preset)
+        own = design or self.own_design
+        self.simulator = own if isinstance(own, Simulator) else Simulator(own, preset=preset)
         self.drawn = self.randomisation.held().draw(np.random.default_rng(0))
         """What holds for this episode."""
         self._build(np.random.default_rng(0))
         self.action_space = Box(-1.0, 1.0, (len(self.speeds),), np.float32)
-        rest = np.full(2 * len(self.speeds) + self.extra, LIMIT, np.float32)
+        rest = np.full(2 * len(self.speeds) + len(self.extra), LIMIT, np.float32)
         most = np.concatenate([self.signals.limits, rest])
         self.observation_space = Box(-most, most, dtype=np.float32)
 
@@ -107,17 +112,11 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode with a new person, place and chip; ``options`` are not used."""
-        super().reset(seed=seed)
-        rng = self.np_random
-        self.drawn = self.randomisation.draw(rng)
-        self._build(rng)
-        self._move_limb(_AWAY)
-        mujoco.mj_forward(self.model, self.data)
-        tare = self.signals.skin.read()
-        self._move_limb(self.limb_pose(0.0))
-        mujoco.mj_forward(self.model, self.data)
-        self.signals.reset(0.0, int(rng.integers(2**31)), tare)
-        return self._observe(), self.judge(np.zeros(len(self.speeds)), 0.0)[2]
+        self.prepare(seed)
+        self.attach()
+        tare = self.skin.read()
+        self.present()
+        return self.switch_on(tare, self.skin.read())
 
     def step(
         self, action: NDArray[np.float32]
@@ -127,6 +126,40 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         Raises:
             SceneError: The action has another shape, or is not finite.
         """
+        reward, over, facts = self.advance(action)
+        return self.observe(self.skin.read()), reward, over, False, facts
+
+    # -- the same in parts, between which somebody reads the sensors -----------------------------
+
+    def prepare(self, seed: int | None) -> None:
+        """Draw an episode and build its world; the person is away, as chips are tared then."""
+        super().reset(seed=seed)
+        self.drawn = self.randomisation.draw(self.np_random)
+        self._build(self.np_random)
+        self._move_limb(_AWAY)
+        mujoco.mj_forward(self.model, self.data)
+
+    def attach(self) -> None:
+        """Attach the sensors to the world."""
+        self.skin = adapter.attach_skin(
+            self.model, self.data, self.sites, self.simulator, threads=1, **self.matter
+        )
+        """The sensors, as they are without chips."""
+
+    def present(self) -> None:
+        """The person comes."""
+        self._move_limb(self.limb_pose(0.0))
+        mujoco.mj_forward(self.model, self.data)
+
+    def switch_on(
+        self, tare: Mapping[str, Reading], now: Mapping[str, Reading]
+    ) -> tuple[Observation, dict[str, Any]]:
+        """The first observation and facts, from readings without the person and with it."""
+        self.signals.reset(0.0, int(self.np_random.integers(2**31)), tare, now)
+        return self.observe(now), self.judge(np.zeros(len(self.speeds)), 0.0)[2]
+
+    def advance(self, action: NDArray[np.float32]) -> tuple[float, bool, dict[str, Any]]:
+        """Move as :meth:`step` says; reward, whether the episode ends, and facts."""
         asked = np.asarray(action, dtype=float)
         if asked.shape != (len(self.speeds),) or not np.isfinite(asked).all():
             raise SceneError(f"action is {action!r}; give {len(self.speeds)} finite numbers")
@@ -139,13 +172,38 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
             force = max(force, self._force())
         mujoco.mj_forward(self.model, self.data)
         reward, over, facts = self.judge(asked, force)
-        observation = self._observe()
-        return observation, reward - SQUEEZE * force, over, False, {**facts, "force": force}
+        return reward - SQUEEZE * force, over, {**facts, "force": force}
+
+    def observe(self, now: Mapping[str, Reading]) -> Observation:
+        """The observation, from what the sensors read now."""
+        joints = self.model.actuator_trnid[:, 0]
+        own = [self.data.qpos[self.model.jnt_qposadr[joints]],
+               self.data.qvel[self.model.jnt_dofadr[joints]], self.also()]  # fmt: skip
+        rest = np.clip(np.concatenate(own), -LIMIT, LIMIT).astype(np.float32)
+        return np.concatenate([self.signals.read(self.data.time, now), rest])
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """What the actions move, joints of the model."""
+        return tuple(self.model.joint(k).name for k in self.model.actuator_trnid[:, 0])
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """What the numbers of an observation are called."""
+        rates = tuple(f"{name}.velocity" for name in self.action_names)
+        return (*self.signals.names, *self.action_names, *rates, *self.extra)
+
+    @property
+    def matter(self) -> AttachOptions:
+        """What the sensors see is made of, as ``attach_skin`` takes it."""
+        cushion = Material("cushion", self.drawn.permittivity)
+        return {"materials": {"limb*": "human", "cushion": cushion},
+                "grounding": {"limb*": self.drawn.grounding}}  # fmt: skip
 
     # -- the world -------------------------------------------------------------------------------
 
     def _build(self, rng: np.random.Generator) -> None:
-        """Make the model anew, with a limb of the size that was drawn, and attach the sensors."""
+        """Make the model anew, with a limb of the size that was drawn, and the chips."""
         self._rng = rng
         self.limb = self.make_limb()
         spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name(self.model_file)))
@@ -153,17 +211,12 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         self._add_limb(spec, angles)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self.start()
         self._move_limb(self.limb_pose(0.0))
+        self.start()
         mujoco.mj_forward(self.model, self.data)
-        skin = adapter.attach_skin(
-            self.model, self.data, self.sites, self.simulator, threads=1,
-            materials={"limb*": "human", "cushion": Material("cushion", self.drawn.permittivity)},
-            grounding={"limb*": self.drawn.grounding},
-        )  # fmt: skip
         names = self.simulator.electrode_names
         self.signals = Signals(
-            skin, {site: self.drawn.readout(self._chip, names, rng) for site in self.sites}
+            {site: self.drawn.readout(self._chip, names, rng) for site in self.sites}
         )
 
     def make_limb(self) -> Limb:
@@ -171,7 +224,7 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
         return arm(self.drawn.build)
 
     def start(self) -> None:
-        """Set the state in which an episode begins."""
+        """Set the state in which an episode begins; the limb is there already."""
 
     def _add_limb(self, spec: mujoco.MjSpec, angles: dict[str, float]) -> None:
         where, body = self.limb.forward(angles), spec.body("limb")
@@ -200,14 +253,19 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
             total += abs(float(one[0]))
         return total
 
-    def _observe(self) -> Observation:
-        joints = self.model.actuator_trnid[:, 0]
-        own = [self.data.qpos[self.model.jnt_qposadr[joints]],
-               self.data.qvel[self.model.jnt_dofadr[joints]], self.also()]  # fmt: skip
-        rest = np.clip(np.concatenate(own), -LIMIT, LIMIT).astype(np.float32)
-        return np.concatenate([self.signals.read(self.data.time), rest])
-
     # -- help for tasks --------------------------------------------------------------------------
+
+    def clearance(self) -> float:
+        """Distance between the robot and the person [m], at most 0.5."""
+        limb = self.model.body("limb").id
+        body = self.model.geom_bodyid
+        person = [g for g in range(self.model.ngeom) if body[g] == limb]
+        robot = [g for g in range(self.model.ngeom)
+                 if self.model.geom_conaffinity[g] and body[g] != limb]  # fmt: skip
+        return min(
+            mujoco.mj_geomDistance(self.model, self.data, a, b, 0.5, None)
+            for a in robot for b in person
+        )  # fmt: skip
 
     def site_frame(self, site: str) -> tuple[Array, Array]:
         """Position [m] and rotation matrix of a site in the world."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +20,13 @@ NEAR, TURN = 0.05, math.radians(20.0)
 """Errors [m], [rad] that each lower the reward to 1/e."""
 LOST = 0.15
 """The episode ends where the pad is further away than this from where it should be [m]."""
+CLEAR = 0.02
+"""The pad begins no nearer to the arm than this [m]: it is raised where it would."""
+_RAISES = 3
+"""So often, as the nearest points of both move meanwhile."""
 EFFORT = 0.01
 """What the square of an action costs."""
+_TO_X = Pose.from_euler((0, 0, 0), (0, math.pi / 2, 0))
 
 
 class LimbFollow(CapacitiveEnv):
@@ -47,11 +53,15 @@ class LimbFollow(CapacitiveEnv):
         self.radius = 0.5 * (build.radius("forearm") + build.radius("wrist"))
         """Of the middle of the forearm [m]."""
         self._middle = build.length("upper arm") + 0.5 * build.length("forearm")
+        self._hang = _TO_X @ Pose((0, 0, self._middle))
         return {}
 
     def start(self) -> None:
         yaw, pitch, _ = self.astray(turned=True)
         self.data.qpos[:] = 0.0, 0.0, self.radius + GAP, yaw, pitch
+        for _ in range(_RAISES):
+            mujoco.mj_forward(self.model, self.data)
+            self.data.qpos[2] += max(0.0, CLEAR - self.clearance())
 
     def limb_pose(self, time: float) -> Pose:
         y, z, yaw, pitch = (
@@ -60,7 +70,7 @@ class LimbFollow(CapacitiveEnv):
         )
         x0, y0, z0 = self._rest
         middle = Pose.from_euler((x0, y + y0, z + 0.5 * z0), (0.0, pitch, yaw))
-        return middle @ Pose.from_euler((0, 0, 0), (0, math.pi / 2, 0)) @ Pose((0, 0, self._middle))
+        return middle @ self._hang
 
     def judge(self, action: Array, force: float) -> tuple[float, bool, dict[str, Any]]:
         pose = Pose(self.data.mocap_pos[0], self.data.mocap_quat[0][[1, 2, 3, 0]])

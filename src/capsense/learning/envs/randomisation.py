@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
 
+from capsense._validate import suggest
 from capsense.errors import SceneError
 from capsense.humans import Build
 from capsense.readout.calibration import LinearSensor
@@ -99,6 +101,23 @@ class Randomisation:
                     f"randomisation: {field.name} is {(low, high)}; give two finite numbers that "
                     "do not fall"
                 )
+
+    @classmethod
+    def of(cls, given: Randomisation | Mapping[str, Sequence[float]] | None) -> Randomisation:
+        """One that is given, or made of some ranges by name; else the usual one.
+
+        Raises:
+            SceneError: There is no range of a name, or one is wrong.
+        """
+        if isinstance(given, Randomisation):
+            return given
+        known = [field.name for field in dataclasses.fields(cls)]
+        for name, pair in (given or {}).items():
+            if name not in known:
+                raise SceneError(f"randomisation: no range {name!r}; {suggest(name, known)}")
+            if not isinstance(pair, Sequence) or len(pair) != 2:
+                raise SceneError(f"randomisation: {name} is {pair!r}; give two numbers")
+        return cls(**{name: (pair[0], pair[1]) for name, pair in (given or {}).items()})
 
     def held(self) -> Randomisation:
         """The middle of every range, and nothing random."""

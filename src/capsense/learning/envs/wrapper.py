@@ -84,25 +84,25 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         inner: Any = self.env.unwrapped
         if inner.model is not self._model:
             self._attach()
-        sensors = self.signals.skin.sensors
-        empty = {name: sensor.simulator.empty for name, sensor in sensors.items()}
-        self.signals.reset(inner.data.time, int(self._rng.integers(2**31)), empty)
+        empty = {name: sensor.simulator.empty for name, sensor in self.skin.sensors.items()}
+        seed = int(self._rng.integers(2**31))
+        self.signals.reset(inner.data.time, seed, empty, self.skin.read())
         return self.observation(observation), info
 
     def observation(self, observation: Any) -> dict[str, Any]:
         """What there was, and what the sensors feel."""
         inner: Any = self.env.unwrapped
         before = observation if isinstance(observation, dict) else {"observation": observation}
-        return before | {KEY: self.signals.read(inner.data.time)}
+        return before | {KEY: self.signals.read(inner.data.time, self.skin.read())}
 
     def _attach(self) -> None:
         inner: Any = self.env.unwrapped
         self._model = inner.model
         how = self._how.copy()
         readout = how.pop("readout")
-        skin = adapter.attach_skin(inner.model, inner.data, **how, threads=1)
-        chips = {n: make_readout(readout, s.simulator) for n, s in skin.sensors.items()}
-        self.signals = Signals(skin, {n: chip for n, chip in chips.items() if chip is not None})
+        self.skin = adapter.attach_skin(inner.model, inner.data, **how, threads=1)
+        chips = {n: make_readout(readout, s.simulator) for n, s in self.skin.sensors.items()}
+        self.signals = Signals({n: chip for n, chip in chips.items() if chip is not None})
 
 
 def write_model(env_id: str, body: str, pose: Pose, path: str | Path, name: str = "pad") -> str:
