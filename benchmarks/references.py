@@ -33,7 +33,8 @@ from capsense.constants import EPS0
 from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
-from capsense.field.boundary import _walls, terminals
+from capsense.field.boundary import terminals
+from capsense.field.facets import walls
 from capsense.field.panels import Grading, concatenate, cut_facet, make_panels
 
 Array = NDArray[np.float64]
@@ -210,7 +211,7 @@ class Solution:
                   for f in e.surface.facets]  # fmt: skip
         sheets += [(f, c.surface.rims, shield, names.index(c.name)) for c in design.conductors
                    for f in c.surface.facets]  # fmt: skip
-        sheets += [(f, np.zeros((0, 2, 3)), coarse, WALLS) for f in _walls(design)]
+        sheets += [(f, np.zeros((0, 2, 3)), coarse, WALLS) for f in walls(design)]
         if surface is not None:
             grading = Grading(3e-4 * scale, smallest=0.004 * scale, largest=0.006 * scale)
             sheets += [(f, surface.rims, grading, OBJECT) for f in surface.facets]

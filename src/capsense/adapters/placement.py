@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.model import Conductor, Design, Electrode
+from capsense.design.model import Conductor, Design, Electrode, Layer
 from capsense.scene import Body, Layers, Scene, TriMesh
 from capsense.scene.mesh_shape import TriangleShape
 from capsense.simulator import Simulator
@@ -130,7 +130,7 @@ def _wound(shape: TriangleShape, points: Array) -> NDArray[np.bool_]:
     return out
 
 
-def points_on(electrode: Electrode | Conductor) -> Array:
+def points_on(electrode: Electrode | Conductor | Layer) -> Array:
     """Corners of a sheet's triangles, and points spread evenly over it [m], shape (n, 3)."""
     corners = electrode.surface.triangles
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -113,11 +113,12 @@ def describe(design: Design) -> str:
                 k.name,
                 k.material,
                 f"{k.eps_r:g}",
-                *(_span(low, high) for low, high in zip(k.lower, k.upper, strict=True)),
+                *_spans(k.surface),
+                str(len(k.surface.facets)),
             )
             for k in design.layers
         ]
-        blocks.append(table(("layer", "material", "eps_r", *_SPANS), rows))
+        blocks.append(table(("layer", "material", "eps_r", *_SPANS, "faces"), rows))
     if design.conductors:
         rows = [
             (c.name, c.role.value, *_spans(c.surface), _area(c.surface)) for c in design.conductors

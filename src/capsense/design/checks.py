@@ -120,7 +120,18 @@ def _layer_inside_domain(layer: Layer, domain: Domain, source: str) -> None:
 
 def _apart(one: Layer, other: Layer, source: str) -> None:
     low, high = np.maximum(one.lower, other.lower), np.minimum(one.upper, other.upper)
-    if np.all(high - low > TOUCH):
+    if not np.all(high - low > TOUCH):
+        return
+    if one.facets or other.facets:
+        from capsense.design.solid import overlap
+
+        point = overlap(one.surface, other.surface)
+        if point is not None:
+            raise DesignError(
+                f"{source}: {_label(other)}: overlaps {_label(one)} at {_at(point)}; move one of "
+                "them or cut it back in CAD, so that they share no more than flat faces"
+            )
+    else:
         raise DesignError(
             f"{source}: {_label(other)}: overlaps {_label(one)} over {_at(high - low)} at "
             f"{_at((low + high) / 2)}; change z, size or center so that they only share a face"
@@ -156,6 +167,9 @@ def _no_short(one: Electrode | Conductor, other: Electrode | Conductor, source: 
 
 def _not_crossing(sheet: Electrode | Conductor, layer: Layer, source: str) -> None:
     low, high = sheet.surface.bounds
+    if layer.facets:
+        _not_through(sheet, layer, source)
+        return
     within = np.all(low >= layer.lower - TOUCH) and np.all(high <= layer.upper + TOUCH)
     if within or not enters_box(sheet.surface, layer.lower, layer.upper):
         return
@@ -164,6 +178,21 @@ def _not_crossing(sheet: Electrode | Conductor, layer: Layer, source: str) -> No
         f"to {_at(high)}, the layer {_at(layer.lower)} to {_at(layer.upper)}; put it on a face of "
         f"the layer (such as z = {layer.upper[2]:g}), or wholly inside or outside"
     )
+
+
+def _not_through(sheet: Electrode | Conductor, part: Layer, source: str) -> None:
+    from capsense.design.solid import crossing
+
+    low, high = sheet.surface.bounds
+    if np.any(low > part.upper) or np.any(high < part.lower):
+        return
+    point = crossing(sheet.surface.triangles, part.surface.triangles)
+    if point is not None:
+        raise DesignError(
+            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at {_at(point)}, and "
+            "partly outside; put it wholly inside or outside, or flat on a flat face; where both "
+            "are curved leave a gap of 0.2 mm, for they are made of flat pieces"
+        )
 
 
 SLIVER = 1e-5

@@ -70,6 +70,24 @@ class Surface:
         return float(sum(f.polygon.area for f in self.facets))
 
 
+def box_facets(lower: Array, upper: Array) -> tuple[Facet, ...]:
+    """The six faces of an upright box, normals outwards."""
+    faces = []
+    size, center = upper - lower, (lower + upper) / 2
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            n = np.zeros(3)
+            n[axis] = sign
+            u = np.zeros(3)
+            u[(axis + 1) % 3] = 1.0
+            half_u, half_v = size[(axis + 1) % 3] / 2, size[(axis + 2) % 3] / 2
+            outline = box(-half_u, -half_v, half_u, half_v)
+            faces.append(
+                Facet(outline, center + n * size[axis] / 2, np.array([u, np.cross(n, u), n]))
+            )
+    return tuple(faces)
+
+
 def ring_vertices(facet: Facet) -> list[Array]:
     """Vertices [m] of a facet's outline and of each hole in the sensor frame, each (k, 3)."""
     rings = (facet.polygon.exterior, *facet.polygon.interiors)

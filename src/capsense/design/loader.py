@@ -11,7 +11,7 @@ import numpy as np
 
 from capsense._validate import nearest, read_toml, suggest
 from capsense.design.checks import check_design, cut_clearance, snap_to_layers
-from capsense.design.geometry import Surface
+from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.design.shapes import (
     SHAPES,
@@ -25,6 +25,7 @@ from capsense.design.shapes import (
 from capsense.design.tables import LAYER_EPS_R, PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
+LAYER_KEYS = ("name", "material", "eps_r")
 STL_KEYS = ("file", "unit", "scale", "part", "closed")
 TOP_KEYS = (
     "name",
@@ -119,17 +120,17 @@ def parse_design(
         from capsense.design.stl_shape import read_imprint_group
 
         electrodes += read_imprint_group(table, where, domain)
-    layers = [_read_layer(t) for t in items("layer")]
+    layers = [_read_layer(t, where) for t in items("layer")]
     stack = tuple(layers)
     electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack)) for e in electrodes]
     conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
     conductors = [Conductor(c.name, c.role, snap_to_layers(c.surface, stack)) for c in conductors]
     if "bend" in data:
         radius = read_bend(DesignTable(data["bend"], source, "bend", limit))
-        if layers:
+        if slabs := [layer.name for layer in layers if not layer.facets]:
             raise DesignError(
-                f'{source}: layer "{layers[0].name}": layers are flat boxes and cannot be bent; '
-                "remove the layers or [bend]"
+                f'{source}: layer "{slabs[0]}": flat layers cannot be bent; remove them or [bend], '
+                'or give a shape = "cylinder" or "stl", which keeps its place'
             )
         electrodes = [Electrode(e.name, _bent(e, radius, source)) for e in electrodes]
         conductors = [Conductor(c.name, c.role, _bent(c, radius, source)) for c in conductors]
@@ -205,9 +206,39 @@ def _read_conductor(
     return Conductor(name, role, surface)
 
 
-def _read_layer(table: DesignTable) -> Layer:
-    table.only(("name", "material", "eps_r", "size", "center", "z"))
+def _read_layer(table: DesignTable, folder: Path) -> Layer:
     name = table.string("name")
+    material, eps_r = _read_material(table)
+    if "shape" in table:
+        facets = _read_part(table, folder)
+        lower, upper = Surface(facets, np.empty((0, 2, 3))).bounds
+        return Layer(name, material, eps_r, lower, upper, facets)
+    table.only((*LAYER_KEYS, "size", "center", "z"))
+    sx, sy = table.sizes("size", 2, "[x, y] in metres")
+    cx, cy = table.coordinates("center", (2,), (0.0, 0.0))
+    z0, z1 = table.interval("z")
+    lower = np.array([cx - sx / 2, cy - sy / 2, z0])
+    upper = np.array([cx + sx / 2, cy + sy / 2, z1])
+    return Layer(name, material, eps_r, lower, upper)
+
+
+def _read_part(table: DesignTable, folder: Path) -> tuple[Facet, ...]:
+    """The faces of a dielectric part with a ``shape``, normals outwards."""
+    common = (*LAYER_KEYS, "shape", *PLACEMENT_KEYS)
+    shape = table.choice("shape", ("box", "cylinder", "stl"))
+    if shape == "stl":
+        from capsense.design.stl_shape import read_stl_solid
+
+        table.only((*common, "file", "unit", "scale"))
+        return read_stl_solid(table, folder)
+    if shape == "box":
+        table.only((*common, "size"))
+        return box_surface(table, read_placement(table)).facets
+    table.only((*common, "radius", "length"))
+    return cylinder_surface(table, read_placement(table)).facets
+
+
+def _read_material(table: DesignTable) -> tuple[str, float]:
     if "material" in table and "eps_r" in table:
         raise table.error(
             f"material = {table.data['material']!r} and eps_r = {table.data['eps_r']!r} both set "
@@ -220,14 +251,7 @@ def _read_layer(table: DesignTable) -> Layer:
                 f"material = {material!r} is not known; {suggest(material, LAYER_EPS_R)}; "
                 "or give eps_r = a number instead"
             )
-        eps_r = LAYER_EPS_R[material.lower()]
-    elif "eps_r" in table:
-        material, eps_r = "custom", table.number("eps_r", 1.0, 1000.0)
-    else:
-        raise table.error('missing key: give material = "…" or eps_r = a number')
-    sx, sy = table.sizes("size", 2, "[x, y] in metres")
-    cx, cy = table.coordinates("center", (2,), (0.0, 0.0))
-    z0, z1 = table.interval("z")
-    lower = np.array([cx - sx / 2, cy - sy / 2, z0])
-    upper = np.array([cx + sx / 2, cy + sy / 2, z1])
-    return Layer(name, material, eps_r, lower, upper)
+        return material, LAYER_EPS_R[material.lower()]
+    if "eps_r" in table:
+        return "custom", table.number("eps_r", 1.0, 1000.0)
+    raise table.error('missing key: give material = "…" or eps_r = a number')

@@ -6,11 +6,12 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.geometry import Surface, ring_vertices
+from capsense.design.geometry import Facet, Surface, box_facets, ring_vertices
 
 Array = NDArray[np.float64]
 
@@ -76,15 +77,30 @@ class Conductor:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A dielectric slab: an axis-aligned box of homogeneous material."""
+    """A dielectric part of homogeneous material: an upright box, or any closed surface."""
 
     name: str
     material: str
     eps_r: float
     lower: Array
-    """Lower corner [m], shape (3,)."""
+    """Lower corner of it or of its bounding box [m], shape (3,)."""
     upper: Array
     """Upper corner [m], shape (3,)."""
+    facets: tuple[Facet, ...] = ()
+    """Faces of a part that is no upright box, normals outwards; none of a box."""
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Its closed surface, without rims."""
+        return Surface(self.facets or box_facets(self.lower, self.upper), np.empty((0, 2, 3)))
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Which points [m] lie inside, shape (n, 3) -> (n,)."""
+        if self.facets:
+            from capsense.design.solid import inside
+
+            return inside(points, self.surface.triangles)
+        return np.asarray(((points > self.lower) & (points < self.upper)).all(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +147,12 @@ def design_hash(design: Design) -> str:
         for c in design.conductors
     ]
     others += [
-        f"layer {float(k.eps_r)!r} {_nanometres(np.concatenate([k.lower, k.upper]))}"
+        "\n".join(
+            [
+                f"layer {float(k.eps_r)!r} {_nanometres(np.concatenate([k.lower, k.upper]))}",
+                *(_surface_lines(k.surface) if k.facets else ()),
+            ]
+        )
         for k in design.layers
     ]
     return hashlib.sha256("\n".join(lines + sorted(others)).encode()).hexdigest()

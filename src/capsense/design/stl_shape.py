@@ -93,6 +93,20 @@ def read_stl_surface(table: DesignTable, folder: Path, domain: Domain) -> Surfac
     return sheet_surface(mesh)
 
 
+def read_stl_solid(table: DesignTable, folder: Path) -> tuple[Facet, ...]:
+    """Read a dielectric part of shape "stl": the faces of a closed surface, normals outwards.
+
+    Raises:
+        DesignError: If the file, its unit or its content is wrong, or if the surface is open.
+    """
+    from capsense.design.solid import turned_outwards
+
+    triangles = _read_triangles(table, folder)
+    mesh = _weld(table, read_placement(table).apply(triangles))
+    _require_closed(table, mesh, "a dielectric part")
+    return turned_outwards(sheet_surface(mesh).facets)
+
+
 def _read_part(table: DesignTable, folder: Path, domain: Domain) -> Surface:
     for key in ("scale", "closed", *PLACEMENT_KEYS):
         if key in table:

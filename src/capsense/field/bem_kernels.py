@@ -121,6 +121,54 @@ def polygon_gradient(edges, normal, x, y, z, out):
 
 
 @kernel
+def solid_angle(edges, normal, x, y, z):
+    """Return the solid angle of a polygon from a point, positive in front of it, zero in its plane.
+
+    It is the normal part of :func:`polygon_gradient`, with the other sign.
+    """
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    d = nx * (x - edges[0, 0, 0]) + ny * (y - edges[0, 0, 1]) + nz * (z - edges[0, 0, 2])
+    h, beta = abs(d), 0.0
+    if h <= 1e-12:
+        return 0.0
+    for e in range(edges.shape[0]):
+        ax, ay, az = edges[e, 0, 0], edges[e, 0, 1], edges[e, 0, 2]
+        lx, ly, lz = edges[e, 1, 0] - ax, edges[e, 1, 1] - ay, edges[e, 1, 2] - az
+        length = math.sqrt(lx * lx + ly * ly + lz * lz)
+        if length < 1e-15:
+            continue
+        lx, ly, lz = lx / length, ly / length, lz / length
+        px, py, pz = ax - x, ay - y, az - z
+        lm = px * lx + py * ly + pz * lz
+        lp = lm + length
+        ux, uy, uz = ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx
+        t = px * ux + py * uy + pz * uz
+        r0 = t * t + h * h
+        rp, rm = math.sqrt(r0 + lp * lp), math.sqrt(r0 + lm * lm)
+        beta += math.atan(t * lp / (r0 + h * rp)) - math.atan(t * lm / (r0 + h * rm))
+    return beta if d > 0 else -beta
+
+
+@kernel
+def _flux_mean(p, i, j, floor):
+    """The same mean as :func:`_mean_normal_gradient`, so that Gauss's law holds exactly.
+
+    Panel i is met in closed form and panel j by quadrature: from any point of a closed surface the
+    solid angles of its panels sum to 2π. Else matter of a high permittivity gains a charge.
+    """
+    edges, normal = p.edges[p.first[i] : p.first[i + 1]], p.normals[i]
+    total = 0.0
+    for q in range(p.quad.shape[1]):
+        w = p.weights[j, q]
+        if w != 0.0:
+            x, y, z = p.quad[j, q, 0], p.quad[j, q, 1], p.quad[j, q, 2]
+            if i != j:
+                total += w * solid_angle(edges, normal, x, y, z)
+            total -= w * solid_angle(edges, normal, x, y, 2.0 * floor - z)
+    return total / p.weights[i].sum()
+
+
+@kernel
 def _panel_potential(p, j, x, y, z):
     """Potential of unit charge density on panel j, times 4π eps0 [m]."""
     dx, dy, dz = x - p.centers[j, 0], y - p.centers[j, 1], z - p.centers[j, 2]
@@ -213,29 +261,32 @@ def _fill_potentials(start, stop, points, floor, p, out):
 
 
 def system_matrix(
-    is_interface: NDArray[np.bool_], contrast: Array, floor: float, panels: Polygons
+    kind: NDArray[np.int64], contrast: Array, floor: float, panels: Polygons
 ) -> Array:
     """Return the boundary-element matrix, shape (n, n), rows scaled by 4π eps0.
 
+    ``kind``: 0 conductors, 1 interfaces, 2 interfaces of parts that are no upright boxes.
     Conductor rows average the potential over the panel (Galerkin, outer integral by quadrature).
     Interface rows state that the normal displacement is continuous:
     ``2π σ + contrast · 4π eps0 E_n = 0`` with contrast = (e1 − e2) / (e1 + e2), where the normal
     points from medium 2 into medium 1 and E_n is the principal value.
     """
     out = np.empty((len(panels.centers),) * 2)
-    return filled(_fill_system, out, is_interface, contrast, floor, panels)
+    return filled(_fill_system, out, kind, contrast, floor, panels)
 
 
 @compiled
-def _fill_system(start, stop, is_interface, contrast, floor, p, out):
+def _fill_system(start, stop, kind, contrast, floor, p, out):
     grad = np.empty(3)
     for i in range(start, stop):
         for j in range(out.shape[1]):
-            if is_interface[i]:
+            if kind[i] == 2:
+                out[i, j] = -contrast[i] * _flux_mean(p, i, j, floor)
+            elif kind[i] == 1:
                 out[i, j] = -contrast[i] * _mean_normal_gradient(p, i, j, floor, grad)
             else:
                 out[i, j] = _mean_potential(p, i, j, floor)
-        if is_interface[i]:
+        if kind[i]:
             out[i, i] += 2.0 * math.pi
 
 

@@ -13,14 +13,22 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import shapely
 from numpy.typing import NDArray
 
 from capsense.constants import EPS0
 from capsense.design.geometry import Facet
-from capsense.design.model import Design, Layer, Role
+from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field import bem_kernels as kernels
+from capsense.field.facets import (
+    FAR_PLANE,
+    PLANE_TOL,
+    interfaces,
+    plane_spacings,
+    smallest_gaps,
+    thickness_of,
+    walls,
+)
 from capsense.field.panels import Grading, Panels, concatenate, cut_facet, make_panels
 
 Array = NDArray[np.float64]
@@ -28,12 +36,9 @@ Array = NDArray[np.float64]
 GROUND, INTERFACE = -1, -2
 """Owners of panels that belong to no terminal."""
 
-_PLANE_TOL = 1e-6
 _MAX_PANELS = 16_000
 _FEW_FACETS = 64
 """Sheets of more facets than this are curved; their facets are not searched for narrow gaps."""
-_FAR_PLANE = 0.01
-"""Parallel sheets farther apart than this [m] need no panels of their distance."""
 _FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
 _FINEST, _COARSEST = 0.5, 8.0
@@ -70,11 +75,11 @@ class BoundaryModel:
 
 def eps_at(design: Design, points: Array) -> Array:
     """Relative permittivity of a design at points [m], shape (..., 3) -> (...)."""
-    eps = np.ones(points.shape[:-1])
+    flat = points.reshape(-1, 3)
+    eps = np.ones(len(flat))
     for layer in design.layers:
-        inside = ((points > layer.lower) & (points < layer.upper)).all(axis=-1)
-        eps[inside] = layer.eps_r
-    return eps
+        eps[layer.contains(flat)] = layer.eps_r
+    return eps.reshape(points.shape[:-1])
 
 
 def room_scale(design: Design) -> float:
@@ -134,24 +139,20 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
     for body in design.sheets:
         owner = names.index(body.name) if body.name in names else GROUND
         for facet in body.surface.facets:
-            on_floor = (
-                abs(facet.axes[2, 2]) > 1 - 1e-9 and abs(facet.origin[2] - floor) < _PLANE_TOL
-            )
+            on_floor = abs(facet.axes[2, 2]) > 1 - 1e-9 and abs(facet.origin[2] - floor) < PLANE_TOL
             if not on_floor:
                 sheets.append((facet, owner))
                 flat.append(len(body.surface.facets) <= _FEW_FACETS)
     rims = np.concatenate([b.surface.rims for b in design.sheets])
-    gaps, spacings = np.full(len(sheets), np.inf), np.full(len(sheets), _FAR_PLANE)
+    gaps, spacings = np.full(len(sheets), np.inf), np.full(len(sheets), FAR_PLANE)
     few = np.flatnonzero(flat)
     if len(few):
-        gaps[few] = _smallest_gaps([sheets[k] for k in few])
-        spacings[few] = _plane_spacings([sheets[k] for k in few])
-    thin = min((float((la.upper - la.lower)[2]) for la in design.layers), default=math.inf)
+        gaps[few] = smallest_gaps([sheets[k] for k in few])
+        spacings[few] = plane_spacings([sheets[k] for k in few])
+    thin = min((thickness_of(la) for la in design.layers), default=math.inf)
 
     parts: list[Panels] = []
     owners: list[NDArray[np.int64]] = []
-    front: list[Array] = []
-    back: list[Array] = []
 
     def add(facet: Facet, owner: int, grading: Grading, reach: float) -> None:
         pieces = cut_facet(facet, rims, grading, reach)
@@ -160,9 +161,6 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
         panels = make_panels(facet, pieces)
         parts.append(panels)
         owners.append(np.full(len(panels), owner, dtype=np.int64))
-        step = 1e-7 * panels.normals
-        front.append(eps_at(design, panels.centers + step))
-        back.append(eps_at(design, panels.centers - step))
 
     reach = 2.5 * thin if math.isfinite(thin) else 0.0
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
@@ -171,22 +169,18 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
         edge = scale * max(min(0.01 * width, 0.075 * gap, coarse), 5e-6)
         largest = scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
         add(facet, owner, _grading(facet, edge, largest, scale), 2.5 * spacing)
-    for facet, thickness in _interfaces(design, sheets):
+    for facet, thickness in interfaces(design, [facet for facet, _ in sheets]):
         edge = scale * min(3e-4, 0.3 * thickness)
         largest = scale * min(0.006, max(1.25 * thickness, 0.001))
         largest = max(largest, scale * 0.01 * _extent(facet))
         add(facet, INTERFACE, _grading(facet, edge, largest, scale), reach)
-    for facet in _walls(design):
+    for facet in walls(design):
         add(facet, GROUND, Grading(0.01, largest=scale * 0.04 * room_scale(design)), 0.0)
 
-    return BoundaryModel(
-        concatenate(parts),
-        np.concatenate(owners),
-        np.concatenate(front),
-        np.concatenate(back),
-        floor,
-        len(names),
-    )
+    panels = concatenate(parts)
+    step = 1e-7 * panels.normals
+    front, back = (eps_at(design, panels.centers + side * step) for side in (1, -1))
+    return BoundaryModel(panels, np.concatenate(owners), front, back, floor, len(names))
 
 
 def _grading(facet: Facet, edge: float, largest: float, scale: float) -> Grading:
@@ -200,112 +194,6 @@ def _extent(facet: Facet) -> float:
     """The longer side of a facet's bounding rectangle [m]."""
     x0, y0, x1, y1 = facet.polygon.bounds
     return float(max(x1 - x0, y1 - y0))
-
-
-def _smallest_gaps(sheets: list[tuple[Facet, int]]) -> list[float]:
-    """Distance of each facet to the nearest other facet [m], from their outlines."""
-    outlines = []
-    for facet, _ in sheets:
-        rings = [facet.polygon.exterior, *facet.polygon.interiors]
-        outlines.append(np.concatenate([facet.to_sensor(np.asarray(r.coords)[:-1]) for r in rings]))
-    gaps = []
-    for k, (facet, owner) in enumerate(sheets):
-        gap = math.inf
-        for other, (mate, mate_owner) in enumerate(sheets):
-            if other == k or (mate_owner == owner and owner >= 0):
-                continue
-            local = (outlines[other] - facet.origin) @ facet.axes.T
-            if np.abs(local[:, 2]).max() < _PLANE_TOL:
-                flat = _to_plane(mate, facet)
-                gap = min(gap, float(facet.polygon.boundary.distance(flat)))
-        gaps.append(max(gap, 1e-5))
-    return gaps
-
-
-def _plane_spacings(sheets: list[tuple[Facet, int]]) -> list[float]:
-    """Distance of each facet to the nearest parallel facet that faces it [m], at most 10 mm."""
-    out = []
-    for k, (facet, _) in enumerate(sheets):
-        spacing = _FAR_PLANE
-        for other, (mate, _) in enumerate(sheets):
-            height = abs((mate.origin - facet.origin) @ facet.axes[2])
-            parallel = abs(mate.axes[2] @ facet.axes[2]) > 1 - 1e-6
-            if other != k and parallel and _PLANE_TOL < height < spacing:
-                shadow = _to_plane(mate, facet)
-                if facet.polygon.intersects(shadow):
-                    spacing = height
-        out.append(spacing)
-    return out
-
-
-def _to_plane(facet: Facet, target: Facet) -> shapely.Polygon:
-    """Express a coplanar facet's polygon in another facet's plane coordinates."""
-
-    def convert(uv: Array) -> Array:
-        return ((facet.to_sensor(uv) - target.origin) @ target.axes.T)[:, :2]
-
-    return shapely.transform(facet.polygon, convert)
-
-
-def _coplanar(facet: Facet, plane: Facet) -> bool:
-    parallel = abs(facet.axes[2] @ plane.axes[2]) > 1 - 1e-9
-    return bool(parallel and abs((facet.origin - plane.origin) @ plane.axes[2]) < _PLANE_TOL)
-
-
-def _box_faces(layer: Layer) -> list[Facet]:
-    """The six faces of a box, normals outward."""
-    faces = []
-    size, center = layer.upper - layer.lower, (layer.lower + layer.upper) / 2
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            n = np.zeros(3)
-            n[axis] = sign
-            u = np.zeros(3)
-            u[(axis + 1) % 3] = 1.0
-            v = np.cross(n, u)
-            half_u = size[(axis + 1) % 3] / 2
-            half_v = size[(axis + 2) % 3] / 2
-            origin = center + n * size[axis] / 2
-            faces.append(
-                Facet(shapely.box(-half_u, -half_v, half_u, half_v), origin, np.array([u, v, n]))
-            )
-    return faces
-
-
-def _interfaces(design: Design, sheets: list[tuple[Facet, int]]) -> list[tuple[Facet, float]]:
-    """Bare dielectric interfaces (faces not covered by a conductor), with the slab thickness."""
-    out: list[tuple[Facet, float]] = []
-    lower, upper = design.domain.lower, design.domain.upper
-    faces = [_box_faces(layer) for layer in design.layers]
-    for k, layer in enumerate(design.layers):
-        for face in faces[k]:
-            on_wall = np.minimum(
-                np.abs((face.origin - lower) @ face.axes[2]),
-                np.abs((face.origin - upper) @ face.axes[2]),
-            )
-            if on_wall < _PLANE_TOL and not design.domain.open:
-                continue
-            region = face.polygon
-            for facet, _ in sheets:
-                if _coplanar(facet, face):
-                    region = region.difference(_to_plane(facet, face))
-            for earlier in range(k):
-                for mate in faces[earlier]:
-                    if _coplanar(mate, face):
-                        region = region.difference(_to_plane(mate, face))
-            for piece in shapely.get_parts(region):
-                if piece.area > 1e-12 and piece.geom_type == "Polygon":
-                    thickness = float((layer.upper - layer.lower).min())
-                    out.append((Facet(piece, face.origin, face.axes), thickness))
-    return out
-
-
-def _walls(design: Design) -> list[Facet]:
-    """Ceiling and side walls of the box; the floor is met by images. An open domain has none."""
-    if design.domain.open:
-        return []
-    box = Layer("box", "", 1.0, design.domain.lower, design.domain.upper)
-    return [f for f in _box_faces(box) if f.axes[2, 2] > -0.5]
 
 
 class BoundarySolution:
@@ -324,9 +212,8 @@ class BoundarySolution:
         self._contrast = (self.model.eps_front - self.model.eps_back) / (
             self.model.eps_front + self.model.eps_back
         )
-        matrix = kernels.system_matrix(
-            owner == INTERFACE, self._contrast, self.model.floor, panels.polygons
-        )
+        kind = np.where(owner == INTERFACE, 1 + any(k.facets != () for k in design.layers), 0)
+        matrix = kernels.system_matrix(kind, self._contrast, self.model.floor, panels.polygons)
         progress("boundary elements: factorising")
         self._lu = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=True)
 

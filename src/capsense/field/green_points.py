@@ -184,7 +184,7 @@ def reachable_points(surface: Surroundings, sources: Array, clearance: float, co
     margin = 0.02 * (upper - lower)
     reached = ((points > lower + margin) & (points < upper - margin)).all(axis=1)
     for layer in design.layers:
-        reached &= ((points < layer.lower) | (points > layer.upper)).any(axis=1)
+        reached &= ~layer.contains(points)
     points = points[reached]
     distance, nearest = surface.tree.query(points)
     apart = distance > clearance * surface.coarseness[nearest] ** 0.5

@@ -59,9 +59,11 @@ class Outline:
         self._spread = float(np.sqrt(0.04 * max(e.surface.area for e in design.electrodes)))
         """How far apart they lie, at most about [m]."""
         rest = [points_on(c) for c in design.conductors]
-        self._all = np.concatenate([
-            self._starts, *rest, *(_on_box(layer.lower, layer.upper) for layer in design.layers)
-        ])  # fmt: skip
+        rest += [
+            points_on(layer) if layer.facets else _on_box(layer.lower, layer.upper)
+            for layer in design.layers
+        ]
+        self._all = np.concatenate([self._starts, *rest])
 
     def gap(self, scene: Iterable[Body]) -> float:
         """Least distance from any body to electrodes, shields and plates, by points on them [m]."""

@@ -283,8 +283,7 @@ def lattice_sensor(design: Design, terminals: Sequence[str], settings: MeshSetti
     mesh = mesh.with_groups(node_groups={**groups, GROUND: np.flatnonzero(owner == WALL)})
     eps = np.ones(mesh.n_tets)
     for layer in design.layers:
-        inside = (mesh.centroids > layer.lower) & (mesh.centroids < layer.upper)
-        eps[inside.all(axis=1)] = layer.eps_r
+        eps[layer.contains(mesh.centroids)] = layer.eps_r
     return MeshSensor(mesh, tuple(terminals), (GROUND,), eps)
 
 

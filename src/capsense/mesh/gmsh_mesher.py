@@ -93,7 +93,8 @@ def mesh_design(
 
     Raises:
         MeshError: If a size is not positive, there are more than `MAX_FACETS` facets, an electrode
-            touches the box or another conductor, names are used twice, or Gmsh fails.
+            touches the box or another conductor, names are used twice, a layer is no upright box,
+            or Gmsh fails.
         MissingDependencyError: If Gmsh or a shared library that it needs is not installed.
     """
     sizes = {
@@ -105,6 +106,11 @@ def mesh_design(
             raise MeshError(f"{name} must be positive, not {value}")
     if size_far < size_at_edges:
         raise MeshError(f"size_far ({size_far}) is below size_at_edges ({size_at_edges})")
+    if shaped := [layer.name for layer in design.layers if layer.facets]:
+        raise MeshError(
+            f"layer {shaped[0]!r} has a shape of its own, which this mesher does not know; leave "
+            "it out, or make it an upright box with size and z"
+        )
     surfaces = _named_surfaces(design)
     n_facets = sum(len(surface.facets) for surface in surfaces.values())
     if n_facets > MAX_FACETS:

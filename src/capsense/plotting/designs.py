@@ -52,11 +52,11 @@ def draw_design(design: Design, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def outlines(surface: Surface) -> list[Polygon]:
-    """Shadows [mm] of a surface on the xy plane; facets on edge leave none."""
+def outlines(surface: Surface, plane: tuple[int, int] = (0, 1)) -> list[Polygon]:
+    """Shadows [mm] of a surface on a plane, xy unless told; facets on edge leave none."""
     shadows = []
     for facet in surface.facets:
-        rings = [r[:, :2] * 1e3 for r in ring_vertices(facet)]
+        rings = [r[:, list(plane)] * 1e3 for r in ring_vertices(facet)]
         shadows.append(Polygon(rings[0], rings[1:]).buffer(0))
     if len(shadows) > 1:  # without the seams between the strips of a bent sheet
         shadows = [s.buffer(1e-6, join_style="mitre") for s in shadows]
@@ -88,13 +88,11 @@ def _note(ax: Axes, text: str, at: tuple[float, float], **style: Any) -> None:
 def _top_view(design: Design, ax: Axes) -> None:
     reach: list[Array] = []
     for layer in sorted(design.layers, key=lambda k: float(k.upper[2])):
-        low, high = layer.lower[:2] * 1e3, layer.upper[:2] * 1e3
         matter = "" if layer.material == "custom" else f"{layer.material}, "
         style: dict[str, Any] = {"fc": LAYER_COLOUR, "ec": "#9a9c86", "lw": 1.0, "ls": "--"}
         label = f"{layer.name} ({matter}εr {layer.eps_r:g})"
-        plate = shapely.geometry.box(*low, *high)
-        ax.add_patch(outline_patch(plate, label=label, zorder=0, **style))
-        reach += [low, high]
+        add_surface(ax, layer.surface, label, zorder=0, **style)
+        reach += list(layer.surface.bounds[:, :2] * 1e3)
     conductors = sorted(design.conductors, key=lambda c: float(c.surface.bounds[1, 2]))
     top = max(float(e.surface.bounds[1, 2]) for e in design.electrodes)
     for order, conductor in enumerate(conductors, start=1):
@@ -136,12 +134,16 @@ def _label_place(surface: Surface, parts: list[Polygon]) -> tuple[float, float, 
 
 
 def _is_curved(design: Design) -> bool:
-    """Whether some electrode is not flat and level."""
-    return any(np.ptp(e.surface.bounds[:, 2]) > 1e-6 for e in design.electrodes)
+    """Whether some electrode is not flat and level, or some dielectric no slab."""
+    bent = any(np.ptp(e.surface.bounds[:, 2]) > 1e-6 for e in design.electrodes)
+    return bent or any(layer.facets for layer in design.layers)
 
 
 def _profile(design: Design, ax: Axes) -> None:
     """What is curved, seen along +y, to scale."""
+    for layer in design.layers:
+        for outline in outlines(layer.surface, (0, 2)):
+            ax.add_patch(outline_patch(outline, fc=LAYER_COLOUR, ec="#9a9c86", lw=0.8))
     for conductor in design.conductors:
         _edge_on(ax, conductor.surface, lambda z: z * 1e3, ROLE_COLOURS[conductor.role], 0.8)
     for number, electrode in enumerate(design.electrodes):

@@ -36,6 +36,7 @@ from capsense.plotting.designs import (
     add_surface,
     draw_design,
     outline_patch,
+    outlines,
 )
 from capsense.reading import Reading
 from capsense.recording.export import run_of
@@ -151,9 +152,7 @@ def _draw_bodies(
 
 def _sensor_from_above(design: Design, colours: list[str], axes: Axes) -> None:
     for layer in design.layers:
-        low, high = layer.lower[:2] * 1e3, layer.upper[:2] * 1e3
-        plate = shapely.geometry.box(*low, *high)
-        axes.add_patch(outline_patch(plate, fc=LAYER_COLOUR, ec=FAINT, lw=0.6))
+        add_surface(axes, layer.surface, fc=LAYER_COLOUR, ec=FAINT, lw=0.6)
     for conductor in design.conductors:
         add_surface(axes, conductor.surface, fc="#d5dade", ec="none")
     for electrode, colour in zip(design.electrodes, colours, strict=True):
@@ -162,9 +161,8 @@ def _sensor_from_above(design: Design, colours: list[str], axes: Axes) -> None:
 
 def _sensor_from_the_side(design: Design, colours: list[str], axes: Axes, axis: int) -> None:
     for layer in design.layers:
-        low, high = layer.lower * 1e3, layer.upper * 1e3
-        slab = shapely.geometry.box(low[axis], low[2], high[axis], high[2])
-        axes.add_patch(outline_patch(slab, fc=LAYER_COLOUR, ec=FAINT, lw=0.6))
+        for outline in outlines(layer.surface, (axis, 2)):
+            axes.add_patch(outline_patch(outline, fc=LAYER_COLOUR, ec=FAINT, lw=0.6))
     sheets = [(c.surface, ROLE_COLOURS[c.role], 1.5) for c in design.conductors]
     sheets += [(e.surface, c, 3.0) for e, c in zip(design.electrodes, colours, strict=True)]
     for surface, colour, width in sheets:

@@ -177,6 +177,9 @@ class SceneDrawing:
 
     def _draw_stack(self, design: Design) -> None:
         for k, layer in enumerate(design.layers):
+            if layer.facets:
+                self._sheet(f"/layers/{k}", layer.surface, LAYER)
+                continue
             less = min(SHRUNK, 0.2 * float(layer.upper[2] - layer.lower[2]))
             size = layer.upper - layer.lower - [0.0, 0.0, 2 * less]
             self._scene.add_box(
