@@ -159,6 +159,11 @@ class TriMesh(TriangleShape):
         return tuple(TriMesh(self.vertices, faces) for faces in chosen)
 
     @cached_property
+    def piece_bounds(self) -> Array:
+        """Lower and upper corners of the pieces [m], shape (2, n, 3)."""
+        return np.stack([piece.bounds() for piece in self.pieces], axis=1)
+
+    @cached_property
     def volume(self) -> float:
         self._require_inside("a volume")
         return enclosed_volume(self.vertices, self.faces)
