@@ -423,3 +423,11 @@ def test_a_large_mesh_round_the_domain_changes_nothing(sim, grounding):
     assert not reading.delta.any()
     assert reading.jacobian.shape == (1, 6, 6, 6)
     assert not reading.jacobian.any()
+
+
+@pytest.mark.parametrize("material", ["wood", cs.Material("damp", 4.0, 1e-5), "steel"])
+def test_a_body_that_does_not_count_reads_nothing(sim, material):
+    """Invariant: all of its surface is beyond the walls; hardly a charge function is left."""
+    around = cs.Body(cs.Box((3.0, 3.0, 3.0)), cs.Pose(), material, "floating")
+    reading = sim.step(cs.Scene([around]), jacobian=material == "wood")
+    assert np.abs(reading.delta).max() < 1e-21

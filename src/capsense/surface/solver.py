@@ -15,6 +15,7 @@ from capsense.errors import SceneError, SolveError
 from capsense.field.change import Change
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
+from capsense.scene.contact import Sheets
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.matter import UNIT, Matter, matter_of, sizes_of
@@ -113,6 +114,7 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self._middle, self._reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         self._last: tuple[View, Solution] | None = None
+        self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
         """Return what a scene changes.
@@ -130,8 +132,20 @@ class SurfaceSolver:
             return Change(nothing, 0.0, jacobian=slope)
         self._last = view, solution
         matrix, error = self.in_farads(solution)
+        if self._meets_electrodes(view):
+            error = math.inf
         loss = -matrix.imag if np.iscomplexobj(matrix) else None
         return Change(matrix.real, error, unknowns=solution.size, loss=loss, jacobian=slope)
+
+    def _meets_electrodes(self, view: View) -> bool:
+        """Whether an electrode lies inside a body, or touches a conductor."""
+        low, high = self._sheets.bounds
+        bounds = view.packed.bounds[view.met]
+        near = ((bounds[:, 1] > low) & (bounds[:, 0] < high)).all(axis=1)
+        return any(
+            self._sheets.meet(view.scene[int(view.met[k])], bool(view.matter.conducting[k]))
+            for k in np.flatnonzero(near).tolist()
+        )
 
     def potentials(self, points: Array) -> Array:
         """Potentials of the last scene at points [V], shape (n, 3) -> (n, terminals)."""
@@ -187,7 +201,7 @@ class SurfaceSolver:
                 )  # fmt: skip
             else:
                 out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
-        if not (out.size and np.isfinite(out.delta).all()):
+        if out.size < 0 or not np.isfinite(out.delta).all():
             raise SolveError(
                 "the charges of the bodies cannot be told apart; look for bodies that coincide"
             )
