@@ -86,3 +86,34 @@ def test_it_does_not_depend_on_what_a_large_body_is_tied_to(pair: Pair, groundin
         assert reading.stats.solver_error < 0.05 * np.abs(reading.delta).max()
     assert np.median(share) < 1.0
     assert max(share) < 5.0
+
+
+def _open_shell() -> cs.TriMesh:
+    """A ball without a third of it, at its far end."""
+    ball = cs.Sphere(0.03).to_trimesh()
+    return cs.TriMesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0.01])
+
+
+@pytest.mark.parametrize("material", ["steel", "wood"])
+@pytest.mark.parametrize(
+    ("shape", "height", "of_steel", "of_wood"),
+    [
+        (cs.Box((0.15, 0.15, 0.02)), 0.009, True, True),
+        (cs.Box((0.15, 0.15, 0.02)), 0.0101, True, False),
+        (cs.Box((0.15, 0.15, 0.02)), 0.0106, False, False),
+        (cs.Box((3.0, 3.0, 3.0)), 0.0, True, True),
+        (cs.Sphere(0.03), 0.027, True, True),
+        (_open_shell(), 0.02, True, True),
+        (_open_shell(), 0.033, False, False),
+        (cs.Sphere(0.02), 0.03, False, False),
+    ],
+    ids=["inside", "touching", "near", "deep inside", "ball", "shell", "shell off", "ball off"],
+)
+def test_an_electrode_inside_a_body_cannot_be_trusted(
+    pair: Pair, shape: cs.Shape, height: float, of_steel: bool, of_wood: bool, material: str
+) -> None:
+    """Invariant: the error is then the largest capacitance, and never where a body is clear."""
+    body = cs.Body(shape, cs.Pose((0, 0, height)), material)
+    reading = pair[0].step(cs.Scene([body]))
+    doubted = reading.stats.solver_error >= np.abs(reading.capacitance).max()
+    assert doubted == (of_steel if material == "steel" else of_wood)

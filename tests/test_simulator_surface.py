@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from field_cases import (
@@ -362,8 +364,26 @@ def test_unknown_options(name, value):
         cs.Simulator("six_patch_bare", **{name: value})
 
 
-@pytest.mark.parametrize("grounding", ["grounded", "floating", 2e-11])
-def test_a_large_mesh_of_several_parts_reads_as_they_do(sim, grounding):
+def test_what_crosses_a_wall_out_of_sight_costs_little(sim):
+    """Invariant: a ball is near, a long bar leaves the domain far from the electrodes."""
+    ball = cs.Body(cs.Sphere(0.03), cs.Pose((0, 0, 0.05)))
+    far = cs.Body(cs.Box((0.6, 0.3, 0.05)), cs.Pose((0.25, 0.1, 0.4)))
+    near, both = (sim.step(cs.Scene(bodies)) for bodies in ([ball], [ball, far]))
+    assert both.stats.unknowns < near.stats.unknowns + 12
+    preset = sim._solver.preset
+    try:
+        sim._solver.preset = replace(preset, threshold=1e-4)
+        exact = sim.step(cs.Scene([ball, far])).delta
+    finally:
+        sim._solver.preset = preset
+    np.testing.assert_allclose(both.delta, exact, rtol=0, atol=0.01 * exact.max())
+
+
+@pytest.mark.parametrize(
+    ("grounding", "material"),
+    [("grounded", "steel"), ("floating", "steel"), (2e-11, "steel"), ("grounded", "wood")],
+)
+def test_a_large_mesh_of_several_parts_reads_as_they_do(sim, grounding, material):
     """Measured: two crossing capsules and far balls, as one mesh and as bodies in touch."""
     near = [
         cs.Body(cs.Capsule(0.015, 0.12), cs.Pose((0.0, 0.01, 0.04), (0, 0.5**0.5, 0, 0.5**0.5))),
@@ -377,14 +397,14 @@ def test_a_large_mesh_of_several_parts_reads_as_they_do(sim, grounding):
     mesh = cs.TriMesh(vertices, faces)
     assert len(mesh.pieces) == 5
     share = grounding / 2 if isinstance(grounding, float) else grounding
-    bodies = [cs.Body(b.shape, b.pose, "steel", share) for b in near]
+    bodies = [cs.Body(b.shape, b.pose, material, share) for b in near]
     expected = sim.step(cs.Scene(bodies)).delta
-    got = sim.step(cs.Scene([cs.Body(mesh, material="steel", grounding=grounding)]), jacobian=True)
+    got = sim.step(cs.Scene([cs.Body(mesh, material=material, grounding=grounding)]), jacobian=True)
     np.testing.assert_allclose(got.delta, expected, rtol=0, atol=0.02 * expected.max())
     assert got.jacobian.shape == (1, 6, 6, 6)
     step = 2e-4
     higher, lower = (
-        sim.step(cs.Scene([cs.Body(mesh, cs.Pose((0, 0, z)), "steel", grounding)])).delta
+        sim.step(cs.Scene([cs.Body(mesh, cs.Pose((0, 0, z)), material, grounding)])).delta
         for z in (step, -step)
     )
     slope = (higher - lower) / (2 * step)
@@ -404,3 +424,11 @@ def test_a_large_mesh_round_the_domain_changes_nothing(sim, grounding):
     assert not reading.delta.any()
     assert reading.jacobian.shape == (1, 6, 6, 6)
     assert not reading.jacobian.any()
+
+
+@pytest.mark.parametrize("material", ["wood", cs.Material("damp", 4.0, 1e-5), "steel"])
+def test_a_body_that_does_not_count_reads_nothing(sim, material):
+    """Invariant: all of its surface is beyond the walls; hardly a charge function is left."""
+    around = cs.Body(cs.Box((3.0, 3.0, 3.0)), cs.Pose(), material, "floating")
+    reading = sim.step(cs.Scene([around]), jacobian=material == "wood")
+    assert np.abs(reading.delta).max() < 1e-21

@@ -19,7 +19,11 @@ class StepStats:
     """How a step was solved."""
 
     solver_error: float
-    """Estimated error of a capacitance that more unknowns or iterations would remove [F]."""
+    """Estimated error of a capacitance that more unknowns or iterations would remove [F].
+
+    As large as the largest capacitance where the reading means nothing: an electrode lies inside a
+    body, or within 0.2 mm of a conductor. The paper's scheme does not tell.
+    """
     wall_time: float
     """Time the step took [s]."""
     unknowns: int = 0

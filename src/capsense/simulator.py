@@ -250,6 +250,7 @@ class Simulator:
             change = change - 1j * found.loss
         slope = None if found.jacobian is None else terminals.slope(change, found.jacobian)
         change = terminals.change(change)
+        error = min(error, float(np.abs(terminals.empty + change).max()))
         stats = StepStats(error, perf_counter() - start, found.unknowns, found.iterations)
         reading = self._reading(change.real, stats, slope)
         if found.loss is None:

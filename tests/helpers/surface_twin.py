@@ -227,18 +227,24 @@ def reduced(
 # ---- scores ----
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
+LONG, SHORE = (0.03, 0.06), 5e-3
 
 
 def scores(
-    pieces: tuple[Piece, ...], trees: list[tuple[Array, Array, Array]], green
+    pieces: tuple[Piece, ...], trees: list[tuple[Array, Array, Array]], green, room: Array
 ) -> list[Array]:
-    """Share of the electrodes' energies that each split takes up alone, raised from below."""
+    """Share of the electrodes' energies that each split takes up alone, raised from below.
+
+    Parts that cross a wall have at least the share of the split that made them, by length.
+    """
     seen, stiff = [], []
     energy = np.zeros(green.far_phi.shape[1])
     for piece, (kids, panel, charge) in zip(pieces, trees, strict=True):
         share = shares(kids, panel, charge)
         block = free_block(piece.panels) / piece.scale
-        means, linear = _means(piece, kids, share, green)
+        means, looks = _means(piece, kids, share, green, room)
+        linear = {k: look.linear for k, look in looks.items()}
+        net = 0.0
         own = np.zeros(len(kids))
         for k, value in means.items():
             x, y = kids[k]
@@ -251,25 +257,31 @@ def scores(
                 value = means[x] - means[y]
                 energy += (1 - linear[k]) * value**2 / own[k]
         if not piece.neutral:
-            energy += means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.tie)
-        seen.append((means, linear))
+            net = means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.tie)
+            energy += net
+        seen.append((means, linear, looks, net))
         stiff.append(own)
     weight = 1 / (energy + 0.01 * np.linalg.norm(energy))
     out = []
-    for (means, linear), own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
-        score = np.zeros(len(kids))
+    for (means, linear, looks, net), own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
+        score, alone = np.zeros(len(kids)), np.zeros(len(kids))
         for k in means:
             if own[k] > 0:
                 x, y = kids[k]
                 value = weight @ (means[x] - means[y]) ** 2 / own[k]
+                alone[k] = (1 - linear[k]) * value
                 for below in (score[x], score[y]):
                     value = max(value, below) + 0.5 * min(value, below)
                 score[k] = (1 - linear[k]) * value
+        alone[0] = max(alone[0], looks[0].crossing * np.sum(weight * net))
         for k in range(len(kids)):
             for part in kids[k]:
                 if part >= 0 and kids[part, 0] >= 0:
                     score[part] += linear.get(part, 1.0) * DECAY * score[k]
-        out.append(score)
+                    if part in looks:
+                        ratio = min(1.0, looks[part].size / looks[k].size)
+                        alone[part] = max(alone[part], looks[part].crossing * alone[k] * ratio)
+        out.append(np.maximum(score, alone))
     return out
 
 
@@ -277,24 +289,44 @@ def members_of(share: Array, cluster: int) -> Array:
     return np.flatnonzero(share[:, cluster])
 
 
+class Look(NamedTuple):
+    """A cluster that is looked at."""
+
+    linear: float
+    """How linear it sees the potential."""
+    crossing: float
+    """How much it crosses a wall."""
+    size: float
+    """Its length [m]."""
+
+
+def _smooth(x: float) -> float:
+    x = min(1.0, max(0.0, x))
+    return x * x * (3 - 2 * x)
+
+
 def _means(
-    piece: Piece, kids: Array, share: Array, green: GreenFunction
-) -> tuple[dict[int, Array], dict[int, float]]:
-    """Potentials in the centres of the clusters that are looked at, finest first, and how linear
-    each sees it."""
+    piece: Piece, kids: Array, share: Array, green: GreenFunction, room: Array
+) -> tuple[dict[int, Array], dict[int, Look]]:
+    """Potentials in the centres of the clusters that are looked at, finest first, and the looks."""
     sources = green.far_sources.astype(float)
     image = sources * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
-    out, linear = {}, {}
+    out, looks = {}, {}
     wanted = [0]
     for k in wanted:
         center, second = charge_moments(piece.panels, share[:, k])
         point = piece.scale * piece.rotation @ center + piece.position
         size = piece.scale * np.sqrt(12.0 * max(np.linalg.eigvalsh(second)[2], 0.0))
         near = 1 / np.maximum(np.linalg.norm(point - sources, axis=1), LEAST)
+        inside = min((point - room[0]).min(), (room[1] - point).min())
+        off = np.linalg.norm(np.maximum(np.maximum(room[0] - point, point - room[1]), 0.0))
         out[k] = (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
-        t = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
-        t = np.clip(t, 0.0, 1.0) if k >= COARSE else 0.0
-        linear[k] = t * t * (3 - 2 * t)
-        if kids[k, 0] >= 0 and linear[k] < 1:
+        out[k] *= 1 - _smooth(off / SHORE)
+        crossing = _smooth(2 - 4 * abs(inside) / size)
+        crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
+        even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
+        even = _smooth(even) if inside > 0 else 1.0
+        looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, size)
+        if kids[k, 0] >= 0 and looks[k].linear < 1:
             wanted += kids[k].tolist()
-    return {k: out[k] for k in sorted(out, reverse=True)}, linear
+    return {k: out[k] for k in sorted(out, reverse=True)}, looks

@@ -725,7 +725,7 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
-    score(bodies, first, green, 0.0375, np.empty(green.terminals), scores)
+    score(bodies, first, green, np.empty(green.terminals), scores)
     return choose(bodies, first, scores, threshold, WIDTH), scores, first
 
 
@@ -734,7 +734,7 @@ def test_scores(name: str) -> None:
     """Differential: what each function alone takes up, raised by the scores below it."""
     scene = scenes()[name]
     _, found, first = cut_of(scene, 0.1)
-    wanted = twin.scores(scene.pieces, scene.trees, exact())
+    wanted = twin.scores(scene.pieces, scene.trees, exact(), packed_green().room)
     for b, each in enumerate(wanted):
         mine = found[first[b] : first[b + 1]]
         np.testing.assert_allclose(mine, each, rtol=2e-3, atol=2e-6 * found.max())

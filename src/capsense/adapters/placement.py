@@ -7,25 +7,21 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.model import Conductor, Design, Electrode, Layer
+from capsense.design.model import Design
 from capsense.scene import Body, Layers, Scene, TriMesh
-from capsense.scene.mesh_shape import TriangleShape
+from capsense.scene.contact import TOUCH, distances, points_on
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS
 
 Array = NDArray[np.float64]
 
-_TOUCH = 2e-4
-"""What is nearer to an electrode than this [m] touches it."""
 _COARSE = 0.05
 """Panels of a body wider than this [m] say little of a sensor."""
-_POINTS = 100
-"""About so many points stand for an electrode."""
 
 
 def placement(scene: Scene, simulator: Simulator) -> list[str]:
     """What is wrong with the bodies of a scene, given in the sensor frame."""
-    points = {e.name: points_on(e) for e in simulator.design.electrodes}
+    points = {e.name: points_on(e.surface.triangles) for e in simulator.design.electrodes}
     found = []
     for body in scene:
         found += _contacts(body, points)
@@ -60,10 +56,10 @@ def _contacts(body: Body, electrodes: dict[str, Array]) -> list[str]:
     inside, touching, depth = [], [], 0.0
     for name, points in electrodes.items():
         off = distances(body, points)
-        if off.min() < -_TOUCH:
+        if off.min() < -TOUCH:
             inside.append(name)
             depth = max(depth, -float(off.min()))
-        elif off.min() < _TOUCH:
+        elif off.min() < TOUCH:
             touching.append(name)
     out = []
     if inside:
@@ -100,48 +96,6 @@ def _coarse(body: Body, panels: int) -> list[str]:
         f"{body.name!r} is a mesh of {area:.2g} m², solved with panels of some {1e3 * width:.0f} "
         "mm; cut it into meshes of 0.4 m or less, or keep only what comes near the sensor"
     ]
-
-
-def distances(body: Body, points: Array) -> Array:
-    """Distances of points to a body [m], negative inside; of an open mesh, by its winding."""
-    local, shape = body.pose.inverse().apply(points), body.shape
-    if not isinstance(shape, TriangleShape) or shape.closed:
-        return shape.signed_distance(local)
-    off = shape.distance(local)
-    return np.where(_wound(shape, local), -off, off)
-
-
-def _wound(shape: TriangleShape, points: Array) -> NDArray[np.bool_]:
-    """Points that an open surface winds round by more than a half.
-
-    A. Jacobson, L. Kavan, O. Sorkine-Hornung, *Robust inside-outside segmentation using
-    generalized winding numbers* (2013); solid angles after A. van Oosterom and J. Strackee (1983).
-    """
-    low, high = shape.bounds()
-    near = ((points > low) & (points < high)).all(axis=1)
-    out = np.zeros(len(points), dtype=bool)
-    for k in np.flatnonzero(near).tolist():
-        arms = shape.vertices[shape.faces] - points[k]
-        a, b, c = arms[:, 0], arms[:, 1], arms[:, 2]
-        u, v, w = (np.linalg.norm(x, axis=1) for x in (a, b, c))
-        below = u * v * w + (a * b).sum(1) * w + (b * c).sum(1) * u + (c * a).sum(1) * v
-        angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below)
-        out[k] = abs(angle.sum()) > 2 * math.pi
-    return out
-
-
-def points_on(electrode: Electrode | Conductor | Layer) -> Array:
-    """Corners of a sheet's triangles, and points spread evenly over it [m], shape (n, 3)."""
-    corners = electrode.surface.triangles
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normals, axis=1)
-    steps = np.arange(_POINTS) + 0.5
-    triangle = np.searchsorted(np.cumsum(area) / area.sum(), steps / _POINTS)
-    u, v = np.sqrt(steps * 0.7548776662 % 1.0), steps * 0.5698402910 % 1.0  # Roberts' R2 sequence
-    shares = np.stack([1 - u, u * (1 - v), u * v], axis=1)
-    spread = (shares[:, :, None] * corners[np.minimum(triangle, len(area) - 1)]).sum(axis=1)
-    few = corners.reshape(-1, 3)[:: max(1, 3 * len(corners) // _POINTS)]
-    return np.concatenate([few, spread])
 
 
 def _electrodes(names: list[str], one: str, many: str) -> str:

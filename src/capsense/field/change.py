@@ -20,7 +20,7 @@ class Change:
     matrix: Array
     """Change of the matrix [F], shape (terminals, terminals)."""
     error: float
-    """Estimated error of its largest entry [F]."""
+    """Estimated error of its largest entry [F]; infinite where an electrode lies inside a body."""
     iterations: int = 0
     """Iterations of the linear solver; 0 for a direct one."""
     unknowns: int = 0

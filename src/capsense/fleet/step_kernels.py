@@ -94,8 +94,8 @@ def step_rows(start, stop, bodies, poses, sensor, found):
             for i in range(m):
                 found.error[e, s] = max(found.error[e, s], abs(doubt[i, i]))
                 for j in range(m):
-                    found.delta[e, s, i, j] = out.delta[i, j] if out.size > 0 else np.nan
-            if slopes and out.size > 0:
+                    found.delta[e, s, i, j] = out.delta[i, j] if out.size >= 0 else np.nan
+            if slopes and out.size >= 0:
                 slope = jacobian(out, room[:count], green)
                 for c in range(count):
                     found.slope[e, s, place[c]] = slope[c]

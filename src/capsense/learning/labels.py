@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
-from capsense.adapters.placement import distances, points_on
 from capsense.design import Design
 from capsense.scene import Body, Capsule, Cylinder, Scene
+from capsense.scene.contact import distances, points_on
 
 Array = NDArray[np.float64]
 
@@ -55,12 +55,14 @@ class Outline:
 
     def __init__(self, design: Design) -> None:
         self._triangles = np.concatenate([e.surface.triangles for e in design.electrodes])
-        self._starts = np.concatenate([points_on(e) for e in design.electrodes])
+        self._starts = np.concatenate([points_on(e.surface.triangles) for e in design.electrodes])
         self._spread = float(np.sqrt(0.04 * max(e.surface.area for e in design.electrodes)))
         """How far apart they lie, at most about [m]."""
-        rest = [points_on(c) for c in design.conductors]
+        rest = [points_on(c.surface.triangles) for c in design.conductors]
         rest += [
-            points_on(layer) if layer.facets else _on_box(layer.lower, layer.upper)
+            points_on(layer.surface.triangles)
+            if layer.facets
+            else _on_box(layer.lower, layer.upper)
             for layer in design.layers
         ]
         self._all = np.concatenate([self._starts, *rest])

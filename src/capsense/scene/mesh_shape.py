@@ -55,7 +55,7 @@ class TriangleShape(Shape):
             SceneError: The points do not have shape (n, 3), or the surface is not closed.
         """
         self._require_inside("signed distances")
-        return self._distances(points)
+        return self.ray_distance(points)
 
     def distance(self, points: ArrayLike) -> Array:
         """Exact distance to the nearest triangle [m], of open surfaces too.
@@ -69,19 +69,20 @@ class TriangleShape(Shape):
         Raises:
             SceneError: The points do not have shape (n, 3).
         """
-        return np.abs(self._distances(points))
+        return np.abs(self.ray_distance(points))
 
     @property
     @abstractmethod
     def closed(self) -> bool:
         """Whether the surface has an inside."""
 
-    def _distances(self, points: ArrayLike) -> Array:
+    def ray_distance(self, points: ArrayLike, *, down: bool = False) -> Array:
+        """As :meth:`signed_distance`; of an open surface, one ray along z tells what is inside."""
         from capsense.scene.geometry_kernels import signed_distances
 
-        p = as_points(points)
+        p = as_points(points) * (1.0, 1.0, -1.0 if down else 1.0)
         out = np.empty(len(p))
-        signed_distances(self._boxes, np.ascontiguousarray(p), out)
+        signed_distances(self._turned_boxes if down else self._boxes, p, out)
         return out
 
     @cached_property
@@ -89,6 +90,12 @@ class TriangleShape(Shape):
         from capsense.scene.geometry_kernels import boxed
 
         return boxed(self.vertices[self.faces])
+
+    @cached_property
+    def _turned_boxes(self) -> Boxes:
+        from capsense.scene.geometry_kernels import boxed
+
+        return boxed(self.vertices[self.faces] * (1.0, 1.0, -1.0))
 
     def to_trimesh(self) -> trimesh.Trimesh:
         import trimesh
@@ -157,6 +164,11 @@ class TriMesh(TriangleShape):
         label = np.where(share[label] < 0.001, -1, label)
         chosen = [self.faces[label == k] for k in np.unique(label)]
         return tuple(TriMesh(self.vertices, faces) for faces in chosen)
+
+    @cached_property
+    def piece_bounds(self) -> Array:
+        """Lower and upper corners of the pieces [m], shape (2, n, 3)."""
+        return np.stack([piece.bounds() for piece in self.pieces], axis=1)
 
     @cached_property
     def volume(self) -> float:

@@ -29,7 +29,7 @@ _COARSE = 31
 _DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 _LONG = 0.03, 0.06
-"""Clusters that cross a wall come to be split where they are longer than this [m]."""
+"""Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 USED, FRONTIER, LEAF = 2, 1, 0
 """State of a cluster: its function is used; it is split for an estimate only; it is not split."""
 
@@ -62,19 +62,18 @@ def chosen(bodies, green, threshold, width):
     for b in range(bodies.shape[0]):
         first[b + 1] = first[b] + 2 * bodies[b].n - 1
     weight, scores = np.empty(green.terminals), np.empty(first[-1])
-    score(bodies, first, green, threshold * width, weight, scores)
+    score(bodies, first, green, weight, scores)
     return choose(bodies, first, scores, threshold, width)
 
 
 @compiled
-def score(bodies, first, green, enough, weight, scores):
+def score(bodies, first, green, weight, scores):
     """Share of the electrodes' energies that each charge function takes up alone.
 
     Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
-    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. A score of
-    ``enough`` has a cluster split for certain, as those that cross a wall must be. Clusters that
-    are small against their distance from the design are not looked into: φ⁰ is linear there, and
-    the scores of their parts follow from their own.
+    raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. Clusters that
+    are small against their distance from the design, and cross no wall, are not looked into: φ⁰ is
+    linear there, and the scores of their parts follow from their own.
     """
     terminals, lead, total = green.terminals, green.lead, first[-1]
     means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
@@ -107,9 +106,9 @@ def score(bodies, first, green, enough, weight, scores):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
     for b in range(bodies.shape[0]):
         span = slice(first[b], first[b + 1])
-        for k in range(first[b], first[b + 1]):
-            scores[k] = enough * crossing[k]
-        _raise_scores(bodies[b], means[span], met[span], linear[span], weight, scores[span])
+        _raise_scores(
+            bodies[b], means[span], met[span], linear[span], crossing[span], weight, scores[span]
+        )
 
 
 @compiled
@@ -147,11 +146,15 @@ def _mean_potentials(body, green, means, met, crossing, linear):
         )
         if k >= _COARSE:
             part = size / math.sqrt(square + 1e-12)
-            linear[k] = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
+            even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0])) if room > 0.0 else 1.0
+            linear[k] = even * (1.0 - crossing[k])
         if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
             lift(points[found : found + 1], least_gap(size, green.cover), green.box)
-        if linear[k] > 0.0 or kids[2 * k] < 0:
-            places[found], inner[found] = k, 1.0 - smooth(math.sqrt(out) / SHORE)
+        share = 1.0 - smooth(math.sqrt(out) / SHORE)
+        for i in range(green.lead):
+            means[k, i] = 0.0
+        if share > 0.0 and (linear[k] > 0.0 or kids[2 * k] < 0):
+            places[found], inner[found] = k, share
             found += 1
         if linear[k] < 1.0 and kids[2 * k] >= 0:
             met[kids[2 * k]] = met[kids[2 * k + 1]] = True
@@ -171,27 +174,44 @@ def _mean_potentials(body, green, means, met, crossing, linear):
 
 
 @compiled
-def _raise_scores(body, mean, met, linear, weight, scores):
-    kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
+def _raise_scores(body, mean, met, linear, crossing, weight, scores):
+    """Score a body's clusters from the mean potentials of those that were met.
+
+    Charge beyond a wall costs so much energy that none is there. A part that crosses one can carry
+    charge where it is inside only if it is split too. So it gets the score of the function that it
+    is a part of, times its share of the length.
+    """
+    kids, function = integers(body.kids), integers(body.function)
+    own, extent = doubles(body.own), doubles(body.extent)
     count = 2 * body.n - 1
+    alone, net = np.zeros(count), 0.0
     for k in range(count - 1, -1, -1):
-        a = kids[2 * k]
+        a, scores[k] = kids[2 * k], 0.0
         if a >= 0 and met[a]:
-            value = 0.0
             for i in range(weight.shape[0]):
                 d = float(mean[a, i] - mean[kids[2 * k + 1], i])
-                value += weight[i] * d * d
-            value *= body.scale / own[function[k]]
+                alone[k] += weight[i] * d * d
+            alone[k] *= (1.0 - linear[k]) * body.scale / own[function[k]]
+            value = alone[k]
             for c in range(2):
-                below = scores[kids[2 * k + c]]
+                below = (1.0 - linear[k]) * scores[kids[2 * k + c]]
                 value = max(value, below) + 0.5 * min(value, below)
-            scores[k] = max(scores[k], (1.0 - linear[k]) * value)
+            scores[k] = value
+    if not body.neutral:
+        for i in range(weight.shape[0]):
+            net += weight[i] * float(mean[0, i]) ** 2
+        net *= crossing[0] / (own[0] / body.scale + body.tie)
+    alone[0] = max(alone[0], net)
     for k in range(count):
         for c in range(2):
             part = kids[2 * k + c]
             if part >= 0 and kids[2 * part] >= 0:
                 share = linear[part] if met[part] else 1.0
                 scores[part] += share * _DECAY * scores[k]
+                held = crossing[part] * alone[k] * min(1.0, extent[part] / extent[k])
+                alone[part] = max(alone[part], held)
+    for k in range(count):
+        scores[k] = max(scores[k], alone[k])
 
 
 @compiled

@@ -316,6 +316,8 @@ def _factorise(matrix, root, own, factor):
         By how much it was raised, relative to itself; -1 where there is no factor.
     """
     shift = 0.0
+    if root.shape[0] == 0:  # no function counts
+        return shift
     while shift < 1e3:
         for f in range(root.shape[0]):
             for e in range(f):

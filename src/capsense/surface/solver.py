@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ from capsense.field.change import Change
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
+from capsense.scene.contact import Sheets
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.step import Solution, potential_change, solve, solve_lossy
@@ -107,6 +109,7 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self._middle, self._reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         self._last: tuple[View, Solution] | None = None
+        self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
         """Return what a scene changes.
@@ -124,8 +127,20 @@ class SurfaceSolver:
             return Change(nothing, 0.0, jacobian=slope)
         self._last = view, solution
         matrix, error = self.in_farads(solution)
+        if self._meets_electrodes(view):
+            error = math.inf
         loss = -matrix.imag if np.iscomplexobj(matrix) else None
         return Change(matrix.real, error, unknowns=solution.size, loss=loss, jacobian=slope)
+
+    def _meets_electrodes(self, view: View) -> bool:
+        """Whether an electrode lies inside a body, or touches a conductor."""
+        low, high = self._sheets.bounds
+        bounds = view.packed.bounds[view.met]
+        near = ((bounds[:, 1] > low) & (bounds[:, 0] < high)).all(axis=1)
+        return any(
+            self._sheets.meet(view.scene[int(view.met[k])], bool(view.matter.conducting[k]))
+            for k in np.flatnonzero(near).tolist()
+        )
 
     def potentials(self, points: Array) -> Array:
         """Potentials of the last scene at points [V], shape (n, 3) -> (n, terminals)."""
@@ -181,7 +196,7 @@ class SurfaceSolver:
                 )  # fmt: skip
             else:
                 out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
-        if not (out.size and np.isfinite(out.delta).all()):
+        if out.size < 0 or not np.isfinite(out.delta).all():
             raise SolveError(
                 "the charges of the bodies cannot be told apart; look for bodies that coincide"
             )
@@ -230,12 +245,11 @@ class SurfaceSolver:
         places: list[int] = []
         offsets: list[Array] = []
         for place, k in enumerate(view.met.tolist()):
-            rotation, middle = packed.rotation[k], self._middle - packed.position[k]
-            parts = self._parts(view, place, middle @ rotation)
+            parts, share = self._parts(view, place)
             for part, at in parts:
-                found.append(self.functions_of(part, _OF_MANY if len(parts) > 1 else 1.0))
+                found.append(self.functions_of(part, share))
                 places.append(place)
-                offsets.append(rotation @ at)
+                offsets.append(packed.rotation[k] @ at)
         chosen, shapes = view.met[places], [shape for shape, _ in found]
         shift = np.array(offsets).reshape(-1, 3)
         records = np.array([s.record for s in shapes], BODY)
@@ -246,27 +260,32 @@ class SurfaceSolver:
         matter.write(records, shapes)
         return PackedBodies(records, chosen, matter, shapes, shift)
 
-    def _parts(self, view: View, place: int, middle: Array) -> list[tuple[Shape, Array]]:
-        """Parts of a body to be solved for, and where they are in its frame [m].
+    def _parts(self, view: View, place: int) -> tuple[list[tuple[Shape, Array]], float]:
+        """Parts of a body to be solved for, where they are in its frame [m], and panels for each.
 
-        Long bodies are cut, see :func:`windowed`. Of a large conducting mesh each connected part
-        has charge functions of its own, if it reaches into the domain.
+        Long bodies are cut, see :func:`windowed`. Each connected part of a large mesh has charge
+        functions of its own, if it reaches into the domain; current between them is not followed,
+        so that lossy meshes stay whole.
+
+        Returns:
+            Parts and their places, and the share of the usual panels that each is given.
         """
-        shape = view.scene[int(view.met[place])].shape
+        k, matter = int(view.met[place]), view.matter
+        shape, rotation = view.scene[k].shape, view.packed.rotation[k]
+        position = view.packed.position[k]
         if (
             not isinstance(shape, TriMesh)
             or np.ptp(shape.bounds(), axis=0).max() < _LARGE
-            or not view.matter.conducting[place]
+            or not (matter.conducting[place] or matter.eps[place].imag == 0)
             or shape.parts == 1
         ):
-            return [windowed(shape, middle, self._reach)]
-        near: list[tuple[Shape, Array]] = []
-        for part in shape.pieces:
-            low, high = part.bounds()
-            off = np.maximum(np.maximum(low - middle, middle - high), 0.0)
-            if np.linalg.norm(off) < 0.5 * self._reach:
-                near.append((part, np.zeros(3)))
-        return near
+            return [windowed(shape, (self._middle - position) @ rotation, self._reach)], 1.0
+        low, high = shape.piece_bounds
+        middle = position + 0.5 * (low + high) @ rotation.T
+        half = 0.5 * (high - low) @ np.abs(rotation.T)
+        room = self.green.room
+        near = ((middle + half > room[0]) & (middle - half < room[1])).all(axis=1)
+        return [(shape.pieces[i], np.zeros(3)) for i in np.flatnonzero(near).tolist()], _OF_MANY
 
     def functions_of(
         self, shape: Shape, share: float = 1.0

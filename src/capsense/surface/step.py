@@ -45,7 +45,7 @@ class Solution(NamedTuple):
     owner: NDArray[Any]
     """Body of each leaf, shape (l,)."""
     size: int
-    """Functions solved for; 0 where there is no solution."""
+    """Functions solved for; -1 where there is no solution."""
     shift: float
     """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
 
@@ -86,7 +86,7 @@ def solve(
     delta, left, x, shift = reduced(cut, functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
-    size = functions.solved if shift >= 0.0 else 0
+    size = functions.solved if shift >= 0.0 else -1
     return Solution(
         delta[:m, :m], left[:m, :m], charge, leaves.points, leaves.extent, leaves.owner, size, shift
     )

@@ -1,0 +1,104 @@
+"""Whether sheets of a sensor lie inside a body, or touch one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.scene.mesh_shape import TriangleShape
+from capsense.scene.scene import Body
+from capsense.scene.shapes import ShapeKind
+
+Array = NDArray[np.float64]
+
+TOUCH = 2e-4
+"""What is nearer to an electrode than this [m] touches it."""
+_FEW = 10
+"""About so many points of each electrode are looked at first."""
+
+
+class Sheets:
+    """The electrodes of a sensor, as points.
+
+    Args:
+        sheets: Triangles of each electrode [m], shapes (t, 3, 3).
+    """
+
+    def __init__(self, sheets: Sequence[Array]) -> None:
+        self._few = np.concatenate([points_on(corners, _FEW) for corners in sheets])
+        self._many = np.concatenate([points_on(corners) for corners in sheets])
+        apart = np.linalg.norm(self._many[:, None] - self._few, axis=2)
+        self._nearest = apart.argmin(axis=1)
+        self._reach = float(apart.min(axis=1).max())
+        self.bounds = np.array([self._few.min(axis=0) - TOUCH, self._few.max(axis=0) + TOUCH])
+        """Corners of a box around all of them [m], shape (2, 3)."""
+
+    def meet(self, body: Body, conducting: bool) -> bool:
+        """Whether one of them lies inside a body, or touches one that conducts.
+
+        A depth image has no inside.
+        """
+        if body.shape.kind == ShapeKind.LAYERS:
+            return False
+        off = _quick(body, self._few)
+        if off.min() > self._reach:
+            return False
+        close = off[self._nearest] <= self._reach
+        off = np.concatenate([off, _quick(body, self._many[close])])
+        return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
+
+
+def _quick(body: Body, points: Array) -> Array:
+    """As :func:`distances`; of the points that rays find in an open mesh, only one is made sure."""
+    local, shape = body.pose.inverse().apply(points), body.shape
+    if not isinstance(shape, TriangleShape) or shape.closed or not len(points):
+        return shape.signed_distance(local)
+    off = np.minimum(shape.ray_distance(local), shape.ray_distance(local, down=True))
+    deepest = int(off.argmin())
+    if off[deepest] < -TOUCH and not _wound(shape, local[[deepest]])[0]:
+        return np.abs(off)
+    return off
+
+
+def distances(body: Body, points: Array) -> Array:
+    """Distances of points to a body [m], negative inside; of an open mesh, by its winding."""
+    local, shape = body.pose.inverse().apply(points), body.shape
+    if not isinstance(shape, TriangleShape) or shape.closed:
+        return shape.signed_distance(local)
+    off = shape.distance(local)
+    return np.where(_wound(shape, local), -off, off)
+
+
+def _wound(shape: TriangleShape, points: Array) -> NDArray[np.bool_]:
+    """Points that an open surface winds round by more than a half.
+
+    A. Jacobson, L. Kavan, O. Sorkine-Hornung, *Robust inside-outside segmentation using
+    generalized winding numbers* (2013); solid angles after A. van Oosterom and J. Strackee (1983).
+    """
+    low, high = shape.bounds()
+    near = ((points > low) & (points < high)).all(axis=1)
+    out = np.zeros(len(points), dtype=bool)
+    for k in np.flatnonzero(near).tolist():
+        arms = shape.vertices[shape.faces] - points[k]
+        a, b, c = arms[:, 0], arms[:, 1], arms[:, 2]
+        u, v, w = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        below = u * v * w + (a * b).sum(1) * w + (b * c).sum(1) * u + (c * a).sum(1) * v
+        angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below)
+        out[k] = abs(angle.sum()) > 2 * math.pi
+    return out
+
+
+def points_on(corners: Array, count: int = 100) -> Array:
+    """Corners of triangles (t, 3, 3), and some ``count`` points spread evenly [m], shape (n, 3)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    steps = np.arange(count) + 0.5
+    triangle = np.searchsorted(np.cumsum(area) / area.sum(), steps / count)
+    u, v = np.sqrt(steps * 0.7548776662 % 1.0), steps * 0.5698402910 % 1.0  # Roberts' R2 sequence
+    shares = np.stack([1 - u, u * (1 - v), u * v], axis=1)
+    spread = (shares[:, :, None] * corners[np.minimum(triangle, len(area) - 1)]).sum(axis=1)
+    few = corners.reshape(-1, 3)[:: max(1, 3 * len(corners) // count)]
+    return np.concatenate([few, spread])
