@@ -37,7 +37,8 @@ class FleetSkin:
     """Reads the sensors of several worlds of one kind by a fleet.
 
     Readings are those of the worlds' own sensors, but a person who touches the robot stays a
-    conductor of its own, and long bodies are not cut; see :class:`~capsense.fleet.Fleet`.
+    conductor of its own, and long bodies are not cut; on Warp, parts of a limb are conductors of
+    their own. See :class:`~capsense.fleet.Fleet`.
 
     Args:
         worlds: The worlds; their models hold the same geoms, of sizes of their own.
