@@ -43,7 +43,6 @@ def test_example_and_both_kinds_of_sensors():
     # the class beside the scene, at the state that the run has left
     (scene,) = scenes
     wall, arm = scene.sim.rigid_solver.entities
-    fall = arm.get_pos()
     arm.set_pos(torch.tensor([[0.09, 0.01, 1.02], [0.1, 0.0, 1.0], [0.11, 0.0, 0.97]]))
     half = 0.5**0.5
     site = LinkSite(wall.links[0], (0.02, 0.0, 0.0), (0.0, half, 0.0, half))
@@ -53,9 +52,10 @@ def test_example_and_both_kinds_of_sensors():
     seen = cs.Pose((0.0, 0.0, 1.0), (0.0, half, 0.0, half)).inverse()
     shape = cs.Cylinder(0.035, 0.24)
     for e in range(3):
-        place, turn = (x[e].numpy(force=True).astype(float) for x in (arm.get_pos(), arm.get_quat()))
+        place, turn = (
+            x[e].numpy(force=True).astype(float) for x in (arm.get_pos(), arm.get_quat())
+        )
         body = cs.Body(shape, seen @ cs.Pose(place, np.roll(turn, -1)), "human")
         truth = simulator.step(cs.Scene([body])).delta
         assert np.abs(delta[e, 0] - truth).max() < 1e-4 * np.abs(truth).max()
-    assert fall.shape == (3, 3)
-    assert sensors.names == ("cylinder_baselink",) or len(sensors.names) == 2
+    assert sensors.names[-1] == "cylinder_baselink"

@@ -54,9 +54,7 @@ def test_jacobian_with_floating_conductors_of_the_design(monkeypatch):
     for module in ("capsense.fleet.fleet", "capsense.simulator"):
         monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: field)
     loose = [Conductor(x.name, Role.FLOATING, x.surface) for x in whole.electrodes[4:]]
-    design = replace(
-        whole, electrodes=whole.electrodes[:4], conductors=(*whole.conductors, *loose)
-    )
+    design = replace(whole, electrodes=whole.electrodes[:4], conductors=(*whole.conductors, *loose))
     fleet = Fleet(design, BODIES, COUNT, sensors=2, device="warp:cpu", budget=64)
     assert against_twin(fleet, *some_poses(2)) < 1e-4
 

@@ -67,7 +67,7 @@ class CapacitiveSensors(ParallelSensors):
     ) -> None:
         rules, other = split_rules(options, FleetOptions)
         self._solver = scene.sim.rigid_solver
-        worlds, device = max(int(scene.n_envs), 1), wp.device_from_torch(gs.device)
+        worlds, device = max(int(scene.n_envs), 1), wp.get_device(str(gs.device))
         parts: list[WorldShape] = []
         poses: list[tuple[float, ...]] = []
         left: list[str] = []
@@ -90,7 +90,7 @@ class CapacitiveSensors(ParallelSensors):
         at = [k for _, k in carriers], [(*s.position, *s.quaternion) for s in sites]
 
         def everywhere(values: Any, kind: type) -> Any:
-            array = np.asarray(values, kind)
+            array: Any = np.asarray(values, kind)
             return np.broadcast_to(array, (worlds, *array.shape)).copy()
 
         self._fix(*((everywhere(n, np.int32), everywhere(p, np.float32)) for n, p in (seen, at)))

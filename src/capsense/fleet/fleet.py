@@ -270,7 +270,7 @@ class Fleet:
             )  # fmt: skip
         where, at = (
             each
-            if each is None or hasattr(each, "__dlpack__") and not isinstance(each, np.ndarray)
+            if each is None or (hasattr(each, "__dlpack__") and not isinstance(each, np.ndarray))
             else _checked(name, each, shape)
             for name, each, shape in zip(
                 ("poses", "sensors"), (poses, sensors), shapes, strict=True
