@@ -8,7 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.fleet import warp_laws as laws
-from capsense.fleet.warp_laws import Law
+from capsense.fleet.warp_laws import WarpLaw
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,7 +16,7 @@ WHITE, POLES, MAINS, CLIMATE = (wp.constant(k) for k in range(4))
 
 
 @wp.struct
-class Chip:
+class ChipFigures:
     """The figures of a chip with K channels; times in seconds."""
 
     sense: wp.array(dtype=wp.int32)  # electrode that a channel reads, (K,)
@@ -30,7 +30,7 @@ class Chip:
     period: wp.float64
     lag: wp.float64
     slack: wp.float64
-    law: Law
+    law: WarpLaw
     actual: wp.array(dtype=wp.float64)  # what the offset DAC subtracts [F], (codes,); empty: none
     step: wp.float64  # what its user takes for one step [F]
     follow: wp.int32
@@ -60,7 +60,7 @@ class State:
 
 @wp.kernel
 def channels(
-    chip: Chip, delta: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
+    chip: ChipFigures, delta: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
     state: State,
 ):  # fmt: skip
     """Capacitances of all channels, as ``ChannelBank.values``."""
@@ -75,7 +75,7 @@ def channels(
 
 
 @wp.func
-def _at(chip: Chip, first: int, count: int, time: wp.float64):
+def _at(chip: ChipFigures, first: int, count: int, time: wp.float64):
     """Value of a profile at a time, linear between its points."""
     out = chip.profile[1, first]
     for k in range(1, count):
@@ -90,7 +90,7 @@ def _at(chip: Chip, first: int, count: int, time: wp.float64):
 
 @wp.func
 def _staged(
-    chip: Chip, state: State, k: int, c: int, time: wp.float64, given: wp.float64, seed: wp.uint32
+    chip: ChipFigures, state: State, k: int, c: int, time: wp.float64, given: wp.float64, seed: wp.uint32
 ):
     """Send a value through all stages."""
     value = given
@@ -120,7 +120,7 @@ def _staged(
 
 
 @wp.func
-def _converted(chip: Chip, state: State, k: int, c: int, value: wp.float64):
+def _converted(chip: ChipFigures, state: State, k: int, c: int, value: wp.float64):
     """Code and capacitance of a value, as ``Conversion``."""
     used = int(0)
     inside = value
@@ -143,7 +143,7 @@ def _converted(chip: Chip, state: State, k: int, c: int, value: wp.float64):
 
 @wp.kernel
 def convert(
-    chip: Chip, state: State, code: wp.array3d(dtype=wp.int64),
+    chip: ChipFigures, state: State, code: wp.array3d(dtype=wp.int64),
     capacitance: wp.array3d(dtype=wp.float64), age: wp.array3d(dtype=wp.float64),
 ):  # fmt: skip
     """Take the samples whose instants have come, and tell those that can be read."""

@@ -73,7 +73,7 @@ class WarpChips:
                 f'channel {name!r} leaves electrodes open, which chips know on device "cpu" only; '
                 'give it rest="grounded" or "guard"'
             )
-        out = kernels.Chip()
+        out = kernels.ChipFigures()
         out.sense, out.sign = array(bank._sense, wp.int32), array(bank._sign)
         out.volts, out.shield = array(bank._volts), array(bank._shield)
         out.base = array((empty[bank._sense] * bank._volts).sum(axis=1))
