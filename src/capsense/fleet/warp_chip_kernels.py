@@ -90,7 +90,13 @@ def _at(chip: ChipFigures, first: int, count: int, time: wp.float64):
 
 @wp.func
 def _staged(
-    chip: ChipFigures, state: State, k: int, c: int, time: wp.float64, given: wp.float64, seed: wp.uint32
+    chip: ChipFigures,
+    state: State,
+    k: int,
+    c: int,
+    time: wp.float64,
+    given: wp.float64,
+    seed: wp.uint32,
 ):
     """Send a value through all stages."""
     value = given
