@@ -69,6 +69,6 @@ def test_a_scene_steps():
         )  # fmt: skip
         truth = sensor.read().delta
         assert np.abs(now[w, 0] - truth).max() < 1e-4 * np.abs(truth).max()
+    other = CapacitanceCfg(name="other", sites=("robot/nose",)).build()
     with pytest.raises(SceneError, match="robot/nose"):
-        other = CapacitanceCfg(name="other", sites=("robot/nose",)).build()
         other.initialize(sim.mj_model, sim.model, sim.data, "cpu")
