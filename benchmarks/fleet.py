@@ -89,6 +89,24 @@ def rate(options: dict[str, Any], count: int) -> float:
     return count / float(np.median(times[1:]))
 
 
+def memory(options: dict[str, Any]) -> tuple[int, int]:
+    """Bytes that a sensor with one body takes on Warp, without gradients and with them."""
+    from capsense.fleet.warp_cut import WarpCut
+
+    sizes = []
+    for count in (8, 16):
+        fleet = cs.Fleet(DESIGN, [FINGER], count, **options)
+        fleet.step(fingers(count, np.random.default_rng(0)), jacobian=True)
+        core = fleet._warp
+        parts = [
+            list(vars(core).values()), [getattr(core.cut, name) for name in WarpCut.vars],
+            core._slopes,
+        ]  # fmt: skip
+        sizes.append([sum(getattr(x, "capacity", 0) or 0 for x in part) for part in parts])
+    core_size, cut, slopes = ((b - a) // 8 for a, b in zip(*sizes, strict=True))
+    return core_size + cut, core_size + cut + slopes
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--device", default="cpu", help="cpu, warp:cpu or cuda:0 (default: cpu)")
@@ -109,6 +127,9 @@ def main() -> int:
         told = ", ".join(
             f"{np.sqrt((e**2).mean()):.2f} {np.abs(e).max():.2f}" for e in (single, every)
         )
+        if options.device != "cpu":
+            plain, whole = memory(chosen)
+            print(f"{value!s:10} {plain:,} bytes a sensor, {whole:,} with gradients")
         for count in options.counts:
             print(f"{value!s:10} {count:12} {rate(chosen, count):10,.0f}   {told}", flush=True)
     return 0

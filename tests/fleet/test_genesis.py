@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch")
 
 def test_example_and_both_kinds_of_sensors():
     """Differential and measured: finite, varying, highest level with the pad, as by hand."""
-    from capsense.adapters.genesis import CapacitiveSensors, LinkSite
+    from capsense.adapters.genesis import GenesisSensors, LinkSite
 
     path = Path(__file__).parents[2] / "examples" / "fleet_genesis.py"
     spec = importlib.util.spec_from_file_location(path.stem, path)
@@ -43,11 +43,10 @@ def test_example_and_both_kinds_of_sensors():
     # the class beside the scene, at the state that the run has left
     (scene,) = scenes
     wall, arm = scene.sim.rigid_solver.entities
-    fall = arm.get_pos()
     arm.set_pos(torch.tensor([[0.09, 0.01, 1.02], [0.1, 0.0, 1.0], [0.11, 0.0, 0.97]]))
     half = 0.5**0.5
     site = LinkSite(wall.links[0], (0.02, 0.0, 0.0), (0.0, half, 0.0, half))
-    sensors = CapacitiveSensors(scene, [site], materials={"cylinder*": "human"})
+    sensors = GenesisSensors(scene, [site], materials={"cylinder*": "human"})
     delta = sensors.read().delta
     simulator = cs.Simulator("six_patch", preset="learning")
     seen = cs.Pose((0.0, 0.0, 1.0), (0.0, half, 0.0, half)).inverse()
@@ -59,5 +58,4 @@ def test_example_and_both_kinds_of_sensors():
         body = cs.Body(shape, seen @ cs.Pose(place, np.roll(turn, -1)), "human")
         truth = simulator.step(cs.Scene([body])).delta
         assert np.abs(delta[e, 0] - truth).max() < 1e-4 * np.abs(truth).max()
-    assert fall.shape == (3, 3)
-    assert sensors.names == ("cylinder_baselink",) or len(sensors.names) == 2
+    assert sensors.names[-1] == "cylinder_baselink"

@@ -1,4 +1,4 @@
-"""Sensors in Genesis: ``scene.add_sensor(Capacitance(…))``, or ``CapacitiveSensors`` beside it."""
+"""Sensors in Genesis: ``scene.add_sensor(Capacitance(…))``, or ``GenesisSensors`` beside it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LinkSite:
     """(x, y, z, w)."""
 
 
-class CapacitiveSensors(ParallelSensors):
+class GenesisSensors(ParallelSensors):
     """Sensors on links of a Genesis scene, in all of its environments.
 
     Collision geoms of rigid entities are seen, by the names of their links. Planes, terrains and
@@ -67,7 +67,7 @@ class CapacitiveSensors(ParallelSensors):
     ) -> None:
         rules, other = split_rules(options, FleetOptions)
         self._solver = scene.sim.rigid_solver
-        worlds, device = max(int(scene.n_envs), 1), wp.device_from_torch(gs.device)
+        worlds, device = max(int(scene.n_envs), 1), wp.get_device(str(gs.device))
         parts: list[WorldShape] = []
         poses: list[tuple[float, ...]] = []
         left: list[str] = []
@@ -90,7 +90,7 @@ class CapacitiveSensors(ParallelSensors):
         at = [k for _, k in carriers], [(*s.position, *s.quaternion) for s in sites]
 
         def everywhere(values: Any, kind: type) -> Any:
-            array = np.asarray(values, kind)
+            array: Any = np.asarray(values, kind)
             return np.broadcast_to(array, (worlds, *array.shape)).copy()
 
         self._fix(*((everywhere(n, np.int32), everywhere(p, np.float32)) for n, p in (seen, at)))
@@ -154,7 +154,7 @@ class CapacitanceMetadata(SimpleSensorMetadata):
 
     asked: list[tuple[Any, LinkSite, int]] = field(default_factory=list)
     """Options of each sensor, where it sits, and how many numbers it has."""
-    groups: list[tuple[CapacitiveSensors, list[slice]]] = field(default_factory=list)
+    groups: list[tuple[GenesisSensors, list[slice]]] = field(default_factory=list)
     """Sensors of one design and their rows of the data."""
     scene: Any = None
 
@@ -171,7 +171,7 @@ class CapacitanceMetadata(SimpleSensorMetadata):
             ]  # fmt: skip
             left = [k for k in left if k not in alike]
             sites = [self.asked[k][1] for k in alike]
-            sensors = CapacitiveSensors(self.scene, sites, first.design, **first.options)
+            sensors = GenesisSensors(self.scene, sites, first.design, **first.options)
             self.groups.append((sensors, [slice(rows[k], rows[k + 1]) for k in alike]))
 
 

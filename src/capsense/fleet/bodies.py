@@ -83,7 +83,7 @@ class BodyTable:
         for number in places:
             if number not in range(self.places):
                 raise SceneError(f"join: {number!r} is none of the places 0 to {self.places - 1}")
-            _require_conductors(self.given[:, number], self._solver.excitation_frequency)
+            _require_conductors(self.given[:, number].tolist(), self._solver.excitation_frequency)
         for number in places:
             group[group == group[number]] = group[places[0]]
 

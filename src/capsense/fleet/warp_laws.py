@@ -16,7 +16,7 @@ _FAR = wp.constant(wp.float64(1e300))  # stands for infinity
 
 
 @wp.struct
-class Law:
+class WarpLaw:
     """How code and capacitance belong together."""
 
     kind: wp.int32
@@ -39,7 +39,7 @@ def law_of(law: Any) -> Any:
     Raises:
         ReadoutError: It is none that is known here.
     """
-    out = Law()
+    out = WarpLaw()
     out.rising, out.low, out.high = int(law.rising), law.low, law.high
     if isinstance(law, LinearLaw):
         out.kind, out.scale, out.zero = _LINEAR, 1 / law.lsb, law.zero
@@ -62,7 +62,7 @@ def law_of(law: Any) -> Any:
 
 
 @wp.func
-def level(law: Law, capacitance: wp.float64):
+def level(law: WarpLaw, capacitance: wp.float64):
     """Code before rounding."""
     one = wp.float64(1.0)
     zero = wp.float64(0.0)
@@ -85,7 +85,7 @@ def level(law: Law, capacitance: wp.float64):
 
 
 @wp.func
-def capacitance(law: Law, code: wp.float64):
+def capacitance(law: WarpLaw, code: wp.float64):
     """Capacitance of a code [F]."""
     one = wp.float64(1.0)
     out = (code - law.zero) / law.scale

@@ -62,11 +62,9 @@ def charges(
         total = potentials[i, j, v]
         for k in range(i + 1, n):
             total -= matrix[k, i, v] * potentials[k, j, v]
+        potentials[i, j, v] = 0.0
         if matrix[i, i, v] > 0.0:
-            total = total / matrix[i, i, v]
-        else:
-            total = 0.0
-        potentials[i, j, v] = total
+            potentials[i, j, v] = total / matrix[i, i, v]
 
 
 @wp.kernel

@@ -95,7 +95,7 @@ def factorise_lossy(
                         wp.vec2(matrix[j, k, v], matrix[k, j, v]),
                     )
                 pivot = wp.vec2(matrix[j, j, v], loss[j, v])
-                if pivot[0] > 0.0:
+                if pivot[0] > 0.0:  # noqa: SIM108 - Warp has no conditional of vectors
                     value = over(value, pivot)
                 else:
                     value = wp.vec2()
@@ -131,7 +131,7 @@ def forward(
                         wp.vec2(potentials[k, t, v], quadrature[k, t, v]),
                     )
                 pivot = wp.vec2(matrix[i, i, v], loss[i, v])
-                if pivot[0] > 0.0:
+                if pivot[0] > 0.0:  # noqa: SIM108
                     right = over(right, pivot)
                 else:
                     right = wp.vec2()
