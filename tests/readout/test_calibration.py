@@ -331,3 +331,15 @@ def test_white_noise_is_what_flicker_leaves_of_the_residuals():
     wanted = inverse @ (white * np.eye(2) + q.T @ covered) @ inverse.T
     assert 0.1 * squares < left < 0.9 * squares
     assert covariance == pytest.approx(wanted)
+
+
+def test_a_few_samples_far_off_are_doubted():
+    """Most residuals are normal noise of 1 fF by their median deviation, some are 20 fF off."""
+    true, _, time = recording(np.random.default_rng(0), 400)
+    noise = np.random.default_rng(1).standard_normal(true.shape)
+    noise[::20] += 20.0
+    with pytest.warns(CalibrationWarning, match="channel 0"):
+        fit = calibrate(true, true + 1e-15 * noise, time)
+    left = fit.residuals
+    scale = 1.4826 * np.median(np.abs(left - np.median(left, axis=0)), axis=0)
+    assert fit.excess == pytest.approx(np.sqrt((left**2).mean(axis=0)) / scale)
