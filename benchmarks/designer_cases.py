@@ -1,8 +1,9 @@
-"""Designs as people draw them: ``python benchmarks/designer_cases.py [pair] [grid] [array]``.
+"""Designs as people draw them: ``python benchmarks/designer_cases.py [case ...]``.
 
 ``pair`` and ``grid``: mutual capacitances on an FR4 board with the default panels beside those with
 panels half as large, which takes some minutes. ``array``: 4 x 4 pads over 1 m in a box of 3 m, what
-building it takes, and a cube of 0.1 m over it beside boundary elements.
+building it takes, and a cube of 0.1 m over it beside boundary elements. ``parts``: a pad under
+covers of several shapes, and a plate over them beside boundary elements.
 """
 
 from __future__ import annotations
@@ -10,10 +11,13 @@ from __future__ import annotations
 import resource
 import sys
 import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import boards
 import numpy as np
+import trimesh
 
 import capsense as cs
 from capsense.design.loader import parse_design
@@ -62,6 +66,19 @@ ARRAY = {
     "domain": {"size": [3.0, 3.0, 3.0], "backplane": 0.2},
     "electrode": pads(grid(4, 0.25), 0.225),
 }
+COVERED = {
+    "name": "a pad under a cover",
+    "domain": {"size": [0.3, 0.3, 0.3], "backplane": 0.05},
+    "electrode": [{"name": "E", "shape": "disc", "radius": 0.012}],
+    "conductor": [{"name": "g", "role": "ground", "shape": "disc", "radius": 0.025, "z": -0.002}],
+}
+COVER = {"name": "cover", "eps_r": 3.0}
+COVERS: dict[str, dict[str, Any]] = {
+    "slab": {"size": [0.036, 0.036], "z": [0.0, 0.004]},
+    "box": {"shape": "box", "size": [0.036, 0.036, 0.004], "z": 0.002},
+    "disc": {"shape": "cylinder", "radius": 0.020, "length": 0.004, "z": 0.002},
+    "dome": {"shape": "stl", "file": "dome.stl", "unit": "mm"},
+}
 ENTRIES = {"pair": [(0, 0), (0, 1)], "grid": [(0, 0), (5, 5), (0, 1), (5, 6), (0, 2), (5, 10)]}
 
 
@@ -106,12 +123,43 @@ def array() -> None:
         print(f"  {place}: {below:+.1f} % there, worst of all {worst:.1f} % of it")
 
 
+def dome(folder: Path) -> None:
+    """Write half a ball of 20 mm radius, flat below, in millimetres."""
+    ball = trimesh.creation.icosphere(3, 20.0).vertices
+    turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    foot = 20.0 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    points = np.concatenate([ball[ball[:, 2] > 1e-6], foot])
+    trimesh.convex.convex_hull(points).export(folder / "dome.stl")
+
+
+def parts() -> None:
+    """A pad of 12 mm radius over a ground of 25 mm, under covers of permittivity 3."""
+    with TemporaryDirectory() as folder:
+        dome(Path(folder))
+        for name, cover in COVERS.items():
+            design = parse_design({**COVERED, "layer": [{**cover, **COVER}]}, folder=Path(folder))
+            solution = BoundarySolution(design)
+            empty = solution, solution.densities(np.eye(len(terminals(design))))
+            baseline = solution.terminal_charges(empty[1])[0, 0]
+            print(f"{name}: {len(solution.model.panels)} panels, C {baseline / FEMTO:.1f} fF")
+            sim = cs.Simulator(design, background=build_background(design))
+            boards.SIZE = (0.06, 0.06, 0.02)
+            for gap in (0.003, 0.005, 0.02, 0.05):
+                centre = np.array([0.0, 0.0, design.layers[0].upper[2] + gap + 0.01])
+                wanted = boards.reference(design, centre, empty, 1.0)[0, 0]
+                body = cs.Body(cs.Box(boards.SIZE), cs.Pose(tuple(centre)), "steel")
+                error = 100 * (sim.step(cs.Scene([body])).delta[0, 0] / wanted - 1)
+                print(f"  plate {1e3 * gap:.0f} mm above: {wanted / FEMTO:.2f} fF, {error:+.1f} %")
+
+
 def main() -> None:
     """Run the cases that are named, or all."""
-    chosen = sys.argv[1:] or ["pair", "grid", "array"]
+    chosen = sys.argv[1:] or ["pair", "grid", "array", "parts"]
     for name in chosen:
         if name == "array":
             array()
+        elif name == "parts":
+            parts()
         else:
             compare(name, {"pair": PAIR, "grid": GRID}[name])
 

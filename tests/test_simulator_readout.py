@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -135,3 +136,21 @@ def test_attached(make: Make) -> None:
     other = cs.mujoco.attach(model, data, site="s", design=sim, readout="mpr121")
     assert "mpr121" in repr(other.readout).lower()
     assert sim.step(cs.Scene()).counts is None
+
+
+def test_a_lossy_body_turns_the_phase_that_a_demodulating_chip_sees(make: Make) -> None:
+    """The chip's magnitude grows beyond that of the capacitance alone; a plain chip sees that."""
+    body = cs.Body(cs.Sphere(0.02), cs.Pose((0.0, 0.0, 0.03)), cs.Material("gel", 5.0, 2e-4))
+    sim = make(readout="sdr")
+    for time in (0.0, 0.1):
+        reading = sim.step(cs.Scene([body]), time=time)
+    assert reading.conductance is not None
+    assert reading.counts is not None
+    dry = replace(reading, conductance=None, counts=None)
+    wet = replace(reading, conductance=1e3 * reading.conductance, counts=None)
+    for chip, seen in (("sdr", True), ("ad7746", False)):
+        one, other = (
+            cs.Readout.preset(chip, sim.electrode_names)([0.0, 0.1], [r, r]) for r in (dry, wet)
+        )
+        assert np.array_equal(one.code, other.code) != seen
+    assert len(reading.counts) > 0

@@ -13,7 +13,7 @@ import capsense as cs
 from capsense import codec
 from capsense.cli.design import describe
 from capsense.design.loader import parse_design
-from capsense.design.solid import crossing, depths, inside, overlap, thickness
+from capsense.design.solid import _cut, crossing, depths, inside, overlap, thickness
 from capsense.errors import MeshError
 from capsense.mesh.gmsh_mesher import mesh_design
 from capsense.plotting.designs import draw_design
@@ -167,3 +167,14 @@ def test_bend_keeps_parts_in_place():
 def test_gmsh_names_what_it_does_not_know():
     with pytest.raises(MeshError, match=r"'part 0' has a shape of its own"):
         mesh_design(design(None, {**DISC, "z": 0.05}))
+
+
+def test_lines_are_cut_where_they_meet_a_surface():
+    """A line through a box 2 mm thick, from 5 mm before to 13 mm behind, and one beside."""
+    box = design(None, {**BOX, "z": 0.1}).layers[0].surface.triangles
+    line = np.array([[0.001, 0.002, 0.094], [0.001, 0.002, 0.114]])
+    beside = line + np.array([0.1, 0.0, 0.0])
+    found = _cut(line[None], box)[:, 2]
+    for height in (0.094, 0.0965, 0.1, 0.1075, 0.114):
+        assert np.abs(found - height).min() < 1e-9
+    assert np.sort(_cut(beside[None], box)[:, 2]) == pytest.approx([0.094, 0.104, 0.114])

@@ -12,6 +12,7 @@ from capsense.readout.calibration import (
     CalibrationWarning,
     LinearSensor,
     _flicker_covariance,
+    _least_squares,
     base_capacitance,
     calibrate,
     cross_correlation,
@@ -295,3 +296,50 @@ RISING = np.linspace(1, 2, 10)[:, None]
 def test_bad_recordings_are_refused(make, words):
     with pytest.raises(ReadoutError, match=words):
         make()
+
+
+def test_base_of_one_channel_or_many():
+    assert base_capacitance([1.0, 2.0, 6.0]) == pytest.approx(3.0)
+    assert base_capacitance([[1.0, 4.0], [3.0, 8.0]]) == pytest.approx([2.0, 6.0])
+    for nothing in (1.0, []):
+        with pytest.raises(ReadoutError, match="needs readings"):
+            base_capacitance(nothing)
+
+
+def test_a_floor_needs_times_and_recordings_two_axes():
+    values = np.arange(12.0).reshape(6, 2) * 1e-15
+    with pytest.raises(ReadoutError, match="floor need the times"):
+        calibrate(values, values, floor=1e-16, drift=False)
+    with pytest.raises(ReadoutError, match=r"give both as \(n, K\)"):
+        calibrate(values[:, :, None], values[:, :, None])
+
+
+def test_white_noise_is_what_flicker_leaves_of_the_residuals():
+    """By definition: (|r|² − tr Σ + tr QᵀΣQ) / (n − p), and P (white + Σ) Pᵀ of the figures."""
+    rng = np.random.default_rng(4)
+    time = np.arange(40) * 0.1
+    design = np.column_stack([rng.uniform(1.0, 2.0, 40), np.ones(40)])
+    seen = design @ [1.1, 0.3] + rng.normal(0.0, 0.1, 40)
+    figures, covariance, explained = _least_squares(design, seen, 0, time, 0.02)
+    q = np.linalg.qr(design)[0]
+    covered, total = _flicker_covariance(q, time, 0.02)
+    left = total - np.trace(q.T @ covered)
+    assert explained == pytest.approx(left)
+    squares = ((seen - design @ figures) ** 2).sum()
+    white = (squares - left) / 38
+    inverse = np.linalg.pinv(design) @ q
+    wanted = inverse @ (white * np.eye(2) + q.T @ covered) @ inverse.T
+    assert 0.1 * squares < left < 0.9 * squares
+    assert covariance == pytest.approx(wanted)
+
+
+def test_a_few_samples_far_off_are_doubted():
+    """Most residuals are normal noise of 1 fF by their median deviation, some are 20 fF off."""
+    true, _, time = recording(np.random.default_rng(0), 400)
+    noise = np.random.default_rng(1).standard_normal(true.shape)
+    noise[::20] += 20.0
+    with pytest.warns(CalibrationWarning, match="channel 0"):
+        fit = calibrate(true, true + 1e-15 * noise, time)
+    left = fit.residuals
+    scale = 1.4826 * np.median(np.abs(left - np.median(left, axis=0)), axis=0)
+    assert fit.excess == pytest.approx(np.sqrt((left**2).mean(axis=0)) / scale)

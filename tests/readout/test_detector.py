@@ -112,3 +112,18 @@ def test_channels_are_apart():
 def test_bad_detectors_are_refused(make, words):
     with pytest.raises(ReadoutError, match=words):
         make()
+
+
+def test_small_signals_are_taken_over_at_once():
+    """Up to twice the half delta of 3 codes: 6 are, 7 are not."""
+    tracker = SteppingTracker(away=Filter(max_half_delta=3, noise_half_delta=1, noise_count=9))
+    process = tracker.start(1)
+    channel, still = np.array([0]), np.array([False])
+    assert process(channel, np.array([6.0]), still) == [6.0]
+    assert process(channel, np.array([7.0]), still) == [0.0]
+
+
+@pytest.mark.parametrize(("touch", "release"), [(1.0, -1.0), (float("inf"), 1.0), (1.0, 0.0)])
+def test_thresholds_are_finite_and_above_zero(touch, release):
+    with pytest.raises(ReadoutError, match="0 < release <= touch"):
+        Detector(touch, release, ExponentialTracker(50))

@@ -9,7 +9,7 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadoutError
-from capsense.readout.front_end import ShuntFrontEnd, demodulate, demodulated
+from capsense.readout.front_end import ShuntFrontEnd, Wiring, demodulate, demodulated
 
 PAPER = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0)
 
@@ -140,3 +140,45 @@ def test_bad_signals_are_refused(make, words):
     """Nothing becomes NaN in silence."""
     with pytest.raises(ReadoutError, match=words):
         make()
+
+
+def test_wiring_by_hand():
+    """Leads add what they have to ground, short of the driven share, or to each other."""
+    wiring = Wiring(trace=[1.0, 2.0], cable=4.0, shield_gain=0.75, crosstalk=0.1, coupling=0.5)
+    assert wiring.ground(2) == pytest.approx([2.0, 3.0])
+    mixing, offset = wiring.start(np.array([True, False]))
+    assert mixing == pytest.approx(np.array([[1.0, 0.1], [0.1, 1.0]]))
+    assert offset == pytest.approx([2.0, 0.5])
+    given = Wiring(crosstalk=[[0.2, 0.3], [0.4, 0.0]]).start(np.array([True, True]))[0]
+    assert given == pytest.approx(np.array([[1.2, 0.3], [0.4, 1.0]]))
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0])
+def test_shield_gain_may_be_none_or_perfect(gain):
+    assert Wiring(cable=3.0, shield_gain=gain).ground(1) == pytest.approx([3.0 * (1.0 - gain)])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"shield_gain": -0.1}, "shield_gain is -0.1"),
+        ({"shield_gain": 1.1}, "shield_gain is 1.1"),
+        ({"trace": [1.0, -2.0]}, "trace holds -2 F; give zero or more"),
+        ({"crosstalk": [[0.1, 0.2]]}, "crosstalk is"),
+    ],
+)
+def test_wiring_refuses(options, words):
+    with pytest.raises(ReadoutError, match=words):
+        Wiring(**options).start(np.array([True, False]))
+
+
+def test_any_infinite_bandwidth_is_a_fast_amplifier():
+    assert ShuntFrontEnd(bandwidth=float("inf")).output(1e-12) == ShuntFrontEnd().output(1e-12)
+
+
+@pytest.mark.parametrize("frequency", [500.0, 1000.0])
+def test_closed_form_at_multiples_of_half_the_sample_rate(frequency):
+    """The image then folds onto the signal, whole turns away."""
+    samples = np.real(0.6 * np.exp(2j * np.pi * frequency * np.arange(8) / 1000.0 + 0.3j))
+    found = demodulated(0.6 * np.exp(0.3j), frequency, frequency, 1000.0, 8)
+    assert found == pytest.approx(complex(demodulate(samples, frequency, 1000.0)), abs=1e-12)

@@ -236,3 +236,10 @@ def test_same_seed_same_bits_however_dealt(stage):
 def test_bad_stages_are_refused(make, words):
     with pytest.raises(ReadoutError, match=words):
         make()
+
+
+def test_climate_coefficients_of_either_sign_and_profiles_of_pairs():
+    drift = ClimateDrift(offset_per_kelvin=-1e-15, gain_per_percent=-1e-4)
+    assert drift.offset_per_kelvin == -1e-15
+    with pytest.raises(ReadoutError, match="give a number or"):
+        Profile.of([(0.0,), (1.0,)], "temperature")

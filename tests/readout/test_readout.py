@@ -15,10 +15,10 @@ from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import ChannelBank, Pattern, self_patterns
 from capsense.readout.chips import CHIPS
-from capsense.readout.converter import CapDac, LinearLaw
+from capsense.readout.converter import CapDac, LinearLaw, ShuntLaw
 from capsense.readout.counts import Counts, join
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
-from capsense.readout.front_end import Wiring
+from capsense.readout.front_end import ShuntFrontEnd, Wiring
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
@@ -472,3 +472,68 @@ def test_held_values_are_of_fixed_size() -> None:
     assert np.isfinite(held.age).all()
     chip.reset()
     assert np.isinf(chip.sample(0.0, np.zeros((3, 3))).held().age).all()
+
+
+@dataclass
+class LossyReading:
+    """A reading of a sensor near matter that conducts."""
+
+    electrode_names: tuple[str, ...]
+    capacitance: np.ndarray
+    conductance: np.ndarray | None
+
+    @property
+    def self_capacitance(self) -> np.ndarray:
+        return np.diag(self.capacitance)
+
+
+def demodulating(**options):
+    """One mutual channel, demodulated with codes of 40 bits."""
+    front = ShuntFrontEnd(excitation_frequency=250e3, shunt=800.0, gain=10.0, parasitic=20e-12)
+    patterns = (Pattern("B", {"A": 1.0}),)
+    law = ShuntLaw(front, full_scale=0.1, bits=40)
+    bank = ChannelBank(patterns, NAMES)
+    return Readout(bank, Schedule.sequential(1, 1e-3), law, **options), front
+
+
+def test_loss_reaches_the_demodulated_magnitude():
+    """|V_o| of a divider of Y = G + jωC over 1/R + Y + jωC_p, worked out here.
+
+    For a small Y it is ωC √(1 + tan²δ): a loss as large as the capacitance's current reads as
+    41 % more of it.
+    """
+    c, omega = 0.4e-12, 2 * np.pi * 250e3
+    matrix = c * np.array([[3.0, -1.0, 0.0], [-1.0, 3.0, 0.0], [0.0, 0.0, 1.0]])
+    for tangent in (0.0, 0.3, 1.0):
+        reading = LossyReading(NAMES, matrix, tangent * omega * matrix)
+        readout, front = demodulating()
+        counts = join([readout.sample(t, reading) for t in (0.0, 0.01)])
+        admittance = omega * c * (1j + tangent)
+        volts = abs(10.0 * admittance / (1 / 800.0 + admittance + 1j * omega * 20e-12))
+        assert counts.code[0] == pytest.approx(volts / 0.1 * 2**39, rel=1e-9)
+        assert counts.capacitance[0] == pytest.approx(front.recover(volts), rel=1e-9)
+        assert counts.capacitance[0] == pytest.approx(c * np.hypot(1.0, tangent), rel=0.02)
+        again = readout([0.0, 0.01], [reading, reading])
+        assert np.array_equal(again.code, counts.code)
+        assert readout.channel_values(reading) == pytest.approx([c])
+
+
+def test_loss_passes_wiring_stages_and_an_offset_dac():
+    """They act on the capacitance and leave the loss as it is."""
+    omega = 2 * np.pi * 250e3
+    matrix = 2e-12 * np.array([[3.0, -1.0, 0.0], [-1.0, 3.0, 0.0], [0.0, 0.0, 1.0]])
+    reading = LossyReading(NAMES, matrix, 0.5 * omega * matrix)
+    readout, front = demodulating(
+        wiring=Wiring(coupling=1e-12), dac=CapDac(1e-12, 4), stages=(White(1e-30, 1e-3),)
+    )
+    counts = readout([0.0, 0.01], [reading, reading])
+    left = abs(front.output(np.array(0.0e-12 - 1j * 1e-12)))
+    assert np.abs(counts.code[0]) == pytest.approx(left / 0.1 * 2**39, rel=1e-4)
+
+
+def test_loss_changes_nothing_of_other_laws():
+    """What their chips make of a conductance no source says; they report the capacitance."""
+    matrix = np.eye(3) * 1e-12
+    lossy, dry = (LossyReading(NAMES, matrix, g) for g in (np.eye(3) * 1e-6, None))
+    one, other = (plain()([0.0, 0.1], [r, r]) for r in (lossy, dry))
+    assert same(one, other)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from capsense._validate import suggest
 from capsense.errors import ReadoutError
-from capsense.readout.checks import Array, real, require
+from capsense.readout.checks import Array, phasors, require
 
 Rest = Literal["grounded", "floating", "guard"]
 RESTS: tuple[Rest, ...] = ("grounded", "floating", "guard")
@@ -166,7 +166,8 @@ class ChannelBank:
         they carry no charge, ``v_f = −C_ff⁻¹ (C_fd v_d)``.
 
         Args:
-            capacitance: Maxwell matrices [F], shields at ground, shape (..., M, M).
+            capacitance: Maxwell matrices [F], shields at ground, shape (..., M, M); complex ones
+                where matter has losses, C − jG/ω.
             shield_coupling: Charge on each electrode per volt on all shields together [F],
                 shape (..., M); None where the sensor has no shields.
 
@@ -176,7 +177,7 @@ class ChannelBank:
         Raises:
             ReadoutError: The shape does not fit the electrodes, or a number is not finite.
         """
-        matrix = real("capacitance", capacitance)
+        matrix = phasors("capacitance", capacitance)
         m = len(self.electrodes)
         if matrix.shape[-2:] != (m, m):
             raise ReadoutError(

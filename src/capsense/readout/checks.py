@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,17 @@ def real(what: str, values: object) -> Array:
     if array.dtype.kind not in "fiu":
         raise ReadoutError(f"{what}: {array.dtype} values are no real numbers; give such")
     return np.asarray(array, dtype=float)
+
+
+def phasors(what: str, values: object) -> NDArray[Any]:
+    """Real or complex numbers as an array of any shape.
+
+    Raises:
+        ReadoutError: They are neither; ``what`` names them.
+    """
+    if isinstance(values, np.ndarray) and values.dtype == complex:
+        return values
+    return real(what, values)
 
 
 def finite(what: str, values: object) -> Array:

@@ -193,7 +193,8 @@ class ShuntLaw:
 
     The phase tells the sign, so that noise about zero stays noise about zero. The capacitance is
     what the recovery formula makes of the magnitude, as in Schöffmann et al. 2022; see
-    :mod:`capsense.readout.front_end` for its error.
+    :mod:`capsense.readout.front_end` for its error. A complex capacitance C − jG/ω, of matter that
+    conducts, has a phasor V_o of another phase and magnitude.
     """
 
     front_end: ShuntFrontEnd
@@ -220,9 +221,10 @@ class ShuntLaw:
 
     def level(self, capacitance: Array) -> Array:
         """Code before rounding."""
-        size = np.abs(self.front_end.output(np.abs(capacitance)))
+        sign = np.where(capacitance.real < 0.0, -1.0, 1.0)
+        size = np.abs(self.front_end.output(sign * capacitance))
         scale = 2 ** (self.bits - 1) / self.full_scale
-        return np.asarray(np.sign(capacitance) * size * scale, dtype=float)
+        return np.asarray(sign * size * scale, dtype=float)
 
     def capacitance(self, code: Ints) -> Array:
         """Capacitance of a code [F]."""
@@ -273,7 +275,7 @@ class CapDac:
 
     def nearest(self, capacitance: Array) -> Ints:
         """Code nominally nearest to capacitances [F]."""
-        return np.clip(np.rint(capacitance / self.step), 0, self.codes - 1).astype(np.int64)
+        return np.clip(np.rint(capacitance.real / self.step), 0, self.codes - 1).astype(np.int64)
 
     def stride(self, law: Law) -> int:
         """Steps to a new code after a saturated sample: half a converter's range, at least one."""
@@ -358,7 +360,7 @@ def quantise(law: Law, capacitance: ArrayLike) -> tuple[Ints, Flags]:
     Returns:
         Codes, and flags of :class:`Range`, of the capacitances' shape.
     """
-    level = np.rint(law.level(np.asarray(capacitance, dtype=float)))
+    level = np.rint(law.level(np.asarray(capacitance)))
     clipped = np.minimum(np.maximum(level, law.low), law.high)
     flags = np.zeros(level.shape, dtype=np.uint8)
     wrong = clipped != level

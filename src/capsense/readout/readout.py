@@ -8,13 +8,13 @@ from dataclasses import replace
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_number
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank
-from capsense.readout.checks import Array, real, require, require_whole
-from capsense.readout.converter import CapDac, Conversion, Law
+from capsense.readout.checks import Array, phasors, real, require, require_whole
+from capsense.readout.converter import CapDac, Conversion, Law, ShuntLaw
 from capsense.readout.counts import Counts
 from capsense.readout.detector import Detector
 from capsense.readout.front_end import Wiring
@@ -180,6 +180,10 @@ class Readout:
         Raises:
             ReadoutError: The shape does not fit, or a number is not finite.
         """
+        return np.asarray(self._phasors(capacitance).real)
+
+    def _phasors(self, capacitance: ReadingLike | ArrayLike) -> NDArray[Any]:
+        """As :meth:`channel_values`, but C − jG/ω of a reading whose loss the law takes."""
         if _is_reading(capacitance):
             reading = cast("ReadingLike", capacitance)
             if reading.electrode_names != self.bank.electrodes:
@@ -188,7 +192,11 @@ class Readout:
                     f"{self.bank.electrodes}; make it with the simulator's electrode_names"
                 )
             matrix = reading.capacitance
-            return self.bank.values(matrix, reading.self_capacitance - np.diag(matrix))
+            shields = reading.self_capacitance - np.diag(matrix)
+            conductance = getattr(reading, "conductance", None)
+            if conductance is not None and isinstance(self.law, ShuntLaw):
+                matrix = matrix - 1j * conductance / self.law.front_end.omega
+            return self.bank.values(matrix, shields)
         array = real("capacitance", capacitance)
         if array.ndim != 1:
             return self.bank.values(array)
@@ -218,7 +226,7 @@ class Readout:
         Raises:
             ReadoutError: Time goes back or is not finite, or the capacitances do not fit.
         """
-        values = self._wired(self.channel_values(capacitance))
+        values = self._wired(self._phasors(capacitance))
         if values.ndim != 1:
             raise ReadoutError("sample takes one instant; call the readout for a recording")
         now = as_number(time) - self._start
@@ -253,8 +261,8 @@ class Readout:
         if t.ndim != 1 or not len(t) or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
             raise ReadoutError("times must be finite numbers that rise, of shape (n,)")
         if isinstance(capacitance, Sequence) and any(map(_is_reading, capacitance)):
-            capacitance = np.array([self.channel_values(c) for c in capacitance])
-        array = real("capacitance", capacitance)
+            capacitance = np.array([self._phasors(c) for c in capacitance])
+        array = phasors("capacitance", capacitance)
         if array.ndim not in (2, 3) or len(array) != len(t):
             raise ReadoutError(
                 f"{len(t)} times for capacitances of shape {array.shape}; give (n, K) or (n, M, M)"
@@ -364,10 +372,13 @@ class Readout:
 
     def _fill(self, counts: Counts, instant: Array, value: Array) -> None:
         """Send one batch through stages, converter and detector, into its place."""
+        turned, value = value.imag, value.real  # drift and noise leave a loss as it is
         for process in self._processes:
             value = process(counts.channel, instant, value)
         if not np.isfinite(value).all():
             raise ReadoutError("a stage made a number that is not finite; correct its figures")
+        if turned.any():
+            value = value + 1j * turned
         counts.code[:], counts.capacitance[:], counts.flags[:] = self._convert(
             counts.channel, value
         )
