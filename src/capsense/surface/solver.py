@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.errors import SceneError, SolveError
-from capsense.field.change import Change
+from capsense.field.change import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.contact import Sheets
@@ -162,6 +162,15 @@ class SurfaceSolver:
             if inside.any():
                 out[inside] = 0.0 if body.grounding == "grounded" else out[inside].mean(axis=0)
         return out
+
+    def charges(self) -> Charges | None:
+        """Charges on the bodies of the last scene; None where there are none."""
+        if self._last is None:
+            return None
+        _, solution = self._last
+        area = np.maximum(solution.extent, 1e-9)[:, None] ** 2
+        density = UNIT * np.abs(solution.charge[:, : self.green.terminals]) / area
+        return Charges(solution.points.mean(axis=1), density, float(np.median(solution.extent)))
 
     def reset(self) -> None:
         """Forget the last scene; no reading depends on the one before."""
