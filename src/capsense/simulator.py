@@ -20,7 +20,7 @@ from capsense.errors import BatchError, FieldError, ReadoutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.change import Change, Terminals
+from capsense.field.change import Change, Charges, Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame
@@ -42,6 +42,8 @@ class _Solver(Protocol):
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change: ...
 
     def potentials(self, points: Array) -> Array: ...
+
+    def charges(self) -> Charges | None: ...
 
     def reset(self) -> None: ...
 
@@ -332,6 +334,15 @@ class Simulator:
         """
         with self._one:
             return self._solver.potentials(as_points(points))
+
+    def charges(self) -> Charges | None:
+        """Charges on the bodies of the last step, for drawing.
+
+        Returns:
+            Places and densities; None where no body was near, or with ``"fem_masked"``.
+        """
+        with self._one:
+            return self._solver.charges()
 
     def copy(self) -> Simulator:
         """Another sensor of the same design and settings, at rest; the two share the field.

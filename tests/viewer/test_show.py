@@ -72,7 +72,7 @@ def test_the_robot_in_pybullet() -> None:
 
 
 class Watcher:
-    """A client of a page, whose picture is of one colour."""
+    """A client of a page, whose picture is of one colour; on the right there is nothing."""
 
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {}
@@ -80,7 +80,9 @@ class Watcher:
 
     def get_render(self, rows: int, columns: int, **_: Any) -> np.ndarray:
         self.shade += 10
-        return np.full((rows, columns, 4), self.shade, np.uint8)
+        picture = np.full((rows, columns, 4), self.shade, np.uint8)
+        picture[:, : columns // 2, 3], picture[:, columns // 2 :, 3] = 255, 0
+        return picture
 
     def send_file_download(self, name: str, content: bytes, *, save_immediately: bool) -> None:
         assert save_immediately
@@ -88,7 +90,7 @@ class Watcher:
 
 
 def test_pictures_and_videos() -> None:
-    """A picture as it is; a video of all samples, as long as they last."""
+    """A picture on white; a video of all samples, as long as they last."""
     player = Player(Counting(6, period=0.05))
     watcher = Watcher()
     try:
@@ -99,6 +101,7 @@ def test_pictures_and_videos() -> None:
     with Image.open(io.BytesIO(watcher.files["capsense.png"])) as picture:
         assert picture.size == SIZE[::-1]
         assert picture.getpixel((5, 5)) == (10, 10, 10)
+        assert picture.getpixel((SIZE[1] - 5, 5)) == (255, 255, 255)
     with Image.open(io.BytesIO(watcher.files["capsense.webp"])) as video:
         assert video.n_frames == 6  # type: ignore[attr-defined]
         video.seek(5)

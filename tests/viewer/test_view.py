@@ -21,7 +21,6 @@ from capsense.errors import ProtocolError, ServerError
 from capsense.viewer.charts import Plane, region
 from capsense.viewer.scene_drawing import SHADES, SceneDrawing
 from capsense.viewer.show import Follower
-from capsense.viewer.source import charges_of
 from capsense.viewer.view import LiveView, check_address
 
 
@@ -154,7 +153,7 @@ def test_charges(server: Any) -> None:
     ball = cs.Body(cs.Sphere(0.02), cs.Pose((x, y, 0.04)), "steel", name="ball")
     scene = cs.Scene([ball])
     simulator.step(scene)
-    charges = charges_of(simulator)
+    charges = simulator.charges()
     assert charges is not None
     stage.show_bodies(scene)
     stage.show_charges(charges, 1)
@@ -166,7 +165,7 @@ def test_charges(server: Any) -> None:
     assert darkest[2] < 0.025
     assert nodes(server, "/names/") == ["/names/0"]
     simulator.step(cs.Scene())
-    assert charges_of(simulator) is None
+    assert simulator.charges() is None
     stage.show_charges(None, 1)
     assert "/charge" not in server.scene._handle_from_node_name
 

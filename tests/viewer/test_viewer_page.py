@@ -162,6 +162,18 @@ def test_the_potential_is_drawn(page: Any) -> None:
     assert painted(page, lambda count: count < 10) < 10
 
 
+def test_pictures_are_handed_over(page: Any) -> None:
+    """A picture of the size promised, on white as on the page."""
+    page.get_by_text("export", exact=True).click()
+    with page.expect_download() as found:
+        press(page, "Picture (.png)")
+    with Image.open(found.value.path()) as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    assert pixels.shape == (720, 1280, 3)
+    assert (pixels[0, 0] > 250).all()
+    assert np.ptp(pixels, axis=(0, 1)).min() > 100
+
+
 def painted(page: Any, enough: Callable[[int], bool]) -> int:
     """How many pixels have a colour that only potentials have, as soon as that is enough."""
     colours = palette()[6:12].astype(int)

@@ -33,6 +33,18 @@ class Change:
     (bodies, terminals, terminals, 6)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Charges:
+    """Charges that the terminals draw onto the bodies."""
+
+    points: Array
+    """Where they sit [m], shape (n, 3)."""
+    density: Array
+    """Size of the surface density for each terminal at 1 V [C/m²], shape (n, terminals)."""
+    pitch: float
+    """Usual distance of neighbours [m]."""
+
+
 class Terminals:
     """The terminals of a design: t in all, of which k are driven: n electrodes, then shields.
 

@@ -322,6 +322,9 @@ class MaskedScenes:
         """
         raise ValueError('method "fem_masked" gives no potentials; use "surface"')
 
+    def charges(self) -> None:
+        """Not offered."""
+
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
         """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
         assert not jacobian

@@ -16,7 +16,7 @@ from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces, wi
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.elements.store import rigid
 from capsense.errors import SceneError, SolveError
-from capsense.field.change import Change
+from capsense.field.change import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
@@ -157,6 +157,15 @@ class SurfaceSolver:
             if inside.any():
                 out[inside] = 0.0 if body.grounding == "grounded" else out[inside].mean(axis=0)
         return out
+
+    def charges(self) -> Charges | None:
+        """Charges on the bodies of the last scene; None where there are none."""
+        if self._last is None:
+            return None
+        _, solution = self._last
+        area = np.maximum(solution.extent, 1e-9)[:, None] ** 2
+        density = UNIT * np.abs(solution.charge[:, : self.green.terminals]) / area
+        return Charges(solution.points.mean(axis=1), density, float(np.median(solution.extent)))
 
     def reset(self) -> None:
         """Forget the last scene; no reading depends on the one before."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.codec import design_from_json
-from capsense.constants import EPS0
 from capsense.design import Design
 from capsense.errors import ProtocolError, RecordingError, ServerError
+from capsense.field.change import Charges
 from capsense.reading import Reading, StepStats
 from capsense.recording.session import GONE, reading_of
 from capsense.scenario import Channel, Scenario
@@ -24,7 +24,6 @@ from capsense.server.client import Client
 from capsense.server.frames import DepthMessage, ReadingMessage
 from capsense.server.messages import MessageTable, Open, read_open, read_scene
 from capsense.simulator import Simulator
-from capsense.surface.solver import SurfaceSolver
 
 if TYPE_CHECKING:
     from capsense.field.green import GreenFunction
@@ -33,18 +32,6 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Charges:
-    """Charges that the terminals draw onto the bodies."""
-
-    points: Array
-    """Where they sit [m], shape (n, 3)."""
-    density: Array
-    """Size of the surface density for each terminal at 1 V [C/m²], shape (n, terminals)."""
-    pitch: float
-    """Usual distance of neighbours [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +130,7 @@ class ScenarioSource:
         if plane is None:
             return Frame(index, time, scene, reading)
         found = self._simulator.potentials(plane.points)
-        return Frame(index, time, scene, reading, plane, found, charges_of(self._simulator))
+        return Frame(index, time, scene, reading, plane, found, self._simulator.charges())
 
     def close(self) -> None:
         """Nothing is held."""
@@ -185,7 +172,7 @@ class RecordingSource:
             return frame
         self._simulator.step(step.scene)
         found = self._simulator.potentials(plane.points)
-        return replace(frame, plane=plane, potentials=found, charges=charges_of(self._simulator))
+        return replace(frame, plane=plane, potentials=found, charges=self._simulator.charges())
 
     def close(self) -> None:
         """Nothing is held."""
@@ -194,18 +181,6 @@ class RecordingSource:
 def green_of(simulator: Simulator) -> GreenFunction | None:
     """Green's function of a simulator that gives potentials; None if it does not."""
     return simulator.background.green if simulator.method == "surface" else None
-
-
-def charges_of(simulator: Simulator) -> Charges | None:
-    """Charges of a simulator's last step; None where no body was near or it has none to show."""
-    solver = simulator._solver
-    if not isinstance(solver, SurfaceSolver) or solver._last is None:
-        return None
-    _, solution = solver._last
-    terminals = solver.green.terminals
-    area = np.maximum(solution.extent, 1e-9)[:, None] ** 2
-    density = 4 * np.pi * EPS0 * np.abs(solution.charge[:, :terminals]) / area
-    return Charges(solution.points.mean(axis=1), density, float(np.median(solution.extent)))
 
 
 Address = tuple[int, int]

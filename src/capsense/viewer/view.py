@@ -247,7 +247,10 @@ def send_video(client: Any, player: Playback, wait: Callable[[float], None] = ti
 
 
 def _seen(client: Any) -> Any:
-    return client.get_render(*SIZE, transport_format="png")[..., :3]
+    """What a client sees, on white: where nothing is, a picture is transparent black."""
+    picture = client.get_render(*SIZE, transport_format="png").astype(float)
+    cover = picture[..., 3:] / 255
+    return np.rint(cover * picture[..., :3] + 255 * (1 - cover)).astype(np.uint8)
 
 
 PERIOD = 0.05
