@@ -227,6 +227,7 @@ def reduced(
 # ---- scores ----
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
+CROSSING = 10.0
 LONG, SHORE = (0.03, 0.06), 5e-3
 
 
@@ -235,7 +236,7 @@ def scores(
 ) -> list[Array]:
     """Share of the electrodes' energies that each split takes up alone, raised from below.
 
-    Parts that cross a wall have at least the share of the split that made them, by length.
+    Parts that cross a wall have at least ten times the share of their body.
     """
     seen, stiff = [], []
     energy = np.zeros(green.far_phi.shape[1])
@@ -264,24 +265,24 @@ def scores(
     weight = 1 / (energy + 0.01 * np.linalg.norm(energy))
     out = []
     for (means, linear, looks, net), own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
-        score, alone = np.zeros(len(kids)), np.zeros(len(kids))
+        score = np.zeros(len(kids))
         for k in means:
             if own[k] > 0:
                 x, y = kids[k]
                 value = weight @ (means[x] - means[y]) ** 2 / own[k]
-                alone[k] = (1 - linear[k]) * value
                 for below in (score[x], score[y]):
                     value = max(value, below) + 0.5 * min(value, below)
                 score[k] = (1 - linear[k]) * value
-        alone[0] = max(alone[0], looks[0].crossing * np.sum(weight * net))
+        score[0] = max(score[0], looks[0].crossing * np.sum(weight * net))
         for k in range(len(kids)):
             for part in kids[k]:
                 if part >= 0 and kids[part, 0] >= 0:
                     score[part] += linear.get(part, 1.0) * DECAY * score[k]
-                    if part in looks:
-                        ratio = min(1.0, looks[part].size / looks[k].size)
-                        alone[part] = max(alone[part], looks[part].crossing * alone[k] * ratio)
-        out.append(np.maximum(score, alone))
+        whole = CROSSING * score[0]
+        for k in reversed(range(len(kids))):
+            crossing = looks[k].crossing if k in looks else 0.0
+            score[k] = max(score[k], crossing * whole, *(score[p] for p in kids[k] if p >= 0))
+        out.append(score)
     return out
 
 
@@ -296,8 +297,6 @@ class Look(NamedTuple):
     """How linear it sees the potential."""
     crossing: float
     """How much it crosses a wall."""
-    size: float
-    """Its length [m]."""
 
 
 def _smooth(x: float) -> float:
@@ -326,7 +325,7 @@ def _means(
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
         even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
         even = _smooth(even) if inside > 0 else 1.0
-        looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, size)
+        looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing)
         if kids[k, 0] >= 0 and looks[k].linear < 1:
             wanted += kids[k].tolist()
     return {k: out[k] for k in sorted(out, reverse=True)}, looks

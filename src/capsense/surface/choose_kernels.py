@@ -30,6 +30,8 @@ _DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
+_CROSSING = 10.0
+"""Least score of clusters that cross a wall, over that of their body."""
 USED, FRONTIER, LEAF = 2, 1, 0
 """State of a cluster: its function is used; it is split for an estimate only; it is not split."""
 
@@ -178,40 +180,39 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
     """Score a body's clusters from the mean potentials of those that were met.
 
     Charge beyond a wall costs so much energy that none is there. A part that crosses one can carry
-    charge where it is inside only if it is split too. So it gets the score of the function that it
-    is a part of, times its share of the length.
+    charge where it is inside only if it is split too, which its own score does not tell. So that
+    is at least _CROSSING times the score of the body.
     """
-    kids, function = integers(body.kids), integers(body.function)
-    own, extent = doubles(body.own), doubles(body.extent)
+    kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     count = 2 * body.n - 1
-    alone, net = np.zeros(count), 0.0
     for k in range(count - 1, -1, -1):
         a, scores[k] = kids[2 * k], 0.0
         if a >= 0 and met[a]:
+            value = 0.0
             for i in range(weight.shape[0]):
                 d = float(mean[a, i] - mean[kids[2 * k + 1], i])
-                alone[k] += weight[i] * d * d
-            alone[k] *= (1.0 - linear[k]) * body.scale / own[function[k]]
-            value = alone[k]
+                value += weight[i] * d * d
+            value *= body.scale / own[function[k]]
             for c in range(2):
-                below = (1.0 - linear[k]) * scores[kids[2 * k + c]]
+                below = scores[kids[2 * k + c]]
                 value = max(value, below) + 0.5 * min(value, below)
-            scores[k] = value
+            scores[k] = (1.0 - linear[k]) * value
     if not body.neutral:
+        net = 0.0
         for i in range(weight.shape[0]):
             net += weight[i] * float(mean[0, i]) ** 2
-        net *= crossing[0] / (own[0] / body.scale + body.tie)
-    alone[0] = max(alone[0], net)
+        scores[0] = max(scores[0], crossing[0] * net / (own[0] / body.scale + body.tie))
     for k in range(count):
         for c in range(2):
             part = kids[2 * k + c]
             if part >= 0 and kids[2 * part] >= 0:
                 share = linear[part] if met[part] else 1.0
                 scores[part] += share * _DECAY * scores[k]
-                held = crossing[part] * alone[k] * min(1.0, extent[part] / extent[k])
-                alone[part] = max(alone[part], held)
-    for k in range(count):
-        scores[k] = max(scores[k], alone[k])
+    whole = _CROSSING * scores[0]
+    for k in range(count - 1, -1, -1):
+        scores[k] = max(scores[k], crossing[k] * whole)
+        if kids[2 * k] >= 0:
+            scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
 
 
 @compiled
