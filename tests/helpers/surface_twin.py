@@ -227,7 +227,7 @@ def reduced(
 # ---- scores ----
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
-CROSSING = 10.0
+CROSSING = 5.0
 LONG, SHORE = (0.03, 0.06), 5e-3
 
 
@@ -236,7 +236,7 @@ def scores(
 ) -> list[Array]:
     """Share of the electrodes' energies that each split takes up alone, raised from below.
 
-    Parts that cross a wall have at least ten times the share of their body.
+    Parts that cross a wall have at least five times the share of their body, by length.
     """
     seen, stiff = [], []
     energy = np.zeros(green.far_phi.shape[1])
@@ -280,8 +280,8 @@ def scores(
                     score[part] += linear.get(part, 1.0) * DECAY * score[k]
         whole = CROSSING * score[0]
         for k in reversed(range(len(kids))):
-            crossing = looks[k].crossing if k in looks else 0.0
-            score[k] = max(score[k], crossing * whole, *(score[p] for p in kids[k] if p >= 0))
+            part = looks[k].crossing * looks[k].size / looks[0].size if k in looks else 0.0
+            score[k] = max(score[k], part * whole, *(score[p] for p in kids[k] if p >= 0))
         out.append(score)
     return out
 
@@ -297,6 +297,8 @@ class Look(NamedTuple):
     """How linear it sees the potential."""
     crossing: float
     """How much it crosses a wall."""
+    size: float
+    """Its length [m]."""
 
 
 def _smooth(x: float) -> float:
@@ -325,7 +327,7 @@ def _means(
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
         even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
         even = _smooth(even) if inside > 0 else 1.0
-        looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing)
+        looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, size)
         if kids[k, 0] >= 0 and looks[k].linear < 1:
             wanted += kids[k].tolist()
     return {k: out[k] for k in sorted(out, reverse=True)}, looks

@@ -30,8 +30,8 @@ _DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
-_CROSSING = 10.0
-"""Least score of clusters that cross a wall, over that of their body."""
+_CROSSING = 5.0
+"""Least score of clusters that cross a wall, over their share of that of their body by length."""
 USED, FRONTIER, LEAF = 2, 1, 0
 """State of a cluster: its function is used; it is split for an estimate only; it is not split."""
 
@@ -181,10 +181,10 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
 
     Charge beyond a wall costs so much energy that none is there. A part that crosses one can carry
     charge where it is inside only if it is split too, which its own score does not tell. So that
-    is at least _CROSSING times the score of the body.
+    is at least _CROSSING times the score of the body, times the part's share of its length.
     """
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
-    count = 2 * body.n - 1
+    extent, count = doubles(body.extent), 2 * body.n - 1
     for k in range(count - 1, -1, -1):
         a, scores[k] = kids[2 * k], 0.0
         if a >= 0 and met[a]:
@@ -210,7 +210,7 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
                 scores[part] += share * _DECAY * scores[k]
     whole = _CROSSING * scores[0]
     for k in range(count - 1, -1, -1):
-        scores[k] = max(scores[k], crossing[k] * whole)
+        scores[k] = max(scores[k], crossing[k] * whole * extent[k] / extent[0])
         if kids[2 * k] >= 0:
             scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
 
