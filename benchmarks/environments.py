@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from time import perf_counter, process_time
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,6 +21,14 @@ import capsense.learning.envs
 Rate = tuple[float, float]
 
 
+def _rate(env: Any, action: Any, count: int, seconds: float) -> Rate:
+    start, begun, steps = perf_counter(), process_time(), 0
+    while perf_counter() - start < seconds:
+        env.step(action)
+        steps += count
+    return steps / (perf_counter() - start), steps / (process_time() - begun)
+
+
 def alone(name: str, seconds: float) -> Rate:
     """Steps a second of a single environment: by the clock, and of the processor."""
     env = gymnasium.make(name, max_episode_steps=10**9)
@@ -27,11 +36,7 @@ def alone(name: str, seconds: float) -> Rate:
     env.reset(seed=0)
     for _ in range(5):
         env.step(action)
-    start, begun, steps = perf_counter(), process_time(), 0
-    while perf_counter() - start < seconds:
-        env.step(action)
-        steps += 1
-    return steps / (perf_counter() - start), steps / (process_time() - begun)
+    return _rate(env, action, 1, seconds)
 
 
 def together(name: str, count: int, seconds: float) -> Rate:
@@ -43,11 +48,7 @@ def together(name: str, count: int, seconds: float) -> Rate:
     envs.reset(seed=0)
     for _ in range(2):
         envs.step(actions)
-    start, begun, steps = perf_counter(), process_time(), 0
-    while perf_counter() - start < seconds:
-        envs.step(actions)
-        steps += count
-    return steps / (perf_counter() - start), steps / (process_time() - begun)
+    return _rate(envs, actions, count, seconds)
 
 
 def main() -> None:

@@ -46,6 +46,25 @@ class Polygons(NamedTuple):
 
 
 @kernel
+def _edge(ends, normal, x, y, z):
+    """An edge of a polygon (2, 3), seen from a point.
+
+    Returns:
+        Its normal in the plane, outward; how far its line lies that way; where its ends lie along
+        the line; its length. The first six mean nothing where that is zero.
+    """
+    ax, ay, az = ends[0, 0], ends[0, 1], ends[0, 2]
+    lx, ly, lz = ends[1, 0] - ax, ends[1, 1] - ay, ends[1, 2] - az
+    length = math.sqrt(lx * lx + ly * ly + lz * lz)
+    lx, ly, lz = lx / length, ly / length, lz / length
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    ux, uy, uz = ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx
+    px, py, pz = ax - x, ay - y, az - z
+    low = px * lx + py * ly + pz * lz
+    return ux, uy, uz, px * ux + py * uy + pz * uz, low, low + length, length
+
+
+@kernel
 def polygon_potential(edges, normal, x, y, z):
     """Return ∫ dS' / |r − r'| [m] over a polygon given by its edges (k, 2, 3)."""
     nx, ny, nz = normal[0], normal[1], normal[2]
@@ -53,18 +72,9 @@ def polygon_potential(edges, normal, x, y, z):
     h = abs(d)
     total = 0.0
     for e in range(edges.shape[0]):
-        ax, ay, az = edges[e, 0, 0], edges[e, 0, 1], edges[e, 0, 2]
-        lx, ly, lz = edges[e, 1, 0] - ax, edges[e, 1, 1] - ay, edges[e, 1, 2] - az
-        length = math.sqrt(lx * lx + ly * ly + lz * lz)
+        _, _, _, t, lm, lp, length = _edge(edges[e], normal, x, y, z)
         if length < 1e-15:
             continue
-        lx, ly, lz = lx / length, ly / length, lz / length
-        px, py, pz = ax - x, ay - y, az - z
-        lm = px * lx + py * ly + pz * lz
-        lp = lm + length
-        # outward in-plane normal of the edge: l x n
-        ux, uy, uz = ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx
-        t = px * ux + py * uy + pz * uz
         r0 = t * t + h * h
         if r0 < 1e-24:
             continue
@@ -89,17 +99,9 @@ def polygon_gradient(edges, normal, x, y, z, out):
     h = abs(d)
     gx, gy, gz, beta = 0.0, 0.0, 0.0, 0.0
     for e in range(edges.shape[0]):
-        ax, ay, az = edges[e, 0, 0], edges[e, 0, 1], edges[e, 0, 2]
-        lx, ly, lz = edges[e, 1, 0] - ax, edges[e, 1, 1] - ay, edges[e, 1, 2] - az
-        length = math.sqrt(lx * lx + ly * ly + lz * lz)
+        ux, uy, uz, t, lm, lp, length = _edge(edges[e], normal, x, y, z)
         if length < 1e-15:
             continue
-        lx, ly, lz = lx / length, ly / length, lz / length
-        px, py, pz = ax - x, ay - y, az - z
-        lm = px * lx + py * ly + pz * lz
-        lp = lm + length
-        ux, uy, uz = ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx
-        t = px * ux + py * uy + pz * uz
         r0 = t * t + h * h + _TINY
         rp = math.sqrt(r0 + lp * lp)
         rm = math.sqrt(r0 + lm * lm)
@@ -132,17 +134,9 @@ def solid_angle(edges, normal, x, y, z):
     if h <= 1e-12:
         return 0.0
     for e in range(edges.shape[0]):
-        ax, ay, az = edges[e, 0, 0], edges[e, 0, 1], edges[e, 0, 2]
-        lx, ly, lz = edges[e, 1, 0] - ax, edges[e, 1, 1] - ay, edges[e, 1, 2] - az
-        length = math.sqrt(lx * lx + ly * ly + lz * lz)
+        _, _, _, t, lm, lp, length = _edge(edges[e], normal, x, y, z)
         if length < 1e-15:
             continue
-        lx, ly, lz = lx / length, ly / length, lz / length
-        px, py, pz = ax - x, ay - y, az - z
-        lm = px * lx + py * ly + pz * lz
-        lp = lm + length
-        ux, uy, uz = ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx
-        t = px * ux + py * uy + pz * uz
         r0 = t * t + h * h
         rp, rm = math.sqrt(r0 + lp * lp), math.sqrt(r0 + lm * lm)
         beta += math.atan(t * lp / (r0 + h * rp)) - math.atan(t * lm / (r0 + h * rm))
