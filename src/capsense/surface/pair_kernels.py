@@ -8,6 +8,7 @@ import numpy as np
 
 from capsense._jit import compiled, pasted
 from capsense._simd import muladd, rsqrt
+from capsense.field.green_kernels import smooth
 
 FAR = 0.75
 """Clusters farther apart than so many of their joint extents are met by their moments."""
@@ -90,6 +91,49 @@ def _add_lifted(leaves, out):
                 more -= mean_inverse(true[i], true[j], size)
                 out[i, j] += more
                 out[j, i] += more
+
+
+@compiled
+def spare_images(leaves, rows, pairs, green):
+    """Take back what four points meet their own images too much near a flat design.
+
+    Four points stand for a rectangle a distance d from another by as much as 1/(4 d) too much,
+    where d is small against its side. The design's own answer ψ·ψ is scaled by what a mirror
+    at its face would be off.
+    """
+    points, image = leaves.points, np.empty((4, 3))
+    for j in range(points.shape[0]):
+        inverse = 0.0
+        for q in range(4):
+            height = points[j, q, 2] - green.box[1, 2]
+            if height <= 0.0:
+                inverse = 0.0
+                break
+            inverse += 0.25 / height
+        side = math.sqrt(12.0 * _arm(points[j], 1) * _arm(points[j], 2))
+        if inverse * side < 4.0:
+            continue
+        most = _mirror_mean(2.0 / (inverse * side)) / side
+        square = 0.0
+        for k in range(green.lead, rows.shape[1]):
+            square += float(rows[j, k]) ** 2
+        for q in range(4):
+            for i in range(2):
+                image[q, i] = points[j, q, i]
+            image[q, 2] = 2.0 * green.floor - points[j, q, 2]
+        square += mean_inverse(points[j], image, 0.0)
+        extra = square - most
+        pairs[j, j] += max(0.0, extra) * smooth(10.0 * extra / square)
+
+
+@compiled
+def _mirror_mean(t):
+    """Mean of 1/r between parallel unit squares a distance t apart, one above the other."""
+    a, b, square = math.sqrt(1.0 + t * t), math.sqrt(2.0 + t * t), t * t
+    whole = 2.0 * math.log((1.0 + b) / a) - t * math.atan(1.0 / (t * b))
+    first = 0.5 * (b + (1.0 + square) * math.log((1.0 + b) / a))
+    first -= 0.5 * (a + square * math.log((1.0 + a) / t))
+    return 4.0 * (whole - 2.0 * first + (b**3 - 2.0 * a**3 + t**3) / 3.0)
 
 
 @compiled
