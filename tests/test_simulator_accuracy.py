@@ -24,6 +24,7 @@ from field_cases import (
 )
 
 import capsense as cs
+from capsense.constants import EPS0
 from capsense.design.model import Domain
 
 Array = np.ndarray
@@ -69,6 +70,29 @@ def test_grounded_bar_nearly_touching(simulators, gap, bound):
     """Measured against boundary elements: 16 % at 1 mm, less than half the distance that fields are
     fitted at."""
     check(simulators("six_patch_bare"), "six_patch_bare", f"bar {gap}", bound, 0.1)
+
+
+@pytest.mark.parametrize(("gap", "other"), [(1, 0.3), (2, 0.1)])
+def test_grounded_bar_nearly_touching_with_few_functions(simulators, gap, other):
+    """Measured against boundary elements: 16 %."""
+    sim = cs.Simulator(
+        "six_patch_bare", preset="learning", background=simulators("six_patch_bare").background
+    )
+    check(sim, "six_patch_bare", f"bar {gap}", 0.18, other)
+
+
+@pytest.mark.parametrize("preset", ["learning", "standard"])
+@pytest.mark.parametrize("size", [(0.15, 0.15, 0.02), (0.3, 0.25, 0.05), (0.06, 0.2, 0.1)])
+def test_wide_boxes_near_contact_read_less_than_plates(simulators, preset, size):
+    """Invariant: from 1 to 0.3 mm no electrode has more than a plate as wide as it would."""
+    known = simulators("six_patch_bare")
+    sim = cs.Simulator("six_patch_bare", preset=preset, background=known.background)
+    for gap in (1e-3, 5e-4, 3e-4):
+        for turn in np.linspace(0.1, 1.5, 4):
+            pose = cs.Pose.from_euler((0.01, -0.02, gap + 0.5 * size[2]), (0, 0, turn))
+            found = np.diag(sim.step(cs.Scene([cs.Body(cs.Box(size), pose)])).delta)
+            assert (found > 0).all()
+            assert found.max() < 1.2 * EPS0 * 0.03**2 / gap
 
 
 @pytest.mark.parametrize("kind", SPHERES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from surface_scenes import Placed, green_of, pack
@@ -10,7 +12,7 @@ import capsense as cs
 from capsense.field.green_kernels import beyond, least_gap, lift
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import Leaves, placed
-from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
+from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
 
 Array = np.ndarray
 BOX = np.array([[-0.05, -0.04, -0.001], [0.05, 0.04, 0.0]])
@@ -133,3 +135,25 @@ def test_charge_out_of_reach_has_a_large_energy() -> None:
         for r in (none, reach)
     )
     np.testing.assert_allclose(second - first, np.diag(1e6 * reach**3), rtol=1e-6, atol=0.1)
+
+
+@pytest.mark.parametrize("height", [3e-4, 1e-3, 8e-3])
+def test_no_image_attracts_more_than_a_mirror(height: float) -> None:
+    """Differential: wide squares meet themselves in a flat face as by the mean over all of them."""
+    side, green = 0.02, green_of()
+    arm = side / math.sqrt(12.0)
+    points = np.array([[[x, y, height] for x in (arm, -arm) for y in (arm, -arm)]])
+    points[..., 2] += green.box[1, 2]
+    one, none = np.ones(1), np.zeros(1)
+    leaves = Leaves(points, points, side * one, none, np.zeros(1, int), none)
+    rows = np.zeros((1, green.lead + 8), np.float32)
+    rows[0, green.lead] = 30.0  # the square of it is what the design answers [1/m]
+    pairs = np.zeros((1, 1), np.float32)
+    bound_images(leaves, rows, pairs, green)
+    off = (np.arange(2000) + 0.5) / 2000  # of two points of the square, over its side
+    square = (1.0 - off)[:, None] * (1.0 - off)
+    distance = np.sqrt(off[:, None] ** 2 + off**2 + (2.0 * height / side) ** 2)
+    mirror = 4.0 * (square / distance).mean() / side
+    floor = mean_inverse(points[0], points[0] * [1, 1, -1] + [0, 0, 2 * green.floor], 0.0)
+    wanted = 900.0 + floor - mirror if height < 5e-3 else 0.0
+    assert pairs[0, 0] == pytest.approx(wanted, rel=1e-4)

@@ -18,6 +18,9 @@ BARRIER = 1e6
 """Energy of charge that is out of reach [1/m]."""
 LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
+_WIDE = 4.0
+"""Sides of a cluster, over its distance from a flat design, from which on its images are bounded:
+four points are good to 0.1 % of their mean up to there."""
 SOFT = 0.15
 """Distance, as a part of the larger extent, below which 1/r of two points is bounded: flat clusters
 that coincide then have less energy between them than each has alone. Coarse ones that are bent may
@@ -94,36 +97,36 @@ def _add_lifted(leaves, out):
 
 
 @compiled
-def spare_images(leaves, rows, pairs, green):
-    """Take back what four points meet their own images too much near a flat design.
+def bound_images(leaves, rows, pairs, green):
+    """Let no cluster meet its own images in a flat design more than in a mirror at its face.
 
-    Four points stand for a rectangle a distance d from another by as much as 1/(4 d) too much,
-    where d is small against its side. The design's own answer ψ·ψ is scaled by what a mirror
-    at its face would be off.
+    Four points a distance d from their images stand for a wide rectangle as if it were met by as
+    much as 1/(4 d) more than it is. Charge on it would cost too little energy, or none. Gradients
+    do not follow this bound; it takes effect for bodies much wider than their gap only.
+
+    Args:
+        leaves: The clusters.
+        rows: Their rows, shape (l, w).
+        pairs: As of :func:`leaf_pairs`; the diagonal is raised.
+        green: Green's function of the design.
     """
+    if green.cover > 1.0:
+        return
     points, image = leaves.points, np.empty((4, 3))
     for j in range(points.shape[0]):
         inverse = 0.0
         for q in range(4):
-            height = points[j, q, 2] - green.box[1, 2]
-            if height <= 0.0:
-                inverse = 0.0
-                break
-            inverse += 0.25 / height
-        side = math.sqrt(12.0 * _arm(points[j], 1) * _arm(points[j], 2))
-        if inverse * side < 4.0:
-            continue
-        most = _mirror_mean(2.0 / (inverse * side)) / side
-        square = 0.0
-        for k in range(green.lead, rows.shape[1]):
-            square += float(rows[j, k]) ** 2
-        for q in range(4):
-            for i in range(2):
-                image[q, i] = points[j, q, i]
+            inverse += 0.25 / max(points[j, q, 2] - green.box[1, 2], 1e-9)
+            image[q, 0], image[q, 1] = points[j, q, 0], points[j, q, 1]
             image[q, 2] = 2.0 * green.floor - points[j, q, 2]
-        square += mean_inverse(points[j], image, 0.0)
-        extra = square - most
-        pairs[j, j] += max(0.0, extra) * smooth(10.0 * extra / square)
+        side = math.sqrt(12.0 * _arm(points[j], 1) * _arm(points[j], 2))
+        if inverse * side < _WIDE or points[j, :, 2].min() < green.box[1, 2]:
+            continue
+        met = mean_inverse(points[j], image, 0.0)
+        for k in range(green.lead, rows.shape[1]):
+            met += float(rows[j, k]) ** 2
+        extra = met - _mirror_mean(2.0 / (inverse * side)) / side
+        pairs[j, j] += max(0.0, extra) * smooth(10.0 * extra / met)
 
 
 @compiled

@@ -17,7 +17,7 @@ from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, chosen
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
-from capsense.surface.pair_kernels import leaf_pairs, spare_images
+from capsense.surface.pair_kernels import bound_images, leaf_pairs
 from capsense.surface.solve_kernels import (
     GAIN,
     Functions,
@@ -69,7 +69,7 @@ def prepared(
     leaves = placed(bodies, cut, green, INSIDE)
     rows = leaf_rows(leaves.points, leaves.beyond, green)
     pairs = leaf_pairs(leaves, green.floor)
-    spare_images(leaves, rows, pairs, green)
+    bound_images(leaves, rows, pairs, green)
     functions = functions_of(bodies, cut)
     return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
 
