@@ -75,12 +75,12 @@ def same_functions(count: int) -> Iterator[None]:
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
         cut, leaves, functions, system = prepared(bodies, green)
-        delta, left, x, shift = reduced(cut, functions, system, others[2])
+        delta, left, coarse, x, shift = reduced(cut, functions, system, others[2])
         charge = leaf_charges(cut, functions, x, len(leaves.points))
         m = green.terminals
         return step.Solution(
-            delta[:m, :m], left[:m, :m], charge, leaves.points, leaves.extent, leaves.owner,
-            functions.solved, shift,
+            delta[:m, :m], left[:m, :m], coarse[:m], charge,
+            leaves.points, leaves.extent, leaves.owner, functions.solved, shift,
         )  # fmt: skip
 
     with (

@@ -22,6 +22,8 @@ SOFT = 0.15
 """Points of different bodies see 1/r bounded at so many of the larger one's extent."""
 GAIN = 1.3
 """What functions that are left out stand for, themselves and all below."""
+COARSE_PANELS = 0.6
+"""What panels are too coarse for, over the energy of the functions that end in them."""
 
 
 @dataclass(frozen=True)
@@ -186,11 +188,12 @@ def reduced(
     trees: list[tuple[Array, Array, Array]],
     chosen: list[Chosen],
     green: GreenFunction,
-) -> tuple[Array, Array]:
-    """ΔC and the part of it that is estimated, from chosen functions (kids, panel, charge)."""
+) -> tuple[Array, Array, Array]:
+    """ΔC and the part of it that is estimated, from chosen functions (kids, panel, charge), and
+    what panels are too coarse for."""
     share = [shares(*tree) for tree in trees]
     found = clusters(pieces, [s[:, c.leaves] for s, c in zip(share, chosen, strict=True)])
-    columns, blocks, fade, above = [], [], [], []
+    columns, blocks, fade, above, ends = [], [], [], [], []
     for b, (piece, tree, all_of, cut) in enumerate(zip(pieces, trees, share, chosen, strict=True)):
         kids = tree[0]
         haars = all_of[:, kids[cut.functions, 0]] - all_of[:, kids[cut.functions, 1]]
@@ -207,6 +210,8 @@ def reduced(
         blocks.append(block)
         fade.append(np.concatenate([[1.0] * len(start), cut.fade]))
         above.append(np.concatenate([[1.0] * len(start), cut.above]))
+        panels = (kids[kids[cut.functions]][..., 0] < 0).mean(axis=1)
+        ends.append(np.concatenate([[0.0] * len(start), panels]))
     to_leaves = np.concatenate(columns, axis=1)
     matrix = to_leaves.T @ interaction(found, green) @ to_leaves
     at = np.cumsum([0, *(len(b) for b in blocks)])
@@ -221,7 +226,8 @@ def reduced(
     lack = GAIN * (1 - t) * (1 - (1 - parent) ** 4) / np.diag(matrix)
     residual = phi - matrix @ x
     left = residual.T @ (lack[:, None] * residual)
-    return phi.T @ x + left, left
+    coarse = COARSE_PANELS * (np.concatenate(ends) * np.diag(matrix)) @ x**2
+    return phi.T @ x + left, left, coarse
 
 
 # ---- scores ----

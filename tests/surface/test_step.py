@@ -199,10 +199,12 @@ def test_chosen_functions_are_solved_and_the_others_estimated(name: str, thresho
     """
     scene = scenes()[name]
     cut = prepared(scene.packed(), packed_green(), threshold, WIDTH)[0]
-    delta, left = twin.reduced(scene.pieces, scene.trees, chosen_of(cut, len(scene)), exact())
+    chosen = chosen_of(cut, len(scene))
+    delta, left, coarse = twin.reduced(scene.pieces, scene.trees, chosen, exact())
     found = scene.solved(threshold)
     assert apart(found.delta, delta) < 6e-4
     assert np.abs(found.left - left).max() < 3e-4 * np.abs(delta).max()
+    assert np.abs(found.coarse - coarse).max() < 3e-4 * np.abs(delta).max()
     assert np.abs(left).max() > 1e-3 * np.abs(delta).max()
 
 

@@ -91,5 +91,5 @@ class CpuCore:
                 solver.green, preset.threshold, preset.width,
             )  # fmt: skip
             found.delta[e, s], loss[e, s] = out.delta.real, -out.delta.imag
-            found.error[e, s] = np.abs(np.diag(out.left)).max()
+            found.error[e, s] = (np.abs(np.diag(out.left)) + out.coarse).max()
         return loss

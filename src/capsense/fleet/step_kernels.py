@@ -90,9 +90,11 @@ def step_rows(start, stop, bodies, poses, sensor, found):
             if count == 0 or found.lossy[e, s]:
                 continue
             out = solve(room[:count], green, sensor.threshold, sensor.width, slopes)
-            doubt = out.delta if out.shift > sensor.doubtful else out.left
             for i in range(m):
-                found.error[e, s] = max(found.error[e, s], abs(doubt[i, i]))
+                doubt = abs(out.left[i, i]) + out.coarse[i]
+                if out.shift > sensor.doubtful:
+                    doubt = abs(out.delta[i, i])
+                found.error[e, s] = max(found.error[e, s], doubt)
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.size >= 0 else np.nan
             if slopes and out.size >= 0:

@@ -19,6 +19,9 @@ times the energy in free space, which goes with k. The figure makes square sheet
 1 to 3 mm read within 30 % of boxes of that thickness, mostly within 15 %."""
 GAIN = 1.3
 """What the functions directly below the cut stand for: themselves, and all below them."""
+COARSE = 0.6
+"""What panels are too coarse for, by estimate, over the energy of the functions that end in them.
+Wide boxes 1 to 8 mm from a sensor are off by 0.2 to 0.9 times that (``benchmarks/limits.py``)."""
 
 
 _ROWS = 4
@@ -34,6 +37,8 @@ class Functions(NamedTuple):
     """Its number among the functions of the shape, shape (f,)."""
     body: NDArray[Any]
     """Its body, shape (f,)."""
+    ends: NDArray[Any]
+    """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,)."""
     solved: int
     """How many are solved for."""
 
@@ -51,6 +56,21 @@ class System(NamedTuple):
     """Energies of all functions by themselves [1/m], shape (f,)."""
 
 
+class Reduced(NamedTuple):
+    """The solution of a system, for m columns of φ⁰."""
+
+    delta: NDArray[Any]
+    """ΔC [m], shape (m, m)."""
+    left: NDArray[Any]
+    """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    coarse: NDArray[Any]
+    """Estimate of what panels are too coarse for, of the diagonal [m], shape (m,)."""
+    charge: NDArray[Any]
+    """Charges of all functions [m], shape (f, m)."""
+    shift: float
+    """What was added to the diagonal to make it definite, relative; -1 where nothing did."""
+
+
 @compiled
 def functions_of(bodies, cut):
     """List the charge functions of a cut, those to be solved for first."""
@@ -63,6 +83,7 @@ def functions_of(bodies, cut):
         np.empty(count, np.int64),
         np.empty(count, np.int64),
     )
+    ends = np.zeros(count)
     f = solved = 0
     for rest in range(2):
         for a in range(cut.node.shape[0]):
@@ -73,15 +94,25 @@ def functions_of(bodies, cut):
             if cut.kids[a, 0] >= 0 and (cut.fade[a] == 0.0) == (rest == 1):
                 # functions are numbered breadth first, as clusters are
                 cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
+                ends[f] = _panels(bodies[b], cut.node[a])
                 f += 1
         if rest == 0:
             solved = f
-    return Functions(cluster[:f], number[:f], body[:f], solved)
+    return Functions(cluster[:f], number[:f], body[:f], ends[:f], solved)
 
 
 @compiled
 def _function(body, node):
     return integers(body.function)[node]
+
+
+@compiled
+def _panels(body, node):
+    kids, out = integers(body.kids), 0.0
+    for c in range(2):
+        if kids[2 * kids[2 * node + c]] < 0:
+            out += 0.5
+    return out
 
 
 @compiled
@@ -243,7 +274,7 @@ def _add_matter(bodies, functions, matrix, rest, own):
 
 @compiled
 def reduced(cut, functions, system, adjoint):
-    """ΔC, the part of it that was estimated, the charges of all functions, a shift of the diagonal.
+    """Solve a system.
 
     Functions that fade in by t are taken as √t A √t with their own energy whole. What they lack,
     and functions not solved for, add the energy that the potential they leave has in them alone.
@@ -266,7 +297,7 @@ def reduced(cut, functions, system, adjoint):
     shift = _factorise(matrix, root, own, factor)
     if shift < 0.0:
         delta[0, 0] = np.nan
-        return delta, left, x, shift
+        return Reduced(delta, left, np.zeros(m), x, shift)
     substitute(factor, x[:solved])
     for f in range(solved):
         for i in range(m):
@@ -291,6 +322,10 @@ def reduced(cut, functions, system, adjoint):
             if lack[f] == 0.0:
                 phi[f, i] = 0.0
     _add_products(phi, charge, left)
+    coarse = np.zeros(m)
+    for f in range(solved):
+        for i in range(m):
+            coarse[i] += COARSE * functions.ends[f] * own[f] * x[f, i] ** 2
     if adjoint:
         _add_adjoint(matrix, rest, root, lack, factor, charge, x)
     for f in range(solved, total):
@@ -302,7 +337,7 @@ def reduced(cut, functions, system, adjoint):
     for i in range(m):
         for j in range(i):
             delta[i, j] = delta[j, i] = 0.5 * (delta[i, j] + delta[j, i])
-    return delta, left, x, shift
+    return Reduced(delta, left, coarse, x, shift)
 
 
 @compiled

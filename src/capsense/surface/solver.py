@@ -219,8 +219,10 @@ class SurfaceSolver:
         The error is an estimate of that of the largest entry [F]; where bodies lie within each
         other or within the sensor so that the matrix had to be changed, it is all of that entry.
         """
-        doubt = solution.delta if solution.shift > DOUBTFUL else solution.left
-        return UNIT * solution.delta, UNIT * float(np.abs(np.diag(doubt).real).max())
+        doubt = np.abs(np.diag(solution.left).real) + solution.coarse
+        if solution.shift > DOUBTFUL:
+            doubt = np.abs(np.diag(solution.delta).real)
+        return UNIT * solution.delta, UNIT * float(doubt.max())
 
     def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
         """How the matrix of all terminals changes with the poses of a scene's bodies.

@@ -19,6 +19,7 @@ from capsense.surface.choose_kernels import Cut, chosen
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs
 from capsense.surface.solve_kernels import (
+    COARSE,
     GAIN,
     Functions,
     System,
@@ -36,6 +37,8 @@ class Solution(NamedTuple):
     """Change of the Maxwell matrix [m], shape (m, m); complex where matter has losses."""
     left: NDArray[Any]
     """The part of it that functions outside the system stand for [m], shape (m, m)."""
+    coarse: NDArray[Any]
+    """Estimate of what panels are too coarse for, of its diagonal [m], shape (m,)."""
     charge: NDArray[Any]
     """Charge on each leaf for each terminal at 1 V [m], shape (l, m)."""
     points: NDArray[Any]
@@ -84,13 +87,14 @@ def solve(
     :func:`prepared`.
     """
     cut, leaves, functions, system = prepared(bodies, green, threshold, width)
-    delta, left, x, shift = reduced(cut, functions, system, adjoint)
+    delta, left, coarse, x, shift = reduced(cut, functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
     size = functions.solved if shift >= 0.0 else -1
     return Solution(
-        delta[:m, :m], left[:m, :m], charge, leaves.points, leaves.extent, leaves.owner, size, shift
-    )
+        delta[:m, :m], left[:m, :m], coarse[:m], charge,
+        leaves.points, leaves.extent, leaves.owner, size, shift,
+    )  # fmt: skip
 
 
 @compiled
@@ -177,9 +181,10 @@ def solve_lossy(
     x = np.zeros((len(fade), m), complex)
     x[:n], x[n:] = solved, extra[n:]
     delta = _product(phi[:n, :m].T, solved) + left
+    coarse = COARSE * (functions.ends[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     return Solution(
-        0.5 * (delta + delta.T), np.ascontiguousarray(left.real), charge,
+        0.5 * (delta + delta.T), np.ascontiguousarray(left.real), coarse, charge,
         leaves.points, leaves.extent, leaves.owner, n, 0.0,
     )  # fmt: skip
 
