@@ -3,6 +3,7 @@
 - contact: grounded bodies 2 to 0.5 mm above an electrode, each preset, and one with 2,800 panels,
   against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels do not
   help there.
+- wide boxes in parallel with the sensor, against 2,800 panels, and what their readings tell of it.
 - dielectrics in depth images of 128 × 128 pixels with front and back, against the shapes.
 - sheets of a dielectric as deforming surfaces of 800 triangles, against boxes as thick.
 - bodies that reach into the sensor: error estimates over the largest entry.
@@ -65,6 +66,30 @@ def contact(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         yield name, [float(np.abs(diagonal_errors(f, truth)).max()) for f in found]
 
 
+def wide(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Median and largest difference from 2,800 panels, and the median estimate, each preset.
+
+    Both are of the scene's largest diagonal, for boxes of 0.03 to 0.3 m, parallel to the sensor.
+    """
+    sims = [cs.Simulator(DESIGN, preset=p, background=sim.background) for p in PRESETS]
+    finer = SurfaceSolver(sim.background.green, sim.design, preset=FINER)
+    random = np.random.default_rng(5)
+    sizes = np.round(random.uniform([0.03, 0.03, 0.01], [0.3, 0.3, 0.1], (8, 3)), 2)
+    for gap in (0.0005, 0.001, 0.002, 0.004, 0.008):
+        off, told = [], []
+        for size in sizes:
+            place = (*random.uniform(-0.06, 0.06, 2), gap + size[2] / 2)
+            pose = cs.Pose.from_euler(place, (0, 0, random.uniform(0, 3)))
+            scene = cs.Scene([cs.Body(cs.Box(tuple(size)), pose)])
+            truth = np.diag(finer.solve(scene).matrix)
+            readings = [s.step(scene) for s in sims]
+            off.append([np.abs(np.diag(r.delta) - truth).max() / truth.max() for r in readings])
+            told.append([r.stats.solver_error / truth.max() for r in readings])
+        middle, most = np.median(off, axis=0), np.max(off, axis=0)
+        table = np.stack([middle, most, np.median(told, axis=0)], axis=1)
+        yield f"gap {1e3 * gap:g} mm", table.ravel().tolist()
+
+
 def images(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     """Errors of depth images of dielectrics at 5, 10, 20, 50 mm."""
     for name, shape in (("ball", cs.Sphere(0.03)), ("box", cs.Box((0.08, 0.06, 0.04)))):
@@ -106,6 +131,7 @@ def inside(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
 
 PARTS = {
     "contact, presets learning, standard, fine, and 2,800 panels": contact,
+    "wide boxes: median and largest error, and median estimate, of each preset": wide,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
     "deforming sheets of dielectrics, gaps of 5, 10, 20, 50 mm": cloth,
     "in the sensor: error estimate with lowest points at 1, 0, -1, -5 mm": inside,

@@ -293,6 +293,7 @@ def main() -> None:
         smoothness=smoothness(out / "smoothness.json"), boards=boards(out / "boards.txt"),
         elements=elements(out / "peers_bem.json"),
         contact=limited("contact", *PRESETS, "2,800 panels"),
+        wide=limited("wide", *(f"{p}: {x}" for p in PRESETS for x in ("median", "worst", "told"))),
         images=limited("images", *GAPS), cloth=limited("cloth", *GAPS),
         inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),
         studies=studies(reproduced), foretold=foretold(),

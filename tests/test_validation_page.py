@@ -112,7 +112,7 @@ def test_designs(validation: ModuleType) -> None:
 
 @pytest.mark.parametrize(
     ("part", "columns", "bound"),
-    [("contact", 4, 350), ("images", 4, 20), ("cloth", 4, 35), ("inside", 4, 1000)],
+    [("contact", 4, 50), ("wide", 9, 70), ("images", 4, 20), ("cloth", 4, 35), ("inside", 4, 1000)],
 )
 def test_limits(validation: ModuleType, part: str, columns: int, bound: float) -> None:
     """Limits are those on the page."""
