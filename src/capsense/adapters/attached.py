@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
-from capsense.adapters.placement import nothing_seen, placement, turned_round
+from capsense.adapters.placement import blind, nothing_seen, placement, sees, turned_round
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import SceneError
+from capsense.errors import CapSenseError, SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
@@ -142,13 +142,14 @@ class AttachedSensor(ABC):
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
         scene = self.scene()
-        return placement(scene, self.simulator) if len(scene) else [nothing_seen(self._design)]
+        found = placement(scene, self.simulator)
+        return found if found or sees(self.simulator, scene) else [nothing_seen(self._design)]
 
     def warn(self) -> None:
         """Warn of what :meth:`check` finds, if the simulator's state is known yet."""
         try:
             found = self.check()
-        except SceneError:
+        except CapSenseError:  # what is wrong will be told at the first reading
             return
         if found:
             warnings.warn("sensor: " + ";\nand ".join(found), stacklevel=3)
@@ -273,11 +274,12 @@ class GeometrySensor(AttachedSensor):
 
     def check(self) -> list[str]:
         frames = self._now(None)
-        if len(self.world.scene(frames)):
-            return super().check()
+        found = super().check()
+        if not blind(found):
+            return found
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
-        return [turned_round([str(b.name) for b in behind])] if len(behind) else super().check()
+        return [turned_round([str(b.name) for b in behind])] if len(behind) else found
 
     def refresh(self) -> None:
         """Take the world's solids over again, after their shapes, sizes or number changed.
