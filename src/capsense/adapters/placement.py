@@ -41,8 +41,8 @@ def nothing_seen(design: Design) -> str:
     """The finding for a sensor whose domain is empty."""
     size = " × ".join(f"{v:g}" for v in design.domain.size)
     return (
-        f"{_NOTHING}: the sensor sees {size} m in front of its electrodes, along the z of its frame; bring something there, or look for what "
-        "exclude, groups and exclude_own leave out"
+        f"{_NOTHING}: the sensor sees {size} m in front of its electrodes, along the z of its "
+        "frame; bring something there, or look for what exclude, groups and exclude_own leave out"
     )
 
 
@@ -50,8 +50,9 @@ def turned_round(names: list[str]) -> str:
     """The finding for a sensor that has everything at its back."""
     listed = ", ".join(map(repr, names[:4])) + (", …" if len(names) > 4 else "")
     return (
-        f"{_NOTHING}, but {listed} would be if the sensor faced the other way: its z must point out of the sensor; if it should see that, "
-        'turn its frame half round about x (quaternion (1, 0, 0, 0), in MJCF euler="180 0 0")'
+        f"{_NOTHING}, but {listed} would be if the sensor faced the other way: its z must point "
+        "out of the sensor; if it should see that, turn its frame half round about x (quaternion "
+        '(1, 0, 0, 0), in MJCF euler="180 0 0")'
     )
 
 
