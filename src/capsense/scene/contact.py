@@ -33,7 +33,10 @@ class Sheets:
         self._many = np.concatenate([points_on(corners) for corners in sheets])
         apart = np.linalg.norm(self._many[:, None] - self._few, axis=2)
         self._nearest = apart.argmin(axis=1)
-        self._reach = float(apart.min(axis=1).max())
+        self._reach = apart.min(axis=1) + TOUCH
+        self._middle = self._few.mean(axis=0, keepdims=True)
+        arms = np.concatenate([self._few, self._many]) - self._middle
+        self._radius = float(np.linalg.norm(arms, axis=1).max()) + TOUCH
         self.bounds = np.array([self._few.min(axis=0) - TOUCH, self._few.max(axis=0) + TOUCH])
         """Corners of a box around all of them [m], shape (2, 3)."""
 
@@ -44,11 +47,12 @@ class Sheets:
         """
         if body.shape.kind == ShapeKind.LAYERS:
             return False
-        off = _quick(body, self._few)
-        if off.min() > self._reach:
+        if _quick(body, self._middle)[0] > self._radius:
             return False
-        close = off[self._nearest] <= self._reach
-        off = np.concatenate([off, _quick(body, self._many[close])])
+        off = _quick(body, self._few)
+        close = off[self._nearest] <= self._reach  # others are no nearer than the few around them
+        if close.any():
+            off = np.concatenate([off, _quick(body, self._many[close])])
         return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
 
 
