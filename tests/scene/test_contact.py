@@ -9,16 +9,15 @@ import capsense as cs
 from capsense.scene.contact import TOUCH, Sheets, distances, points_on
 
 CORNERS = np.array([[[0, 0, 0], [0.03, 0, 0], [0.03, 0.03, 0]]], float)
-PADS = [CORNERS - (0.035, 0, 0), CORNERS + (0.005, -0.01, 0.002)]
+PADS = [CORNERS - np.array([0.035, 0, 0]), CORNERS + np.array([0.005, -0.01, 0.002])]
 
 
-@pytest.mark.parametrize("shape", [cs.Sphere(0.02), cs.Box((0.03, 0.02, 0.004)), "closed", "open"])
+@pytest.mark.parametrize("shape", [cs.Sphere(0.02), cs.Box((0.03, 0.03, 0.015)), "mesh"])
 def test_sheets_meet_what_their_points_meet(shape: cs.Shape | str) -> None:
     """Differential: bodies on their way past the sheets, far, near, touching and around them."""
     if isinstance(shape, str):
         ball = cs.Sphere(0.02).to_trimesh()
-        kept = ball.vertices[ball.faces].mean(axis=1)[:, 2] < (1 if shape == "closed" else 0.01)
-        shape = cs.TriMesh(ball.vertices, ball.faces[kept])
+        shape = cs.TriMesh(ball.vertices, ball.faces)
     sheets, points = Sheets(PADS), np.concatenate([points_on(pad) for pad in PADS])
     rng = np.random.default_rng(4)
     met = []
