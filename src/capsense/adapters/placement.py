@@ -61,10 +61,9 @@ def _contacts(scene: Scene, electrodes: dict[str, Array]) -> list[str]:
     inside: dict[str, list[str]] = {}
     touching: dict[str, list[str]] = {}
     depth = 0.0
-    for body in scene:
-        if isinstance(body.shape, Layers):
-            continue
-        for name, points in electrodes.items():
+    bodies = [body for body in scene if not isinstance(body.shape, Layers)]
+    for name, points in electrodes.items():
+        for body in bodies:
             nearest = float(distances(body, points).min())
             if nearest < TOUCH:
                 found = inside if nearest < -TOUCH else touching
