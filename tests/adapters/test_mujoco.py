@@ -356,6 +356,9 @@ def test_a_robot_that_is_drawn_and_collides(
     assert len(twice) == warned
     assert all(r"collide (groups=[0])" in text and r"(groups=[1])" in text for text in twice)
     assert len(sensor.world.solids) == seen
+    (found,) = sensor.check()  # the robot behind is no reason to turn the sensor round
+    assert "nothing is in view" in found
+    assert "faced the other way" not in found
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "sensor: bodies")
         cs.mujoco.attach(model, data, "pad", tiny_simulator, groups=[0])

@@ -235,6 +235,10 @@ class WorldSource(ABC):
         """
 
     @abstractmethod
+    def robot(self, frame: int) -> set[int]:
+        """The frames of the robot that a frame belongs to."""
+
+    @abstractmethod
     def links(self) -> tuple[Array, Array]:
         """Origins [m] (f, 3) and quaternions (f, 4) of the moving frames, as they are now."""
 
@@ -247,6 +251,8 @@ class GeometrySensor(AttachedSensor):
 
     world: World
     """Everything it may see."""
+    _carrier: int
+    """The frame that carries it."""
 
     def __init__(self, simulator: Simulator, source: WorldSource) -> None:
         super().__init__(simulator)
@@ -279,7 +285,9 @@ class GeometrySensor(AttachedSensor):
             return found
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
-        return [turned_round([str(b.name) for b in behind])] if len(behind) else found
+        own = self.world.names(self.source.robot(self._carrier))
+        others = [str(b.name) for b in behind if b.name not in own]
+        return [turned_round(others)] if others else found
 
     def refresh(self) -> None:
         """Take the world's solids over again, after their shapes, sizes or number changed.

@@ -298,6 +298,10 @@ class ModelSource(WorldSource):
             )
         self._chosen = True
 
+    def robot(self, frame: int) -> set[int]:
+        root = self.model.body_rootid
+        return set(np.flatnonzero(root == root[frame]).tolist())
+
     def soft(self, own: int | None) -> list[SoftSolid]:
         soft = [self._reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
         return [s for s in soft if s is not None]

@@ -150,6 +150,10 @@ class ClientSource(WorldSource):
             warnings.warn("sensor: " + ";\n".join(dict.fromkeys(notes)), stacklevel=2)
         return out
 
+    def robot(self, frame: int) -> set[int]:
+        body = self._links[frame].body
+        return {number for number, link in enumerate(self._links) if link.body == body}
+
     def soft(self, own: int | None) -> list[SoftSolid]:
         numbers = [i for i, k in enumerate(self._links) if i != own and is_soft(self.client, k)]
         return [soft for i in numbers for soft in self._soft_of(i)]
