@@ -17,7 +17,7 @@ from capsense.adapters.placement import blind, nothing_seen, placement, sees, tu
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
-from capsense.errors import CapSenseError, SceneError
+from capsense.errors import SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
@@ -143,13 +143,13 @@ class AttachedSensor(ABC):
         """
         scene = self.scene()
         found = placement(scene, self.simulator)
-        return found if found or sees(self.simulator, scene) else [nothing_seen(self._design)]
+        return found if sees(self.simulator, scene) else [nothing_seen(self._design)]
 
     def warn(self) -> None:
         """Warn of what :meth:`check` finds, if the simulator's state is known yet."""
         try:
             found = self.check()
-        except CapSenseError:  # what is wrong will be told at the first reading
+        except SceneError:  # which the first reading will raise, too
             return
         if found:
             warnings.warn("sensor: " + ";\nand ".join(found), stacklevel=3)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
+from capsense.errors import CapSenseError
 from capsense.scene import Body, Layers, Scene, TriMesh
 from capsense.scene.contact import TOUCH, distances, points_on
 from capsense.simulator import Simulator
@@ -29,7 +30,10 @@ def placement(scene: Scene, simulator: Simulator) -> list[str]:
 
 def sees(simulator: Simulator, scene: Scene) -> bool:
     """Whether a scene changes any reading: a box around a body may be in view, and itself not."""
-    return bool(len(scene) and simulator.step_batch([scene], threads=1)[0].delta.any())
+    try:
+        return bool(len(scene) and simulator.step_batch([scene], threads=1)[0].delta.any())
+    except CapSenseError:  # which a reading will raise, too
+        return True
 
 
 def blind(found: list[str]) -> bool:

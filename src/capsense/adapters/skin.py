@@ -10,7 +10,7 @@ from capsense._thread_pool import OneAtATime, ThreadPool
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
 from capsense.adapters.placement import blind
-from capsense.errors import CapSenseError, ReadoutError, SceneError
+from capsense.errors import ReadoutError, SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene import Pose
@@ -86,7 +86,7 @@ class AttachedSkin:
         """Warn of what :meth:`check` finds; some sensors of a skin may well see nothing."""
         try:
             found = self.check()
-        except CapSenseError:  # what is wrong will be told at the first reading
+        except SceneError:  # which the first reading will raise, too
             return
         unseen = {name for name, texts in found.items() if blind(texts)}
         listed = [
