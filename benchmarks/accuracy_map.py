@@ -197,6 +197,7 @@ def plot(results: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator, NullFormatter
 
+    plt.style.use("capsense.plotting.capsense")
     figure, axes = plt.subplots(figsize=(6.4, 4), layout="constrained")
     for method in dict.fromkeys(r["label"].split()[0] for r in results):
         mine = [r for r in results if r["label"].split()[0] == method and "all" in r]
@@ -211,15 +212,14 @@ def plot(results: list[dict[str, Any]], path: Path) -> None:
             text = r["label"].removeprefix(method).strip()
             axes.annotate(text, (r["all"]["ms"], r["all"]["rms"]), (0, -14), fontsize=9,
                           textcoords="offset points", ha="center")  # fmt: skip
-    axes.set(xlabel="median step, one core, ms", ylabel="error of the diagonal of ΔC, %")
+    axes.set(xlabel="median step, one core [ms]", ylabel="error of the diagonal of ΔC [%]")
     axes.margins(0.15)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
-    axes.grid(True, which="both", alpha=0.3)
-    axes.legend(frameon=False)
-    figure.savefig(path, dpi=120)
+    axes.legend()
+    figure.savefig(path)
     plt.close(figure)
 
 

@@ -70,6 +70,8 @@ def checks(sim: Any, bar: int) -> Iterator[tuple[str, float, float]]:
             reading = sensor.read().delta.diagonal()
             yield "the reading against the shapes', in %", 100 * error(reading, simulator, place), 5
             before = now
+        several = float(sensor.vision_sensor.script is None)
+        yield "a read is one remote call (CoppeliaSim 4.7 or later)", several, 0.0
     sensor.remove()
 
 

@@ -36,6 +36,7 @@ def test_a_sound_sensor_warns_of_nothing(shapes_in: SensorIn) -> None:
         ((-0.01, 0.0, 0.02), r"touch(es)? '.*ball.*', as a short circuit would"),
         ((0.0, 0.0, -0.06), r"nothing is in view, .*, but '.*ball.*' would be if the sensor faced"),
         ((9.0, 0.0, 0.0), r"nothing is in view, .* exactly 0: the sensor sees 0\.1 × 0\.1 × 0\.1"),
+        ((0.068, 0.068, 0.05), r"nothing is in view, .* exactly 0"),  # a box around it is
     ],
 )
 def test_a_wrong_place_is_told(place: Any, message: str, shapes_in: SensorIn) -> None:
@@ -44,6 +45,17 @@ def test_a_wrong_place_is_told(place: Any, message: str, shapes_in: SensorIn) ->
         sensor = shapes_in(ball_at(*place), cs.Pose())
     (found,) = sensor.check()
     assert any(fix in found for fix in ("exclude=[", "quaternion (1, 0, 0, 0)", "exclude, groups"))
+
+
+def test_bodies_one_in_another_are_one_finding(shapes_in: SensorIn) -> None:
+    """A robot's links and their covers: every electrode and every body is named once."""
+    with pytest.warns(UserWarning, match="lie inside"):
+        sensor = shapes_in(
+            [*ball_at(0, 0, 0.01), Thing("cover", cs.Sphere(0.03), cs.Pose())], cs.Pose()
+        )
+    (found,) = sensor.check()
+    assert found.count("ball") == found.count("cover") >= 2
+    assert found.count("'A'") == 1
 
 
 def test_an_open_mesh_is_entered_as_a_closed_one(tiny_simulator: cs.Simulator) -> None:

@@ -270,7 +270,7 @@ def test_a_lost_simulator_is_named(server: StandIn, tiny_simulator: cs.Simulator
     sensor = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
     sim.startSimulation()
     server.close()
-    with pytest.raises(cs.AdapterError, match=r"did not answer sim.getSimulationState in time"):
+    with pytest.raises(cs.AdapterError, match=r"did not answer sim.callScriptFunction in time"):
         sensor.read()
     with pytest.raises(cs.AdapterError, match="connection to CoppeliaSim is broken"):
         sensor.read()
@@ -339,3 +339,36 @@ def test_a_collection_that_is_gone_is_made_anew(
     assert hidden == {screen}
     server.collections.clear()
     sensor.remove()
+
+
+def test_one_call_a_read(server: StandIn, sim: Any, tiny_simulator: cs.Simulator) -> None:
+    """By a script at the vision sensor, which goes with it; the same reading without one."""
+    put(server, "block")
+    sensor = cs.coppeliasim.attach(sim, "/Robot/flange", tiny_simulator)
+    sim.startSimulation()
+    server.calls.clear()
+    expected = sensor.read().delta
+    assert server.calls == ["sim.callScriptFunction"]
+    server.script_fails = True
+    assert np.array_equal(sensor.read().delta, expected)
+    server.calls.clear()
+    assert np.array_equal(sensor.read().delta, expected)
+    assert server.calls == [
+        "sim.getSimulationState", "sim.handleVisionSensor", "sim.getVisionSensorDepth",
+        "sim.getVisionSensorImg",
+    ]  # fmt: skip
+    things = len(server.things)
+    sensor.remove()
+    assert len(server.things) == things - 2
+
+
+def test_a_simulator_that_makes_no_scripts(tiny_simulator: cs.Simulator) -> None:
+    """CoppeliaSim 4.6 reads by several calls."""
+    server = StandIn(without=("createScript",))
+    server.add("pad")
+    sim = cs.coppeliasim.connect(port=server.port, timeout=5.0)
+    sensor = cs.coppeliasim.attach(sim, "/pad", tiny_simulator)
+    sim.startSimulation()
+    assert not sensor.read().delta.any()
+    assert "sim.callScriptFunction" not in server.calls
+    server.close()

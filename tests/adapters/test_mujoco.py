@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -331,3 +332,33 @@ def test_example_models_load(tmp_path: Path, tiny_simulator: cs.Simulator) -> No
     corners = body.pose.apply(body.shape.vertices)
     assert corners.min(axis=0) == pytest.approx(box.bounds[0], abs=1e-7)
     assert corners.max(axis=0) == pytest.approx(box.bounds[1], abs=1e-7)
+
+
+@pytest.mark.parametrize(("drawn", "seen", "warned"), [("obj", 14, 1), ("stl", 7, 0)])
+def test_a_robot_that_is_drawn_and_collides(
+    drawn: str, seen: int, warned: int, tiny_simulator: cs.Simulator
+) -> None:
+    """A KUKA of a URDF: two meshes of one link are told, the same mesh twice is seen once."""
+    pybullet_data = pytest.importorskip("pybullet_data", reason="PyBullet is not installed")
+    folder = Path(pybullet_data.getDataPath()) / "kuka_iiwa"
+    text = (folder / "model.urdf").read_text().replace(".obj", f".{drawn}")
+    compiler = f'<compiler discardvisual="false" strippath="false" meshdir="{folder}"/>'
+    text = text.replace("</robot>", f"<mujoco>{compiler}</mujoco></robot>")
+    spec = mujoco.MjSpec.from_string(text)
+    cs.mujoco.add_sensor(spec, "lbr_iiwa_link_7", cs.Pose((0, 0, 0.05)))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
+    twice = [str(w.message) for w in caught if "are seen twice" in str(w.message)]
+    assert len(twice) == warned
+    assert all(r"collide (groups=[0])" in text and r"(groups=[1])" in text for text in twice)
+    assert len(sensor.world.solids) == seen
+    (found,) = sensor.check()  # the robot behind is no reason to turn the sensor round
+    assert "nothing is in view" in found
+    assert "faced the other way" not in found
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "sensor: bodies")
+        cs.mujoco.attach(model, data, "pad", tiny_simulator, groups=[0])

@@ -22,12 +22,13 @@ import zmq
 
 import capsense as cs
 
-SHAPE, DUMMY, VISION = 0, 4, 9
+SHAPE, DUMMY, VISION, SCRIPT = 0, 4, 9, 14
 TIME_STEP = 0.05
 UNPAINTED = (0.5, 0.25, 0.0)
 CONSTANTS = {
     "colorcomponent_auxiliary": 5, "handle_all": -2, "handle_scene": -12, "handle_single": -4,
     "handle_world": -1, "primitiveshape_cuboid": 3, "sceneobject_shape": SHAPE,
+    "scripttype_customization": 6,
     "shapeintparam_static": 3003, "sceneobject_visionsensor": VISION,
     "simulation_stopped": 0, "visionfloatparam_far_clipping": 1001,
     "visionfloatparam_near_clipping": 1000, "visionfloatparam_ortho_size": 1005,
@@ -54,6 +55,7 @@ class Thing:
     parameters: dict[str, float] = field(default_factory=dict)
     depth: bytes = b""
     image: bytes = b""
+    code: str = ""
 
 
 class RefusedError(Exception):
@@ -79,6 +81,8 @@ class StandIn:
         self.headless = False
         """Whether it draws nothing, as builds without OpenGL."""
         self.stepping = False
+        self.script_fails = False
+        """Whether functions of scripts cannot be called."""
         self.mirrored = False
         """Whether images come with the top row first, as they should not."""
         self.on_step: Callable[[float], None] = lambda time: None
@@ -246,11 +250,14 @@ class StandIn:
         return f"{above}/{thing.alias}"
 
     def getObjectsInTree(self, base: int, kind: int = -2, options: int = 0) -> list[int]:
-        assert base == CONSTANTS["handle_scene"] or options == 3
+        assert options in (0, 3)
         return [
             h
             for h, t in self.things.items()
-            if kind in (t.kind, -2) and (options == 0 or t.parent == base)
+            if kind in (t.kind, -2)
+            and (
+                base == CONSTANTS["handle_scene"] or t.parent == base or (h == base and not options)
+            )
         ]
 
     def getObjectType(self, handle: int) -> int:
@@ -323,6 +330,28 @@ class StandIn:
             "perspective_operation": options >> 1 & 1, "entity_to_render": -1,
         }  # fmt: skip
         return handle
+
+    def createScript(self, kind: int, code: str, options: int, lang: str) -> int:
+        assert (kind, options, lang) == (CONSTANTS["scripttype_customization"], 0, "lua")
+        handle = next(self._count)
+        self.things[handle] = Thing("Script", SCRIPT, code=code)
+        return handle
+
+    def initScript(self, script: int) -> None:
+        assert self._thing(script).kind == SCRIPT
+
+    def callScriptFunction(self, name: str, script: int, *arguments: Any) -> tuple[Any, ...]:
+        """Does what the Lua code of the adapter does."""
+        sensor, coloured = arguments
+        if self.script_fails:
+            raise RefusedError("Failed calling script function.")
+        assert f"function {name}(sensor, coloured)" in self._thing(script).code
+        if not self.running:
+            return 0, 0, "", "", 0, 0
+        _, drawn, _ = self.handleVisionSensor(sensor)
+        depth, size = self.getVisionSensorDepth(sensor, 1)
+        colours = self.getVisionSensorImg(sensor)[0] if coloured else ""
+        return 1, len(drawn), depth, colours, *size
 
     def getObjectInt32Param(self, handle: int, which: int) -> int:
         return int(self.getObjectFloatParam(handle, which))

@@ -72,3 +72,16 @@ def test_refusals(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
         cs.plot([], sim)
     with pytest.raises(cs.CapSenseError, match="5 readings, times of shape"):
         cs.plot(readings, sim, times=[0.0, 1.0])
+
+
+def test_the_style_sheet_has_the_colours_of_all_pictures() -> None:
+    """What pages draw with ``plt.style.use`` looks as what ``capsense run`` draws."""
+    import matplotlib.style
+
+    from capsense._style import COLOURS, FAINT, INK
+
+    with matplotlib.style.context("capsense.plotting.capsense"):
+        colours = [entry["color"] for entry in matplotlib.rcParams["axes.prop_cycle"]]
+        assert [f"#{c.lstrip('#')}".upper() for c in colours] == [c.upper() for c in COLOURS]
+        assert f"#{matplotlib.rcParams['axes.edgecolor'].lstrip('#')}" == FAINT
+        assert f"#{matplotlib.rcParams['axes.labelcolor'].lstrip('#')}" == INK

@@ -81,10 +81,10 @@ namespace CapSense
 
         private void OnDisable()
         {
-            if (client == null) return;
-            client.Dispose();
-            view.Dispose();
+            if (client != null) client.Dispose();
+            if (view != null) view.Dispose();
             client = null;
+            view = null;
         }
 
         private void LateUpdate()

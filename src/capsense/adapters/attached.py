@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
-from capsense.adapters.placement import nothing_seen, placement, turned_round
+from capsense.adapters.placement import blind, nothing_seen, placement, sees, turned_round
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
@@ -142,13 +142,14 @@ class AttachedSensor(ABC):
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
         scene = self.scene()
-        return placement(scene, self.simulator) if len(scene) else [nothing_seen(self._design)]
+        found = placement(scene, self.simulator)
+        return found if sees(self.simulator, scene) else [nothing_seen(self._design)]
 
     def warn(self) -> None:
         """Warn of what :meth:`check` finds, if the simulator's state is known yet."""
         try:
             found = self.check()
-        except SceneError:
+        except SceneError:  # which the first reading will raise, too
             return
         if found:
             warnings.warn("sensor: " + ";\nand ".join(found), stacklevel=3)
@@ -234,6 +235,10 @@ class WorldSource(ABC):
         """
 
     @abstractmethod
+    def robot(self, frame: int) -> set[int]:
+        """The frames of the robot that a frame belongs to."""
+
+    @abstractmethod
     def links(self) -> tuple[Array, Array]:
         """Origins [m] (f, 3) and quaternions (f, 4) of the moving frames, as they are now."""
 
@@ -246,6 +251,8 @@ class GeometrySensor(AttachedSensor):
 
     world: World
     """Everything it may see."""
+    _carrier: int
+    """The frame that carries it."""
 
     def __init__(self, simulator: Simulator, source: WorldSource) -> None:
         super().__init__(simulator)
@@ -273,11 +280,14 @@ class GeometrySensor(AttachedSensor):
 
     def check(self) -> list[str]:
         frames = self._now(None)
-        if len(self.world.scene(frames)):
-            return super().check()
+        found = super().check()
+        if not blind(found):
+            return found
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
-        return [turned_round([str(b.name) for b in behind])] if len(behind) else super().check()
+        own = self.world.names(self.source.robot(self._carrier))
+        others = [str(b.name) for b in behind if b.name not in own]
+        return [turned_round(others)] if others else found
 
     def refresh(self) -> None:
         """Take the world's solids over again, after their shapes, sizes or number changed.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -13,14 +14,16 @@ from numpy.typing import NDArray
 from capsense.adapters.attached import DepthSensor, make_simulator
 from capsense.adapters.coppeliasim_remote import (
     Remote,
+    Seen,
     VisionSensor,
     carrier,
-    draws,
+    connect,
     find_vision_sensor,
+    is_lost,
+    look,
     make_vision_sensor,
     remove_vision_sensor,
     show,
-    translated,
 )
 from capsense.adapters.rules import (
     DEFAULTS,
@@ -32,7 +35,7 @@ from capsense.adapters.rules import (
     split_rules,
 )
 from capsense.design.model import Design
-from capsense.errors import AdapterError, SceneError, require_package
+from capsense.errors import AdapterError, SceneError
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
@@ -45,45 +48,6 @@ _TRIES = 10
 """Steps after which a started simulation must be running."""
 _REMOVED = 1
 """Option of ``sim.addItemToCollection``."""
-
-
-def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -> Any:
-    """Connect to a running CoppeliaSim.
-
-    Unlike with the client alone, which would wait for ever, every call fails where CoppeliaSim
-    does not answer in time.
-
-    Args:
-        host: Where CoppeliaSim runs.
-        port: Port of its ZeroMQ remote API server.
-        timeout: How long a call may take [s], a simulation step included.
-
-    Returns:
-        CoppeliaSim's ``sim``.
-
-    Raises:
-        MissingDependencyError: The client is not installed.
-        AdapterError: Nobody answers there, or in another version of the protocol.
-    """
-    require_package("coppeliasim_zmqremoteapi_client", "CoppeliaSim's client", "coppelia")
-    import zmq
-    from coppeliasim_zmqremoteapi_client import RemoteAPIClient
-
-    if not timeout > 0:
-        raise AdapterError(f"timeout is {timeout!r}; give seconds above zero")
-    client = RemoteAPIClient(host, port)
-    client.socket.setsockopt(zmq.LINGER, 0)
-    for way in (zmq.SNDTIMEO, zmq.RCVTIMEO):
-        client.socket.setsockopt(way, round(1000 * timeout))
-    try:
-        return client.require("sim")
-    except zmq.Again:
-        raise AdapterError(
-            f"nobody answers at {host}:{port} within {timeout:g} s; start CoppeliaSim with its "
-            "ZMQ remote API server, or give its host and port"
-        ) from None
-    except Exception as error:  # the client raises nothing finer
-        raise translated('client.require("sim")', error) from error
 
 
 @contextmanager
@@ -275,30 +239,41 @@ class CoppeliaSensor(DepthSensor):
             SceneError: The simulation is not running, or the vision sensor was changed.
             AdapterError: CoppeliaSim does not answer, or draws nothing.
         """
-        remote, handle = self._remote, self.vision_sensor.handle
-        if remote.is_stopped():
+        seen = self._look()
+        if not seen.running:
             raise SceneError(
                 "the simulation is not running; call sim.startSimulation() and sim.step(), or "
                 "step in capsense.coppeliasim.running(sim)"
             )
-        if self._paint is None:
-            remote.call("handleVisionSensor", handle)
-        elif not draws(remote, handle):
-            self._paint.collect(handle)  # CoppeliaSim drops collections of scripts that end
-            if not draws(remote, handle):
+        if self._paint is not None and not seen.drawn:
+            self._paint.collect(self.vision_sensor.handle)  # CoppeliaSim drops collections of
+            seen = self._look()  # scripts that end
+            if not seen.drawn:
                 raise AdapterError(
                     f"CoppeliaSim draws nothing for vision sensor {self.vision_sensor.path!r}; "
                     "builds and machines without OpenGL do not, nor does it while vision sensors "
                     "are disabled: start the usual build, on a machine without a display under "
                     "xvfb-run"
                 )
-        depth = self._image("getVisionSensorDepth", np.dtype("<f4"), 1, 1)
-        seen: Any = self._material
-        if seen is None:
-            seen = self._image("getVisionSensorImg", np.dtype("u1"), 3)
+        depth = self._image(seen, seen.depth, np.dtype("<f4"), 1)
+        matter: Any = self._material
+        if matter is None:
+            matter = self._image(seen, seen.colours, np.dtype("u1"), 3)
         return DepthFrame(
-            depth, seen, self.vision_sensor.camera, grounding=self._grounding, back=self._back
+            depth, matter, self.vision_sensor.camera, grounding=self._grounding, back=self._back
         )
+
+    def _look(self) -> Seen:
+        """What the vision sensor sees; by several calls from now on where its script fails."""
+        coloured = self._material is None
+        if self.vision_sensor.script is not None:
+            try:
+                return look(self._remote, self.vision_sensor, coloured)
+            except AdapterError as error:
+                if is_lost(error):
+                    raise
+                self.vision_sensor = replace(self.vision_sensor, script=None)
+        return look(self._remote, self.vision_sensor, coloured)
 
     def refresh(self) -> None:
         """Colour the world's shapes again, and collect anew which are seen, after some were added.
@@ -320,19 +295,18 @@ class CoppeliaSensor(DepthSensor):
             remove_vision_sensor(self._remote, self.vision_sensor.handle)
 
     def _image(
-        self, name: str, kind: np.dtype[Any], channels: int, *options: int
+        self, seen: Seen, data: bytes, kind: np.dtype[Any], channels: int
     ) -> NDArray[np.generic]:
-        data, (columns, rows) = self._remote.call(name, self.vision_sensor.handle, *options)
-        known = self.vision_sensor.resolution
-        if (rows, columns) != known:
+        (rows, columns), known = seen.resolution, self.vision_sensor.resolution
+        if seen.resolution != known:
             raise SceneError(
                 f"vision sensor {self.vision_sensor.path!r} now has {columns} x {rows} pixels, not "
                 f"{known[1]} x {known[0]}; attach again"
             )
         if len(data) != rows * columns * channels * kind.itemsize:
             raise AdapterError(
-                f"sim.{name} gave {len(data)} bytes for {columns} x {rows} pixels of "
-                f"{channels * kind.itemsize} bytes"
+                f"vision sensor {self.vision_sensor.path!r} gave {len(data)} bytes for "
+                f"{columns} x {rows} pixels of {channels * kind.itemsize} bytes"
             )
         image = np.frombuffer(data, kind)
         return image.reshape((rows, columns, channels)[: 3 if channels > 1 else 2])

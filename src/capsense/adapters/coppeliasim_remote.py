@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 from capsense.adapters.attached import refuse_missing
 from capsense.adapters.rules import Image
-from capsense.errors import AdapterError, SceneError
+from capsense.errors import AdapterError, SceneError, require_package
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 
@@ -45,7 +45,18 @@ _AUXILIARY_CHANNELS = 1
 _CHILDREN = 1 + 2
 """Options of ``sim.getObjectsInTree``: not the object itself, and its own children alone."""
 _ALIAS = "capsense"
-"""Name of the vision sensors made here."""
+"""Name of the vision sensors made here, and of their scripts."""
+_LOOK = """sim = require 'sim'
+function look(sensor, coloured)
+  if sim.getSimulationState() == sim.simulation_stopped then return 0, 0, '', '', 0, 0 end
+  local _, drawn = sim.handleVisionSensor(sensor)
+  local depth, size = sim.getVisionSensorDepth(sensor, 1)
+  local colours = ''
+  if coloured then colours = sim.getVisionSensorImg(sensor) end
+  return 1, #(drawn or {}), depth, colours, size[1], size[2]
+end
+"""
+"""Script of a vision sensor made here: what :func:`look` asks for, in one remote call."""
 
 
 class Remote:
@@ -114,6 +125,45 @@ class Remote:
         return bool(self.call("getSimulationState") == self.constant("simulation_stopped"))
 
 
+def connect(host: str = "localhost", port: int = 23000, timeout: float = 30.0) -> Any:
+    """Connect to a running CoppeliaSim.
+
+    Unlike with the client alone, which would wait for ever, every call fails where CoppeliaSim
+    does not answer in time.
+
+    Args:
+        host: Where CoppeliaSim runs.
+        port: Port of its ZeroMQ remote API server.
+        timeout: How long a call may take [s], a simulation step included.
+
+    Returns:
+        CoppeliaSim's ``sim``.
+
+    Raises:
+        MissingDependencyError: The client is not installed.
+        AdapterError: Nobody answers there, or in another version of the protocol.
+    """
+    require_package("coppeliasim_zmqremoteapi_client", "CoppeliaSim's client", "coppelia")
+    import zmq
+    from coppeliasim_zmqremoteapi_client import RemoteAPIClient
+
+    if not timeout > 0:
+        raise AdapterError(f"timeout is {timeout!r}; give seconds above zero")
+    client = RemoteAPIClient(host, port)
+    client.socket.setsockopt(zmq.LINGER, 0)
+    for way in (zmq.SNDTIMEO, zmq.RCVTIMEO):
+        client.socket.setsockopt(way, round(1000 * timeout))
+    try:
+        return client.require("sim")
+    except zmq.Again:
+        raise AdapterError(
+            f"nobody answers at {host}:{port} within {timeout:g} s; start CoppeliaSim with its "
+            "ZMQ remote API server, or give its host and port"
+        ) from None
+    except Exception as error:  # the client raises nothing finer
+        raise translated('client.require("sim")', error) from error
+
+
 def translated(what: str, error: Exception) -> AdapterError:
     """What the client raised at a call, as an error that names the fix."""
     import zmq
@@ -135,6 +185,13 @@ def translated(what: str, error: Exception) -> AdapterError:
     return AdapterError(f"{what}: {str(error).replace('_=NL=_', ' ').replace('_=TB=_', ' ')}")
 
 
+def is_lost(error: AdapterError) -> bool:
+    """Whether an error of a call means that there is no connection any more."""
+    import zmq
+
+    return isinstance(error.__cause__, zmq.ZMQError)
+
+
 @dataclass(frozen=True)
 class VisionSensor:
     """A vision sensor. Its frame is the sensor frame: z out of the sensor."""
@@ -144,6 +201,46 @@ class VisionSensor:
     camera: OrthographicCamera
     resolution: tuple[int, int]
     """Rows and columns."""
+    script: int | None = None
+    """The script that :func:`look` calls; None for several remote calls."""
+
+
+class Seen(NamedTuple):
+    """What a vision sensor sees."""
+
+    running: bool
+    """Whether the simulation runs; else there is nothing more."""
+    drawn: bool = False
+    """Whether anything was drawn, be it the background alone. A vision sensor that drew returns
+    figures of its image; one that could not, for want of OpenGL or of its collection, none."""
+    depth: bytes = b""
+    """Depths [m], single precision, from the bottom row."""
+    colours: bytes = b""
+    """Red, green and blue, if they were asked for."""
+    resolution: tuple[int, int] = (0, 0)
+    """Rows and columns."""
+
+
+def look(remote: Remote, vision_sensor: VisionSensor, coloured: bool) -> Seen:
+    """Let a vision sensor look, in one remote call where it has a script."""
+    handle = vision_sensor.handle
+    if vision_sensor.script is not None:
+        found = remote.call("callScriptFunction", "look", vision_sensor.script, handle, coloured)
+        running, drawn, depth, colours, columns, rows = found
+        resolution = int(rows), int(columns)
+        return Seen(bool(running), drawn > 0, _binary(depth), _binary(colours), resolution)
+    if remote.is_stopped():
+        return Seen(False)
+    figures = remote.call("handleVisionSensor", handle)
+    drawn = not isinstance(figures, list | tuple) or len(figures) < 2 or len(figures[1]) > 0
+    depth, (columns, rows) = remote.call("getVisionSensorDepth", handle, 1)
+    colours = remote.call("getVisionSensorImg", handle)[0] if coloured else b""
+    return Seen(True, drawn, depth, colours, (rows, columns))
+
+
+def _binary(data: bytes | str) -> bytes:
+    """Bytes of a Lua string, which arrives as text where it happens to be some."""
+    return data.encode() if isinstance(data, str) else data
 
 
 def find_vision_sensor(remote: Remote, handle: int) -> VisionSensor | None:
@@ -192,23 +289,30 @@ def make_vision_sensor(
     mode = remote.constant("visionintparam_render_mode")
     remote.call("setObjectInt32Param", vision_sensor, mode, _AUXILIARY_CHANNELS)
     show(remote, vision_sensor, seen)
-    return _read_vision_sensor(remote, vision_sensor)
+    return replace(
+        _read_vision_sensor(remote, vision_sensor), script=_script(remote, vision_sensor)
+    )
+
+
+def _script(remote: Remote, vision_sensor: int) -> int | None:
+    """The script that :func:`look` calls; None where CoppeliaSim, before 4.7, makes none."""
+    if not hasattr(remote.sim, "createScript"):
+        return None
+    try:
+        kind = remote.constant("scripttype_customization")
+        script = int(remote.call("createScript", kind, _LOOK, 0, "lua"))
+        remote.call("setObjectAlias", script, _ALIAS)
+        remote.call("setObjectParent", script, vision_sensor, False)
+        remote.call("initScript", script)
+    except (AdapterError, AttributeError):
+        return None
+    return script
 
 
 def show(remote: Remote, vision_sensor: int, collection: int) -> None:
     """Let a vision sensor see what is in a collection."""
     entity = remote.constant("visionintparam_entity_to_render")
     remote.call("setObjectInt32Param", vision_sensor, entity, collection)
-
-
-def draws(remote: Remote, vision_sensor: int) -> bool:
-    """Let a vision sensor look; whether anything was drawn, be it the background alone.
-
-    A vision sensor that drew returns figures of its image, fifteen numbers; one that could not,
-    for want of OpenGL or of its collection, returns none.
-    """
-    found = remote.call("handleVisionSensor", vision_sensor)
-    return not isinstance(found, list | tuple) or len(found) < 2 or len(found[1]) > 0
 
 
 def carrier(remote: Remote, handle: int) -> int | None:
@@ -224,7 +328,7 @@ def remove_vision_sensor(remote: Remote, vision_sensor: int) -> None:
     entity = remote.constant("visionintparam_entity_to_render")
     with suppress(AdapterError):  # CoppeliaSim drops collections of scripts that end
         remote.call("destroyCollection", remote.call("getObjectInt32Param", vision_sensor, entity))
-    remote.call("removeObjects", [vision_sensor])
+    remote.call("removeObjects", remote.call("getObjectsInTree", vision_sensor))
 
 
 def _children(remote: Remote, handle: int) -> dict[int, str]:

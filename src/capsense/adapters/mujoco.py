@@ -190,7 +190,7 @@ class MujocoSensor(GeometrySensor):
         self.data = source.data
         """The state that readings are taken of."""
         self._site = site
-        self._body = int(self.model.site_bodyid[site])
+        self._carrier = int(self.model.site_bodyid[site])
         self._turn = np.empty(4)
         super().__init__(simulator, source)
 
@@ -198,14 +198,14 @@ class MujocoSensor(GeometrySensor):
         return float(self.data.time)
 
     def _own_frame(self) -> int | None:
-        return self._body if self.source.rules.exclude_own and self._body else None
+        return self._carrier if self.source.rules.exclude_own and self._carrier else None
 
     def _frames(self, position: Array, quaternion: Array) -> Frames:
         import mujoco
 
         data = self.data
         check_stepped(data, self._site)
-        mujoco.mju_mulQuat(self._turn, data.xquat[self._body], self.model.site_quat[self._site])
+        mujoco.mju_mulQuat(self._turn, data.xquat[self._carrier], self.model.site_quat[self._site])
         return Frames(position, quaternion, data.site_xpos[self._site], self._turn[_SCALAR_LAST])
 
 

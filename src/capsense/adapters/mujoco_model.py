@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -251,6 +252,7 @@ class ModelSource(WorldSource):
         self._geoms = [
             i for i in range(model.ngeom) if groups is None or int(model.geom_group[i]) in groups
         ]
+        self._chosen = groups is not None
         super().__init__(rules)
 
     def refresh(self) -> None:
@@ -261,14 +263,44 @@ class ModelSource(WorldSource):
         self._set_back = self._bad_numbers()
 
     def solids(self, own: int | None) -> list[Solid]:
-        out = []
+        """All solids but those of a body; of one mesh twice at one place, the first."""
+        kept: dict[object, tuple[int, Solid]] = {}
         for geom in self._geoms:
             if int(self.model.geom_bodyid[geom]) == own:
                 continue
             if geom not in self._made:
                 self._made[geom] = self._reader.solid(geom)
-            out.append(self._made[geom])
-        return [solid for solid in out if solid is not None]
+            s = self._made[geom]
+            if s is not None:  # geoms share the shapes of meshes
+                place = tuple(s.pose.position), tuple(s.pose.quaternion)
+                kept.setdefault((s.frame, id(s.shape), place, s.material, s.tie), (geom, s))
+        self._warn_of_twins(np.array([geom for geom, _ in kept.values()], dtype=int))
+        return [solid for _, solid in kept.values()]
+
+    def _warn_of_twins(self, geoms: NDArray[np.int64]) -> None:
+        """Warn, once, of bodies seen as what collides and as what is only drawn."""
+        m = self.model
+        collide = (m.geom_contype[geoms] != 0) | (m.geom_conaffinity[geoms] != 0)
+        body = m.geom_bodyid[geoms]
+        twice = np.intersect1d(body[collide], body[~collide])
+        twice = twice[twice > 0]
+        groups = m.geom_group[geoms]
+        some = np.isin(body, twice)
+        solid, drawn = (np.unique(groups[some & c]).tolist() for c in (collide, ~collide))
+        if not self._chosen and len(twice) and not set(solid) & set(drawn):
+            listed = ", ".join(repr(m.body(int(b)).name) for b in twice[:3]) + ", …" * (
+                len(twice) > 3
+            )
+            warnings.warn(
+                f"sensor: bodies {listed} are seen twice, as geoms that collide (groups={solid}) "
+                f"and as geoms that are only drawn (groups={drawn}); give attach one of the two",
+                stacklevel=2,
+            )
+        self._chosen = True
+
+    def robot(self, frame: int) -> set[int]:
+        root = self.model.body_rootid
+        return set(np.flatnonzero(root == root[frame]).tolist())
 
     def soft(self, own: int | None) -> list[SoftSolid]:
         soft = [self._reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]

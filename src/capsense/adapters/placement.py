@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
+from capsense.errors import CapSenseError
 from capsense.scene import Body, Layers, Scene, TriMesh
 from capsense.scene.contact import TOUCH, distances, points_on
 from capsense.simulator import Simulator
@@ -17,25 +18,35 @@ Array = NDArray[np.float64]
 
 _COARSE = 0.05
 """Panels of a body wider than this [m] say little of a sensor."""
+_NOTHING = "nothing is in view, so that every change is exactly 0"
 
 
 def placement(scene: Scene, simulator: Simulator) -> list[str]:
     """What is wrong with the bodies of a scene, given in the sensor frame."""
     points = {e.name: points_on(e.surface.triangles) for e in simulator.design.electrodes}
-    found = []
-    for body in scene:
-        found += _contacts(body, points)
-        found += _coarse(body, PRESETS[simulator.preset].panels)
-    return found
+    panels = PRESETS[simulator.preset].panels
+    return _contacts(scene, points) + [text for body in scene for text in _coarse(body, panels)]
+
+
+def sees(simulator: Simulator, scene: Scene) -> bool:
+    """Whether a scene changes any reading: a box around a body may be in view, and itself not."""
+    try:
+        return bool(len(scene) and simulator.step_batch([scene], threads=1)[0].delta.any())
+    except CapSenseError:  # which a reading will raise, too
+        return True
+
+
+def blind(found: list[str]) -> bool:
+    """Whether findings say that nothing is in view."""
+    return any(text.startswith(_NOTHING) for text in found)
 
 
 def nothing_seen(design: Design) -> str:
     """The finding for a sensor whose domain is empty."""
     size = " × ".join(f"{v:g}" for v in design.domain.size)
     return (
-        f"nothing is in view, so that every change is exactly 0: the sensor sees {size} m in front "
-        "of its electrodes, along the z of its frame; bring something there, or look for what "
-        "exclude, groups and exclude_own leave out"
+        f"{_NOTHING}: the sensor sees {size} m in front of its electrodes, along the z of its "
+        "frame; bring something there, or look for what exclude, groups and exclude_own leave out"
     )
 
 
@@ -43,42 +54,55 @@ def turned_round(names: list[str]) -> str:
     """The finding for a sensor that has everything at its back."""
     listed = ", ".join(map(repr, names[:4])) + (", …" if len(names) > 4 else "")
     return (
-        f"nothing is in view, so that every change is exactly 0, but {listed} would be if the "
-        "sensor faced the other way: its z must point out of the sensor; if it should see that, "
-        'turn its frame half round about x (quaternion (1, 0, 0, 0), in MJCF euler="180 0 0")'
+        f"{_NOTHING}, but {listed} would be if the sensor faced the other way: its z must point "
+        "out of the sensor; if it should see that, turn its frame half round about x (quaternion "
+        '(1, 0, 0, 0), in MJCF euler="180 0 0")'
     )
 
 
-def _contacts(body: Body, electrodes: dict[str, Array]) -> list[str]:
-    """Electrodes within a body, and electrodes that touch it."""
-    if isinstance(body.shape, Layers):
-        return []
-    inside, touching, depth = [], [], 0.0
+def _contacts(scene: Scene, electrodes: dict[str, Array]) -> list[str]:
+    """Electrodes within bodies, and electrodes that touch some: a finding for each of the two."""
+    inside: dict[str, list[str]] = {}
+    touching: dict[str, list[str]] = {}
+    depth = 0.0
+    bodies = [body for body in scene if not isinstance(body.shape, Layers)]
     for name, points in electrodes.items():
-        off = distances(body, points)
-        if off.min() < -TOUCH:
-            inside.append(name)
-            depth = max(depth, -float(off.min()))
-        elif off.min() < TOUCH:
-            touching.append(name)
+        for body in bodies:
+            nearest = float(distances(body, points).min())
+            if nearest < TOUCH:
+                found = inside if nearest < -TOUCH else touching
+                found.setdefault(name, []).append(str(body.name))
+                depth = max(depth, -nearest)
     out = []
     if inside:
         out.append(
-            f"{_electrodes(inside, 'lies', 'lie')} inside {body.name!r}, up to "
-            f"{1e3 * depth:.2g} mm deep, and readings mean nothing; {_mend(body, depth)}"
+            f"{_electrodes(inside, 'lies', 'lie')} inside {_bodies(inside)}, up to "
+            f"{1e3 * depth:.2g} mm deep, and readings mean nothing; {_mend(inside, depth)}"
         )
     if touching:
         out.append(
-            f"{_electrodes(touching, 'touches', 'touch')} {body.name!r}, as a short circuit would; "
-            f"{_mend(body, 1e-3)}"
+            f"{_electrodes(touching, 'touches', 'touch')} {_bodies(touching)}, as a short circuit "
+            f"would; {_mend(touching, 1e-3)}"
         )
     return out
 
 
-def _mend(body: Body, depth: float) -> str:
+def _met(found: dict[str, list[str]]) -> list[str]:
+    """The bodies that electrodes meet, each once."""
+    return list(dict.fromkeys(body for bodies in found.values() for body in bodies))
+
+
+def _bodies(found: dict[str, list[str]]) -> str:
+    met = _met(found)
+    return ", ".join(map(repr, met[:4])) + f" and {len(met) - 4} more" * (len(met) > 4)
+
+
+def _mend(found: dict[str, list[str]], depth: float) -> str:
+    met = _met(found)
+    more = ", …" * (len(met) > 4)
     return (
         f"move the sensor's frame at least {1e3 * max(depth, 1e-3):.2g} mm out of it, or leave it "
-        f"out with exclude=[{body.name!r}]"
+        f"out with exclude=[{', '.join(map(repr, met[:4]))}{more}]"
     )
 
 
@@ -98,7 +122,8 @@ def _coarse(body: Body, panels: int) -> list[str]:
     ]
 
 
-def _electrodes(names: list[str], one: str, many: str) -> str:
+def _electrodes(found: dict[str, list[str]], one: str, many: str) -> str:
+    names = list(found)
     if len(names) == 1:
         return f"electrode {names[0]!r} {one}"
     listed = ", ".join(map(repr, names[:6])) + (f" and {len(names) - 6} more" * (len(names) > 6))

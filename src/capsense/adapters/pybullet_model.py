@@ -150,6 +150,10 @@ class ClientSource(WorldSource):
             warnings.warn("sensor: " + ";\n".join(dict.fromkeys(notes)), stacklevel=2)
         return out
 
+    def robot(self, frame: int) -> set[int]:
+        body = self._links[frame].body
+        return {number for number, link in enumerate(self._links) if link.body == body}
+
     def soft(self, own: int | None) -> list[SoftSolid]:
         numbers = [i for i, k in enumerate(self._links) if i != own and is_soft(self.client, k)]
         return [soft for i in numbers for soft in self._soft_of(i)]
@@ -210,7 +214,11 @@ class ClientSource(WorldSource):
         drawn = p.getVisualShapeData(link.body, physicsClientId=self.client)
         drawn = [entry for entry in drawn if entry[1] == link.link]
         if any(entry[2] == _HEIGHT_FIELD for entry in drawn):
-            raise _refuse(link, "is a height field, of which PyBullet tells nothing but its bounds")
+            self._notes.append(
+                f"{link.names[-1]!r} is a height field, of which PyBullet tells nothing but its "
+                "bounds (left out)"
+            )
+            return
         if self._shapes == "visual":
             to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
             flat = lost = False
@@ -231,7 +239,9 @@ class ClientSource(WorldSource):
         # entries 0 and 1 are sound in the first record of a link only
         data = p.getCollisionShapeData(link.body, link.link, physicsClientId=self.client)
         if self._shapes == "visual" and not data and flat:
-            raise _refuse(link, "has a flat visual mesh, without an inside, and no collision shape")
+            self._notes.append(
+                f"{link.names[-1]!r} has a flat visual mesh and no collision shape (left out)"
+            )
         for number, entry in enumerate(data):
             if self._is_nothing(link, entry):
                 continue
@@ -266,7 +276,7 @@ class ClientSource(WorldSource):
             return shape
         if kind != p.GEOM_MESH or not file:
             what = "mesh without a file" if kind == p.GEOM_MESH else f"shape of type {kind}"
-            raise _refuse(link, f"has a visual {what}, which cannot be sensed")
+            raise UnusableShape(f"{link.names[-1]!r} has a visual {what}")
         hull = self.rules.takes_hull(link.names)
         key = (file, sizes, hull)
         if key not in self._meshes:
@@ -288,7 +298,7 @@ class ClientSource(WorldSource):
         if kind == p.GEOM_PLANE:
             return HalfSpace(), pose @ _turned_to(sizes)
         if kind != p.GEOM_MESH:
-            raise _refuse(link, f"has a collision shape of type {kind}, which cannot be sensed")
+            raise UnusableShape(f"{link.names[-1]!r} has a collision shape of type {kind}")
         label = link.names[-1]
         if file != _NO_FILE:
             key = (file, sizes, "parts")
@@ -300,7 +310,9 @@ class ClientSource(WorldSource):
             link.body, link.link, collisionShapeIndex=number, physicsClientId=self.client
         )
         if not vertices:
-            raise _refuse(link, "has a concave collision mesh that PyBullet does not give out")
+            raise UnusableShape(
+                f"{link.names[-1]!r} has a concave collision mesh that PyBullet does not give out"
+            )
         corners = pose.inverse().apply(vertices)  # given in the frame of the centre of mass
         return round_cylinder(corners) or solid_mesh(corners, (), label, hull=True), pose
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from capsense._thread_pool import OneAtATime, ThreadPool
 from capsense._validate import suggest
 from capsense.adapters.attached import GeometrySensor
+from capsense.adapters.placement import blind
 from capsense.errors import ReadoutError, SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import SEED_STRIDE, Readout
@@ -85,13 +86,13 @@ class AttachedSkin:
         """Warn of what :meth:`check` finds; some sensors of a skin may well see nothing."""
         try:
             found = self.check()
-            blind = {name for name, s in self.sensors.items() if not len(s.scene())}
-        except SceneError:
+        except SceneError:  # which the first reading will raise, too
             return
+        unseen = {name for name, texts in found.items() if blind(texts)}
         listed = [
             f"sensor {name!r}: {text}"
             for name, texts in found.items()
-            if name not in blind or len(blind) == len(self)
+            if name not in unseen or len(unseen) == len(self)
             for text in texts
         ]
         if listed:

@@ -183,6 +183,11 @@ class World:
         ]
         return Scene(parts + self._soft_bodies(frames) if self.soft else parts)
 
+    def names(self, frames: set[int]) -> set[str | None]:
+        """What the bodies that some frames carry are called in scenes."""
+        pairs = zip(self.solids, self._bodies, strict=True)
+        return {body.name for solid, body in pairs if solid.frame in frames}
+
     def _parts(self, index: int, body: Body) -> list[Body]:
         """A body that is placed; of a terrain, the tiles that reach into the domain."""
         terrain = self.solids[index].shape

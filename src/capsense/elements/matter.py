@@ -82,15 +82,13 @@ class Matter:
         out = self._ground_ties
         if self.conducting.all():
             return out
-        out = out.copy()
-        for k in np.flatnonzero(~self.conducting):
-            eps = self.eps[k]
-            x = np.clip(np.log(eps.real / _BOUND[0]) / np.log(_BOUND[1] / _BOUND[0]), 0.0, 1.0)
-            current = 1j * eps.imag + eps.real * x * x * (3 - 2 * x)
-            if current == 0 or np.isinf(out[k].real):
-                out[k] = np.inf
-            else:
-                out[k] += (_CONTACT - 1.0) / (current * sizes[k])
+        out, soft = out.copy(), ~self.conducting
+        eps = self.eps[soft]
+        x = np.clip(np.log(eps.real / _BOUND[0]) / np.log(_BOUND[1] / _BOUND[0]), 0.0, 1.0)
+        current = 1j * eps.imag + eps.real * x * x * (3 - 2 * x)
+        tied = (current != 0) & np.isfinite(out[soft].real)
+        path = (_CONTACT - 1.0) / (np.where(tied, current, 1.0) * sizes[soft])
+        out[soft] = np.where(tied, out[soft] + path, np.inf)
         return out
 
     @cached_property
@@ -128,8 +126,9 @@ class Matter:
         if len(places) == len(self.eps) == len(set(places)):
             return self
         at = np.array(places, dtype=np.int64)
-        _, first, same = np.unique(self.group[at], return_index=True, return_inverse=True)
-        return Matter(self.eps[at], self.ground[at], first[same.reshape(-1)])
+        first: dict[int, int] = {}
+        group = [first.setdefault(g, k) for k, g in enumerate(self.group[at].tolist())]
+        return Matter(self.eps[at], self.ground[at], np.array(group))
 
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
         """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
@@ -140,13 +139,12 @@ class Matter:
         records["neutral"] = none & ~shared
         records["tie"] = np.where(shared, SHUT, np.where(none, 0.0, ties.real))
         records["group"], records["softness"] = self.group, softness.real
-        for record, shape, soft in zip(records, shapes, softness, strict=True):
-            if soft == 0:
-                continue
-            if isinstance(shape, RigidShape):
-                record["impedance"] = shape.impedance.ctypes.data
+        for k in np.flatnonzero(softness).tolist():
+            shape = shapes[k]
+            if isinstance(shape, RigidShape):  # `.ctypes` takes much longer
+                records["impedance"][k] = shape.impedance.__array_interface__["data"][0]
             else:
-                record["sheet"] = shape.sheet
+                records["sheet"][k] = shape.sheet
 
 
 def matter_of(bodies: Sequence[Body], frequency: float) -> Matter:

@@ -324,6 +324,9 @@ def windowed(shape: Shape, middle: Array, reach: float) -> tuple[Shape, Array]:
         return shape, np.zeros(3)
     part = np.minimum(size, reach)
     at = np.clip(middle, 0.5 * (part - size), 0.5 * (size - part))
-    if isinstance(shape, Box):
-        return Box(tuple(part.tolist())), at
-    return type(shape)(shape.radius, float(part[2])), at
+    held = shape.__dict__.get("_window")
+    if held is None or held[0] != reach:
+        x, y, z = part.tolist()
+        cut = Box((x, y, z)) if isinstance(shape, Box) else type(shape)(shape.radius, z)
+        held = shape.__dict__["_window"] = reach, cut
+    return held[1], at

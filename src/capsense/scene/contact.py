@@ -28,11 +28,15 @@ class Sheets:
     """
 
     def __init__(self, sheets: Sequence[Array]) -> None:
-        self._few = np.concatenate([points_on(corners, _FEW) for corners in sheets])
+        few = np.concatenate([points_on(corners, _FEW) for corners in sheets])
+        self._few = np.unique(few, axis=0)
         self._many = np.concatenate([points_on(corners) for corners in sheets])
         apart = np.linalg.norm(self._many[:, None] - self._few, axis=2)
         self._nearest = apart.argmin(axis=1)
-        self._reach = float(apart.min(axis=1).max())
+        self._reach = apart.min(axis=1) + TOUCH
+        self._middle = self._few.mean(axis=0, keepdims=True)
+        arms = np.concatenate([self._few, self._many]) - self._middle
+        self._radius = float(np.linalg.norm(arms, axis=1).max()) + TOUCH
         self.bounds = np.array([self._few.min(axis=0) - TOUCH, self._few.max(axis=0) + TOUCH])
         """Corners of a box around all of them [m], shape (2, 3)."""
 
@@ -43,11 +47,12 @@ class Sheets:
         """
         if body.shape.kind == ShapeKind.LAYERS:
             return False
-        off = _quick(body, self._few)
-        if off.min() > self._reach:
+        if _quick(body, self._middle)[0] > self._radius:
             return False
-        close = off[self._nearest] <= self._reach
-        off = np.concatenate([off, _quick(body, self._many[close])])
+        off = _quick(body, self._few)
+        close = off[self._nearest] <= self._reach  # others are no nearer than the few around them
+        if close.any():
+            off = np.concatenate([off, _quick(body, self._many[close])])
         return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
 
 
@@ -58,7 +63,7 @@ def _quick(body: Body, points: Array) -> Array:
         return shape.signed_distance(local)
     off = np.minimum(shape.ray_distance(local), shape.ray_distance(local, down=True))
     deepest = int(off.argmin())
-    if off[deepest] < -TOUCH and not _wound(shape, local[[deepest]])[0]:
+    if off[deepest] < -TOUCH and not _wound(shape, local[[deepest]], -off[[deepest]])[0]:
         return np.abs(off)
     return off
 
@@ -68,26 +73,33 @@ def distances(body: Body, points: Array) -> Array:
     local, shape = body.pose.inverse().apply(points), body.shape
     if not isinstance(shape, TriangleShape) or shape.closed:
         return shape.signed_distance(local)
-    off = shape.distance(local)
-    return np.where(_wound(shape, local), -off, off)
+    rays = np.minimum(shape.ray_distance(local), shape.ray_distance(local, down=True))
+    inside, off = rays < 0, np.abs(rays)
+    inside[inside] = _wound(shape, local[inside], off[inside])
+    return np.where(inside, -off, off)
 
 
-def _wound(shape: TriangleShape, points: Array) -> NDArray[np.bool_]:
+def _wound(shape: TriangleShape, points: Array, off: Array) -> NDArray[np.bool_]:
     """Points that an open surface winds round by more than a half.
+
+    Points nearer to one another than one of them is to the surface, ``off`` [m], are alike.
 
     A. Jacobson, L. Kavan, O. Sorkine-Hornung, *Robust inside-outside segmentation using
     generalized winding numbers* (2013); solid angles after A. van Oosterom and J. Strackee (1983).
     """
-    low, high = shape.bounds()
-    near = ((points > low) & (points < high)).all(axis=1)
     out = np.zeros(len(points), dtype=bool)
-    for k in np.flatnonzero(near).tolist():
+    left = np.ones(len(points), dtype=bool)
+    for k in np.argsort(-off).tolist():
+        if not left[k]:
+            continue
         arms = shape.vertices[shape.faces] - points[k]
         a, b, c = arms[:, 0], arms[:, 1], arms[:, 2]
         u, v, w = (np.linalg.norm(x, axis=1) for x in (a, b, c))
         below = u * v * w + (a * b).sum(1) * w + (b * c).sum(1) * u + (c * a).sum(1) * v
         angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below)
-        out[k] = abs(angle.sum()) > 2 * math.pi
+        alike = np.linalg.norm(points - points[k], axis=1) <= off[k]
+        out[alike & left] = abs(angle.sum()) > 2 * math.pi
+        left[alike] = False
     return out
 
 

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 _LEAF = 4
 """Triangles in a box without parts, at most."""
+_ROUNDED = 1 + 1e-9
+"""Makes room for the rounding of an upper bound."""
 
 
 class Boxes(NamedTuple):
@@ -117,9 +119,13 @@ def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
 def signed_distances(boxes: Boxes, points: Array, out: Array) -> None:
     """Distances [m] to a closed surface, negative inside, at points of shape (n, 3)."""
     stack, least = np.empty(2 * boxes.levels, np.int64), np.empty(2 * boxes.levels)
+    distance = math.inf
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        distance = math.sqrt(_distance2(boxes, x, y, z, stack, least))
+        if n > 0:  # no farther than the last, and the way from there
+            dx, dy, dz = x - points[n - 1, 0], y - points[n - 1, 1], z - points[n - 1, 2]
+            distance = (distance + math.sqrt(dx * dx + dy * dy + dz * dz)) * _ROUNDED
+        distance = math.sqrt(_distance2(boxes, x, y, z, stack, least, distance * distance))
         out[n] = -distance if _winding(boxes, x, y, z, stack) != 0 else distance
 
 
@@ -134,11 +140,14 @@ def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
 
 @compiled
 def _distance2(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64],
-               least: Array) -> float:  # fmt: skip
-    """Squared distance to the nearest triangle; ``stack`` and ``least`` are room to work in."""
+               least: Array, best: float) -> float:  # fmt: skip
+    """Squared distance to the nearest triangle, known to be at most ``best``.
+
+    ``stack`` and ``least`` are room to work in.
+    """
     count, levels = len(boxes.triangles), boxes.levels
     leaves = 1 << (levels - 1)
-    best, top = math.inf, 1
+    top = 1
     stack[0], least[0] = 0, 0.0
     while top > 0:
         top -= 1
