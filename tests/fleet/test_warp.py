@@ -56,17 +56,16 @@ def test_errors_over_the_reference_map(scenes, budget, single, every):
 
 
 def test_twin(scenes):
-    """Differential: the same clusters in double precision; where two are equally large against
-    their distance either may be split."""
+    """Differential: the same clusters in double precision. Of two that are equally large against
+    their distance, as in symmetric bodies, rounding decides: the twin then follows."""
     fleet, where = fleet_of(scenes, 64)
-    delta = fleet.step(where).delta.numpy()[:, 0]
-    errors, twin = [], twin_of(fleet)
-    with same_functions(64):
-        for d, s in zip(delta, scenes, strict=True):
+    delta, twin = fleet.step(where).delta.numpy()[:, 0], twin_of(fleet)
+    taken = fleet._warp.cut.number.numpy().reshape(fleet.places, 64, -1)
+    with same_functions(64) as favoured:
+        for e, (d, s) in enumerate(zip(delta, scenes, strict=True)):
+            favoured[:] = taken[: len(s.scene), 1:, e]
             truth = twin.step(s.scene).delta
-            errors.append(np.abs(d - truth).max() / np.abs(truth).max())
-    assert np.quantile(errors, 0.98) < 1e-4
-    assert max(errors) < 2e-3
+            assert np.abs(d - truth).max() < 1e-4 * np.abs(truth).max(), s.name
 
 
 def test_several_sensors_places_and_matter():
@@ -163,6 +162,38 @@ def test_a_step_allocates_nothing_and_waits_for_nothing(monkeypatch):
     fleet.step(where, frame, time=time, jacobian=True)
     assert seen[0] == seen[1]
     assert len(seen[0]) > 10
+
+
+def test_captured_steps():
+    """Differential: a graph that is captured once gives what steps give, to the last bit, after
+    poses, time and bodies have changed; nothing of a step is left out of it."""
+    if not hasattr(wp, "capture_save"):
+        pytest.skip("this version of Warp captures on GPUs only")
+    rng = np.random.default_rng(16)
+    where = wp.array(poses(rng, 3, 3), dtype=wp.float32, device="cpu")
+    frame = wp.array(frames(rng, 3, 2), dtype=wp.float32, device="cpu")
+    time = wp.zeros(1, dtype=wp.float64, device="cpu")
+    fleet, other = (
+        Fleet("six_patch", BODIES, 3, sensors=2, device="warp:cpu", budget=32) for _ in range(2)
+    )
+    for each in (fleet, other):
+        each.use_readout("fdc1004", seed=3)
+        each.step(where, frame, time=0.0, jacobian=True)
+    with wp.ScopedCapture("cpu") as capture:
+        found = fleet.step(where, frame, time=time, jacobian=True)
+    for k in (1, 2):
+        where.assign(poses(rng, 3, 3).astype(np.float32))
+        frame.assign(frames(rng, 3, 2).astype(np.float32))
+        time.fill_(0.1 * k)
+        wp.capture_launch(capture.graph)
+        truth = other.step(where, frame, time=0.1 * k, jacobian=True)
+        assert truth.delta.numpy().any()
+        for name in ("capacitance", "delta", "conductance", "shield_coupling", "jacobian"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(truth, name))
+        for name in ("code", "capacitance", "age"):
+            np.testing.assert_array_equal(getattr(found.held, name), getattr(truth.held, name))
+        for each in (fleet, other):
+            each.change(0, BODIES[1], [1])
 
 
 @pytest.mark.parametrize("lossy", [False, True])

@@ -17,7 +17,7 @@ from capsense.field.cache import default_settings, load_or_build
 from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.cpu_core import CpuCore
-from capsense.fleet.reading import FleetCheck, FleetReading
+from capsense.fleet.reading import FleetCheck, FleetReading, on_device
 from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
@@ -227,7 +227,8 @@ class Fleet:
         """Return the readings of all environments.
 
         On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
-        not looked at; nothing waits for the device, so that a step can go into a CUDA graph.
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph. On the
+        CPU, arrays of others are copied.
 
         Args:
             poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
@@ -235,7 +236,8 @@ class Fleet:
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
             time: Time of the scenes [s], not before that of the last step; a readout needs it. On
-                Warp it may be an array of shape (1,) and double precision, for CUDA graphs.
+                Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
+                graphs.
             jacobian: Whether to work out ``reading.jacobian`` as well.
 
         Raises:
@@ -269,9 +271,7 @@ class Fleet:
                 jacobian,
             )  # fmt: skip
         where, at = (
-            each
-            if each is None or (hasattr(each, "__dlpack__") and not isinstance(each, np.ndarray))
-            else _checked(name, each, shape)
+            each if each is None or on_device(each) else _checked(name, each, shape)
             for name, each, shape in zip(
                 ("poses", "sensors"), (poses, sensors), shapes, strict=True
             )

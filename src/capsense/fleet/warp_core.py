@@ -18,6 +18,7 @@ from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
 from capsense.fleet import warp_slope as slope
 from capsense.fleet import warp_solve as solution
+from capsense.fleet.reading import on_device
 from capsense.fleet.step_kernels import Bodies
 from capsense.fleet.warp_chips import WarpChips
 from capsense.readout.readout import Readout
@@ -199,7 +200,7 @@ def as_transforms(poses: Any, room: Any) -> Any:
     Raises:
         SceneError: They are of another shape or precision, on another device, or not contiguous.
     """
-    if not hasattr(poses, "__dlpack__") or isinstance(poses, np.ndarray):
+    if not on_device(poses):
         room.assign(np.ascontiguousarray(poses, np.float32))
         return room
     if not isinstance(poses, wp.array):
