@@ -28,7 +28,7 @@ def cut_of(
 ) -> Cut:
     """Clusters by what is largest against its distance from the design, ``count`` for each body.
 
-    Of clusters that are as large to 1e-6, those are split whose functions are ``favoured``.
+    Of clusters that are as large to 1e-5, those are split whose functions are ``favoured``.
     """
     rows: list[tuple] = []
     leaves: list[int] = []
@@ -39,7 +39,7 @@ def cut_of(
         size = body["scale"] * tree.extent
         need = np.where(tree.kids[:, 0] < 0, 0.0, size / (np.maximum(away, 0.5 * size) + 1e-3))
         if favoured:
-            need *= 1.0 + 1e-6 * np.isin(tree.function, favoured[b])
+            need *= 1.0 + 1e-5 * np.isin(tree.function, favoured[b])
         heap, split = [(-need[0], 0)], set()
         while len(heap) < count and heap[0][0] < 0.0:
             _, k = heapq.heappop(heap)

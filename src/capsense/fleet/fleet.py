@@ -46,9 +46,9 @@ class Fleet:
     :meth:`change`. Bodies out of a sensor's sight cost nothing on the CPU.
 
     On the CPU, readings are those of :meth:`Simulator.step` of the same preset; but bodies that
-    touch each other are not joined to one conductor, and bodies longer than the diagonal of the
-    sensor's box are not cut. On Warp every body is cut into as many clusters as ``budget`` says,
-    in single precision: the fewer, the faster and the less exact, see :meth:`check`.
+    touch each other are not joined to one conductor. On Warp every body is cut into as many
+    clusters as ``budget`` says, in single precision: the fewer, the faster and the less exact, see
+    :meth:`check`.
 
     Args:
         design: A design, its name, or the path of its file.
@@ -123,8 +123,8 @@ class Fleet:
                 f"device {self.device!r} needs Warp; install it with: pip install 'capsense[warp]'"
             ) from error
         return WarpCore(
-            self._solver.green, self._terminals, (self.count, self.places, self.sensors), budget,
-            2 * np.pi * self._solver.excitation_frequency, known_device(self.device),
+            self._solver, self._terminals, (self.count, self.places, self.sensors), budget,
+            known_device(self.device),
         )  # fmt: skip
 
     @property

@@ -37,8 +37,8 @@ class FleetSkin:
     """Reads the sensors of several worlds of one kind by a fleet.
 
     Readings are those of the worlds' own sensors, but a person who touches the robot stays a
-    conductor of its own, and long bodies are not cut; on Warp, bodies are cut into 64 clusters
-    each. See :class:`~capsense.fleet.Fleet`.
+    conductor of its own; on Warp, bodies are cut into 64 clusters each. See
+    :class:`~capsense.fleet.Fleet`.
 
     Args:
         worlds: The worlds; their models hold the same geoms, of sizes of their own.
