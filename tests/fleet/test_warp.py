@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 from cluster_twin import same_functions, twin_of
-from reference_scenes import DESIGN, diagonal_errors, reference_scenes
+from reference_scenes import diagonal_errors, fleet_of, reference_scenes
 from test_fleet import BODIES, LONG, frames, long_poses, poses, scene
 
 import capsense as cs
@@ -24,27 +24,12 @@ def scenes():
     return [s for s in reference_scenes() if all(isinstance(b.shape, PRIMITIVES) for b in s.scene)]
 
 
-def fleet_of(scenes, budget):
-    """A fleet with a scene in each environment, and its poses."""
-    most = max(len(s.scene) for s in scenes)
-    fleet = Fleet(DESIGN, BODIES[:1] * most, len(scenes), device="warp:cpu", budget=budget)
-    where = np.zeros((len(scenes), most, 7))
-    where[..., 6] = 1.0
-    for place in range(most):
-        fleet.change(place, [s.scene[place] if place < len(s.scene) else None for s in scenes])
-        for e, s in enumerate(scenes):
-            if place < len(s.scene):
-                pose = s.scene[place].pose
-                where[e, place] = [*pose.position, *pose.quaternion]
-    return fleet, where
-
-
 @pytest.mark.parametrize(
     ("budget", "single", "every"), [(32, 4.0, 8.0), (64, 1.5, 2.5), (128, 0.7, 1.0)]
 )
 def test_errors_over_the_reference_map(scenes, budget, single, every):
     """Measured: rms of the diagonal [%], of single bodies from 15 mm on, and of all scenes."""
-    fleet, where = fleet_of(scenes, budget)
+    fleet, where = fleet_of(scenes, device="warp:cpu", budget=budget)
     delta = fleet.step(where).delta.numpy()[:, 0].astype(float)
     errors = np.array(
         [100 * diagonal_errors(d, s.delta) for d, s in zip(delta, scenes, strict=True)]
@@ -58,7 +43,7 @@ def test_errors_over_the_reference_map(scenes, budget, single, every):
 def test_twin(scenes):
     """Differential: the same clusters in double precision. Of two that are equally large against
     their distance, as in symmetric bodies, rounding decides: the twin then follows."""
-    fleet, where = fleet_of(scenes, 64)
+    fleet, where = fleet_of(scenes, device="warp:cpu")
     delta, twin = fleet.step(where).delta.numpy()[:, 0], twin_of(fleet)
     taken = fleet._warp.cut.number.numpy().reshape(fleet.places, 64, -1)
     with same_functions(64) as favoured:
