@@ -18,6 +18,7 @@ from capsense._simd import (
     splat,
     vadd,
     vmadd,
+    where_above,
 )
 
 
@@ -26,6 +27,12 @@ def _combine(x, y, scalar, two, out):
     for k in range(0, x.size, SIMD_WIDTH):
         left, right = span(x, k), span(y, k)
         put_span(out, k, vmadd(left, right, vadd(madd(scalar, left, splat(two)), right)))
+
+
+@njit
+def _larger(x, y, over, other, out):
+    for k in range(0, x.size, SIMD_WIDTH):
+        put_span(out, k, where_above(span(x, k), span(y, k), span(over, k), span(other, k)))
 
 
 @njit
@@ -67,6 +74,16 @@ def test_every_lane_and_row_is_treated_alike(kind):
     out = np.full_like(x, np.nan)
     _combine(x, y, kind(-1.5), kind(2.0), out)
     np.testing.assert_allclose(out, x * y - 1.5 * x + 2.0 + y, rtol=0, atol=20 * np.finfo(kind).eps)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_lanes_are_chosen(kind):
+    """Differential; equal numbers are not above each other."""
+    x, y, over, other = np.random.default_rng(6).normal(size=(4, 11, SIMD_WIDTH)).astype(kind)
+    y[::2, 3] = x[::2, 3]
+    out = np.empty_like(x)
+    _larger(x, y, over, other, out)
+    np.testing.assert_array_equal(out, np.where(x > y, over, other))
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])

@@ -3,7 +3,8 @@
 The functions below are one or a few LLVM instructions each, whatever the processor's own width:
 ``splat(s)`` fills all elements, ``vadd(u, v)`` is ``u + v``, ``madd(s, v, w)`` is ``s v + w`` with
 a scalar s, ``vmadd(u, v, w)`` is ``u v + w`` element by element, ``horizontal_sum(v)`` adds the
-elements, and ``muladd(a, b, c)`` is ``a b + c`` of scalars.
+elements, ``where_above(u, v, x, y)`` is x where u > v, else y, and ``muladd(a, b, c)`` is
+``a b + c`` of scalars.
 
 ``at(x, k)`` is element k of a C-ordered array of any shape, ``span`` is the eight from k on, and
 ``put_span`` writes them: unlike ``x[k]``, which counts from the end where k is negative, they do
@@ -153,6 +154,16 @@ def vmadd(typing: Any, left: Any, right: Any, addend: Any) -> Any:
         return multiply_add(builder, *args)
 
     return left(left, left, left), code
+
+
+@intrinsic
+def where_above(typing: Any, left: Any, right: Any, over: Any, other: Any) -> Any:
+    """``over`` where ``left`` is above ``right``, else ``other``, element by element."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
+
+    return left(left, left, left, left), code
 
 
 @intrinsic

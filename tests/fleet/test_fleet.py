@@ -34,6 +34,23 @@ def frames(rng, *shape):
     return np.concatenate([rng.uniform(-0.01, 0.01, (*shape, 3)), turn], axis=-1)
 
 
+LONG = [
+    cs.Body(cs.Box((2.0, 1.5, 0.05)), material="wood"),
+    cs.Body(cs.Capsule(0.03, 3.0), material="human", grounding=100e-12),
+    cs.Body(cs.Cylinder(0.04, 1.2), material="steel", grounding="floating"),
+]
+
+
+def long_poses():
+    """Poses of bodies that reach far out of a sensor's box, more so from one to the next."""
+    where = np.zeros((3, 3, 7))
+    where[:, 1:, 3:] = [0, 0.5**0.5, 0, 0.5**0.5]
+    where[:, 0, 6] = 1.0
+    for k in range(3):
+        where[k, :, :3] = [0.3 * k, 0.1 * k, 0.15], [0.4 * k, -0.06, 0.05], [0.2 * k, 0.06, 0.07]
+    return where, frames(np.random.default_rng(8), 3, 1)
+
+
 @pytest.fixture(scope="module")
 def fleet():
     return Fleet("six_patch", BODIES, COUNT, sensors=2)
@@ -78,6 +95,18 @@ def test_jacobians_are_those_of_simulators(fleet, simulator):
             np.testing.assert_allclose(found[e, s], truth, rtol=0, atol=1e-5 * np.abs(truth).max())
 
 
+def test_long_bodies_are_cut(simulator):
+    """Differential: to the part that counts, which goes along the body as that moves."""
+    where, sensors = long_poses()
+    found = Fleet("six_patch", LONG, 3).step(where, sensors, jacobian=True)
+    for e in range(3):
+        truth = simulator.step(scene(LONG, where[e], sensors[e, 0]), jacobian=True)
+        for name in ("delta", "jacobian"):
+            wanted = getattr(truth, name)
+            miss = np.abs(getattr(found, name)[e, 0] - wanted).max()
+            assert miss < 1e-5 * np.abs(wanted).max()
+
+
 def test_what_stands_in_a_place_changes(simulator):
     """Differential: sizes, materials and absence differ between environments."""
     fleet = Fleet("six_patch", BODIES[:2], COUNT)
@@ -89,6 +118,7 @@ def test_what_stands_in_a_place_changes(simulator):
         cs.Body(cs.Capsule(0.005, 0.025), material="human"),
     ]  # fmt: skip
     fleet.change(0, others, rows)
+    fleet.change(0, [], [])
     where = poses(rng, COUNT, 2)
     found = fleet.step(where).delta[:, 0]
     given = {k: [BODIES[0], BODIES[1]] for k in range(COUNT)}

@@ -23,8 +23,13 @@ from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 Array = NDArray[np.float64]
 
 
-def cut_of(green: Green, bodies: NDArray[np.void], trees: list, count: int) -> Cut:
-    """Clusters by what is largest against its distance from the design, ``count`` for each body."""
+def cut_of(
+    green: Green, bodies: NDArray[np.void], trees: list, count: int, favoured: list[Array]
+) -> Cut:
+    """Clusters by what is largest against its distance from the design, ``count`` for each body.
+
+    Of clusters that are as large to 1e-5, those are split whose functions are ``favoured``.
+    """
     rows: list[tuple] = []
     leaves: list[int] = []
     for b, (body, tree) in enumerate(zip(bodies, trees, strict=True)):
@@ -33,6 +38,8 @@ def cut_of(green: Green, bodies: NDArray[np.void], trees: list, count: int) -> C
         away = np.linalg.norm(np.maximum(np.maximum(low - center, center - high), 0.0), axis=1)
         size = body["scale"] * tree.extent
         need = np.where(tree.kids[:, 0] < 0, 0.0, size / (np.maximum(away, 0.5 * size) + 1e-3))
+        if favoured:
+            need *= 1.0 + 1e-5 * np.isin(tree.function, favoured[b])
         heap, split = [(-need[0], 0)], set()
         while len(heap) < count and heap[0][0] < 0.0:
             _, k = heapq.heappop(heap)
@@ -55,9 +62,15 @@ def cut_of(green: Green, bodies: NDArray[np.void], trees: list, count: int) -> C
 
 
 @contextmanager
-def same_functions(count: int) -> Iterator[None]:
-    """Let solvers take the charge functions that a fleet on Warp takes, ``count`` for each body."""
+def same_functions(count: int) -> Iterator[list[Array]]:
+    """Let solvers take the charge functions that a fleet on Warp takes, ``count`` for each body.
+
+    Yields:
+        A list for the numbers of the functions of each body that are taken where two clusters are
+        equally large.
+    """
     trees: list = []
+    favoured: list[Array] = []
     pack = SurfaceSolver.pack
 
     def packed(solver: SurfaceSolver, view: View) -> PackedBodies:
@@ -66,7 +79,7 @@ def same_functions(count: int) -> Iterator[None]:
         return out
 
     def prepared(bodies: NDArray[np.void], green: Green, *_: float) -> tuple:
-        cut = cut_of(green, bodies, trees, count)
+        cut = cut_of(green, bodies, trees, count, favoured)
         leaves = placed(bodies, cut, green, INSIDE)
         rows = leaf_rows(leaves.points, leaves.beyond, green)
         functions = functions_of(bodies, cut)
@@ -88,7 +101,7 @@ def same_functions(count: int) -> Iterator[None]:
         patch("capsense.surface.solver.solve", solve),
         patch.object(step, "prepared", prepared),
     ):
-        yield
+        yield favoured
 
 
 def twin_of(fleet: cs.Fleet) -> cs.Simulator:

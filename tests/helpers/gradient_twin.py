@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from capsense.field.green_kernels import Green
+from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, Green
 from capsense.surface.pair_kernels import FAR, SOFT
 from capsense.surface.step import Solution
 
@@ -66,16 +66,16 @@ def _rows(points: Array, still: Array, green: Green) -> Array:
     )
     x = np.clip((green.blend[1] - off) / (green.blend[1] - green.blend[0]), 0.0, 1.0)
     share = (x * x * (3 - 2 * x))[:, None]
-    rows = share * (_potentials(points, green.near, green.floor) @ green.near_table)
-    far = (1 - share) * (_potentials(points, green.far, green.floor) @ green.far_table)
+    rows = share * (_potentials(points, green.near, green.floor, NEAR_LEAST) @ green.near_table)
+    far = (1 - share) * (_potentials(points, green.far, green.floor, FAR_LEAST) @ green.far_table)
     rows[:, : far.shape[1]] += far
     return rows
 
 
-def _potentials(points: Array, sources: Array, floor: float) -> Array:
+def _potentials(points: Array, sources: Array, floor: float, least: float) -> Array:
     s = sources.T.astype(float)
     mirrored = s * [1, 1, -1] + [0, 0, 2 * floor]
-    direct = 1 / np.linalg.norm(points[:, :, None] - s, axis=-1)
+    direct = 1 / np.maximum(np.linalg.norm(points[:, :, None] - s, axis=-1), least)
     return (direct - 1 / np.linalg.norm(points[:, :, None] - mirrored, axis=-1)).mean(axis=1)
 
 

@@ -83,6 +83,21 @@ def reference_scenes(path: Path = MAP) -> tuple[ReferenceScene, ...]:
     return tuple(out)
 
 
+def fleet_of(scenes: list[ReferenceScene], **options: Any) -> tuple[cs.Fleet, Array]:
+    """A fleet with a scene in each environment, and its poses."""
+    most = max(len(s.scene) for s in scenes)
+    fleet = cs.Fleet(DESIGN, [cs.Body(cs.Sphere(0.01))] * most, len(scenes), **options)
+    poses = np.zeros((len(scenes), most, 7))
+    poses[..., 6] = 1.0
+    for place in range(most):
+        fleet.change(place, [s.scene[place] if place < len(s.scene) else None for s in scenes])
+        for e, s in enumerate(scenes):
+            if place < len(s.scene):
+                pose = s.scene[place].pose
+                poses[e, place] = [*pose.position, *pose.quaternion]
+    return fleet, poses
+
+
 def diagonal_errors(delta: Array, reference: Array) -> Array:
     """Relative errors of the diagonal; entries below the floor are measured against it."""
     truth = np.diag(reference)

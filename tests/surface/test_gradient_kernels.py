@@ -77,6 +77,22 @@ def test_agrees_with_differences_of_fine_solutions(name: str) -> None:
     assert _apart(found, _differences(bodies, 1e-3)) < (0.03 if name == SCREENED else 0.015)
 
 
+@pytest.mark.parametrize(
+    ("shape", "depth"), [(cs.Capsule(0.004, 0.03), 0.004), (cs.Sphere(0.005), 0.012)]
+)
+def test_bodies_within_a_sensor_feel_no_source_that_their_potential_is_bounded_by(shape, depth):
+    """Regression: against central differences of the values; forces of those sources were not
+    bounded, which made the Jacobian wrong by half to over the whole of it."""
+    green = green_of("arm_segment")
+    place = (0.016, 0.011, float(green.box[1, 2]) + shape.radius - depth)
+    bodies = pack(Placed(shape, place, ACROSS, eps_r=1.2))
+    found = jacobian(solve(bodies, green, 1e-4, 2.5, True), bodies, green)[..., :3]
+    for k in range(3):
+        ends = [solve(moved(bodies, 0, k, s), green, 1e-4, 2.5, True).delta for s in (5e-5, -5e-5)]
+        miss = found[0, ..., k] - (ends[0] - ends[1]) / 1e-4
+        assert np.abs(miss).max() < 0.03 * np.abs(found).max()
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_coarse_solutions_have_nearly_the_jacobian_of_fine_ones(name: str) -> None:
     bodies, _, found = _solved(name, 0.015)

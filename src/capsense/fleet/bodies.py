@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from capsense.elements.matter import matter_of
+from capsense.elements.pieces import windowed
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.errors import SceneError
 from capsense.fleet.step_kernels import Bodies
 from capsense.scene import Body
 from capsense.surface.solver import SurfaceSolver
+
+Array = NDArray[np.float64]
 
 
 class BodyTable:
@@ -33,7 +36,7 @@ class BodyTable:
         self.bodies = Bodies(
             np.zeros(0, BODY), np.zeros(0), np.full(shape, -1), np.ones(shape),
             np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, np.int64),
-            np.zeros((sensors, places), np.bool_), np.arange(places),
+            np.zeros((*shape, 3)), np.zeros((sensors, places), np.bool_), np.arange(places),
         )  # fmt: skip
         self.given = np.full(shape, None, object)
         """The bodies themselves, shape (e, b)."""
@@ -48,6 +51,8 @@ class BodyTable:
         if isinstance(place, bool) or not isinstance(place, int) or not 0 <= place < self.places:
             raise SceneError(f"place is {place!r}; there are places 0 to {self.places - 1}")
         rows = np.arange(self.count) if environments is None else np.asarray(environments).ravel()
+        if not rows.size:
+            return
         if rows.dtype.kind not in "iu" or (len(rows) and not (
             rows.min() >= 0 and rows.max() < self.count
         )):  # fmt: skip
@@ -93,14 +98,15 @@ class BodyTable:
         table = self.bodies
         return bool((table.softness.imag != 0).any() or (table.tie.imag != 0).any())
 
-    def _row(self, body: Body | None) -> tuple[int, float, complex, complex, int]:
-        """Shape, scale, softness, tie and neutrality of a body."""
+    def _row(self, body: Body | None) -> tuple[int, float, complex, complex, int, Array]:
+        """Shape, scale, softness, tie and neutrality of a body, and what is cut off of it."""
         if body is None:
-            return -1, 1.0, 0.0, 0.0, 1
+            return -1, 1.0, 0.0, 0.0, 1, np.zeros(3)
         if not isinstance(body, Body):
             raise SceneError(f"{body!r} is not a Body")
         matter = matter_of([body], self._solver.excitation_frequency)
-        shape, size = self._solver.functions_of(body.shape)
+        window, _ = windowed(body.shape, np.zeros(3), self._solver.reach)
+        shape, size = self._solver.functions_of(window)
         if not isinstance(shape, RigidShape):
             raise SceneError(
                 f"{type(body.shape).__name__} is not rigid; a fleet takes primitives and TriMesh"
@@ -109,7 +115,8 @@ class BodyTable:
         neutral = int(np.isinf(tie.real))
         soft = complex(matter.softness[0])
         number = self._number(shape, soft != 0.0)
-        return number, size, soft, 0.0 if neutral else tie, neutral
+        cut = 0.5 * np.ptp(body.shape.bounds(), axis=0) - 0.5 * np.ptp(window.bounds(), axis=0)
+        return number, size, soft, 0.0 if neutral else tie, neutral, cut
 
     def _number(self, shape: RigidShape, soft: bool) -> int:
         """The number of a shape in the table, which it joins if it is new."""

@@ -41,7 +41,8 @@ class CpuCore:
             SolveError: Some environments have no solution.
         """
         (e, b, _), s = bodies.shape, sensors.shape[1]
-        where, solver, terminals = Poses(bodies, sensors), self._solver, self._terminals
+        solver, terminals = self._solver, self._terminals
+        where = Poses(bodies, sensors, solver.middle)
         green = solver.green
         m = green.terminals
         slope = np.zeros((e if jacobian else 0, s, b, m, m, 6))

@@ -17,7 +17,7 @@ from capsense.field.cache import default_settings, load_or_build
 from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.cpu_core import CpuCore
-from capsense.fleet.reading import FleetCheck, FleetReading
+from capsense.fleet.reading import FleetCheck, FleetReading, on_device
 from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
@@ -46,9 +46,9 @@ class Fleet:
     :meth:`change`. Bodies out of a sensor's sight cost nothing on the CPU.
 
     On the CPU, readings are those of :meth:`Simulator.step` of the same preset; but bodies that
-    touch each other are not joined to one conductor, and bodies longer than the diagonal of the
-    sensor's box are not cut. On Warp every body is cut into as many clusters as ``budget`` says,
-    in single precision: the fewer, the faster and the less exact, see :meth:`check`.
+    touch each other are not joined to one conductor. On Warp every body is cut into as many
+    clusters as ``budget`` says, in single precision: the fewer, the faster and the less exact, see
+    :meth:`check`.
 
     Args:
         design: A design, its name, or the path of its file.
@@ -123,8 +123,8 @@ class Fleet:
                 f"device {self.device!r} needs Warp; install it with: pip install 'capsense[warp]'"
             ) from error
         return WarpCore(
-            self._solver.green, self._terminals, (self.count, self.places, self.sensors), budget,
-            2 * np.pi * self._solver.excitation_frequency, known_device(self.device),
+            self._solver, self._terminals, (self.count, self.places, self.sensors), budget,
+            known_device(self.device),
         )  # fmt: skip
 
     @property
@@ -227,7 +227,8 @@ class Fleet:
         """Return the readings of all environments.
 
         On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
-        not looked at; nothing waits for the device, so that a step can go into a CUDA graph.
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph. On the
+        CPU, arrays of others are copied.
 
         Args:
             poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
@@ -235,7 +236,8 @@ class Fleet:
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
             time: Time of the scenes [s], not before that of the last step; a readout needs it. On
-                Warp it may be an array of shape (1,) and double precision, for CUDA graphs.
+                Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
+                graphs.
             jacobian: Whether to work out ``reading.jacobian`` as well.
 
         Raises:
@@ -269,9 +271,7 @@ class Fleet:
                 jacobian,
             )  # fmt: skip
         where, at = (
-            each
-            if each is None or (hasattr(each, "__dlpack__") and not isinstance(each, np.ndarray))
-            else _checked(name, each, shape)
+            each if each is None or on_device(each) else _checked(name, each, shape)
             for name, each, shape in zip(
                 ("poses", "sensors"), (poses, sensors), shapes, strict=True
             )

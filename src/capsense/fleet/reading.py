@@ -1,4 +1,4 @@
-"""What a fleet's step returns."""
+"""What a fleet's step takes and returns."""
 
 from __future__ import annotations
 
@@ -52,3 +52,8 @@ class FleetCheck:
     """The largest."""
     where: tuple[int, int]
     """Environment and sensor that have it."""
+
+
+def on_device(values: Any) -> bool:
+    """Whether values are an array of Warp, PyTorch or JAX, which is taken by DLPack."""
+    return hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)

@@ -31,6 +31,9 @@ class Bodies(NamedTuple):
     """Energy that ties it to ground [1/m], complex, shape (e, b)."""
     neutral: NDArray[Any]
     """Whether it has no net charge, shape (e, b)."""
+    slack: NDArray[Any]
+    """Half of what is cut off of a long body along each axis [m], shape (e, b, 3); what is left is
+    nearest to the middle of the domain, see ``elements.pieces.windowed``."""
     hidden: NDArray[Any]
     """Whether a sensor does not see a place, shape (s, b)."""
     group: NDArray[Any]
@@ -56,6 +59,8 @@ class Poses(NamedTuple):
     """Shape (e, b, 7)."""
     sensors: NDArray[Any]
     """Shape (e, s, 7)."""
+    middle: NDArray[Any]
+    """Middle of the domain in the sensor frame [m], shape (3,)."""
 
 
 class Found(NamedTuple):
@@ -80,6 +85,7 @@ def step_rows(start, stop, bodies, poses, sensor, found):
     green, slopes = sensor.green, found.slope.shape[0] > 0
     m = green.terminals
     room, place = np.empty(places, bodies.shapes.dtype), np.empty(places, np.int64)
+    turn = np.empty((3, 3))
     for e in range(start, stop):
         for s in range(sensors):
             count = seen(bodies, poses, e, s, green.room, room, place)
@@ -98,6 +104,9 @@ def step_rows(start, stop, bodies, poses, sensor, found):
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.size >= 0 else np.nan
             if slopes and out.size >= 0:
+                _matrix(poses.sensors[e, s], turn)
+                for c in range(count):  # bodies turn about their own origins
+                    _position(poses, e, place[c], s, turn, room[c])
                 slope = jacobian(out, room[:count], green)
                 for c in range(count):
                     found.slope[e, s, place[c]] = slope[c]
@@ -156,6 +165,16 @@ def _matrix(pose, out):
 
 
 @compiled
+def _position(poses, e, b, s, turn, body):
+    """Set the position of a record to that of a body in a sensor's frame."""
+    for i in range(3):
+        at = 0.0
+        for k in range(3):
+            at += turn[k, i] * (poses.bodies[e, b, k] - poses.sensors[e, s, k])
+        body.position[i] = at
+
+
+@compiled
 def _placed(bodies, e, b, poses, s, turns, room, record):
     """Fill the record of a body in a sensor's frame; False where it is out of its sight.
 
@@ -167,18 +186,22 @@ def _placed(bodies, e, b, poses, s, turns, room, record):
     reach = scale * bodies.radius[u]
     record[0] = bodies.shapes[u]
     body = record[0]
-    for i in range(3):
-        at = 0.0
-        for k in range(3):
-            at += turn[k, i] * (poses.bodies[e, b, k] - poses.sensors[e, s, k])
-        if at + reach < room[0, i] or at - reach > room[1, i]:
-            return False
-        body.position[i] = at
-        for j in range(3):
+    _position(poses, e, b, s, turn, body)
+    for j in range(3):
+        off = 0.0
+        for i in range(3):
             total = 0.0
             for k in range(3):
                 total += turn[k, i] * own[k, j]
             body.rotation[i, j] = total
+            off += total * (poses.middle[i] - body.position[i])
+        off = min(max(off, -bodies.slack[e, b, j]), bodies.slack[e, b, j])
+        for i in range(3):
+            body.position[i] += body.rotation[i, j] * off
+    for i in range(3):
+        at = body.position[i]
+        if at + reach < room[0, i] or at - reach > room[1, i]:
+            return False
     body.scale, body.tie = scale, bodies.tie[e, b].real
     body.neutral, body.softness = bodies.neutral[e, b], bodies.softness[e, b].real
     if bodies.softness[e, b] == 0.0:

@@ -15,6 +15,7 @@ import warp as wp
 
 from capsense.errors import ReadoutError
 from capsense.fleet import warp_chip_kernels as kernels
+from capsense.fleet.reading import on_device
 from capsense.fleet.warp_laws import law_of
 from capsense.readout.counts import Held
 from capsense.readout.noise import ClimateDrift, Context, Flicker, Mains, RandomWalk, White
@@ -144,8 +145,8 @@ class WarpChips:
         """Tell what the sensors see at a time; get what the chips' registers hold.
 
         Args:
-            time: [s], not before the last call's; or an array of Warp that holds it, of shape
-                (1,) and double precision, which is not looked at.
+            time: [s], not before the last call's; or an array on the device that holds it, of
+                shape (1,) and double precision, which is not looked at.
             delta: Change of the Maxwell matrices [F], shape (e, s, n, n).
             shields: Charge on each electrode per volt on all shields together [F], (e, s, n).
 
@@ -153,9 +154,14 @@ class WarpChips:
             Arrays of shape (e, s, K), written anew by the next call.
 
         Raises:
-            ReadoutError: Time is not finite, goes back, or leaps.
+            ReadoutError: Time is not finite, goes back, or leaps; or an array is another one.
         """
-        if isinstance(time, wp.array):
+        if on_device(time):
+            time = time if isinstance(time, wp.array) else wp.from_dlpack(time)
+            if (time.dtype, time.shape) != (wp.float64, (1,)):
+                raise ReadoutError(
+                    f"time is {time.dtype.__name__} of shape {time.shape}; give float64 of (1,)"
+                )
             wp.copy(self._state.now, time)
         else:
             self._readout.require_forward(time, self._last)

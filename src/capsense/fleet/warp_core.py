@@ -13,14 +13,15 @@ from capsense.elements.matter import UNIT
 from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.change import Terminals
-from capsense.field.green_kernels import Green
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
 from capsense.fleet import warp_slope as slope
 from capsense.fleet import warp_solve as solution
+from capsense.fleet.reading import on_device
 from capsense.fleet.step_kernels import Bodies
 from capsense.fleet.warp_chips import WarpChips
 from capsense.readout.readout import Readout
+from capsense.surface.solver import SurfaceSolver
 
 Array = NDArray[np.float64]
 
@@ -29,27 +30,27 @@ class WarpCore:
     """Solves views, each sensor in each environment one.
 
     Args:
-        green: Green's function of the design.
+        solver: Knows the design.
         terminals: Of the design.
         counts: How many environments, places for bodies, and sensors.
         clusters: Into how many clusters a body is cut.
-        omega: Angular frequency of the excitation [1/s].
         device: Warp's device.
     """
 
     def __init__(
-        self, green: Green, terminals: Terminals, counts: tuple[int, int, int], clusters: int,
-        omega: float, device: Any,
+        self, solver: SurfaceSolver, terminals: Terminals, counts: tuple[int, int, int],
+        clusters: int, device: Any,
     ) -> None:  # fmt: skip
-        self.device, self.counts, self.clusters, self._omega = device, counts, clusters, omega
-        self._taken = 0
+        self.device, self.counts, self.clusters, self._taken = device, counts, clusters, 0
+        self._omega = 2 * np.pi * solver.excitation_frequency
         self._slopes: list[Any] | None = None
-        self.green, self.circuit = _response(green, device), _circuit(terminals, device)
+        self.green, self.circuit = _response(solver, device), _circuit(terminals, device)
         environments, places, sensors = counts
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
         room = self.room
         cut = warp_cut.WarpCut()
         cut.pose = room(places, views, dtype=wp.transform)
+        cut.moved = room(places, views, dtype=wp.vec3)
         for name in ("node", "split", "number", "lifted"):
             setattr(cut, name, room(n, views, dtype=wp.int32))
         for name in ("score", "part", "extent", "beyond", "near"):
@@ -58,7 +59,7 @@ class WarpCore:
         cut.leader = room(places, views, dtype=wp.int32)
         cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
         self.cut = cut
-        passes, t = self.green.near_table.shape[1], green.terminals
+        passes, t = self.green.near_table.shape[1], self.green.terminals
         self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, t, views)
         self.whole = room(t, t, views, dtype=wp.vec2d)
@@ -78,6 +79,7 @@ class WarpCore:
         for name in ("softness", "tie"):
             setattr(self.places, name, room(environments, places, dtype=wp.vec2))
         self.places.scale = room(environments, places)
+        self.places.slack = room(environments, places, dtype=wp.vec3)
         self.places.hidden = room(sensors, places, dtype=wp.int32)
         self.places.group = room(places, dtype=wp.int32)
 
@@ -89,7 +91,8 @@ class WarpCore:
         """Take over what stands where, in the memory that there is; new shapes take new memory."""
         for name in ("choice", "neutral", "hidden", "group"):
             getattr(self.places, name).assign(getattr(bodies, name).astype(np.int32))
-        self.places.scale.assign(bodies.scale.astype(np.float32))
+        for name in ("scale", "slack"):
+            getattr(self.places, name).assign(getattr(bodies, name).astype(np.float32))
         for name in ("softness", "tie"):
             both = getattr(bodies, name).astype(np.complex64).view(np.float32)
             getattr(self.places, name).assign(both.reshape(*bodies.scale.shape, 2))
@@ -199,7 +202,7 @@ def as_transforms(poses: Any, room: Any) -> Any:
     Raises:
         SceneError: They are of another shape or precision, on another device, or not contiguous.
     """
-    if not hasattr(poses, "__dlpack__") or isinstance(poses, np.ndarray):
+    if not on_device(poses):
         room.assign(np.ascontiguousarray(poses, np.float32))
         return room
     if not isinstance(poses, wp.array):
@@ -219,15 +222,15 @@ def as_transforms(poses: Any, room: Any) -> Any:
     return out
 
 
-def _response(green: Green, device: Any) -> Any:
-    out = warp_cut.Response()
+def _response(solver: SurfaceSolver, device: Any) -> Any:
+    out, green = warp_cut.Response(), solver.green
     for name in ("near", "far"):
         sources = np.ascontiguousarray(getattr(green, name).T, np.float32)
         table = getattr(green, f"{name}_table")
         parts = np.ascontiguousarray(table.reshape(len(table), -1, warp_cut.WIDTH))
         setattr(out, name, wp.array(sources, dtype=wp.vec3, device=device))
         setattr(out, f"{name}_table", wp.array(parts, dtype=warp_cut.row, device=device))
-    out.lead, out.terminals = green.lead, green.terminals
+    out.lead, out.terminals, out.middle = green.lead, green.terminals, wp.vec3(*solver.middle)
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blend.tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (

@@ -56,6 +56,7 @@ class Places:
     softness: wp.array2d(dtype=wp.vec2)  # complex, as ties are
     tie: wp.array2d(dtype=wp.vec2)
     neutral: wp.array2d(dtype=wp.int32)
+    slack: wp.array2d(dtype=wp.vec3)  # half of what is cut off along each axis
     group: wp.array(dtype=wp.int32)  # joined places have the same number, (b,)
     hidden: wp.array2d(dtype=wp.int32)  # whether a sensor does not see a place, (s, b)
 
@@ -78,6 +79,7 @@ class Response:
     box1: wp.vec3
     room0: wp.vec3
     room1: wp.vec3
+    middle: wp.vec3
 
 
 @wp.struct
@@ -85,6 +87,7 @@ class WarpCut:
     """Clusters and functions of every view, K for each place; n = b K."""
 
     pose: wp.array2d(dtype=wp.transform)  # of the bodies in the sensor frame, (b, v)
+    moved: wp.array2d(dtype=wp.vec3)  # from a body's origin to that of what is left of it, (b, v)
     node: wp.array2d(dtype=wp.int32)  # cluster in each place, -1 for none, (n, v)
     score: wp.array2d(dtype=wp.float32)
     split: wp.array2d(dtype=wp.int32)  # place of the cluster that was split for this one, (n, v)
@@ -145,7 +148,12 @@ def choose(
     if u < 0 or places.hidden[s, b] != 0:
         return
     at = wp.transform_multiply(wp.transform_inverse(sensors[e, s]), bodies[e, b])
+    slack = places.slack[e, b]
+    off = wp.transform_point(wp.transform_inverse(at), green.middle)
+    moved = wp.transform_vector(at, wp.min(wp.max(off, -slack), slack))
+    at = wp.transform(wp.transform_get_translation(at) + moved, wp.transform_get_rotation(at))
     cut.pose[b, v] = at
+    cut.moved[b, v] = moved
     scale = places.scale[e, b]
     away = _off(wp.transform_get_translation(at), green.room0, green.room1)
     if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u]:

@@ -14,7 +14,10 @@ from capsense.surface.pair_kernels import BARRIER, FAR, SOFT
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-_SOFT, _FAR, _BARRIER = wp.constant(SOFT), wp.constant(FAR), wp.constant(BARRIER)
+_SOFT, _FAR = wp.constant(SOFT), wp.constant(FAR)
+_BARRIER, _STIFF = wp.constant(BARRIER), wp.constant(600.0)
+"""Energy of charge that is out of reach [1/m], at most the second number [m] over the square of a
+large cluster's extent: in single precision more of it would hide what is in reach."""
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
 _WIDTH = wp.constant(WIDTH)
 
@@ -142,7 +145,7 @@ def pairs(green: Response, cut: WarpCut, clusters: int, out: wp.array3d(dtype=wp
             value += _more(cut, i, j, v)
         if i == j:
             x = cut.beyond[i, v]
-            value += _BARRIER * x * x * x
+            value += wp.min(_BARRIER, _STIFF / (cut.extent[i, v] * cut.extent[i, v])) * x * x * x
     out[i, j, v] = value
     out[j, i, v] = value
 

@@ -233,4 +233,6 @@ def slopes(
             f = b * clusters + k
             if cut.node[f, v] >= 0:
                 total += charge[f, i, v] * pull[f, j, v] + charge[f, j, v] * pull[f, i, v]
-        out[v, b, i, j] = circuit.unit * total
+        force = wp.spatial_top(total)
+        torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
+        out[v, b, i, j] = circuit.unit * wp.spatial_vector(force, torque)

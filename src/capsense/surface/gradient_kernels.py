@@ -19,7 +19,7 @@ import numpy as np
 
 from capsense._dense import WIDTH, multiply, multiply_simd
 from capsense._jit import compiled
-from capsense.field.green_kernels import distances, near_share
+from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, distances, near_share
 from capsense.surface.leaf_kernels import (
     near_pairs,
     pair_line,
@@ -73,15 +73,15 @@ def jacobian(solution, bodies, green):
 @compiled
 def _add_design(points, charge, bounds, green, work):
     """Add forces and torques by the design's sources, (b, 6, lead, lead)."""
-    n, lead, floor = points.shape[0], charge.shape[1], np.float32(green.floor)
+    n, lead, floor = points.shape[0], charge.shape[1], green.floor
     distance = distances(points, green)
     near_part, far_part = np.empty(n), np.empty(n)
     for j in range(n):
         near_part[j] = near_share(distance[j], green.blend)
         far_part[j] = 1.0 - near_part[j]
     sources, far_sources = _padded(green.near), _padded(green.far)
-    near = _source_sums(points, charge, near_part, bounds, sources, floor)
-    far = _source_sums(points, charge, far_part, bounds, far_sources, floor)
+    near = _source_sums(points, charge, near_part, bounds, sources, (floor, NEAR_LEAST))
+    far = _source_sums(points, charge, far_part, bounds, far_sources, (floor, FAR_LEAST))
     modes = np.zeros((lead, green.near_table.shape[1]), np.float32)
     _add_modes(near, green.near_table, modes)
     _add_modes(far, green.far_table, modes)
@@ -105,14 +105,17 @@ def _padded(sources):
 
 
 @compiled
-def _source_sums(points, charge, share, bounds, sources, floor):
+def _source_sums(points, charge, share, bounds, sources, limits):
     """Sums over each body's charges, weighted with ``share``, of what a source does to them.
+
+    ``limits`` are the height of the floor and the least distance from a source [m].
 
     Returns:
         Shape (b, 6, lead, s), the six numbers of
         :func:`capsense.surface.leaf_kernels.source_lines`; b = 0 where no weight is above zero.
     """
     count, lead, width = bounds.shape[0] - 1, charge.shape[1], sources.shape[1]
+    floor, least = np.float32(limits[0]), np.float32(limits[1])
     some_count = 0
     for j in range(points.shape[0]):
         some_count += share[j] > 0.0
@@ -139,7 +142,7 @@ def _source_sums(points, charge, share, bounds, sources, floor):
             if chosen == 0:
                 continue
             left = _narrowed(left, chosen)
-            source_lines(some[:chosen], sources, floor, lines)
+            source_lines(some[:chosen], sources, floor, least, lines)
             for r in range(6):
                 multiply(left, lines[r, :chosen], sums)
                 _add(sums, out[b, r])

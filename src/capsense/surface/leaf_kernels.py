@@ -15,7 +15,19 @@ from numpy.typing import NDArray
 
 from capsense._dense import multiply
 from capsense._jit import compiled, pasted
-from capsense._simd import SIMD_WIDTH, at, doubles, madd, put_span, rsqrt, span, splat, vadd, vmadd
+from capsense._simd import (
+    SIMD_WIDTH,
+    at,
+    doubles,
+    madd,
+    put_span,
+    rsqrt,
+    span,
+    splat,
+    vadd,
+    vmadd,
+    where_above,
+)
 from capsense.field.green_kernels import (
     FAR_LEAST,
     NEAR_LEAST,
@@ -199,16 +211,18 @@ def _add_rows(points, chosen, share, sources, table, floor, least, out):
 
 
 @compiled
-def source_lines(points, sources, floor, out):
+def source_lines(points, sources, floor, least, out):
     """What every source does to the sum over four points (k, 4, 3), each of unit charge.
 
-    ``out`` (6, k, s) is filled with: potential [1/m]; force along x, y, z [1/m²]; force along x and
-    y, times the height of the source for its own part and of the image for that of the image [1/m].
+    Floor and ``least`` are as ``source_potentials`` takes them: a point that is nearer to a source
+    than ``least`` [m] feels no force of it. ``out`` (6, k, s) is filled with: potential [1/m];
+    force along x, y, z [1/m²]; force along x and y, times the height of the source for its own part
+    and of the image for that of the image [1/m].
     """
     width = sources.shape[1]
     layer = out.shape[1] * width
     zero, minus = splat(np.float32(0.0)), np.float32(-1.0)
-    two = splat(np.float32(2.0) * floor)
+    two, bound = splat(np.float32(2.0) * floor), splat(least * least)
     for i in range(points.shape[0]):
         for s in range(0, width, SIMD_WIDTH):
             sx, sy, high = span(sources, s), span(sources, width + s), span(sources, 2 * width + s)
@@ -221,10 +235,12 @@ def source_lines(points, sources, floor, out):
                 z = splat(at(points, o + 2))
                 dz, ez = madd(minus, high, z), madd(minus, low, z)
                 across = vmadd(dx, dx, vmadd(dy, dy, zero))
-                a = rsqrt(vmadd(dz, dz, across))
+                square = vmadd(dz, dz, across)
+                a = rsqrt(where_above(square, bound, square, bound))
                 b = rsqrt(vmadd(ez, ez, across))
                 value = vadd(value, madd(minus, b, a))
                 a = vmadd(vmadd(a, a, zero), madd(minus, a, zero), zero)
+                a = where_above(square, bound, a, zero)
                 b = vmadd(vmadd(b, b, zero), b, zero)
                 both, arm = vadd(a, b), vmadd(high, a, vmadd(low, b, zero))
                 fx, fy = vmadd(dx, both, fx), vmadd(dy, both, fy)

@@ -107,7 +107,8 @@ class SurfaceSolver:
         self.green = pack_green(green, design)
         self._function = green
         walls = np.array([design.domain.lower, design.domain.upper])
-        self._middle, self._reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
+        self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
+        """Middle and diagonal of the domain [m], as :func:`windowed` takes them."""
         self._last: tuple[View, Solution] | None = None
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
 
@@ -290,7 +291,7 @@ class SurfaceSolver:
             or not (matter.conducting[place] or matter.eps[place].imag == 0)
             or shape.parts == 1
         ):
-            return [windowed(shape, (self._middle - position) @ rotation, self._reach)], 1.0
+            return [windowed(shape, (self.middle - position) @ rotation, self.reach)], 1.0
         low, high = shape.piece_bounds
         middle = position + 0.5 * (low + high) @ rotation.T
         half = 0.5 * (high - low) @ np.abs(rotation.T)

@@ -37,8 +37,8 @@ class FleetSkin:
     """Reads the sensors of several worlds of one kind by a fleet.
 
     Readings are those of the worlds' own sensors, but a person who touches the robot stays a
-    conductor of its own, and long bodies are not cut; on Warp, parts of a limb are conductors of
-    their own. See :class:`~capsense.fleet.Fleet`.
+    conductor of its own; on Warp, bodies are cut into 64 clusters each. See
+    :class:`~capsense.fleet.Fleet`.
 
     Args:
         worlds: The worlds; their models hold the same geoms, of sizes of their own.
@@ -109,18 +109,18 @@ class FleetSkin:
         others[rows] = False
         sensors[others, :, 2] -= 2 * _FAR
         found = self._fleet.step(poses[:, : self._places], sensors)
-        matrix, delta = (
-            a if isinstance(a, np.ndarray) else a.numpy().astype(float)
-            for a in (found.capacitance, found.delta)
+        # on Warp the next step writes its arrays anew
+        matrix, delta, shields = (
+            a if isinstance(a, np.ndarray) else np.array(a.numpy(), float)
+            for a in (found.capacitance, found.delta, found.shield_coupling)
         )
-        shields = found.shield_coupling
         error = found.error
         return [
             {
                 site: Reading(
                     matrix[n, k], delta[n, k],
                     StepStats(0.0 if error is None else float(error[n, k]), 0.0), self._names,
-                    np.zeros(len(self._names)) if shields is None else shields[n, k],
+                    shields[n, k],
                 )
                 for k, site in enumerate(self._worlds[n].sites)
             }
