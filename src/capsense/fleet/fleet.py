@@ -311,6 +311,7 @@ class Fleet:
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
         simulator = Simulator(self.design, excitation_frequency=self._solver.excitation_frequency)
         errors = np.empty((len(drawn), s, *self.baseline.shape))
+        contact = []
         for row, k in enumerate(drawn.tolist()):
             for j in range(s):
                 frame = Pose() if at is None else Pose(at[k, j, :3], at[k, j, 3:])
@@ -320,12 +321,15 @@ class Fleet:
                     for body, pose, out in zip(self._table.given[k], where[k], hidden, strict=True)
                     if body is not None and not out
                 )
-                truth = simulator.step(scene).delta
+                reading = simulator.step(scene)
+                truth = reading.delta
+                if reading.stats.solver_error >= np.abs(reading.capacitance).max():
+                    contact.append((k, j))
                 errors[row, j] = (found[k, j] - truth) / max(np.abs(truth).max(), 1e-18)
         row, j = np.unravel_index(np.abs(errors).max(axis=(2, 3)).argmax(), errors.shape[:2])
         return FleetCheck(
             tuple(drawn.tolist()), float(np.sqrt((errors**2).mean())), float(np.abs(errors).max()),
-            (int(drawn[row]), int(j)),
+            (int(drawn[row]), int(j)), tuple(contact),
         )  # fmt: skip
 
 
