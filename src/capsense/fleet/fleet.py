@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._thread_pool import OneAtATime
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
@@ -110,6 +111,7 @@ class Fleet:
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self._table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
+        self._one = OneAtATime()
         self._cpu = CpuCore(self._solver, self._terminals, self._table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
@@ -152,8 +154,9 @@ class Fleet:
             SceneError: There is no such place or environment, the numbers do not match, or a body
                 is of a shape that is not rigid, or no conductor in a place that is joined.
         """
-        self._table.change(place, bodies, environments)
-        self._take_over()
+        with self._one:
+            self._table.change(place, bodies, environments)
+            self._take_over()
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """Leave places out of what a sensor sees, such as the link that carries it.
@@ -243,13 +246,14 @@ class Fleet:
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
         """
-        if self._chips is None:
-            return self.solved(poses, sensors, jacobian=jacobian)
-        if time is None:
+        if self._chips is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
-        reading = self.solved(poses, sensors, jacobian=jacobian)
-        matrix = reading.capacitance if self._warp is None else reading.delta
-        return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
+        with self._one:
+            reading = self.solved(poses, sensors, jacobian=jacobian)
+            if self._chips is None:
+                return reading
+            matrix = reading.capacitance if self._warp is None else reading.delta
+            return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
