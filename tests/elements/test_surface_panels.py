@@ -118,11 +118,12 @@ def test_cells_across_the_thinnest_side(size, cells):
 
 @pytest.mark.parametrize("widest", [3.0, 24.0, 40.0, 97.0])
 @pytest.mark.parametrize("cap", [4, 9, 20])
-def test_rings_and_the_number_of_their_panels(widest, cap):
+@pytest.mark.parametrize("step", [0.1, 1.0])
+def test_rings_and_the_number_of_their_panels(widest, cap, step):
     """Invariant: poles of one node, neighbours equal or twice; panels as many as predicted."""
     angle = np.linspace(0.0, 0.5 * np.pi, cap)
     rho = np.concatenate([np.sin(angle), np.ones(3), np.sin(angle)[::-1]])
-    nodes = _ring_counts(rho, np.full(len(rho), 0.1), widest)
+    nodes = _ring_counts(rho, np.full(len(rho), step), widest)
     assert nodes[0] == nodes[-1] == 1
     inner = nodes[1:-1]
     assert inner.max() == max(12, 4 * round(widest / 4))
