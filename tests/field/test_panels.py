@@ -114,6 +114,16 @@ def test_rims_of_another_sheet_refine_from_an_eighth_of_their_height_on():
     assert sum(p.area for p in near) == pytest.approx(polygon.area, rel=1e-6)
 
 
+def test_a_rim_that_stands_upright_is_not_graded_to():
+    """Invariant: it is no line in the facet's plane."""
+    facet = Facet(SHAPES["square"], np.zeros(3), np.eye(3))
+    rim = np.array([[[0.01, 0.012, 0.0], [0.01, 0.012, 0.001]]])
+    plain, near = (
+        cut_facet(facet, r, Grading(1e-4, largest=0.004), reach=0.003) for r in (rim[:0], rim)
+    )
+    assert near == plain
+
+
 def test_concatenation_keeps_panels_apart():
     """Invariant: edges, quadrature and areas stay with their panel."""
     parts = [cut(SHAPES[n], Grading(5e-4, largest=0.01))[1] for n in ("holes", "square", "L")]
