@@ -41,10 +41,7 @@ def a_scene(rng: np.random.Generator, domain: Domain) -> cs.Scene:
 
 @pytest.mark.parametrize("count", [60, pytest.param(500, marks=pytest.mark.slow)])
 def test_it_is_that_of_weak_signals_too(pair: Pair, count: int) -> None:
-    """Against a solve for a thousand times finer functions, over signals from 1e-20 to 1e-12 F.
-
-    Of these scenes, that solve is within a thousandth of the estimate of one for all functions.
-    """
+    """Against a solve for a thousand times finer functions, over signals from 1e-20 to 1e-12 F."""
     sim, whole = pair
     rng = np.random.default_rng(5)
     found = []
