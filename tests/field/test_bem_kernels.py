@@ -159,12 +159,13 @@ MIRROR = np.array([1.0, 1.0, -1.0])
 def panels() -> Panels:
     """Some thirty panels that touch, face and cross each other's planes, one right on the floor."""
     turned = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+    skew = np.array([[2.0, 1.0, 2.0], [-2.0, 2.0, 1.0], [-1.0, -2.0, 2.0]]) / 3
     corner = shapely.Polygon([(0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.01, 0.02), (0.0, 0.02)])
     facets = [
         Facet(shapely.box(-0.01, -0.01, 0.01, 0.01), np.array([0.002, 0.001, 0.003]), np.eye(3)),
         Facet(shapely.box(0.0, 0.0, 0.02, 0.01), np.array([0.0, 0.0, FLOOR + 1e-4]), np.eye(3)),
         Facet(corner, np.array([0.015, -0.02, 0.004]), turned),
-        Facet(corner, np.array([0.07, 0.05, 0.02]), turned.T),
+        Facet(corner, np.array([0.07, 0.05, 0.02]), skew),
     ]
     return concatenate(
         [make_panels(f, cut_facet(f, np.empty((0, 2, 3)), Grading(1e-3))) for f in facets]
