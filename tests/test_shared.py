@@ -116,3 +116,20 @@ def test_threads_that_share_a_robots_skin(
     skin = cs.mujoco.attach_skin(model, data, ["a", "b"], sensor, threads=1)
     monkeypatch.setattr(skin_module, "read_all", alone(skin_module.read_all))
     assert all(set(readings) == {"a", "b"} for readings in at_once(lambda _: skin.read()))
+
+
+def test_threads_that_share_a_fleet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its chips are sampled, and its bodies changed, by one thread at a time."""
+    fleet = cs.Fleet("six_patch", [cs.Body(cs.Sphere(0.02))], 2)
+    fleet.use_readout("fdc1004")
+    poses = np.array([[[0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0]]] * 2)
+    expected = fleet.step(poses, time=0.0).delta
+    monkeypatch.setattr(fleet._chips, "sample", alone(fleet._chips.sample))
+    monkeypatch.setattr(fleet._table, "change", alone(fleet._table.change))
+
+    def work(k: int) -> np.ndarray:
+        fleet.change(0, cs.Body(cs.Sphere(0.02)))
+        return fleet.step(poses, time=0.01).delta
+
+    for delta in at_once(work):
+        np.testing.assert_array_equal(delta, expected)

@@ -39,22 +39,23 @@ def a_scene(rng: np.random.Generator, domain: Domain) -> cs.Scene:
     return cs.Scene([body() for _ in range(rng.integers(1, 3))])
 
 
-def test_it_is_that_of_weak_signals_too(pair: Pair) -> None:
+@pytest.mark.parametrize("count", [60, pytest.param(500, marks=pytest.mark.slow)])
+def test_it_is_that_of_weak_signals_too(pair: Pair, count: int) -> None:
     """Against a solve for a thousand times finer functions, over signals from 1e-20 to 1e-12 F."""
     sim, whole = pair
     rng = np.random.default_rng(5)
     found = []
-    for _ in range(60):
+    for _ in range(count):
         scene = a_scene(rng, sim.design.domain)
         reading, best = sim.step(scene), whole.step(scene)
         error = np.abs(reading.delta - best.delta).max()
         found.append((error / reading.stats.solver_error, np.abs(best.delta).max(), error))
     share, signal, error = np.array(found).T
     weak = signal < 1e-16
-    assert weak.sum() > 30
+    assert weak.sum() > 0.5 * count
     assert np.median(share) < 1.0
     assert np.quantile(share, 0.95) < 5.0
-    assert share.max() < 20.0
+    assert ((share < 20.0) | (error < 0.01 * signal)).all()
     assert np.median(error[weak] / signal[weak]) < 0.01
 
 

@@ -84,3 +84,17 @@ def test_outside_bodies_change_nothing(masked):
     """Invariant: nothing masked, nothing changed."""
     delta = masked.step(cs.Scene([cs.Body(cs.Sphere(0.05), cs.Pose((0.5, 0, 0.1)))])).delta
     np.testing.assert_allclose(delta, 0.0, atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("gap", "material", "contact"),
+    [(-0.001, "steel", True), (0.0, "steel", True), (0.001, "steel", False),
+     (-0.001, "glass", True), (0.0, "glass", False)],
+)  # fmt: skip
+def test_contact_is_told(simulators, masked, gap, material, contact):
+    """Invariant: as by the surface method: the error is as large as the largest capacitance."""
+    scene = cs.Scene([bar(gap, material=material)])
+    for sim in (masked, simulators("six_patch_bare")):
+        reading = sim.step(scene)
+        told = reading.stats.solver_error >= np.abs(reading.capacitance).max()
+        assert told == contact

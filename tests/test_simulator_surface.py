@@ -109,6 +109,19 @@ def test_random_scenes(sim, seed):
         assert_physical(sim.step(scene).capacitance, 2e-3)
 
 
+def test_thin_rods_through_the_electrodes(sim):
+    """Invariant: no positive off-diagonal, whatever lies across the electrodes; one once had."""
+    rng = np.random.default_rng(1)
+    rods = [cs.Cylinder(10**r, 0.1) for r in (-3.3, -2.8, -2.3)]
+    for k in range(24):
+        place = *rng.uniform(-0.06, 0.06, 2), rng.uniform(-0.02, 0.05)
+        rod = cs.Body(
+            rods[k % 3], cs.Pose(place, rng.normal(size=4)), cs.Material("matter", 3242.0),
+            grounding=("grounded", "floating")[k % 2],
+        )  # fmt: skip
+        assert_physical(sim.step(cs.Scene([rod])).capacitance, 0.0)
+
+
 def test_a_reading_does_not_depend_on_those_before_it(sim):
     """Invariant: to the last bit."""
     scenes = [cs.Scene([ball(z)]) for z in (0.08, 0.045, 0.08)]

@@ -22,7 +22,7 @@ class StepStats:
     """Estimated error of a capacitance that more unknowns or iterations would remove [F].
 
     As large as the largest capacitance where the reading means nothing: an electrode lies inside a
-    body, or within 0.2 mm of a conductor. The paper's scheme does not tell.
+    body, or within 0.2 mm of a conductor.
     """
     wall_time: float
     """Time the step took [s]."""

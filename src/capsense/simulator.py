@@ -161,7 +161,9 @@ class Simulator:
 
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)
-            scenes = MaskedScenes(sensor, self.excitation_frequency)
+            scenes = MaskedScenes(
+                sensor, self.excitation_frequency, electrodes=self.design.electrode_names
+            )
             return scenes, self.background.capacitance if self.mesh is None else scenes.empty
         from capsense.surface.solver import PRESETS, SurfaceSolver
 

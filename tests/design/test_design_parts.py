@@ -35,6 +35,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     half.export(out / "half.stl")
     cavity = trimesh.creation.icosphere(2, 8.0)  # its triangles face into the matter on purpose
     trimesh.util.concatenate([ball, cavity]).export(out / "shell.stl")
+    other = ball.copy().apply_translation([12.0, 1.0, 0.0])
+    trimesh.util.concatenate([ball, other]).export(out / "two.stl")
+    folded = ball.copy()  # one surface; its top is pushed out through its bottom
+    folded.vertices[folded.vertices[:, 2] > 9.0, 2] -= 25.0
+    folded.export(out / "folded.stl")
+    bars = [trimesh.creation.box(size) for size in ((20.0, 1.0, 0.9), (0.8, 20.0, 0.7))]
+    trimesh.util.concatenate(bars).export(out / "cross.stl")  # no corner of one is in the other
+    trimesh.util.concatenate([trimesh.creation.box([9.0] * 3), trimesh.creation.box(
+        [5.0] * 3).apply_translation([0.3, 0.2, 7.0])]).export(out / "tower.stl")  # fmt: skip
     return out
 
 
@@ -113,6 +122,10 @@ def test_what_may_touch(folder, layers, pad):
         ([BOX, {**BOX, "rotation": 90}], {"z": 0.03}, "overlaps"),  # a cross, no corner in either
         ([BOX, {"size": [0.01, 0.1], "z": [-0.0005, 0.0005]}], {"z": 0.03}, "overlaps"),
         ([{**BALL, "file": "half.stl"}], {}, r"it has \d+ boundary edges.*dielectric part"),
+        ([{**BALL, "file": "two.stl"}], {"z": 0.03}, r"itself, near \(.*part of its own"),
+        ([{**BALL, "file": "tower.stl", "tilt": [20, 30, 0]}], {"z": 0.03}, "or touches itself"),
+        ([{**BALL, "file": "folded.stl"}], {"z": 0.03}, "crosses or touches itself"),
+        ([{**BALL, "file": "cross.stl"}], {"z": 0.03}, "crosses or touches itself"),
         ([{**BALL, "unit": "m"}], {}, r'20 m across with unit = "m".*did you mean unit = "mm"'),
         ([{**BALL, "scale": 0.001}], {}, r'0.02 mm across with unit = "mm".*"m"'),
         ([{**DISC, "center": [0.14, 0, 0]}], {}, "leaves the domain"),

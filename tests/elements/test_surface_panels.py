@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from capsense.elements.grids import _panels, _revolve, _ring_counts
 from capsense.elements.panels import SurfacePanels, panels_of
 from capsense.elements.reference import polygon_points
 from capsense.errors import SceneError
@@ -88,6 +89,47 @@ def test_no_slivers_at_the_poles():
     low, high = np.linalg.eigvalsh(panels.moments)[:, 1:].T
     assert np.sqrt(high / low).max() < 4.0
     assert panels.areas.max() < 6 * panels.areas.min()
+
+
+@pytest.mark.parametrize(
+    ("shape", "longest"),
+    [
+        (Capsule(0.04, 0.25), 1.8),
+        (Capsule(0.008, 0.06), 1.8),
+        (Ellipsoid((0.05, 0.02, 0.2)), 3.3),
+        (Ellipsoid((0.1, 0.1, 0.005)), 6.8),
+        (Cylinder(0.04, 0.25), 6.6),
+    ],
+    ids=repr,
+)
+def test_panels_of_round_shapes_are_no_longer_than(shape, longest):
+    """Measured: length over width; the longest are at rims and round edges."""
+    low, high = np.linalg.eigvalsh(panels_of(shape, 600).moments)[:, 1:].T
+    assert np.sqrt(high / low).max() < longest
+
+
+@pytest.mark.parametrize(("size", "cells"), [((0.15, 0.15, 0.0005), 2), ((0.01, 0.01, 0.5), 3)])
+def test_cells_across_the_thinnest_side(size, cells):
+    """Two across a plate, three across a rod, whose field depends on both of its widths."""
+    panels = panels_of(Box(size), 600)
+    axis = int(np.argmin(size))
+    assert len(np.unique(np.round(panels.corners[..., axis], 9))) == cells + 1
+
+
+@pytest.mark.parametrize("widest", [3.0, 24.0, 40.0, 97.0])
+@pytest.mark.parametrize("cap", [4, 9, 20])
+@pytest.mark.parametrize("step", [0.1, 1.0])
+def test_rings_and_the_number_of_their_panels(widest, cap, step):
+    """Invariant: poles of one node, neighbours equal or twice; panels as many as predicted."""
+    angle = np.linspace(0.0, 0.5 * np.pi, cap)
+    rho = np.concatenate([np.sin(angle), np.ones(3), np.sin(angle)[::-1]])
+    nodes = _ring_counts(rho, np.full(len(rho), step), widest)
+    assert nodes[0] == nodes[-1] == 1
+    inner = nodes[1:-1]
+    assert inner.max() == max(12, 4 * round(widest / 4))
+    assert inner.min() >= 5
+    assert set(np.maximum(inner[1:], inner[:-1]) / np.minimum(inner[1:], inner[:-1])) <= {1.0, 2.0}
+    assert _panels(nodes) == len(_revolve(rho, np.arange(float(len(rho))), nodes))
 
 
 def test_centroids_and_moments_against_quadrature():

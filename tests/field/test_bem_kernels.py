@@ -12,7 +12,7 @@ from scipy.integrate import dblquad
 
 from capsense.design.geometry import Facet
 from capsense.field import bem_kernels as kernels
-from capsense.field.panels import Grading, cut_facet, make_panels
+from capsense.field.panels import Grading, Panels, concatenate, cut_facet, make_panels
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -149,3 +149,143 @@ def test_images_hold_the_floor_at_zero():
     got = kernels.potential_matrix(points, -0.02, panels.polygons).sum(axis=1)
     np.testing.assert_allclose(got[:2], 0.0, atol=1e-15)
     assert got[2] > 0.005
+
+
+FLOOR = -0.011
+MIRROR = np.array([1.0, 1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def panels() -> Panels:
+    """Some thirty panels that touch, face and cross each other's planes, one right on the floor."""
+    turned = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+    skew = np.array([[2.0, 1.0, 2.0], [-2.0, 2.0, 1.0], [-1.0, -2.0, 2.0]]) / 3
+    corner = shapely.Polygon([(0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.01, 0.02), (0.0, 0.02)])
+    facets = [
+        Facet(shapely.box(-0.01, -0.01, 0.01, 0.01), np.array([0.002, 0.001, 0.003]), np.eye(3)),
+        Facet(shapely.box(0.0, 0.0, 0.02, 0.01), np.array([0.0, 0.0, FLOOR + 1e-4]), np.eye(3)),
+        Facet(corner, np.array([0.015, -0.02, 0.004]), turned),
+        Facet(corner, np.array([0.07, 0.05, 0.02]), skew),
+    ]
+    return concatenate(
+        [make_panels(f, cut_facet(f, np.empty((0, 2, 3)), Grading(1e-3))) for f in facets]
+    )
+
+
+def mirrored(r: np.ndarray) -> np.ndarray:
+    return r * MIRROR + [0.0, 0.0, 2 * FLOOR]
+
+
+def near(p: Panels, j: int, r: np.ndarray) -> bool:
+    return bool(np.linalg.norm(r - p.centers[j]) < kernels._NEAR * p.diameters[j])
+
+
+def shape_of(p: Panels, j: int) -> tuple[np.ndarray, np.ndarray]:
+    return p.edges[p.first[j] : p.first[j + 1]], p.normals[j]
+
+
+def slow_potential(p: Panels, j: int, r: np.ndarray) -> float:
+    """Of unit charge density on a panel, and of its image."""
+
+    def alone(r: np.ndarray) -> float:
+        if near(p, j, r):
+            return kernels.polygon_potential(*shape_of(p, j), *r)
+        used = p.weights[j] > 0
+        return (p.weights[j][used] / np.linalg.norm(r - p.quad[j][used], axis=1)).sum()
+
+    return alone(r) - alone(mirrored(r))
+
+
+def slow_gradient(p: Panels, j: int, r: np.ndarray) -> np.ndarray:
+    """Of a panel alone."""
+    if near(p, j, r):
+        out = np.empty(3)
+        kernels.polygon_gradient(*shape_of(p, j), *r, out)
+        return out
+    used = p.weights[j] > 0
+    arm = r - p.quad[j][used]
+    return -(p.weights[j][used, None] * arm / np.linalg.norm(arm, axis=1)[:, None] ** 3).sum(axis=0)
+
+
+def slow_slope(p: Panels, i: int, j: int, image: bool) -> float:
+    """Mean over panel i of the normal gradient of panel j, or of its image."""
+    middle = mirrored(p.centers[i]) if image else p.centers[i]
+    close = np.linalg.norm(middle - p.centers[j]) < kernels._OUTER * (
+        p.diameters[i] + p.diameters[j]
+    )
+    points, weights = (p.quad[i], p.weights[i]) if close else (p.centers[[i]], np.ones(1))
+    slopes = [
+        -p.normals[i] @ (MIRROR * slow_gradient(p, j, mirrored(r))) if image
+        else p.normals[i] @ slow_gradient(p, j, r)
+        for r in points
+    ]  # fmt: skip
+    return float(np.average(slopes, weights=weights))
+
+
+def test_rows_of_conductors_against_slow_means(panels):
+    """Differential: averaged over close panels, and over those closer to the floor than wide."""
+    n = len(panels)
+    matrix = kernels.system_matrix(np.zeros(n, np.int64), np.zeros(n), FLOOR, panels.polygons)
+    far = 0
+    for i in range(n):
+        for j in range(n):
+            apart = panels.centers[i] - panels.centers[j]
+            reach = kernels._OUTER * (panels.diameters[i] + panels.diameters[j])
+            low = panels.diameters[i] > panels.centers[i, 2] - FLOOR
+            points, weights = panels.quad[i], panels.weights[i]
+            if np.linalg.norm(apart) >= reach and not (low and np.hypot(*apart[:2]) < reach):
+                points, weights, far = panels.centers[[i]], np.ones(1), far + 1
+            expected = np.average([slow_potential(panels, j, r) for r in points], weights=weights)
+            assert matrix[i, j] == pytest.approx(expected, rel=1e-9, abs=1e-16)
+    assert 0.1 < far / n**2 < 0.9
+
+
+def test_rows_of_interfaces_against_slow_means(panels):
+    """Differential: fields of panels and images; 2π for a panel's own."""
+    n = len(panels)
+    contrast = np.linspace(-0.9, 0.9, n)
+    matrix = kernels.system_matrix(np.ones(n, np.int64), contrast, FLOOR, panels.polygons)
+    slopes = kernels.normal_gradient_matrix(np.arange(n), FLOOR, panels.polygons)
+    for i in range(n):
+        for j in range(n):
+            expected = slow_slope(panels, i, j, True)
+            if i != j:
+                expected += slow_slope(panels, i, j, False)
+            assert slopes[i, j] == pytest.approx(expected, rel=1e-8, abs=1e-12)
+    np.testing.assert_allclose(matrix, 2 * np.pi * np.eye(n) - contrast[:, None] * slopes)
+
+
+def test_solid_angles_and_rows_of_parts(panels):
+    """Differential: the normal part of the gradient; means over the panel that has the charge."""
+    n = len(panels)
+    contrast = np.linspace(-0.9, 0.9, n)
+    matrix = kernels.system_matrix(np.full(n, 2), contrast, FLOOR, panels.polygons)
+
+    def angle(i: int, r: np.ndarray) -> float:
+        edges, normal = shape_of(panels, i)
+        out = np.empty(3)
+        kernels.polygon_gradient(edges, normal, *r, out)
+        off = abs(normal @ (r - edges[0, 0]))
+        found = kernels.solid_angle(edges, normal, *r)
+        assert found == pytest.approx(-normal @ out if off > 1e-12 else 0.0, abs=1e-9)
+        return found
+
+    for i in range(n):
+        for j in range(n):
+            used = panels.weights[j] > 0
+            total = 0.0
+            for w, r in zip(panels.weights[j][used], panels.quad[j][used], strict=True):
+                total += w * ((angle(i, r) if i != j else 0.0) - angle(i, mirrored(r)))
+            expected = 2 * np.pi * (i == j) - contrast[i] * total / panels.areas[i]
+            assert matrix[i, j] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+def test_fluxes_of_point_charges(panels):
+    """Differential: a point's field through a panel is the panel's at the point, turned round."""
+    points = np.array([[0.0, 0.0, 0.01], [0.03, 0.01, 0.002], [0.2, -0.1, 0.3]])
+    rows = np.array([0, 7, len(panels) - 1])
+    found = kernels.flux_matrix(points, rows, FLOOR, panels.polygons)
+    for k, r in enumerate(points):
+        for m, j in enumerate(rows):
+            ways = slow_gradient(panels, j, r) - slow_gradient(panels, j, mirrored(r))
+            assert found[k, m] == pytest.approx(-panels.normals[j] @ ways, rel=1e-9, abs=1e-13)

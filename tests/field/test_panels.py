@@ -49,6 +49,27 @@ def test_pieces_tile_the_facet(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
+def test_centroids_and_diameters(name):
+    """Definition: centre of the area; twice the distance from it to the farthest corner."""
+    facet = Facet(SHAPES[name], np.array([0.1, -0.2, 0.05]), TILTED)
+    pieces, panels = cut(SHAPES[name], Grading(2e-4, largest=0.006))
+    for piece, center, diameter in zip(pieces, panels.centers, panels.diameters, strict=True):
+        middle = np.array(piece.centroid.coords[0])
+        np.testing.assert_allclose(center, facet.to_sensor(middle), atol=1e-9)
+        corners = np.asarray(piece.exterior.coords)
+        assert diameter == pytest.approx(2 * np.linalg.norm(corners - middle, axis=1).max(), 1e-6)
+
+
+def test_rims_at_a_micrometre_or_less_lie_in_the_facet():
+    """Documented: without reach, those within a micrometre are graded to, others are not."""
+    facet = Facet(SHAPES["square"], np.zeros(3), np.eye(3))
+    for height, finer in ((0.9e-6, True), (1e-6, True), (1.1e-6, False)):
+        rim = np.array([[[0.01, -0.1, height], [0.01, 0.1, height]]])
+        pieces = cut_facet(facet, rim, Grading(1e-4, largest=0.004))
+        assert (min(p.area for p in pieces) < 1e-6) == finer
+
+
+@pytest.mark.parametrize("name", SHAPES)
 def test_quadrature_is_exact_for_quadratics(name):
     """Analytic: ∫ (c + b·x + x·A x) dS by the mid-edge rule on another triangulation."""
     polygon = SHAPES[name]
@@ -91,6 +112,16 @@ def test_rims_of_another_sheet_refine_from_an_eighth_of_their_height_on():
     widths = [np.ptp(np.array(p.bounds).reshape(2, 2), axis=0).min() for p in near]
     assert min(widths) == pytest.approx(2e-4, rel=1e-6)  # the first band of at least 0.125 mm
     assert sum(p.area for p in near) == pytest.approx(polygon.area, rel=1e-6)
+
+
+def test_a_rim_that_stands_upright_is_not_graded_to():
+    """Invariant: it is no line in the facet's plane."""
+    facet = Facet(SHAPES["square"], np.zeros(3), np.eye(3))
+    rim = np.array([[[0.01, 0.012, 0.0], [0.01, 0.012, 0.001]]])
+    plain, near = (
+        cut_facet(facet, r, Grading(1e-4, largest=0.004), reach=0.003) for r in (rim[:0], rim)
+    )
+    assert near == plain
 
 
 def test_concatenation_keeps_panels_apart():

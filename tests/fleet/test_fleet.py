@@ -151,6 +151,14 @@ def test_a_fleet_checks_itself(fleet):
     assert len(set(found.environments)) == 5
     assert 0 < found.rms < found.worst < 0.2
     assert found.where[0] in found.environments
+    assert not found.contact
+
+
+def test_the_check_names_where_bodies_touch_electrodes(fleet):
+    """Invariant: a limb about an electrode; both sensors of an environment stand at its origin."""
+    where = poses(np.random.default_rng(6), COUNT, 3)
+    where[7, 0, :3] = cs.load_design("six_patch").electrodes[2].surface.bounds.mean(axis=0)
+    assert fleet.check(where, samples=COUNT).contact == ((7, 0), (7, 1))
 
 
 def test_page():

@@ -29,6 +29,7 @@ from capsense.field.green_kernels import Green, pack_green, point_potentials, so
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
+from capsense.surface.solve_kernels import _add_products
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import Solution, prepared, solve, solve_lossy
 
@@ -1028,3 +1029,12 @@ def test_conductance_of_a_lossy_ball(sigma: float) -> None:
     assert abs(found.trace() / metal.delta.trace() - wanted) < 0.01 * abs(wanted)
     loss = np.linalg.eigvalsh(reading.conductance)
     assert loss.min() > -1e-3 * loss.max()  # it takes up power
+
+
+@pytest.mark.parametrize("m", [8, 16, 24])
+def test_products_of_wide_matrices(m: int) -> None:
+    """Differential: designs of more than eight terminals, eight columns at a time."""
+    left, right = np.random.default_rng(m).normal(size=(2, 5, m))
+    out = np.ones((m, m))
+    _add_products(left, right, out)
+    np.testing.assert_allclose(out, 1.0 + left.T @ right, rtol=1e-13, atol=1e-13)

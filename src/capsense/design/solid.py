@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from capsense._jit import kernel
 from capsense._thread_pool import filled
 from capsense.design.geometry import TOUCH, Facet, Surface
+from capsense.design.stl import SheetMesh
 
 Array = NDArray[np.float64]
 
@@ -198,6 +199,51 @@ def overlap(one: Surface, other: Surface) -> Array | None:
         if depth.max() > TOUCH:
             return points[np.argmax(depth)]
     return None
+
+
+def self_crossing(mesh: SheetMesh) -> Array | None:
+    """A point [m], shape (3,), near which a closed mesh crosses or touches itself, or None.
+
+    There an edge runs through a triangle, or what is outside of one triangle is inside of its
+    neighbour.
+    """
+    triangles = mesh.vertices[mesh.faces]
+    points, stops = np.moveaxis(mesh.vertices[mesh.pair_edges], 1, 0)
+    pierces = filled(
+        _fill_piercing, np.empty(len(points)), mesh.pair_edges, points, stops - points, mesh.faces,
+        triangles,
+    )  # fmt: skip
+    within = inside(triangles.mean(axis=1) + 1e-7 * mesh.normals, triangles)[mesh.pairs]
+    turns = (within[:, 0] == within[:, 1]) != mesh.opposed
+    found = np.flatnonzero((pierces > 0.0) | turns)
+    return points[found[0]] if len(found) else None
+
+
+@kernel
+def _fill_piercing(
+    start: int, stop: int, edges: Array, points: Array, rays: Array, faces: Array,
+    triangles: Array, out: Array,
+) -> None:  # fmt: skip
+    """Whether edges run through triangles that have no corner in common with them."""
+    for i in range(start, stop):
+        out[i] = 0.0
+        for t in range(len(triangles)):
+            if _apart(points[i], rays[i], triangles[t]):
+                continue
+            if edges[i, 0] not in faces[t] and edges[i, 1] not in faces[t]:
+                out[i] += 0.0 < hit(points[i], rays[i], triangles[t]) < 1.0
+
+
+@kernel
+def _apart(point: Array, ray: Array, triangle: Array) -> bool:
+    """Whether the bounding boxes of a line and a triangle are apart."""
+    for k in range(3):
+        a, b, c = triangle[0, k], triangle[1, k], triangle[2, k]
+        if max(point[k], point[k] + ray[k]) < min(a, b, c):
+            return True
+        if min(point[k], point[k] + ray[k]) > max(a, b, c):
+            return True
+    return False
 
 
 def _samples(one: Array, other: Array) -> Array:

@@ -97,13 +97,21 @@ def read_stl_solid(table: DesignTable, folder: Path) -> tuple[Facet, ...]:
     """Read a dielectric part of shape "stl": the faces of a closed surface, normals outwards.
 
     Raises:
-        DesignError: If the file, its unit or its content is wrong, or if the surface is open.
+        DesignError: If the file, its unit or its content is wrong, or if the surface is open or
+            crosses or touches itself.
     """
-    from capsense.design.solid import turned_outwards
+    from capsense.design.solid import self_crossing, turned_outwards
 
     triangles = _read_triangles(table, folder)
     mesh = _weld(table, read_placement(table).apply(triangles))
     _require_closed(table, mesh, "a dielectric part")
+    place = self_crossing(mesh)
+    if place is not None:
+        at = ", ".join(f"{x:.6g}" for x in place)
+        raise table.error(
+            f'file = "{table.data["file"]}" crosses or touches itself, near ({at}) m; unite its '
+            "solids in CAD, or give each as a part of its own"
+        )
     return turned_outwards(sheet_surface(mesh).facets)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._thread_pool import OneAtATime
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
@@ -110,6 +111,7 @@ class Fleet:
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
         self._table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
+        self._one = OneAtATime()
         self._cpu = CpuCore(self._solver, self._terminals, self._table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
@@ -152,8 +154,9 @@ class Fleet:
             SceneError: There is no such place or environment, the numbers do not match, or a body
                 is of a shape that is not rigid, or no conductor in a place that is joined.
         """
-        self._table.change(place, bodies, environments)
-        self._take_over()
+        with self._one:
+            self._table.change(place, bodies, environments)
+            self._take_over()
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """Leave places out of what a sensor sees, such as the link that carries it.
@@ -245,13 +248,14 @@ class Fleet:
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
         """
-        if self._chips is None:
-            return self.solved(poses, sensors, jacobian=jacobian)
-        if time is None:
+        if self._chips is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
-        reading = self.solved(poses, sensors, jacobian=jacobian)
-        matrix = reading.capacitance if self._warp is None else reading.delta
-        return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
+        with self._one:
+            reading = self.solved(poses, sensors, jacobian=jacobian)
+            if self._chips is None:
+                return reading
+            matrix = reading.capacitance if self._warp is None else reading.delta
+            return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
@@ -311,6 +315,7 @@ class Fleet:
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
         simulator = Simulator(self.design, excitation_frequency=self._solver.excitation_frequency)
         errors = np.empty((len(drawn), s, *self.baseline.shape))
+        contact = []
         for row, k in enumerate(drawn.tolist()):
             for j in range(s):
                 frame = Pose() if at is None else Pose(at[k, j, :3], at[k, j, 3:])
@@ -320,12 +325,15 @@ class Fleet:
                     for body, pose, out in zip(self._table.given[k], where[k], hidden, strict=True)
                     if body is not None and not out
                 )
-                truth = simulator.step(scene).delta
+                reading = simulator.step(scene)
+                truth = reading.delta
+                if reading.stats.solver_error >= np.abs(reading.capacitance).max():
+                    contact.append((k, j))
                 errors[row, j] = (found[k, j] - truth) / max(np.abs(truth).max(), 1e-18)
         row, j = np.unravel_index(np.abs(errors).max(axis=(2, 3)).argmax(), errors.shape[:2])
         return FleetCheck(
             tuple(drawn.tolist()), float(np.sqrt((errors**2).mean())), float(np.abs(errors).max()),
-            (int(drawn[row]), int(j)),
+            (int(drawn[row]), int(j)), tuple(contact),
         )  # fmt: skip
 
 

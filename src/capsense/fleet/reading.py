@@ -52,6 +52,9 @@ class FleetCheck:
     """The largest."""
     where: tuple[int, int]
     """Environment and sensor that have it."""
+    contact: tuple[tuple[int, int], ...] = ()
+    """Environments and sensors whose readings mean nothing: an electrode lies inside a body, or
+    within 0.2 mm of a conductor."""
 
 
 def on_device(values: Any) -> bool:

@@ -6,6 +6,7 @@ with distance from them. Tetrahedra whose centroid lies in a body take its mater
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,6 +28,8 @@ from capsense.mesh import TetMesh, kuhn_tets
 from capsense.mesh.lattice import MeshSettings
 from capsense.mesh.tetmesh import GROUND
 from capsense.scene import Scene
+from capsense.scene.contact import met
+from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
 
@@ -293,14 +296,23 @@ class MaskedScenes:
     Floating conductors are met by a large permittivity, as a scheme that knows only permittivity
     must; impedances to ground cannot be represented and are refused. Each scene is solved from the
     last one's potentials, or from zero.
+
+    Args:
+        sensor: The mesh and its node groups.
+        excitation_frequency: Excitation frequency [Hz].
+        electrodes: Node groups for which contact with bodies is told; by default all that are held.
+        warm_start: Whether to solve from the last potentials.
     """
 
     FLOATING_EPS_R = 1e4
 
     def __init__(
-        self, sensor: MeshSensor, excitation_frequency: float, *, warm_start: bool = True
-    ) -> None:
+        self, sensor: MeshSensor, excitation_frequency: float, *,
+        electrodes: Sequence[str] | None = None, warm_start: bool = True,
+    ) -> None:  # fmt: skip
         self._excitation_frequency = excitation_frequency
+        held = sensor.names if electrodes is None else electrodes
+        self._points = sensor.mesh.points[sensor.mesh.group_nodes(held)]
         self._mesh = sensor.mesh
         self._centroids = sensor.mesh.centroids
         self._solver = MaskedSolver(
@@ -329,7 +341,7 @@ class MaskedScenes:
         """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
         assert not jacobian
         inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)
-        eps = np.ones(len(scene))
+        eps, contact = np.ones(len(scene)), False
         for i, body in enumerate(scene):
             if not isinstance(body.grounding, str):
                 raise SceneError(
@@ -344,6 +356,8 @@ class MaskedScenes:
             local = body.pose.inverse().apply(self._centroids)
             within = body.shape.signed_distance(local) < 0
             conducts = body.material.is_conductor(self._excitation_frequency)
+            off = body.shape.signed_distance(body.pose.inverse().apply(self._points))
+            contact |= body.shape.kind != ShapeKind.LAYERS and met(off, conducts)
             if conducts:
                 eps[i] = GROUNDED if body.grounding == "grounded" else self.FLOATING_EPS_R
                 inside[within] = i
@@ -357,5 +371,6 @@ class MaskedScenes:
         matrix = self._solver.step(inside, eps.tolist())
         stats = self._solver.stats
         goal = self._solver.tolerance * float(np.abs(matrix).max())
+        error = math.inf if contact else goal
         free = self._mesh.n_points - stats.grounded_nodes
-        return Change(matrix - self.empty, goal, int(stats.iterations), free)
+        return Change(matrix - self.empty, error, int(stats.iterations), free)

@@ -53,7 +53,15 @@ class Sheets:
         close = off[self._nearest] <= self._reach  # others are no nearer than the few around them
         if close.any():
             off = np.concatenate([off, _quick(body, self._many[close])])
-        return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
+        return met(off, conducting)
+
+
+def met(off: Array, conducting: bool) -> bool:
+    """Whether points at such distances from a body [m] mean that it holds an electrode.
+
+    One lies inside it, or touches it where it conducts.
+    """
+    return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
 
 
 def _quick(body: Body, points: Array) -> Array:
