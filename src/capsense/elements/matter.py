@@ -128,7 +128,7 @@ class Matter:
         at = np.array(places, dtype=np.int64)
         first: dict[int, int] = {}
         group = [first.setdefault(g, k) for k, g in enumerate(self.group[at].tolist())]
-        return Matter(self.eps[at], self.ground[at], np.array(group))
+        return Matter(self.eps[at], self.ground[at], np.array(group, dtype=np.int64))
 
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
         """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
