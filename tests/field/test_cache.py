@@ -25,8 +25,13 @@ from capsense.design.loader import parse_design
 from capsense.field import background, cache, lock
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import BoundarySolution
-from capsense.field.cache import cache_key, default_cache_dir, default_settings, load_or_build
-from capsense.field.lock import exclusive
+from capsense.field.cache import (
+    cache_key,
+    default_cache_dir,
+    default_settings,
+    exclusive,
+    load_or_build,
+)
 from capsense.field.store import read_arrays, write_arrays
 from capsense.mesh.lattice import MeshSettings
 
