@@ -22,11 +22,16 @@ import tiny_field
 from tiny_field import SETTINGS, digest, tiny_data, tiny_design
 
 from capsense.design.loader import parse_design
-from capsense.field import background, cache, lock
+from capsense.field import background, cache
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import BoundarySolution
-from capsense.field.cache import cache_key, default_cache_dir, default_settings, load_or_build
-from capsense.field.lock import exclusive
+from capsense.field.cache import (
+    cache_key,
+    default_cache_dir,
+    default_settings,
+    exclusive,
+    load_or_build,
+)
 from capsense.field.store import read_arrays, write_arrays
 from capsense.mesh.lattice import MeshSettings
 
@@ -372,7 +377,7 @@ def test_the_lock_excludes_also_where_its_file_is_removed_meanwhile(tmp_path: Pa
                 inside -= 1
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lock, "_POLL", 0.0005)
+        patch.setattr(cache, "_POLL", 0.0005)
         threads = [threading.Thread(target=work) for _ in range(6)]
         for thread in threads:
             thread.start()
@@ -388,7 +393,7 @@ def test_without_locks_a_field_is_built_all_the_same(
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.ENOLCK, "no locks available")
 
-    monkeypatch.setattr(lock.FileLock, "acquire", refuse)
+    monkeypatch.setattr(cache.FileLock, "acquire", refuse)
     assert digest(load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path)) == reference
     assert (tmp_path / f"{KEY}.npz").exists()
 

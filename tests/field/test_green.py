@@ -24,8 +24,13 @@ from capsense.field.green import (
     from_arrays,
     to_arrays,
 )
-from capsense.field.green_points import GreenSettings, Surroundings, spread, training_points
-from capsense.field.openness import openness
+from capsense.field.green_points import (
+    GreenSettings,
+    Surroundings,
+    openness,
+    spread,
+    training_points,
+)
 from capsense.field.store import load_background, save_background
 
 Array = np.ndarray

@@ -9,14 +9,15 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import platformdirs
+from filelock import FileLock, Timeout
 
 from capsense.design.model import Design
 from capsense.errors import FieldError
@@ -27,7 +28,6 @@ from capsense.field.background import (
     build_background,
 )
 from capsense.field.boundary import terminals
-from capsense.field.lock import exclusive
 from capsense.field.store import (
     FORMAT,
     load_background,
@@ -170,3 +170,40 @@ def _sweep(folder: Path, key: str) -> None:
     with suppress(OSError):
         for part in folder.glob(f"{key}*.part"):
             part.unlink(missing_ok=True)
+
+
+_POLL = 0.1
+"""Time between two attempts to take a lock [s]."""
+
+
+@contextmanager
+def exclusive(path: Path, waiting: Callable[[], None] = lambda: None) -> Iterator[bool]:
+    """Hold the lock ``path``; ``waiting`` is called now and then while somebody else holds it.
+
+    Yields whether it is held: where files cannot be locked or written, work goes on without. The
+    file is removed in the end.
+    """
+    lock = FileLock(path)
+    held = _acquire(lock, path, waiting)
+    try:
+        yield held
+    finally:
+        if held:
+            with suppress(OSError):
+                path.unlink()  # before others can have it; those who wait see that it is gone
+            with suppress(OSError):
+                lock.release()
+
+
+def _acquire(lock: FileLock, path: Path, waiting: Callable[[], None]) -> bool:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                lock.acquire(timeout=_POLL, poll_interval=_POLL)
+                return True
+            except Timeout:
+                waiting()
+    except OSError as error:
+        _log.info("builds of the same field are not kept apart: %s", error)
+        return False
