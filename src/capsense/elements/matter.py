@@ -56,6 +56,11 @@ class Matter:
         return np.isinf(self.eps.real)
 
     @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Which bodies are conductors that are not at ground, shape (n,)."""
+        return self.conducting & np.isfinite(self.ground)
+
+    @cached_property
     def lossy(self) -> bool:
         """Whether a body is neither a conductor nor free of losses."""
         return bool(((self.eps.imag != 0) & ~self.conducting).any())
@@ -101,11 +106,10 @@ class Matter:
 
         Meshes and depth images are not looked at, nor are bodies that are all at ground.
         """
-        free = self.conducting & np.isfinite(self.ground)
-        if not free.any():
+        if not self.free.any():
             return self
         group = np.arange(len(chosen))
-        for a in np.flatnonzero(free).tolist():
+        for a in np.flatnonzero(self.free).tolist():
             near = (
                 (packed.bounds[chosen, 0] <= packed.bounds[chosen[a], 1] + _TOUCH)
                 & (packed.bounds[chosen, 1] >= packed.bounds[chosen[a], 0] - _TOUCH)

@@ -252,7 +252,7 @@ class SurfaceSolver:
 
     def pack(self, view: View) -> PackedBodies:
         """Lay out the bodies that reach into the domain."""
-        matter, packed = view.matter.joined(view.scene, view.packed, view.met), view.packed
+        matter, packed = self._joined(view), view.packed
         found: list[tuple[RigidShape | ChangingBody, float]] = []
         places: list[int] = []
         offsets: list[Array] = []
@@ -271,6 +271,19 @@ class SurfaceSolver:
         matter = matter.repeated(places)
         matter.write(records, shapes)
         return PackedBodies(records, chosen, matter, shapes, shift)
+
+    def _joined(self, view: View) -> Matter:
+        """What bodies are made of, with conductors that touch as one.
+
+        Those that are not at ground count outside of the domain too: a person's other limbs.
+        """
+        if not view.matter.free.any():
+            return view.matter
+        whole = matter_of(list(view.scene), self.excitation_frequency)
+        used = np.union1d(view.met, np.flatnonzero(whole.free))
+        places = np.searchsorted(used, view.met)
+        joined = whole.repeated(used.tolist()).joined(view.scene, view.packed, used)
+        return joined.repeated(places.tolist())
 
     def _parts(self, view: View, place: int) -> tuple[list[tuple[Shape, Array]], float]:
         """Parts of a body to be solved for, where they are in its frame [m], and panels for each.
