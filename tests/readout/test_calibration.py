@@ -257,6 +257,16 @@ def test_cross_correlation():
     assert cross_correlation(a, -a) == near(-1.0, rel=1e-12)
 
 
+@pytest.mark.parametrize("drift", [False, True])
+def test_one_sample_more_than_unknowns_is_enough(drift):
+    """Limits: a sample fewer is refused (see below)."""
+    count = 4 if drift else 3
+    true, time = np.array([[1.0], [3.0], [2.0], [5.0]])[:count], np.arange(count)
+    fit = calibrate(true, 2.0 * true + 0.5, time, drift=drift)
+    assert fit.gain == near(2.0, rel=1e-9)
+    assert fit.samples == count
+
+
 ONES = np.ones((10, 1))
 RISING = np.linspace(1, 2, 10)[:, None]
 
