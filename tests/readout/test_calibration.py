@@ -131,6 +131,9 @@ def test_a_sensor_that_is_not_linear_is_doubted():
     noise = 1e-15 * np.random.default_rng(1).standard_normal(true.shape)
     with pytest.warns(CalibrationWarning, match="channel 0"):
         assert calibrate(true, true + 5e10 * true**2 + noise, time).doubtful.all()
+    mild = calibrate(true, true + 2e10 * true**2 + noise, time)  # in doubt from an excess of 2.8
+    assert mild.excess.min() > 1.6
+    assert not mild.doubtful.any()
     for size in (0.0, 1.0, 1000.0):
         fit = calibrate(true, 1.02 * true + size * noise, time)
         assert not fit.doubtful.any()

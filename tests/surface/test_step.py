@@ -29,7 +29,7 @@ from capsense.field.green_kernels import Green, pack_green, point_potentials, so
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
-from capsense.surface.solve_kernels import _add_products
+from capsense.surface.solve_kernels import _add_products, _factorise
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import Solution, prepared, solve, solve_lossy
 
@@ -1038,3 +1038,23 @@ def test_products_of_wide_matrices(m: int) -> None:
     out = np.ones((m, m))
     _add_products(left, right, out)
     np.testing.assert_allclose(out, 1.0 + left.T @ right, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(("between", "raised"), [(0.9, 0.0), (1.0005, 0.001), (1.06, 0.064)])
+def test_energies_that_are_not_definite_are_raised(between: float, raised: float) -> None:
+    """Analytic: the diagonal is raised by 0.001, 0.002, 0.004, … of itself, till it is definite."""
+    root, own = np.array([0.8, 0.5]), np.array([-2.0, 2.0])
+    matrix = np.array([[2.0, 5.0 * between], [5.0 * between, 2.0]])
+    factor, right = np.empty((2, 2)), np.random.default_rng(2).normal(size=(2, 8))
+    assert _factorise(matrix, root, own, factor) == pytest.approx(raised)
+    x = right.copy()
+    substitute(factor, x)
+    wanted = np.array([[2.0 + 2.0 * raised, 2.0 * between], [2.0 * between, 2.0 + 2.0 * raised]])
+    np.testing.assert_allclose(wanted @ x, right, rtol=0, atol=1e-11)
+
+
+def test_energies_that_cannot_be_raised_are_refused() -> None:
+    """Limits: nothing to raise by; and no function at all, which is no failure."""
+    matrix, factor = np.array([[1.0, 2.0], [2.0, 1.0]]), np.empty((2, 2))
+    assert _factorise(matrix, np.ones(2), np.zeros(2), factor) == -1.0
+    assert _factorise(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty((0, 0))) == 0.0
