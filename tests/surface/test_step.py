@@ -673,6 +673,19 @@ def test_pairs_of_one_surface_near_each_other(center, turned, sides, limit: floa
     assert found[0, 1] == found[1, 0]
 
 
+@pytest.mark.parametrize("distance", [0.0118, 0.0122])  # on both sides of 0.6 (10 mm + 10 mm)
+def test_pairs_of_one_surface_are_the_same_in_any_frame(distance: float) -> None:
+    """Invariant: axes change places, and so do rectangles."""
+    found = []
+    for turns in range(3):
+        frame = Rotation.from_rotvec(np.full(3, turns * 2 * math.pi / 3 / math.sqrt(3)))
+        for sign in (-1, 1):
+            center = frame.apply([sign * 0.8 * distance, 0.6 * distance, 0.0])
+            one = (np.zeros(3), frame, (0.01, 0.01))
+            found.append(pairs([one, (center, frame, (0.01, 0.01))], [0, 0], True)[0, 1])
+    np.testing.assert_allclose(found, found[0], rtol=1e-5)
+
+
 def test_rigid_bodies_have_no_pairs_of_their_own() -> None:
     """Invariant: clusters of one rigid body meet through the shape's energies alone."""
     one = (np.zeros(3), Rotation.identity(), (0.01, 0.01))
@@ -1058,3 +1071,17 @@ def test_energies_that_cannot_be_raised_are_refused() -> None:
     matrix, factor = np.array([[1.0, 2.0], [2.0, 1.0]]), np.empty((2, 2))
     assert _factorise(matrix, np.ones(2), np.zeros(2), factor) == -1.0
     assert _factorise(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty((0, 0))) == 0.0
+
+
+def test_energy_of_charge_along_a_sheet() -> None:
+    """Analytic: 6 / ((eps - 1) t) besides, of each function by itself; none of the net charge."""
+    plain = Scene([body(BOX, (0.01, 0.0, 0.05), TILTED, eps_r=5.0, tie=20.0)]).packed()
+    thin = plain.copy()
+    thin["sheet"] = 2e-3
+    before, after = (prepared(b, packed_green(), 0.05, WIDTH)[2:] for b in (plain, thin))
+    functions, solved = before[0], before[0].solved
+    assert 1 < solved < len(functions.cluster)
+    wanted = np.where(functions.cluster < 0, 0.0, 6.0 / (4.0 * 2e-3))
+    np.testing.assert_allclose(after[1].own - before[1].own, wanted, atol=1e-9)
+    more = after[1].matrix - before[1].matrix
+    np.testing.assert_allclose(more, np.diag(wanted[:solved]), atol=1e-9)
