@@ -748,7 +748,16 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "two joined, floating"])
 def test_scores(name: str) -> None:
     """Differential: what each function alone takes up, raised by the scores below it."""
-    scene = scenes()[name]
+    check_scores(scenes()[name])
+
+
+def test_scores_of_a_body_on_a_capacitance_across_a_wall() -> None:
+    """Differential: its net charge costs the energy of the capacitance too."""
+    wall = float(packed_green().room[1, 0])
+    check_scores(Scene([body(BOX, (wall - 0.01, 0.0, 0.05), tie=20.0)]))
+
+
+def check_scores(scene: Scene) -> None:
     _, found, first = cut_of(scene, 0.1)
     wanted = twin.scores(scene.pieces, scene.trees, exact(), packed_green().room)
     for b, each in enumerate(wanted):
