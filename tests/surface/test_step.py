@@ -29,7 +29,7 @@ from capsense.field.green_kernels import Green, pack_green, point_potentials, so
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
-from capsense.surface.solve_kernels import _add_products, _factorise
+from capsense.surface.solve_kernels import _add_products, _factorise, _products
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import Solution, prepared, solve, solve_lossy
 
@@ -1094,3 +1094,12 @@ def test_energy_of_charge_along_a_sheet() -> None:
     np.testing.assert_allclose(after[1].own - before[1].own, wanted, atol=1e-9)
     more = after[1].matrix - before[1].matrix
     np.testing.assert_allclose(more, np.diag(wanted[:solved]), atol=1e-9)
+
+
+def test_products_of_modes_of_either_sign() -> None:
+    """Differential: the last modes count where they are all negative, too."""
+    psi = -np.random.default_rng(4).uniform(0.5, 1.0, (11, 40)).astype(np.float32)
+    psi[:, 33:] = 0.0
+    found, wanted = _products(psi, 6), psi @ psi[:6].T
+    for f in range(11):
+        np.testing.assert_allclose(found[f, : min(f + 1, 6)], wanted[f, : f + 1], rtol=1e-5)
