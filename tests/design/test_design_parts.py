@@ -13,7 +13,8 @@ import capsense as cs
 from capsense import codec
 from capsense.cli.design import describe
 from capsense.design.loader import parse_design
-from capsense.design.solid import _cut, crossing, depths, inside, overlap, thickness
+from capsense.design.solid import _cut, crossing, depths, inside, overlap, self_crossing, thickness
+from capsense.design.stl import weld
 from capsense.errors import MeshError
 from capsense.mesh.gmsh_mesher import mesh_design
 from capsense.plotting.designs import draw_design
@@ -125,7 +126,7 @@ def test_what_may_touch(folder, layers, pad):
         ([{**BALL, "file": "two.stl"}], {"z": 0.03}, r"itself, near \(.*part of its own"),
         ([{**BALL, "file": "tower.stl", "tilt": [20, 30, 0]}], {"z": 0.03}, "or touches itself"),
         ([{**BALL, "file": "folded.stl"}], {"z": 0.03}, "crosses or touches itself"),
-        ([{**BALL, "file": "cross.stl"}], {"z": 0.03}, "crosses or touches itself"),
+        ([{**BALL, "file": "cross.stl"}], {"z": 0.03}, "crosses or touches itself"),  # parity holds
         ([{**BALL, "unit": "m"}], {}, r'20 m across with unit = "m".*did you mean unit = "mm"'),
         ([{**BALL, "scale": 0.001}], {}, r'0.02 mm across with unit = "mm".*"m"'),
         ([{**DISC, "center": [0.14, 0, 0]}], {}, "leaves the domain"),
@@ -137,6 +138,15 @@ def test_what_may_touch(folder, layers, pad):
 def test_what_is_refused(folder, layers, pad, words):
     with pytest.raises(cs.DesignError, match=words):
         design(folder, *layers, pad=pad)
+
+
+def test_solids_that_touch_by_a_face():
+    """No edge runs through a triangle, as the numbers are exact: the insides alone tell."""
+    low, high = trimesh.creation.box([8.0] * 3), trimesh.creation.box([2.0] * 3)
+    for height, refused in ((5.0, True), (6.0, False)):
+        tower = trimesh.util.concatenate([low, high.copy().apply_translation([2.5, 0.25, height])])
+        place = self_crossing(weld(np.array(tower.triangles) / 1024.0))
+        assert (place is not None) == refused
 
 
 def test_a_sheet_that_touches_an_edge_is_on_one_side():

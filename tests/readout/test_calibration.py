@@ -131,6 +131,9 @@ def test_a_sensor_that_is_not_linear_is_doubted():
     noise = 1e-15 * np.random.default_rng(1).standard_normal(true.shape)
     with pytest.warns(CalibrationWarning, match="channel 0"):
         assert calibrate(true, true + 5e10 * true**2 + noise, time).doubtful.all()
+    mild = calibrate(true, true + 2e10 * true**2 + noise, time)  # in doubt from an excess of 2.8
+    assert mild.excess.min() > 1.6
+    assert not mild.doubtful.any()
     for size in (0.0, 1.0, 1000.0):
         fit = calibrate(true, 1.02 * true + size * noise, time)
         assert not fit.doubtful.any()
@@ -255,6 +258,16 @@ def test_cross_correlation():
     assert cross_correlation(a, b) == near(np.corrcoef(a, b)[0, 1], rel=1e-9)
     assert cross_correlation(a, 3e-15 * a + 1e-12) == near(1.0, rel=1e-6)
     assert cross_correlation(a, -a) == near(-1.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("drift", [False, True])
+def test_one_sample_more_than_unknowns_is_enough(drift):
+    """Limits: a sample fewer is refused (see below)."""
+    count = 4 if drift else 3
+    true, time = np.array([[1.0], [3.0], [2.0], [5.0]])[:count], np.arange(count)
+    fit = calibrate(true, 2.0 * true + 0.5, time, drift=drift)
+    assert fit.gain == near(2.0, rel=1e-9)
+    assert fit.samples == count
 
 
 ONES = np.ones((10, 1))

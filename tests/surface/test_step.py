@@ -29,7 +29,7 @@ from capsense.field.green_kernels import Green, pack_green, point_potentials, so
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
-from capsense.surface.solve_kernels import _add_products
+from capsense.surface.solve_kernels import _add_products, _factorise, _products
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import Solution, prepared, solve, solve_lossy
 
@@ -673,6 +673,19 @@ def test_pairs_of_one_surface_near_each_other(center, turned, sides, limit: floa
     assert found[0, 1] == found[1, 0]
 
 
+@pytest.mark.parametrize("distance", [0.0118, 0.0122])  # on both sides of 0.6 (10 mm + 10 mm)
+def test_pairs_of_one_surface_are_the_same_in_any_frame(distance: float) -> None:
+    """Invariant: axes change places, and so do rectangles."""
+    found = []
+    for turns in range(3):
+        frame = Rotation.from_rotvec(np.full(3, turns * 2 * math.pi / 3 / math.sqrt(3)))
+        for sign in (-1, 1):
+            center = frame.apply([sign * 0.8 * distance, 0.6 * distance, 0.0])
+            one = (np.zeros(3), frame, (0.01, 0.01))
+            found.append(pairs([one, (center, frame, (0.01, 0.01))], [0, 0], True)[0, 1])
+    np.testing.assert_allclose(found, found[0], rtol=1e-5)
+
+
 def test_rigid_bodies_have_no_pairs_of_their_own() -> None:
     """Invariant: clusters of one rigid body meet through the shape's energies alone."""
     one = (np.zeros(3), Rotation.identity(), (0.01, 0.01))
@@ -735,7 +748,16 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "two joined, floating"])
 def test_scores(name: str) -> None:
     """Differential: what each function alone takes up, raised by the scores below it."""
-    scene = scenes()[name]
+    check_scores(scenes()[name])
+
+
+def test_scores_of_a_body_on_a_capacitance_across_a_wall() -> None:
+    """Differential: its net charge costs the energy of the capacitance too."""
+    wall = float(packed_green().room[1, 0])
+    check_scores(Scene([body(BOX, (wall - 0.01, 0.0, 0.05), tie=20.0)]))
+
+
+def check_scores(scene: Scene) -> None:
     _, found, first = cut_of(scene, 0.1)
     wanted = twin.scores(scene.pieces, scene.trees, exact(), packed_green().room)
     for b, each in enumerate(wanted):
@@ -1038,3 +1060,46 @@ def test_products_of_wide_matrices(m: int) -> None:
     out = np.ones((m, m))
     _add_products(left, right, out)
     np.testing.assert_allclose(out, 1.0 + left.T @ right, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(("between", "raised"), [(0.9, 0.0), (1.0005, 0.001), (1.06, 0.064)])
+def test_energies_that_are_not_definite_are_raised(between: float, raised: float) -> None:
+    """Analytic: the diagonal is raised by 0.001, 0.002, 0.004, … of itself, till it is definite."""
+    root, own = np.array([0.8, 0.5]), np.array([-2.0, 2.0])
+    matrix = np.array([[2.0, 5.0 * between], [5.0 * between, 2.0]])
+    factor, right = np.empty((2, 2)), np.random.default_rng(2).normal(size=(2, 8))
+    assert _factorise(matrix, root, own, factor) == pytest.approx(raised)
+    x = right.copy()
+    substitute(factor, x)
+    wanted = np.array([[2.0 + 2.0 * raised, 2.0 * between], [2.0 * between, 2.0 + 2.0 * raised]])
+    np.testing.assert_allclose(wanted @ x, right, rtol=0, atol=1e-11)
+
+
+def test_energies_that_cannot_be_raised_are_refused() -> None:
+    """Limits: nothing to raise by; and no function at all, which is no failure."""
+    matrix, factor = np.array([[1.0, 2.0], [2.0, 1.0]]), np.empty((2, 2))
+    assert _factorise(matrix, np.ones(2), np.zeros(2), factor) == -1.0
+    assert _factorise(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty((0, 0))) == 0.0
+
+
+def test_energy_of_charge_along_a_sheet() -> None:
+    """Analytic: 6 / ((eps - 1) t) besides, of each function by itself; none of the net charge."""
+    plain = Scene([body(BOX, (0.01, 0.0, 0.05), TILTED, eps_r=5.0, tie=20.0)]).packed()
+    thin = plain.copy()
+    thin["sheet"] = 2e-3
+    before, after = (prepared(b, packed_green(), 0.05, WIDTH)[2:] for b in (plain, thin))
+    functions, solved = before[0], before[0].solved
+    assert 1 < solved < len(functions.cluster)
+    wanted = np.where(functions.cluster < 0, 0.0, 6.0 / (4.0 * 2e-3))
+    np.testing.assert_allclose(after[1].own - before[1].own, wanted, atol=1e-9)
+    more = after[1].matrix - before[1].matrix
+    np.testing.assert_allclose(more, np.diag(wanted[:solved]), atol=1e-9)
+
+
+def test_products_of_modes_of_either_sign() -> None:
+    """Differential: the last modes count where they are all negative, too."""
+    psi = -np.random.default_rng(4).uniform(0.5, 1.0, (11, 40)).astype(np.float32)
+    psi[:, 33:] = 0.0
+    found, wanted = _products(psi, 6), psi @ psi[:6].T
+    for f in range(11):
+        np.testing.assert_allclose(found[f, : min(f + 1, 6)], wanted[f, : f + 1], rtol=1e-5)

@@ -319,8 +319,6 @@ def reduced(cut, functions, system, adjoint):
     for f in range(total):
         for i in range(m):
             charge[f, i] = lack[f] * phi[f, i]
-            if lack[f] == 0.0:
-                phi[f, i] = 0.0
     _add_products(phi, charge, left)
     coarse = np.zeros(m)
     for f in range(solved):
