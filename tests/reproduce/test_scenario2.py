@@ -65,6 +65,7 @@ def test_course_lies_along_x(which: limb_worlds.Which, upper: str, lower: str) -
     assert near[1:] == pytest.approx([0, 0], abs=1e-12)
 
 
+@pytest.mark.filterwarnings("error:sensor:UserWarning")
 @pytest.mark.parametrize("simulator", ["mujoco", "pybullet"])
 def test_worlds_show_the_limb(simulator: str, simulators: object) -> None:
     """What a world's sensor reads is what the limb's own bodies give at that pose.

@@ -186,7 +186,7 @@ class MujocoWorld:
             '<sensor><rangefinder camera="pad" data="depth"/></sensor></mujoco>'
         )
         self._data = mujoco.MjData(self._model)
-        mujoco.mj_forward(self._model, self._data)
+        self.move(sensor_pose(0.0, 0.0, place.thickest + GAP[0], 0.0, 0.0))
         self.sensor = cs.mujoco.attach(
             self._model, self._data, "pad", sim, perception=view, default_material="human",
             default_grounding=grounding,
@@ -223,6 +223,7 @@ class PybulletWorld:
         image: dict[str, Any] = (
             {"size": WIDTH, "resolution": PIXELS} if view == "depth_camera" else {}
         )
+        self.move(sensor_pose(0.0, 0.0, place.thickest + GAP[0], 0.0, 0.0))
         self.sensor = cs.pybullet.attach(
             client, self._body, design=sim, perception=view, default_material="human",
             default_grounding=grounding, **image,
