@@ -129,26 +129,33 @@ def seen(bodies, poses, e, s, room, records, place):
                 place[count] = b
                 count += 1
     for c in range(count):
-        _connect(bodies.group, records[:count], place, c)
+        _connect(bodies, e, records[:count], place, c)
     return count
 
 
 @compiled
-def _connect(groups, records, place, c):
-    """Make a body one conductor with those that it is joined with, as ``Matter.write`` does."""
-    leader, members, grounded, ground = c, 0, False, 0.0
+def _connect(bodies, e, records, place, c):
+    """Make a body one conductor with those that it is joined with, as ``Matter.write`` does.
+
+    Those that are out of sight count for what ties it to ground.
+    """
+    groups, neutral = bodies.group, bodies.neutral[e]
+    mine, leader, others = groups[place[c]], c, False
     for d in range(records.shape[0]):
-        if groups[place[d]] == groups[place[c]]:
-            leader, members = min(leader, d), members + 1
-            if d < c:  # which has the tie of all by now
-                records[c].group = leader
-                records[c].tie, records[c].neutral = records[d].tie, 0
-                return
-            if not records[d].neutral:
-                grounded = grounded or records[d].tie == 0.0
-                ground += 1.0 / records[d].tie if records[d].tie > 0.0 else 0.0
+        if groups[place[d]] == mine and d != c:
+            leader, others = min(leader, d), True
     records[c].group = leader
-    if members > 1:
+    if leader < c:  # which has the tie of all by now
+        records[c].tie, records[c].neutral = records[leader].tie, 0
+        return
+    grounded, ground = False, 0.0
+    for b in range(groups.shape[0]):
+        if groups[b] == mine and bodies.choice[e, b] >= 0 and not neutral[b]:
+            tie = bodies.tie[e, b].real
+            grounded = grounded or tie == 0.0
+            ground += 1.0 / tie if tie > 0.0 else 0.0
+            others = others or b != place[c]
+    if others:
         records[c].neutral = 0
         records[c].tie = 0.0 if grounded else 1.0 / ground if ground > 0.0 else SHUT
 

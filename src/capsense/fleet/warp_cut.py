@@ -187,8 +187,9 @@ def choose(
 def connect(places: Places, sensors: int, clusters: int, cut: WarpCut):
     """What ties the bodies of a view to ground; places that are joined are one conductor.
 
-    The leader of a group has the function of its net charge. That of each other member is its own
-    equilibrium charge less the leader's, which is neutral.
+    Those that are out of sight count for the tie. The leader of those in sight has the function of
+    the net charge. That of each other member is its own equilibrium charge less the leader's,
+    which is neutral.
     """
     v = wp.tid()
     e = v // sensors
@@ -199,19 +200,21 @@ def connect(places: Places, sensors: int, clusters: int, cut: WarpCut):
         tie = places.tie[e, b]
         neutral = places.neutral[e, b]
         if cut.node[o, v] >= 0:
-            members = int(0)
+            others = int(0)
             grounded = int(0)
             ground = float(0.0)
             for c in range(places.group.shape[0]):
-                if places.group[c] == places.group[b] and cut.node[c * clusters, v] >= 0:
-                    leader = wp.min(leader, c)
-                    members += 1
-                    if places.neutral[e, c] == 0:
+                if places.group[c] == places.group[b] and places.choice[e, c] >= 0:
+                    if cut.node[c * clusters, v] >= 0:
+                        leader = wp.min(leader, c)
+                        others = wp.where(c == b, others, 1)
+                    if places.neutral[e, c] == 0:  # those out of sight count too
+                        others = wp.where(c == b, others, 1)
                         if places.tie[e, c][0] == 0.0:
                             grounded = 1
                         else:
                             ground += 1.0 / places.tie[e, c][0]
-            if members > 1:
+            if others == 1:
                 neutral = wp.where(grounded == 0 and ground == 0.0, 1, 0)
                 tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
             cut.number[o, v] = wp.where(leader == b and neutral != 0, -1, 0)
