@@ -176,7 +176,7 @@ class Fleet:
 
         A fleet does not look for contact. Conductors that are joined share their net charge, and
         are tied to ground by the sum of their capacitances; with one that is grounded all are.
-        Members that a sensor does not see, or that are out of its sight, do not count.
+        Members out of a sensor's sight, hidden ones too, count for what ties the others to ground.
 
         Args:
             places: Numbers of the places; what they are joined with already joins in.
