@@ -246,7 +246,7 @@ def tables(rows: list[dict[str, Any]]) -> str:
         done = f"{sum(r['success'] for r in mine)} of {len(mine)} ({low:.0%} to {high:.0%})"
         touched = sum(r["force"] > 0 for r in mine)
         force, way = mean(r["force"] for r in mine), mean(100 * r["way"] for r in mine)
-        lines.append(f"| {name} | {done} | {touched} | {force[0]:.1f} | {_told(*way)} |")
+        lines.append(f"| {name} | {done} | {touched} | {_told(*force)} | {_told(*way)} |")
     parts.append("\n".join(lines))
     for key, values in (("gap", GAPS), ("limb", ("arm", "leg")), ("group", tuple(GROUPS))):
         heads = [f"{100 * v:.0f} cm" if key == "gap" else v for v in values]  # type: ignore[operator]

@@ -328,6 +328,27 @@ def test_wrapper_adds_and_changes_nothing(tmp_path: Path) -> None:
     np.testing.assert_array_equal(env.reset(seed=4)[0][KEY], felt[0])
 
 
+@pytest.mark.parametrize(
+    ("name", "body"),
+    [("Ant-v5", "torso"), ("Humanoid-v5", "torso"), ("Pusher-v5", "r_wrist_roll_link")],
+)
+def test_wrapper_on_other_models(tmp_path: Path, name: str, body: str) -> None:
+    """They pass Gymnasium's checks, and move as before but for the six digits of MuJoCo's XML."""
+    model = tmp_path / "model.xml"
+    site = write_model(name, body, cs.Pose((0.0, 0.0, 0.1)), model)
+    env = CapacitiveObservation(gymnasium.make(name, xml_file=str(model)), [site])
+    check_env(env, skip_render_check=True)
+    plain = gymnasium.make(name)
+    plain.reset(seed=1)
+    env.reset(seed=1)
+    action = np.random.default_rng(1).uniform(-0.4, 0.4, plain.action_space.shape)
+    before, expected, *_ = plain.step(action)
+    after, reward, *_ = env.step(action)
+    np.testing.assert_allclose(after["observation"], before, rtol=1e-4, atol=1e-4)
+    assert reward == pytest.approx(expected, abs=1e-4)
+    assert after[KEY].shape == (12,)
+
+
 def test_wrapper_refuses_what_has_no_model() -> None:
     with pytest.raises(cs.SceneError, match="no MuJoCo model"):
         CapacitiveObservation(gymnasium.make("CartPole-v1"), ["pad"])

@@ -109,7 +109,7 @@ def write_model(env_id: str, body: str, pose: Pose, path: str | Path, name: str 
     """Write the model of one of Gymnasium's environments, with the site of a sensor on a body.
 
     ``gymnasium.make(env_id, xml_file=str(path))`` then makes the environment; Gymnasium wants the
-    path to begin with ``/``, ``./`` or ``~``.
+    path to begin with ``/``, ``./`` or ``~``. MuJoCo writes numbers with six digits.
 
     Args:
         env_id: Its name, such as ``"Reacher-v5"``.
