@@ -222,6 +222,9 @@ def test_wrong_calls_are_refused(tiny_simulator: cs.Simulator) -> None:
     """A missing site, a state of no pose, foreign data, foreign objects."""
     with pytest.raises(cs.SceneError, match="no site named 'pat'; did you mean 'pad'"):
         sensor_in("", tiny_simulator, site="pat")
+    bare = mujoco.MjModel.from_xml_string("<mujoco/>")
+    with pytest.raises(cs.SceneError, match=r"none at all; cs\.mujoco\.add_sensor\(spec, body"):
+        cs.mujoco.attach(bare, mujoco.MjData(bare), "pad", tiny_simulator)
     with pytest.raises(cs.SceneError, match=r"hold no poses yet; call mujoco\.mj_forward"):
         sensor_in("", tiny_simulator, forward=False).read()
     sensor = sensor_in("", tiny_simulator)

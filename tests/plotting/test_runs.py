@@ -44,6 +44,9 @@ def test_readings(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
     assert list(drawn) == ["E6", "E5", "E4", "E3", "E2", "E1"]
     wanted = [r.self_capacitance[2] / sim.empty.self_capacitance[2] for r in readings]
     np.testing.assert_allclose(drawn["E3"], wanted, rtol=1e-12)
+    assert figure.axes[1].get_xlabel() == "number of the reading"
+    timed = cs.plot(readings, sim, times=HEIGHTS, excitation="self")
+    assert timed.axes[1].get_xlabel() == "time [s]"
     texts = [t.get_text() for axes in figure.axes for t in axes.texts]
     assert texts.count("ball") == texts.count("box") == 2
 
@@ -59,6 +62,21 @@ def test_a_recording(sim: cs.Simulator, scenes: list[cs.Scene], tmp_path: Path) 
         np.testing.assert_array_equal(recorded[label], values)
 
 
+def test_readings_of_a_sensor_on_a_robot(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
+    """The sensor stands for its simulator."""
+
+    class Ridden(cs.AttachedSensor):
+        pose = cs.Pose()
+
+        def scene(self) -> cs.Scene:
+            return scenes[-1]
+
+    sensor = Ridden(sim)
+    readings = [sensor.read()]
+    ridden = lines_of(cs.plot(readings, sensor), "mutual capacitance")
+    np.testing.assert_equal(ridden, lines_of(cs.plot(readings, sim), "mutual capacitance"))
+
+
 def test_a_design() -> None:
     assert cs.plot(cs.load_design("stripe")).axes[0].get_title(loc="left") == "stripe"
 
@@ -68,6 +86,11 @@ def test_refusals(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
     readings = [sim.step(scene) for scene in scenes]
     with pytest.raises(cs.CapSenseError, match="give plot"):
         cs.plot(readings)
+    for wrong in (readings[0], "six_patch"):
+        with pytest.raises(cs.CapSenseError, match=f"not {type(wrong).__name__}; write plot"):
+            cs.plot(wrong, sim)  # type: ignore[arg-type]
+    with pytest.raises(cs.CapSenseError, match="excitation is 'slf'; did you mean 'self'"):
+        cs.plot(readings, sim, excitation="slf")
     with pytest.raises(cs.CapSenseError, match="no reading"):
         cs.plot([], sim)
     with pytest.raises(cs.CapSenseError, match="5 readings, times of shape"):

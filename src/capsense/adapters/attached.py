@@ -336,8 +336,9 @@ def make_simulator(design: Design | str | Path | Simulator) -> Simulator:
     return design if isinstance(design, Simulator) else Simulator(design)
 
 
-def refuse_missing(what: str, name: str, known: Sequence[str]) -> SceneError:
-    """The error for a name that a model does not have."""
+def refuse_missing(what: str, name: str, known: Sequence[str], adds: str = "") -> SceneError:
+    """The error for a name that a model does not have; ``adds`` is the call that adds one."""
     if not known:
-        return SceneError(f"there is no {what} named {name!r}; the model has none at all")
+        fix = f"; {adds} adds one" if adds else ""
+        return SceneError(f"there is no {what} named {name!r}; the model has none at all{fix}")
     return SceneError(f"there is no {what} named {name!r}; {suggest(name, known)}")

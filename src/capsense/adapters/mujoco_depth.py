@@ -138,7 +138,8 @@ def find_site(model: mujoco.MjModel, name: str) -> int:
     _require_name("site", name)
     site = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_SITE), name)
     if site < 0:
-        raise refuse_missing("site", name, [model.site(i).name for i in range(model.nsite)])
+        known = [model.site(i).name for i in range(model.nsite)]
+        raise refuse_missing("site", name, known, "cs.mujoco.add_sensor(spec, body, pose)")
     return int(site)
 
 
@@ -153,7 +154,8 @@ def find_camera(model: mujoco.MjModel, name: str) -> DepthCamera:
     _require_name("camera", name)
     number = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_CAMERA), name)
     if number < 0:
-        raise refuse_missing("camera", name, [model.camera(i).name for i in range(model.ncam)])
+        known = [model.camera(i).name for i in range(model.ncam)]
+        raise refuse_missing("camera", name, known, "cs.mujoco.add_sensor(…, camera=width)")
     if int(model.cam_projection[number]) != 1:
         raise SceneError(
             f"camera {name!r} is in perspective, but depth frames need parallel rays; give it "

@@ -222,7 +222,12 @@ def split_rules(options: Mapping[str, Any], known: type) -> tuple[Rules, dict[st
     names = known.__annotations__
     for name in options:
         if name not in names:
-            raise TypeError(f"attach has no option {name!r}; {suggest(name, names)}")
+            if name in ("preset", "method"):
+                raise TypeError(
+                    f"attach has no option {name!r}, which is the simulator's; give "
+                    f"design=cs.Simulator(design, {name}=…)"
+                )
+            raise TypeError(f"attach has no option {name!r}; {suggest(name, ['design', *names])}")
     ruled = {f.name for f in fields(Rules)}
     rules = Rules(**{name: value for name, value in options.items() if name in ruled})
     return rules, {name: value for name, value in options.items() if name not in ruled}

@@ -28,6 +28,8 @@ from capsense._style import (
     style_of,
     unit_of,
 )
+from capsense._validate import suggest
+from capsense.adapters.attached import AttachedSensor
 from capsense.design.model import Design
 from capsense.errors import CapSenseError
 from capsense.plotting.designs import (
@@ -45,11 +47,10 @@ from capsense.recording.tables import Run
 from capsense.scenario import Excitation
 from capsense.scenario.model import channels_of
 from capsense.scene import Body, Scene
+from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from capsense.simulator import Simulator
 
 
 Array = NDArray[np.float64]
@@ -210,7 +211,7 @@ class _Family:
 
 def plot(
     what: Design | Recording | Sequence[Reading],
-    simulator: Simulator | None = None,
+    simulator: Simulator | AttachedSensor | None = None,
     *,
     times: ArrayLike | None = None,
     scenes: Sequence[Scene] | None = None,
@@ -220,7 +221,7 @@ def plot(
 
     Args:
         what: A design; an open recording; or the readings of a run, n of them.
-        simulator: With readings: the simulator that took them.
+        simulator: With readings: the simulator, or the sensor on a robot, that took them.
         times: With readings: their times [s], shape (n,); by default their numbers.
         scenes: With readings: what the simulator was given, n scenes, to show the bodies' ways.
         excitation: With readings: the signals shown, ``"matrix"``, ``"self"`` or ``"mutual"``.
@@ -230,16 +231,30 @@ def plot(
         beside them the bodies' ways over the electrodes, from above and from the side.
 
     Raises:
-        CapSenseError: There is no reading, readings come without their simulator, or times or
-            scenes are not as many.
+        CapSenseError: There is no reading, readings come without their simulator, times or
+            scenes are not as many, or an argument is of another kind.
     """
     if isinstance(what, Design):
         return cast(Figure, draw_design(what).figure)
+    numbered = times is None and not isinstance(what, Recording)
     if isinstance(what, Recording):
         run = run_of(what, list(what.steps()))
     else:
-        if simulator is None:
-            raise CapSenseError("readings are drawn with their simulator; give plot(readings, sim)")
+        if not isinstance(what, Sequence) or not all(isinstance(r, Reading) for r in what):
+            raise CapSenseError(
+                "plot takes a design, an open recording or a list of readings, not "
+                f"{type(what).__name__}; write plot(cs.load_design(name)) or plot(readings, sim)"
+            )
+        if isinstance(simulator, AttachedSensor):
+            simulator = simulator.simulator
+        if not isinstance(simulator, Simulator):
+            raise CapSenseError(
+                "readings are drawn with the simulator, or the sensor, that took them; give "
+                "plot(readings, sim)"
+            )
+        known = [e.value for e in Excitation]
+        if excitation not in known:
+            raise CapSenseError(f"excitation is {excitation!r}; {suggest(excitation, known)}")
         design, count = simulator.design, len(what)
         moments = np.arange(count) if times is None else np.asarray(times, dtype=float)
         seen = [Scene()] * count if scenes is None else scenes
@@ -255,11 +270,11 @@ def plot(
         )  # fmt: skip
     if not run.times:
         raise CapSenseError("there is no reading to draw; take a step first")
-    return plot_run(run)
+    return plot_run(run, "number of the reading" if numbered else "time [s]")
 
 
-def plot_run(run: Run) -> Figure:
-    """Draw a run; see :func:`plot`."""
+def plot_run(run: Run, across: str = "time [s]") -> Figure:
+    """Draw a run, with this label on the axis of time; see :func:`plot`."""
     values = run.values
     families = _families(run, values)
     columns = len(families)
@@ -272,6 +287,7 @@ def plot_run(run: Run) -> Figure:
         shared = shared or upper
         lower = figure.add_subplot(grid[1, column], sharex=shared)
         _draw_family(family, np.array(run.times), peak, upper, lower)
+        lower.set_xlabel(across, **LABELS)
     colours = [style_of(k)[0] for k in range(len(run.design.electrodes))]
     if run.channels[0].excitation is Excitation.MUTUAL:
         colours = [PLAIN_ELECTRODE] * len(colours)
@@ -355,7 +371,6 @@ def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: A
     upper.set_ylabel("relative to the empty scene", **LABELS)
     upper.tick_params(labelbottom=False)
     lower.set_ylabel(f"change from the empty scene [{unit}]", **LABELS)
-    lower.set_xlabel("time [s]", **LABELS)
     if len(times) > 1:
         _time_strip(lower, times)
 
