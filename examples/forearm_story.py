@@ -91,8 +91,7 @@ class Record:
         ``parts`` are the robot's and the person's, in the world, to be drawn.
         """
         if not self.time:
-            print("time, place along the forearm [mm], change of the self capacitances [fF]")
-            print("   t   mm" + "".join(f"{n:>9}" for n in self.names))
+            print("   t x,mm " + "".join(f"{n:>9}" for n in self.names) + "   change, fF")
         if len(self.time) % 10 == 0:
             row = "".join(f"{v * 1e15:9.2f}" for v in reading.delta.diagonal())
             print(f"{t:4.1f} s {pose.position[0] * 1e3:4.0f}{row}", flush=True)
