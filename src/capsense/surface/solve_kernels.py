@@ -21,7 +21,7 @@ GAIN = 1.3
 """What the functions directly below the cut stand for: themselves, and all below them."""
 COARSE = 0.6
 """What panels are too coarse for, by estimate, over the energy of the functions that end in them.
-Wide boxes 1 to 8 mm from a sensor are off by 0.2 to 0.9 times that (``benchmarks/limits.py``)."""
+``benchmarks/limits.py`` sets the estimate beside the errors of wide boxes near a sensor."""
 
 
 _ROWS = 4
