@@ -18,6 +18,7 @@ All work in compiled code only; ``tests/test_simd.py`` holds them against numpy.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -92,6 +93,11 @@ def _read(place: Any) -> Any:
     return code
 
 
+def _emit(code: Callable[..., Any]) -> Callable[..., Any]:
+    """What an intrinsic is made of, from a function of the builder and the values."""
+    return lambda context, builder, signature, args: code(builder, *args)
+
+
 @intrinsic
 def at(typing: Any, array: Any, index: Any) -> Any:
     """Element ``index`` of an array as it lies in memory."""
@@ -119,59 +125,47 @@ def put_span(typing: Any, array: Any, index: Any, value: Any) -> Any:
 @intrinsic
 def splat(typing: Any, scalar: Any) -> Any:
     """A number in all elements."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _fill(builder, args[0])
-
-    return _of(scalar)(scalar), code
+    return _of(scalar)(scalar), _emit(_fill)
 
 
 @intrinsic
 def vadd(typing: Any, left: Any, right: Any) -> Any:
     """``left + right``, element by element."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fadd(*args)
-
-    return left(left, left), code
+    return left(left, left), _emit(lambda builder, *values: builder.fadd(*values))
 
 
 @intrinsic
 def madd(typing: Any, scalar: Any, value: Any, addend: Any) -> Any:
     """``scalar * value + addend`` with a scalar in the precision of the vectors."""
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return multiply_add(builder, _fill(builder, args[0]), args[1], args[2])
+    def code(builder: Any, s: Any, v: Any, w: Any) -> Any:
+        return multiply_add(builder, _fill(builder, s), v, w)
 
-    return value(value.element, value, value), code
+    return value(value.element, value, value), _emit(code)
 
 
 @intrinsic
 def vmadd(typing: Any, left: Any, right: Any, addend: Any) -> Any:
     """``left * right + addend``, element by element."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return multiply_add(builder, *args)
-
-    return left(left, left, left), code
+    return left(left, left, left), _emit(multiply_add)
 
 
 @intrinsic
 def where_above(typing: Any, left: Any, right: Any, over: Any, other: Any) -> Any:
     """``over`` where ``left`` is above ``right``, else ``other``, element by element."""
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
+    def code(builder: Any, u: Any, v: Any, x: Any, y: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", u, v), x, y)
 
-    return left(left, left, left, left), code
+    return left(left, left, left, left), _emit(code)
 
 
 @intrinsic
 def horizontal_sum(typing: Any, value: Any) -> Any:
     """The sum of all elements."""
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        parts, width = args[0], SIMD_WIDTH
+    def code(builder: Any, parts: Any) -> Any:
+        width = SIMD_WIDTH
         while width > 1:
             width //= 2
             blank = ir.Constant(parts.type, ir.Undefined)
@@ -184,7 +178,7 @@ def horizontal_sum(typing: Any, value: Any) -> Any:
             parts = builder.fadd(low, high)
         return builder.extract_element(parts, ir.Constant(_INT, 0))
 
-    return value.element(value), code
+    return value.element(value), _emit(code)
 
 
 @intrinsic
@@ -192,11 +186,7 @@ def muladd(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """``a * b + c`` of three floats of one precision."""
     if not a == b == c or a not in _CODE:
         return None
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return multiply_add(builder, *args)
-
-    return a(a, a, a), code
+    return a(a, a, a), _emit(multiply_add)
 
 
 @intrinsic
@@ -209,23 +199,23 @@ def rsqrt(typing: Any, value: Any) -> Any:
     if value not in (types.float32, _SINGLE):
         return None
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def each(element: Any, number: float) -> Any:
+    def code(builder: Any, number: Any) -> Any:
+        def each(element: Any, same: float) -> Any:
             if value == types.float32:
-                return ir.Constant(element, number)
-            return ir.Constant(ir.VectorType(element, SIMD_WIDTH), [number] * SIMD_WIDTH)
+                return ir.Constant(element, same)
+            return ir.Constant(ir.VectorType(element, SIMD_WIDTH), [same] * SIMD_WIDTH)
 
         bits = each(_INT, 1).type
-        half = builder.lshr(builder.bitcast(args[0], bits), each(_INT, 1))
-        y = builder.bitcast(builder.sub(each(_INT, 0x5F375A86), half), args[0].type)
+        half = builder.lshr(builder.bitcast(number, bits), each(_INT, 1))
+        y = builder.bitcast(builder.sub(each(_INT, 0x5F375A86), half), number.type)
         single = ir.FloatType()
-        x = builder.fmul(args[0], each(single, -0.5))
+        x = builder.fmul(number, each(single, -0.5))
         for _ in range(3):
             step = multiply_add(builder, x, builder.fmul(y, y), each(single, 1.5))
             y = builder.fmul(y, step)
         return y
 
-    return value(value), code
+    return value(value), _emit(code)
 
 
 def _pointer(kind: Any) -> Any:

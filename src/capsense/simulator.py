@@ -241,6 +241,8 @@ class Simulator:
         with self._one:
             self.steps += 1
             reading = self._of(self._solver.solve(scene, jacobian=jacobian), start)
+            if not reading.delta.any():
+                scene.warn_of_units(max(self.design.domain.size))
             if self.readout is None or time is None:
                 return reading
             return replace(reading, counts=self.readout.sample(time, reading))

@@ -2,7 +2,8 @@
 
 Every builder takes things in the world's frame and the pose of the sensor in it, and returns the
 attached sensor. The link that carries it has a box of its own that would hide the electrodes if it
-were seen. ``WAYS`` lists what the contract is checked on: to add an adapter, add its builder.
+were seen: they are 2 mm under its face. ``WAYS`` lists what the contract is checked on: to add an
+adapter, add its builder.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import numpy as np
 import capsense as cs
 
 CARRIER_BOX = (0.05, 0.04, 0.03)
+BOX_AT = cs.Pose((0, 0, -0.013))
+"""Where that stands in the sensor frame."""
 IMAGE, PIXELS = 0.1, 64
 """Width of depth images [m], that of the small sensor's domain, and their pixels."""
 _COUNT = itertools.count()
@@ -115,7 +118,7 @@ def mjcf(things: Sequence[Thing], sensor: cs.Pose, pixels: int | None = None) ->
         f"<asset>{''.join(a for _, _, a in parts)}</asset><worldbody>{bodies}"
         f'<body name="carrier" {frame(sensor @ offset.inverse())}><freejoint/>'
         f'<geom name="carrier_geom" type="box" size="{numbers(np.divide(CARRIER_BOX, 2))}" '
-        f"{frame(offset)}/>"
+        f"{frame(offset @ BOX_AT)}/>"
         f'<site name="pad" {frame(offset)}/>{camera}</body></worldbody>{reader}</mujoco>'
     )
 
@@ -237,7 +240,7 @@ def fill_bullet(
         load(client, urdf(thing.name, urdf_geometry(thing, folder)), thing.pose, folder)
     offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
     box = f'<box size="{numbers(CARRIER_BOX)}"/>'
-    carrier = load(client, urdf("carrier", box, offset), sensor @ offset.inverse(), folder)
+    carrier = load(client, urdf("carrier", box, offset @ BOX_AT), sensor @ offset.inverse(), folder)
     for body in range(p.getNumBodies(physicsClientId=client)):
         p.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=client)
     p.stepSimulation(physicsClientId=client)
@@ -255,12 +258,12 @@ def coppeliasim_sensor(
 
     server = StandIn()
     offset = cs.Pose((0.01, -0.02, 0.03), (0.1, 0.2, 0.3, 0.9))
-    box = server.add("carrier", cs.Box(CARRIER_BOX), sensor)
+    box = server.add("carrier", cs.Box(CARRIER_BOX), sensor @ BOX_AT)
     for thing in things:
         server.add(thing.name, thing.shape, thing.pose)
     sim = cs.coppeliasim.connect(port=server.port)
     sim.startSimulation()
-    on = server.add("link", local=offset.inverse(), on=box)
+    on = server.add("link", local=(offset @ BOX_AT).inverse(), on=box)
     made = cs.coppeliasim.attach(sim, on, simulator, pose_in_object=offset, **options)
     made.server = server
     return made

@@ -14,10 +14,10 @@ import capsense as cs
 from capsense.elements.rigid import INSIDE
 from capsense.field.green_kernels import Green
 from capsense.surface import step
-from capsense.surface.choose_kernels import Cut
+from capsense.surface.choose_kernels import Cut, functions_of
 from capsense.surface.leaf_kernels import leaf_rows, placed
 from capsense.surface.pair_kernels import leaf_pairs
-from capsense.surface.solve_kernels import assembled, functions_of, leaf_charges, reduced
+from capsense.surface.solve_kernels import assembled, leaf_charges, reduced
 from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 
 Array = NDArray[np.float64]
@@ -57,8 +57,8 @@ def cut_of(
                 leaves.append(place[k])
     body, node, first, second, share, leaf = (np.array(c) for c in zip(*rows, strict=True))
     kids = np.stack([first, second], axis=1)
-    whole = np.ones(len(rows))
-    return Cut(body, node, kids, share, leaf, whole, whole.copy(), np.array(leaves))
+    whole, fade = (first < 0).astype(float), np.ones(len(rows))
+    return Cut(body, node, kids, share, leaf, whole, fade, fade.copy(), np.array(leaves))
 
 
 @contextmanager
@@ -93,7 +93,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         m = green.terminals
         return step.Solution(
             delta[:m, :m], left[:m, :m], coarse[:m], charge,
-            leaves.points, leaves.extent, leaves.owner, functions.solved, shift,
+            leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
         )  # fmt: skip
 
     with (

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, Green
-from capsense.surface.pair_kernels import FAR, SOFT
+from capsense.surface.pair_kernels import FAR
 from capsense.surface.step import Solution
 
 Array = np.ndarray
@@ -51,10 +51,10 @@ def _energy(points: Array, solution: Solution, green: Green) -> Array:
     modes = psi.T @ charge
     image = points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * green.floor]
     still = solution.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * green.floor]
-    pairs = -_means(points, image, _far(solution.points, still, solution.extent), solution.extent)
+    pairs = -_means(points, image, _far(solution.points, still, solution.extent), solution.soft)
     other = solution.owner[:, None] != solution.owner
     far = _far(solution.points, solution.points, solution.extent)
-    pairs += np.where(other, _means(points, points, far, solution.extent), 0.0)
+    pairs += np.where(other, _means(points, points, far, solution.soft), 0.0)
     return phi.T @ charge + charge.T @ phi - charge.T @ pairs @ charge + modes.T @ modes
 
 
@@ -84,7 +84,7 @@ def _far(points: Array, others: Array, extent: Array) -> Array:
     return between > FAR * (extent[:, None] + extent)
 
 
-def _means(points: Array, others: Array, far: Array, extent: Array) -> Array:
+def _means(points: Array, others: Array, far: Array, soft: Array) -> Array:
     """Means of 1/r, by moments where clusters are far apart, else with a bounded 1/r."""
     d = points.mean(axis=1)[:, None] - others.mean(axis=1)
     r = np.linalg.norm(d, axis=-1)
@@ -99,5 +99,5 @@ def _means(points: Array, others: Array, far: Array, extent: Array) -> Array:
             second += 3 * (arm * d).sum(-1) ** 2 / r**2 - (arm**2).sum(-1)
     moments = 1 / r + second / (2 * r**3)
     s = ((points[:, None, :, None] - others[None, :, None]) ** 2).sum(-1)
-    bound = (SOFT * np.maximum(extent[:, None], extent)) ** 4
+    bound = np.maximum(soft[:, None], soft) ** 4
     return np.where(far, moments, ((s**2 + bound[..., None, None]) ** -0.25).mean((-2, -1)))

@@ -6,6 +6,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+from interpreted import fewer, thinned
 from scipy.spatial.transform import Rotation
 
 import capsense as cs
@@ -30,14 +31,14 @@ class Placed(NamedTuple):
 @cache
 def shape_of(shape: cs.Sphere | cs.Capsule | cs.Box) -> RigidShape:
     """The charge functions of a shape, kept for the whole run of the tests."""
-    return rigid_shape(panels_of(shape, 300), apart=True)
+    return rigid_shape(panels_of(shape, fewer(300)), apart=True)
 
 
 @cache
 def green_of(design: str = "six_patch_bare") -> Green:
     """The Green's function of a packaged design."""
     sim = cs.Simulator(design)
-    return pack_green(sim.background.green, sim.design)
+    return pack_green(thinned(sim.background.green), sim.design)
 
 
 def pack(*bodies: Placed) -> Array:

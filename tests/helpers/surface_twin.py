@@ -6,6 +6,7 @@ with what comes after them. Metres, 4π eps0 = 1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -18,8 +19,8 @@ from capsense.elements.panels import SurfacePanels
 from capsense.field.green import GreenFunction
 
 Array = np.ndarray
-SOFT = 0.15
-"""Points of different bodies see 1/r bounded at so many of the larger one's extent."""
+SOFT, ROUND = 0.15, 0.82
+"""Points of different bodies see 1/r bounded: extent and least moment count so much for it."""
 GAIN = 1.3
 """What functions that are left out stand for, themselves and all below."""
 COARSE_PANELS = 0.6
@@ -64,7 +65,7 @@ class Clusters(NamedTuple):
 
     points: Array
     """Shape (k, 4, 3)."""
-    extent: Array
+    soft: Array
     owner: Array
 
 
@@ -92,8 +93,8 @@ def interaction(found: Clusters, green: GreenFunction) -> Array:
     psi = four_point_mean(found.points, green, "psi")
     image = found.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
     other = found.owner[:, None] != found.owner
-    between = np.where(other, inverse_distances(found.points, found.points, found.extent), 0.0)
-    return between - inverse_distances(found.points, image, found.extent) - psi @ psi.T
+    between = np.where(other, inverse_distances(found.points, found.points, found.soft), 0.0)
+    return between - inverse_distances(found.points, image, found.soft) - psi @ psi.T
 
 
 def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
@@ -105,24 +106,24 @@ def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
     return share * first + (1 - share) * second
 
 
-def inverse_distances(points: Array, others: Array, extent: Array) -> Array:
+def inverse_distances(points: Array, others: Array, soft: Array) -> Array:
     """Means over four points each of a bounded 1/r, shape (k, k)."""
     square = ((points[:, None, :, None] - others[None, :, None]) ** 2).sum(axis=-1)
-    bound = (SOFT * np.maximum(extent[:, None], extent)) ** 4
+    bound = np.maximum(soft[:, None], soft) ** 4
     return ((square**2 + bound[:, :, None, None]) ** -0.25).mean(axis=(2, 3))
 
 
 def clusters(pieces: tuple[Piece, ...], charges: list[Array]) -> Clusters:
     """Place clusters; ``charges`` has, body by body, a column of panel charges for each."""
-    points, extent, owner = [], [], []
+    points, soft, owner = [], [], []
     for b, (piece, columns) in enumerate(zip(pieces, charges, strict=True)):
         for column in columns.T:
             center, second = charge_moments(piece.panels, column)
             local, size = rectangle(center, second)
             points.append(piece.scale * local @ piece.rotation.T + piece.position)
-            extent.append(piece.scale * size)
+            soft.append(piece.scale * size)
             owner.append(b)
-    return Clusters(np.array(points), np.array(extent), np.array(owner))
+    return Clusters(np.array(points), np.array(soft), np.array(owner))
 
 
 def charge_moments(panels: SurfacePanels, charge: Array) -> tuple[Array, Array]:
@@ -134,11 +135,12 @@ def charge_moments(panels: SurfacePanels, charge: Array) -> tuple[Array, Array]:
 
 
 def rectangle(center: Array, second: Array) -> tuple[Array, float]:
-    """Four points with the two largest second moments, and the length of a rod with the first."""
+    """Four points with the two largest second moments, and where 1/r from them is bounded [m]."""
     size, axes = np.linalg.eigh(second)
     arms = axes[:, 1:] * np.sqrt(np.maximum(size[1:], 0.0))
     signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
-    return center + signs @ arms.T, float(np.sqrt(12.0 * size[2]))
+    soft = math.sqrt(12.0 * SOFT**2 * size[2] + ROUND * max(size[0], 0.0))
+    return center + signs @ arms.T, soft
 
 
 # ---- charge functions ----
@@ -174,13 +176,34 @@ class Chosen(NamedTuple):
     """What is solved for, of one body."""
 
     leaves: Array
-    """Clusters that are not split."""
+    """Clusters that are represented by themselves."""
+    whole: Array
+    """How far each of these is, 1 if it is not split; the rest is left to its parts."""
     functions: Array
     """Clusters that are split."""
     fade: Array
     """How far the functions are faded in."""
     above: Array
     """The same of the cluster above."""
+
+
+def on_leaves(
+    tree: tuple[Array, Array, Array], share: Array, chosen: Chosen, cluster: int
+) -> Array:
+    """Charges on the leaves of a unit charge on a cluster."""
+    kids, _, charge = tree
+    whole = dict(zip(chosen.leaves.tolist(), chosen.whole.tolist(), strict=True))
+    amount = [charge[share[:, k] > 0].sum() for k in range(len(kids))]
+    left, out = {cluster: 1.0}, dict.fromkeys(whole, 0.0)
+    for k in range(cluster, len(kids)):  # wholes stand before their parts
+        if k in left:
+            value = left.pop(k)
+            if k in whole:
+                out[k] = value * whole[k]
+            value *= 1.0 - whole.get(k, 0.0)
+            if value > 0.0:
+                left |= {part: value * amount[part] / amount[k] for part in kids[k].tolist()}
+    return np.array(list(out.values()))
 
 
 def reduced(
@@ -199,10 +222,15 @@ def reduced(
         haars = all_of[:, kids[cut.functions, 0]] - all_of[:, kids[cut.functions, 1]]
         start = [] if piece.neutral else [0]
         functions = np.column_stack([*(all_of[:, [k]] for k in start), haars])
-        # a function is a sum of the equilibrium charges of leaves
         own = np.flatnonzero(found.owner == b)
         spread = np.zeros((len(found.owner), functions.shape[1]))
-        spread[own] = [functions[all_of[:, leaf] > 0].sum(axis=0) for leaf in cut.leaves]
+        spread[own] = np.column_stack(
+            [*(on_leaves(tree, all_of, cut, k) for k in start)]
+            + [
+                on_leaves(tree, all_of, cut, x) - on_leaves(tree, all_of, cut, y)
+                for x, y in kids[cut.functions]
+            ]
+        )
         columns.append(spread)
         block = functions.T @ piece.block @ functions
         for k in start:

@@ -9,7 +9,7 @@ import pytest
 from surface_scenes import Placed, green_of, pack
 
 import capsense as cs
-from capsense.field.green_kernels import beyond, least_gap, lift
+from capsense.field.green_kernels import beyond, distances, least_gap, lift
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import Leaves, placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
@@ -82,7 +82,30 @@ def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) 
     green = green_of()
     np.testing.assert_allclose(green.room, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]])
     assert green.cover == 0.0
-    assert beyond(np.array([center] * 4), green) == pytest.approx(expected, abs=1e-9)
+    assert beyond(around(np.array(center)), green) == pytest.approx(expected, abs=1e-9)
+
+
+def around(center: Array) -> Array:
+    """Four points with a centre."""
+    return center + 0.01 * np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
+def test_behind_the_face_near_a_side(axis: int, side: int) -> None:
+    """Analytic: half as far as it counts, where the side is a quarter of 5.5 mm away."""
+    green = green_of()
+    center = np.array([0.0, 0.0, float(green.box[1, 2]) - 0.008])
+    center[axis] = green.box[side, axis] + (0.0055 / 4) * (1 - 2 * side)
+    assert beyond(around(center), green) == pytest.approx(0.5, abs=1e-9)
+
+
+def test_distance_of_clusters_from_the_design() -> None:
+    """Analytic: of their centres, from its box, on all sides."""
+    green, centers = green_of(), np.random.default_rng(5).uniform(-0.2, 0.2, (200, 3))
+    points = np.array([around(c) for c in centers])
+    wanted = np.linalg.norm(centers - np.clip(centers, *green.box), axis=1)
+    np.testing.assert_allclose(distances(points, green), wanted, atol=1e-15)
 
 
 def test_curved_designs_lift_nothing() -> None:
@@ -112,9 +135,9 @@ def test_lifted_clusters_of_a_body_meet_where_they_are() -> None:
     true = random.uniform(-0.01, 0.01, (5, 4, 3))
     points = true.copy()
     points[1:3, :, 2] += 2e-3
-    extent, owner, none = np.full(5, 4e-3), np.array([0, 0, 0, 0, 1]), np.zeros(5)
+    size, owner, none = np.full(5, 4e-3), np.array([0, 0, 0, 0, 1]), np.zeros(5)
     before, after = (
-        leaf_pairs(Leaves(points, t, extent, none, owner, none), -1e5) for t in (points, true)
+        leaf_pairs(Leaves(points, t, size, size, none, owner, none), -1e5) for t in (points, true)
     )
     wanted = np.zeros((5, 5))
     for i in range(4):
@@ -129,10 +152,9 @@ def test_charge_out_of_reach_has_a_large_energy() -> None:
     """Analytic: a million per metre times the third power of how far it is beyond."""
     points = np.random.default_rng(4).uniform(-0.01, 0.01, (3, 4, 3))
     none, owner = np.zeros(3), np.zeros(3, int)
-    reach = np.array([0.0, 0.5, 1.0])
+    reach, size = np.array([0.0, 0.5, 1.0]), np.full(3, 4e-3)
     first, second = (
-        leaf_pairs(Leaves(points, points, np.full(3, 4e-3), r, owner, none), -1e5)
-        for r in (none, reach)
+        leaf_pairs(Leaves(points, points, size, size, r, owner, none), -1e5) for r in (none, reach)
     )
     np.testing.assert_allclose(second - first, np.diag(1e6 * reach**3), rtol=1e-6, atol=0.1)
 
@@ -145,7 +167,7 @@ def test_no_image_attracts_more_than_a_mirror(height: float) -> None:
     points = np.array([[[x, y, height] for x in (arm, -arm) for y in (arm, -arm)]])
     points[..., 2] += green.box[1, 2]
     one, none = np.ones(1), np.zeros(1)
-    leaves = Leaves(points, points, side * one, none, np.zeros(1, int), none)
+    leaves = Leaves(points, points, side * one, one, none, np.zeros(1, int), none)
     rows = np.zeros((1, green.lead + 8), np.float32)
     rows[0, green.lead] = 30.0  # the square of it is what the design answers [1/m]
     pairs = np.zeros((1, 1), np.float32)

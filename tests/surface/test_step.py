@@ -7,9 +7,11 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
+import interpreted
 import numpy as np
 import pytest
 import surface_twin as twin
+from interpreted import fewer, limit, thinned
 from numba import njit
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
@@ -29,7 +31,7 @@ from capsense.field.green_kernels import Green, pack_green, point_potentials, so
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
-from capsense.surface.solve_kernels import _add_products, _factorise, _products
+from capsense.surface.solve_kernels import Reduced, _add_products, _factorise, _products, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import Solution, prepared, solve, solve_lossy
 
@@ -46,7 +48,7 @@ ALL = 1e-12
 
 @cache
 def shape_of(shape: cs.Shape, count: int = 150) -> RigidShape:
-    return rigid_shape(panels_of(shape, count))
+    return rigid_shape(panels_of(shape, fewer(count)))
 
 
 @cache
@@ -55,7 +57,7 @@ def simulator() -> cs.Simulator:
 
 
 def exact() -> GreenFunction:
-    return simulator().background.green
+    return thinned(simulator().background.green)
 
 
 def coarse_solver() -> SurfaceSolver:
@@ -175,6 +177,12 @@ TIED = (
     "two joined, floating", "two joined on a capacitance, a third alone",
 )  # fmt: skip
 """Where net charge has an energy of its own."""
+if interpreted.ON:
+    NAMES = (
+        "finger at 5 mm", "floating, made smaller", "finger of eps 80, larger",
+        "ball of eps 2000 with a contact", "three of all kinds",
+        "two joined on a capacitance, a third alone",
+    )  # fmt: skip
 SOME = ("ball between near and far", "box of eps 5", "three of all kinds")
 
 
@@ -185,9 +193,10 @@ SOME = ("ball between near and far", "box of eps 5", "three of all kinds")
 def test_all_functions_together_are_the_panels(name: str) -> None:
     """Differential: with a vanishing threshold, ΔC of one unknown a panel, single precision."""
     scene = scenes()[name]
-    assert 96 <= max(len(p.panels) for p in scene.pieces) <= 200
+    assert fewer(96) <= max(len(p.panels) for p in scene.pieces) <= 200
     found = scene.solved()
-    assert apart(found.delta, twin.galerkin(scene.pieces, exact())) < 3e-5
+    wanted = twin.galerkin(scene.pieces, exact())
+    assert apart(found.delta, wanted) < limit(3e-5, 6e-4)
     assert np.abs(found.left).max() < 1e-6 * np.abs(found.delta).max()
 
 
@@ -203,19 +212,20 @@ def test_chosen_functions_are_solved_and_the_others_estimated(name: str, thresho
     chosen = chosen_of(cut, len(scene))
     delta, left, coarse = twin.reduced(scene.pieces, scene.trees, chosen, exact())
     found = scene.solved(threshold)
-    assert apart(found.delta, delta) < 6e-4
-    assert np.abs(found.left - left).max() < 3e-4 * np.abs(delta).max()
-    assert np.abs(found.coarse - coarse).max() < 3e-4 * np.abs(delta).max()
-    assert np.abs(left).max() > 1e-3 * np.abs(delta).max()
+    assert apart(found.delta, delta) < limit(6e-4, 4e-3)
+    near = limit(3e-4, 1e-3) * np.abs(delta).max()
+    assert np.abs(found.left - left).max() < near
+    assert np.abs(found.coarse - coarse).max() < near
+    assert np.abs(left).max() > limit(1e-3, 0.0) * np.abs(delta).max()
 
 
 def chosen_of(cut: Cut, bodies: int) -> list[twin.Chosen]:
     out = []
     for b in range(bodies):
-        whole = (cut.body == b) & (cut.kids[:, 0] < 0)
-        parted = (cut.body == b) & (cut.kids[:, 0] >= 0)
+        leaf = (cut.body == b) & (cut.whole > 0)
+        at = (cut.body == b) & (cut.kids[:, 0] >= 0)
         out.append(
-            twin.Chosen(cut.node[whole], cut.node[parted], cut.fade[parted], cut.above[parted])
+            twin.Chosen(cut.node[leaf], cut.whole[leaf], cut.node[at], cut.fade[at], cut.above[at])
         )
     return out
 
@@ -241,6 +251,25 @@ def test_charges_on_the_leaves(name: str) -> None:
             assert np.abs(net).max() > most
     phi = twin.four_point_mean(found.points, exact(), "phi0")
     assert apart(phi.T @ found.charge[:, :m], found.delta) < 3e-5
+
+
+@pytest.mark.parametrize("threshold", [0.2, 0.02])
+@pytest.mark.parametrize("name", [n for n in SOME if n in NAMES or not interpreted.ON])
+def test_charges_are_what_derivatives_follow_from(name: str, threshold: float) -> None:
+    """Analytic: as ΔC = φᵀ M φ, it changes by dφᵀ x + xᵀ dφ, what is estimated included."""
+    cut, _, functions, system = prepared(
+        scenes()[name].packed(), packed_green(), threshold, WIDTH
+    )  # fmt: skip
+    way = np.random.default_rng(3).normal(size=system.phi.shape)
+    way *= 0.1 * np.abs(system.phi).max()
+
+    def at(step: float) -> Reduced:
+        return reduced(cut, functions, system._replace(phi=system.phi + step * way), True)
+
+    x = at(0.0).charge
+    wanted = way.T @ x + x.T @ way
+    assert functions.solved < len(functions.cluster)
+    assert apart(0.5 * (at(1.0).delta - at(-1.0).delta), wanted) < 1e-6
 
 
 def test_delta_is_symmetric_and_of_one_sign() -> None:
@@ -300,17 +329,18 @@ def test_clusters_have_the_moments_of_their_panels(shape: cs.Shape) -> None:
         )
         assert tree.charge[k] == pytest.approx(charge[own].sum(), rel=1e-12)
         np.testing.assert_allclose(tree.center[k], center, atol=1e-12 * size)
-        check_points(tree.points[k], tree.extent[k], center, second)
+        check_points(tree.points[k], tree.extent[k], tree.soft[k], center, second)
 
 
-def check_points(points: Array, extent: float, center: Array, second: Array) -> None:
-    """Mean, the two largest second moments, nothing of the smallest."""
+def check_points(points: Array, extent: float, soft: float, center: Array, second: Array) -> None:
+    """Mean, the two largest second moments; the smallest bounds 1/r beside the extent."""
     size = np.linalg.eigvalsh(second)
     off = points - center
     lost = np.linalg.eigvalsh(second - np.einsum("qi,qj->ij", off, off) / 4)
     np.testing.assert_allclose(off.sum(axis=0), 0.0, atol=1e-9 * math.sqrt(size[2]))
     np.testing.assert_allclose(lost, [0.0, 0.0, size[0]], atol=1e-9 * size[2])
     assert extent == pytest.approx(math.sqrt(12 * size[2]), rel=1e-9)
+    assert soft**2 == pytest.approx((0.15 * extent) ** 2 + 0.82 * max(size[0], 0.0), rel=1e-6)
 
 
 def check_tree(clusters: Clusters, n: int) -> None:
@@ -431,20 +461,22 @@ def test_four_points_have_the_largest_moments(rank: int) -> None:
     for size in 10.0 ** rng.uniform(-5, 0, 40):
         half = size * rng.normal(size=(3, rank)) * 10.0 ** rng.uniform(-2, 0, rank)
         points, center = np.empty((4, 3)), size * rng.normal(size=3)
-        extent = four_points(half @ half.T, center, np.empty((3, 3)), points)
-        check_points(points, extent, center, half @ half.T)
+        extent, soft = four_points(half @ half.T, center, np.empty((3, 3)), points)
+        check_points(points, extent, soft, center, half @ half.T)
 
 
 def test_four_points_of_even_and_diagonal_moments() -> None:
     """Analytic: equal moments are kept whichever two are taken; none at all gives the centre."""
     for second in (np.eye(3), np.diag([1.0, 4.0, 4.0]), np.diag([9.0, 0.0, 1.0])):
         points = np.empty((4, 3))
-        extent = four_points(second.copy(), np.zeros(3), np.empty((3, 3)), points)
+        extent, soft = four_points(second.copy(), np.zeros(3), np.empty((3, 3)), points)
         found = np.sort(np.linalg.eigvalsh(points.T @ points / 4))
         np.testing.assert_allclose(found[1:], np.sort(np.diag(second))[1:], rtol=1e-12)
         assert extent == pytest.approx(math.sqrt(12 * second.max()))
+        wanted = 0.0225 * 12 * second.max() + 0.82 * np.diag(second).min()
+        assert soft == pytest.approx(math.sqrt(wanted))
     points = np.empty((4, 3))
-    assert four_points(np.zeros((3, 3)), np.ones(3), np.empty((3, 3)), points) == 0.0
+    assert four_points(np.zeros((3, 3)), np.ones(3), np.empty((3, 3)), points) == (0.0, 0.0)
     np.testing.assert_array_equal(points, np.ones((4, 3)))
 
 
@@ -586,7 +618,8 @@ def pairs(shapes: list, owner: list[int], changing: bool, floor: float = DEEP) -
     points = np.array([flat(*s)[0] for s in shapes])
     extent = np.array([flat(*s)[1] for s in shapes])
     within = np.full(len(shapes), float(changing))
-    leaves = Leaves(points, points, extent, np.zeros(len(shapes)), np.array(owner), within)
+    none = np.zeros(len(shapes))
+    leaves = Leaves(points, points, extent, 0.15 * extent, none, np.array(owner), within)
     return leaf_pairs(leaves, floor)
 
 
@@ -700,24 +733,25 @@ def test_pairs_of_bodies_near_each_other() -> None:
     points = rng.uniform(-0.02, 0.02, (count, 1, 3)) + rng.uniform(-3e-3, 3e-3, (count, 4, 3))
     extent, owner = rng.uniform(0.04, 0.12, count), np.repeat([0, 1, 2], [5, 20, 12])
     none = np.zeros(count)
-    found = leaf_pairs(Leaves(points, points, extent, none, owner, none), DEEP)
+    soft = rng.uniform(0.2, 0.4, count) * extent
+    found = leaf_pairs(Leaves(points, points, extent, soft, none, owner, none), DEEP)
     for i in range(count):
         for j in range(i):
             wanted = 0.0 if owner[i] == owner[j] else mean_inverse(
-                points[i], points[j], max(extent[i], extent[j])
+                points[i], points[j], max(soft[i], soft[j])
             )  # fmt: skip
             assert found[i, j] == pytest.approx(wanted, rel=3e-6, abs=1e-4)
 
 
 def test_bounded_inverse_distance() -> None:
-    """Analytic: 1/√√(r⁴ + (0.15 e)⁴), whatever the order."""
+    """Analytic: 1/√√(r⁴ + s⁴), whatever the order."""
     rng = np.random.default_rng(6)
     first, second = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
     square = ((first[:, None] - second) ** 2).sum(axis=-1)
-    for extent in (0.0, 1.0, 30.0):
-        wanted = ((square**2 + (0.15 * extent) ** 4) ** -0.25).mean()
-        assert mean_inverse(first, second, extent) == pytest.approx(wanted, rel=1e-6)
-        assert mean_inverse(second, first, extent) == pytest.approx(wanted, rel=1e-6)
+    for soft in (0.0, 0.15, 4.5):
+        wanted = ((square**2 + soft**4) ** -0.25).mean()
+        assert mean_inverse(first, second, soft) == pytest.approx(wanted, rel=1e-6)
+        assert mean_inverse(second, first, soft) == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.parametrize("threshold", [0.015, 0.004, 1e-3])
@@ -794,11 +828,21 @@ def test_scores_and_fades_fall_downwards(name: str) -> None:
     parted = cut.kids[:, 0] >= 0
     wanted = np.minimum(x * x * (3 - 2 * x), cut.above)
     np.testing.assert_allclose(cut.fade[parted], wanted[parted], atol=1e-12)
-    np.testing.assert_array_equal(cut.leaves, np.flatnonzero(~parted))
+    entered = np.clip(cut.above / 0.1, 0, 1)
+    wanted = np.where(parted, 1 - entered * entered * (3 - 2 * entered), 1.0)
+    np.testing.assert_allclose(cut.whole, wanted, atol=1e-12)
+    np.testing.assert_array_equal(cut.leaves, np.flatnonzero(cut.whole > 0))
     np.testing.assert_array_equal(cut.leaf[cut.leaves], np.arange(len(cut.leaves)))
-    charge = np.array([scene[cut.body[a]][1].tree.charge[cut.node[a]] for a in cut.leaves])
-    for b in range(len(scene)):
-        assert charge[cut.body[cut.leaves] == b].sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_steps_where_a_function_enters(name: str) -> None:
+    """Invariant: ΔC does not step at thresholds at which a function is about to enter."""
+    scene = scenes()[name]
+    _, scores, _ = cut_of(scene, 0.1)
+    for value in np.unique(scores)[::-1][1:20]:
+        before, after = (scene.solved(value * (1 + t)).delta for t in (1e-6, -1e-6))
+        assert apart(before, after) < 2e-5
 
 
 @pytest.mark.parametrize("name", SOME)
@@ -851,7 +895,7 @@ def test_changing_and_rigid_bodies_agree(shape: cs.Shape, neutral: bool) -> None
         wanted = solve(records, packed_green(), threshold, WIDTH, False)
         found = solve(other, packed_green(), threshold, WIDTH, False)
         assert found.size > 0
-        assert apart(found.delta, wanted.delta) < 0.022
+        assert apart(found.delta, wanted.delta) < limit(0.022, 0.1)
 
 
 # ---- losses ----
@@ -1062,9 +1106,11 @@ def test_products_of_wide_matrices(m: int) -> None:
     np.testing.assert_allclose(out, 1.0 + left.T @ right, rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize(("between", "raised"), [(0.9, 0.0), (1.0005, 0.001), (1.06, 0.064)])
+@pytest.mark.parametrize(
+    ("between", "raised"), [(0.9, 0.0), (1.0005, 0.03), (1.05, 0.06), (1.1, 0.12)]
+)
 def test_energies_that_are_not_definite_are_raised(between: float, raised: float) -> None:
-    """Analytic: the diagonal is raised by 0.001, 0.002, 0.004, … of itself, till it is definite."""
+    """Analytic: the diagonal is raised by 0.03, 0.06, 0.12, … of itself, till it is definite."""
     root, own = np.array([0.8, 0.5]), np.array([-2.0, 2.0])
     matrix = np.array([[2.0, 5.0 * between], [5.0 * between, 2.0]])
     factor, right = np.empty((2, 2)), np.random.default_rng(2).normal(size=(2, 8))

@@ -31,6 +31,10 @@ Ints = NDArray[np.int64]
 INSIDE = 2.5
 """Interior impedance of a surface that is open or changes, over its energy in free space: it is 3
 for a ball in an even field, and 2 for the face of a half-space."""
+SOFT, ROUND = 0.15, 0.82
+"""1/r from the four points of a cluster is bounded below a distance whose square is that of its
+extent times the first, squared, and its least second moment times the second. Two flat squares, or
+two balls, that coincide then have no more energy between them than each has alone."""
 _NORMALS = 0.6
 """How far apart two opposite normals count, as a share of the shape's extent, in splitting."""
 _GRAIN = 1e-9
@@ -45,7 +49,8 @@ BODY = np.dtype(
     [
         ("n", np.int64),  # panels; there are 2 n - 1 clusters
         ("kids", np.int64), ("function", np.int64), ("charge", np.int64), ("center", np.int64),
-        ("points", np.int64), ("extent", np.int64), ("own", np.int64), ("energy", np.int64),
+        ("points", np.int64), ("extent", np.int64), ("soft", np.int64), ("own", np.int64),
+        ("energy", np.int64),
         ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
         ("spread", np.int64),  # second moments of a changing surface, else 0: it has no energies
         ("scale", np.float64),  # the body is so many times as large as the shape
@@ -85,6 +90,8 @@ class Tree(Clusters):
     shape (2 n - 1, 4, 3)."""
     extent: Array
     """Length of a uniform rod with the cluster's largest second moment [m], shape (2 n - 1,)."""
+    soft: Array
+    """Distance below which 1/r from the points is bounded [m], shape (2 n - 1,)."""
 
     def to_functions(self, values: Array) -> Array:
         """Integrate columns of panel values with every charge function, shape (n, k) -> (n, k)."""
@@ -119,7 +126,7 @@ class RigidShape(Frozen):
         record = np.zeros(1, BODY)[0]
         record["n"] = len(self.panels)
         record["energy"], record["own"] = self.energy.ctypes.data, self.own.ctypes.data
-        for name in ("kids", "function", "charge", "center", "points", "extent"):
+        for name in ("kids", "function", "charge", "center", "points", "extent", "soft"):
             record[name] = getattr(self.tree, name).ctypes.data
         return record
 
@@ -272,9 +279,9 @@ def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tr
     arms = (axes * np.sqrt(size)[:, None]).transpose(0, 2, 1)
     signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     points = center[:, None] + signs @ arms[:, 1:]
-    return Tree(
-        kids, clusters.function, panel, share, center, points, np.sqrt(12.0 * size[:, 2])
-    )  # fmt: skip
+    extent = np.sqrt(12.0 * size[:, 2])
+    soft = np.sqrt((SOFT * extent) ** 2 + ROUND * size[:, 0])
+    return Tree(kids, clusters.function, panel, share, center, points, extent, soft)
 
 
 def split(features: Array, charge: Array) -> Clusters:

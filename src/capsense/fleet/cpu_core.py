@@ -16,7 +16,7 @@ from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.reading import FleetReading
 from capsense.fleet.step_kernels import Found, Poses, Sensor, seen, step_rows
-from capsense.surface.solver import DOUBTFUL, SurfaceSolver
+from capsense.surface.solver import SurfaceSolver
 from capsense.surface.step import solve_lossy
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ class CpuCore:
         found = Found(
             np.zeros((e, s, m, m)), np.zeros((e, s)), slope, np.zeros((e, s), np.bool_)
         )  # fmt: skip
-        sensor = Sensor(green, solver.preset.threshold, solver.preset.width, DOUBTFUL)
+        sensor = Sensor(green, solver.preset.threshold, solver.preset.width)
         with first_use():
             in_parts(step_rows, e, self._table.bodies, where, sensor, found)
             loss = self._lossy(where, found)

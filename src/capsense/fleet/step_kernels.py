@@ -48,8 +48,6 @@ class Sensor(NamedTuple):
     threshold: float
     width: float
     """As :func:`capsense.surface.step.solve` takes them."""
-    doubtful: float
-    """Results are in doubt where the diagonal was raised by more than this part of it."""
 
 
 class Poses(NamedTuple):
@@ -98,7 +96,7 @@ def step_rows(start, stop, bodies, poses, sensor, found):
             out = solve(room[:count], green, sensor.threshold, sensor.width, slopes)
             for i in range(m):
                 doubt = abs(out.left[i, i]) + out.coarse[i]
-                if out.shift > sensor.doubtful:
+                if out.shift > 0.0:
                     doubt = abs(out.delta[i, i])
                 found.error[e, s] = max(found.error[e, s], doubt)
                 for j in range(m):

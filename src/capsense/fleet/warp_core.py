@@ -53,7 +53,7 @@ class WarpCore:
         cut.moved = room(places, views, dtype=wp.vec3)
         for name in ("node", "split", "number", "lifted"):
             setattr(cut, name, room(n, views, dtype=wp.int32))
-        for name in ("score", "part", "extent", "beyond", "near"):
+        for name in ("score", "part", "extent", "soft", "beyond", "near"):
             setattr(cut, name, room(n, views))
         cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
         cut.leader = room(places, views, dtype=wp.int32)
@@ -270,7 +270,7 @@ def _shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any:
     out.radius = array(bodies.radius, wp.float32)
     for name, kind in (
         ("kids", wp.int32), ("function", wp.int32), ("charge", wp.float32), ("center", wp.vec3),
-        ("points", wp.vec3), ("extent", wp.float32),
+        ("points", wp.vec3), ("extent", wp.float32), ("soft", wp.float32),
     ):  # fmt: skip
         setattr(out, name, array(joined(name), kind))
     out.energy = array(np.concatenate(blocks), wp.float32)

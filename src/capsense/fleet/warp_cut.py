@@ -43,6 +43,7 @@ class Shapes:
     center: wp.array(dtype=wp.vec3)
     points: wp.array2d(dtype=wp.vec3)
     extent: wp.array(dtype=wp.float32)
+    soft: wp.array(dtype=wp.float32)
     energy: wp.array(dtype=wp.float32)
     impedance: wp.array(dtype=wp.float32)
 
@@ -97,6 +98,7 @@ class WarpCut:
     unlifted: wp.array3d(dtype=wp.vec3)  # the same before they were lifted off the design
     lifted: wp.array2d(dtype=wp.int32)  # whether they were, (n, v)
     extent: wp.array2d(dtype=wp.float32)
+    soft: wp.array2d(dtype=wp.float32)  # distance below which 1/r is bounded [m]
     beyond: wp.array2d(dtype=wp.float32)
     near: wp.array2d(dtype=wp.float32)  # share of the near sources, (n, v)
     leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
@@ -295,6 +297,7 @@ def place(
         cut.points[i, q, v] = p
     cut.lifted[i, v] = lifted
     cut.extent[i, v] = size
+    cut.soft[i, v] = scale * shapes.soft[k]
     middle = 0.5 * (cut.points[i, 0, v] + cut.points[i, 3, v])
     away = wp.length(_off(middle, green.box0, green.box1))
     cut.near[i, v] = _smooth((green.blend1 - away) / (green.blend1 - green.blend0))

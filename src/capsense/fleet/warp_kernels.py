@@ -10,11 +10,11 @@ import warp as wp
 
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
 from capsense.fleet.warp_cut import WIDTH, Places, Response, Shapes, WarpCut, row
-from capsense.surface.pair_kernels import BARRIER, FAR, SOFT
+from capsense.surface.pair_kernels import BARRIER, FAR
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-_SOFT, _FAR = wp.constant(SOFT), wp.constant(FAR)
+_FAR = wp.constant(FAR)
 _BARRIER, _STIFF = wp.constant(BARRIER), wp.constant(600.0)
 """Energy of charge that is out of reach [1/m], at most the second number [m] over the square of a
 large cluster's extent: in single precision more of it would hide what is in reach."""
@@ -108,7 +108,7 @@ def _mean(cut: WarpCut, i: int, j: int, v: int, mirrored: float, floor: float):
 @wp.func
 def bound(cut: WarpCut, i: int, j: int, v: int):
     """Fourth power of the distance below which 1/r of two clusters is bounded."""
-    near = _SOFT * wp.max(cut.extent[i, v], cut.extent[j, v])
+    near = wp.max(cut.soft[i, v], cut.soft[j, v])
     return near * near * near * near + 1.0e-24
 
 

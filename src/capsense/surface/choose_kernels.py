@@ -1,4 +1,4 @@
-"""The step, compiled: which charge functions a scene needs."""
+"""The step, compiled: which clusters and charge functions a scene needs."""
 
 from __future__ import annotations
 
@@ -32,6 +32,8 @@ _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 _CROSSING = 5.0
 """Least score of clusters that cross a wall, over their share of that of their body by length."""
+_PARTED = 0.1
+"""Fade of a function from which on its two clusters are represented by their parts alone."""
 USED, FRONTIER, LEAF = 2, 1, 0
 """State of a cluster: its function is used; it is split for an estimate only; it is not split."""
 
@@ -49,12 +51,29 @@ class Cut(NamedTuple):
     """Share of the first part in its charge, shape (k,)."""
     leaf: NDArray[Any]
     """Its number among the leaves, else -1, shape (k,)."""
+    whole: NDArray[Any]
+    """How far it is represented by itself, not by its parts: 1 where it is not split, (k,)."""
     fade: NDArray[Any]
     """How far its function is faded in, 0 to 1, shape (k,)."""
     above: NDArray[Any]
     """The same of the cluster above, 1 at the top, shape (k,)."""
     leaves: NDArray[Any]
-    """The leaves in this list, shape (l,)."""
+    """The leaves in this list: clusters that are represented by themselves, shape (l,)."""
+
+
+class Functions(NamedTuple):
+    """The charge functions of a cut: those solved for, then those of the estimate."""
+
+    cluster: NDArray[Any]
+    """Cluster in the cut that a function splits, -1 - cluster for the net charge, shape (f,)."""
+    number: NDArray[Any]
+    """Its number among the functions of the shape, shape (f,)."""
+    body: NDArray[Any]
+    """Its body, shape (f,)."""
+    ends: NDArray[Any]
+    """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,)."""
+    solved: int
+    """How many are solved for."""
 
 
 @pasted
@@ -236,9 +255,10 @@ def choose(bodies, first, scores, threshold, width):
                 continue
             place[o + k] = count
             count += 1
-            if state[o + k] == LEAF or kids[2 * k + 0] < 0:
+            if kids[2 * k] < 0:
                 state[o + k] = LEAF
-                leaves += 1
+            leaves += _whole(state[o + k], above[o + k]) > 0.0
+            if state[o + k] == LEAF:
                 continue
             x = math.log(max(scores[o + k], 1e-300) / threshold) / math.log(width)
             fades[o + k] = min(smooth(x), above[o + k])
@@ -250,11 +270,17 @@ def choose(bodies, first, scores, threshold, width):
 
 
 @compiled
+def _whole(state, above):
+    """How far a cluster is represented by itself: it gives way to its parts as it is entered."""
+    return 1.0 if state == LEAF else 1.0 - smooth(above / _PARTED)
+
+
+@compiled
 def _collect(bodies, first, state, place, fades, above, count, leaves):
     cut = Cut(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),
         np.zeros(count), np.empty(count, np.int64), np.empty(count), np.empty(count),
-        np.empty(leaves, np.int64),
+        np.empty(count), np.empty(leaves, np.int64),
     )  # fmt: skip
     leaf = 0
     for b in range(bodies.shape[0]):
@@ -268,14 +294,59 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
                 continue
             cut.body[a], cut.node[a] = b, k
             cut.fade[a], cut.above[a] = fades[o + k], above[o + k]
+            cut.whole[a] = _whole(state[o + k], above[o + k])
             cut.leaf[a] = cut.kids[a, 0] = cut.kids[a, 1] = -1
-            if state[o + k] == LEAF:
+            if cut.whole[a] > 0.0:
                 cut.leaf[a], cut.leaves[leaf] = leaf, a
                 leaf += 1
-            else:
+            if state[o + k] != LEAF:
                 cut.kids[a, 0], cut.kids[a, 1] = (
                     place[o + kids[2 * k + 0]],
                     place[o + kids[2 * k + 1]],
                 )
                 cut.share[a] = charge[kids[2 * k + 0]] / charge[k]
     return cut
+
+
+@compiled
+def functions_of(bodies, cut):
+    """List the charge functions of a cut, those to be solved for first."""
+    count = bodies.shape[0]
+    for a in range(cut.node.shape[0]):
+        if cut.kids[a, 0] >= 0:
+            count += 1
+    cluster, number, body = (
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+    )
+    ends = np.zeros(count)
+    f = solved = 0
+    for rest in range(2):
+        for a in range(cut.node.shape[0]):
+            b = cut.body[a]
+            if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral:
+                cluster[f], number[f], body[f] = -1 - a, 0, b
+                f += 1
+            if cut.kids[a, 0] >= 0 and (cut.fade[a] == 0.0) == (rest == 1):
+                # functions are numbered breadth first, as clusters are
+                cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
+                ends[f] = _panels(bodies[b], cut.node[a])
+                f += 1
+        if rest == 0:
+            solved = f
+    return Functions(cluster[:f], number[:f], body[:f], ends[:f], solved)
+
+
+@compiled
+def _function(body, node):
+    return integers(body.function)[node]
+
+
+@compiled
+def _panels(body, node):
+    kids, out = integers(body.kids), 0.0
+    for c in range(2):
+        if kids[2 * kids[2 * node + c]] < 0:
+            out += 0.5
+    return out

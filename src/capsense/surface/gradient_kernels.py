@@ -24,9 +24,8 @@ from capsense.surface.leaf_kernels import (
     near_pairs,
     pair_line,
     source_lines,
-    weigh,
-    wide_moments,
 )
+from capsense.surface.pair_kernels import cluster_moments
 
 _BLOCK = 32
 """Leaves taken at a time, whose tables stay in the cache."""
@@ -54,7 +53,7 @@ def jacobian(solution, bodies, green):
         bounds[b + 1] = max(bounds[b], bounds[b + 1])
     work = np.zeros((count, 6, lead, lead), np.float32)
     _add_design(points, charge, bounds, green, work)
-    _add_pairs(points, solution.extent, charge, bounds, green.floor, work)
+    _add_pairs(solution, bounds, green.floor, work)
     out = np.empty((count, m, m, 6))
     for b in range(count):
         x, y, z = bodies[b].position[0], bodies[b].position[1], bodies[b].position[2]
@@ -95,12 +94,13 @@ def _add_design(points, charge, bounds, green, work):
 
 
 @compiled
-def _padded(sources):
-    """Sources (3, s) and more of them that nothing depends on, up to a multiple of 32."""
-    out = np.full((3, WIDTH * ((sources.shape[1] + WIDTH - 1) // WIDTH)), np.float32(9.0))
-    for i in range(3):
-        for s in range(sources.shape[1]):
-            out[i, s] = sources[i, s]
+def _padded(table):
+    """A table and more columns that nothing depends on, up to a multiple of WIDTH."""
+    rows, width = table.shape[0], WIDTH * ((table.shape[1] + WIDTH - 1) // WIDTH)
+    out = np.full((rows, width), np.float32(9.0))
+    for i in range(rows):
+        for j in range(table.shape[1]):
+            out[i, j] = table[i, j]
     return out
 
 
@@ -218,16 +218,18 @@ def _add_contracted(sums, coefficients, work):
 
 
 @compiled
-def _add_pairs(points, extent, charge, bounds, floor, work):
+def _add_pairs(solution, bounds, floor, work):
     """Add forces and torques by other bodies' charges and by all images in the floor."""
+    charge, points = solution.charge, solution.points
+    extent, soft = solution.extent, solution.soft
     n, lead = charge.shape
-    width = WIDTH * ((n + WIDTH - 1) // WIDTH)
     image = np.empty((n, 4, 3))
     for j in range(n):
         for q in range(4):
             image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
-    shapes, mirrored = wide_moments(points, extent, width), wide_moments(image, extent, width)
+    shapes = _padded(cluster_moments(points, extent))
+    mirrored, width = _padded(cluster_moments(image, extent)), shapes.shape[1]
     coefficients = np.zeros((width, lead), np.float32)
     for j in range(n):
         for i in range(lead):
@@ -241,16 +243,29 @@ def _add_pairs(points, extent, charge, bounds, floor, work):
         for i in range(start, stop):
             for k in range(lead):
                 left[k, i - start] = charge[i, k]
-            weigh(shapes, i, mirrored, n, 1.0, weight)
+            _weigh(shapes, i, mirrored, n, 1.0, weight)
             pair_line(shapes, i, mirrored, weight, lines, i - start)
-            near_pairs(points, image, extent, i, (0, 0), weight, near, lines[:, i - start])
+            near_pairs(points, image, soft, i, (0, 0), weight, near, lines[:, i - start])
             if stop - start < n:
-                weigh(shapes, i, shapes, n, -1.0, weight)
+                _weigh(shapes, i, shapes, n, -1.0, weight)
                 for j in range(start, stop):
                     weight[j] = 0.0
                 pair_line(shapes, i, shapes, weight, lines, i - start)
                 own = (start, stop)
-                near_pairs(points, points, extent, i, own, weight, near, lines[:, i - start])
+                near_pairs(points, points, soft, i, own, weight, near, lines[:, i - start])
         for r in range(6):
             multiply(left, lines[r], sums[r])
         _add_contracted(sums, coefficients, work[b])
+
+
+@compiled
+def _weigh(shapes, i, others, n, sign, weight):
+    """Give the clusters that cluster i meets by moments the weight ``sign``, others zero."""
+    sign, none = np.float32(sign), np.float32(0.0)
+    x, y, z, reach = shapes[0, i], shapes[1, i], shapes[2, i], shapes[9, i]
+    for j in range(n):
+        dx, dy, dz = x - others[0, j], y - others[1, j], z - others[2, j]
+        far = reach + others[9, j]
+        weight[j] = sign if dx * dx + dy * dy + dz * dz > far * far else none
+    for j in range(n, weight.shape[0]):
+        weight[j] = none

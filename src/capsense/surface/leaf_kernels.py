@@ -28,6 +28,7 @@ from capsense._simd import (
     vmadd,
     where_above,
 )
+from capsense.elements.rigid import ROUND, SOFT
 from capsense.field.green_kernels import (
     FAR_LEAST,
     NEAR_LEAST,
@@ -38,11 +39,10 @@ from capsense.field.green_kernels import (
     near_share,
     source_potentials,
 )
-from capsense.surface.pair_kernels import SOFT, cluster_moments
 
 
 class Leaves(NamedTuple):
-    """The clusters that are not split further."""
+    """The clusters that are represented by themselves, see :class:`Cut`."""
 
     points: NDArray[Any]
     """Four points of each [m], shape (l, 4, 3)."""
@@ -50,6 +50,8 @@ class Leaves(NamedTuple):
     """The same before they were lifted off the design."""
     extent: NDArray[Any]
     """Extents [m], shape (l,)."""
+    soft: NDArray[Any]
+    """Distances below which 1/r from their points is bounded [m], shape (l,)."""
     beyond: NDArray[Any]
     """How far each is out of reach, 0 to 1, see ``green_kernels.beyond``, shape (l,)."""
     owner: NDArray[Any]
@@ -66,8 +68,8 @@ def placed(bodies, cut, green, inside):
     ``inside`` is the impedance of the inside of surfaces that change, over their energy.
     """
     n = cut.leaves.shape[0]
-    points, extent, corners = np.empty((n, 4, 3)), np.empty(n), np.empty((4, 3))
-    true, out = np.empty((n, 4, 3)), np.empty(n)
+    points, corners, true = np.empty((n, 4, 3)), np.empty((4, 3)), np.empty((n, 4, 3))
+    extent, soft, out = np.empty(n), np.empty(n), np.empty(n)
     owner, within = np.empty(n, np.int64), np.zeros(n)
     moments, turn, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for j in range(n):
@@ -81,13 +83,14 @@ def placed(bodies, cut, green, inside):
                 middle[i] = center[3 * k + i]
                 for q in range(3):
                     moments[i, q] = spread[9 * k + 3 * i + q]
-            extent[j] = body.scale * four_points(moments, middle, turn, corners)
+            extent[j], soft[j] = four_points(moments, middle, turn, corners)
         else:
-            extent[j] = body.scale * doubles(body.extent)[k]
+            extent[j], soft[j] = doubles(body.extent)[k], doubles(body.soft)[k]
             local = doubles(body.points)
             for q in range(4):
                 for i in range(3):
                     corners[q, i] = local[12 * k + 3 * q + i]
+        extent[j], soft[j] = body.scale * extent[j], body.scale * soft[j]
         for q in range(4):
             for i in range(3):
                 points[j, q, i] = body.position[i] + body.scale * (
@@ -99,7 +102,7 @@ def placed(bodies, cut, green, inside):
         out[j] = beyond(points[j], green)
         if green.cover < 1.0:
             lift(points[j], least_gap(extent[j], green.cover), green.box)
-    return Leaves(points, true, extent, out, owner, within)
+    return Leaves(points, true, extent, soft, out, owner, within)
 
 
 @compiled
@@ -113,7 +116,8 @@ def four_points(a, center, v, out):
         out: Filled [m], shape (4, 3).
 
     Returns:
-        Length of a uniform rod with the largest second moment [m].
+        Length of a uniform rod with the largest second moment, and the distance below which 1/r
+        from the points is bounded [m].
     """
     for i in range(3):
         for k in range(3):
@@ -146,7 +150,8 @@ def four_points(a, center, v, out):
         x, y = long * v[i, first], short * v[i, second]
         out[0, i], out[1, i] = center[i] + x + y, center[i] + x - y
         out[2, i], out[3, i] = center[i] - x + y, center[i] - x - y
-    return math.sqrt(12.0) * long
+    extent = math.sqrt(12.0) * long
+    return extent, math.sqrt((SOFT * extent) ** 2 + ROUND * max(a[least, least], 0.0))
 
 
 @compiled
@@ -262,30 +267,6 @@ def _put_six(out, place, layer, six):
 
 
 @compiled
-def wide_moments(points, extent, width):
-    """Moments of the clusters, shape (10, width)."""
-    out = np.ones((10, width), np.float32)
-    moments = cluster_moments(points, extent)
-    for i in range(10):
-        for j in range(extent.shape[0]):
-            out[i, j] = moments[i, j]
-    return out
-
-
-@compiled
-def weigh(shapes, i, others, n, sign, weight):
-    """Give the clusters that cluster i meets by moments the weight ``sign``, others zero."""
-    sign, none = np.float32(sign), np.float32(0.0)
-    x, y, z, reach = shapes[0, i], shapes[1, i], shapes[2, i], shapes[9, i]
-    for j in range(n):
-        dx, dy, dz = x - others[0, j], y - others[1, j], z - others[2, j]
-        far = reach + others[9, j]
-        weight[j] = sign if dx * dx + dy * dy + dz * dz > far * far else none
-    for j in range(n, weight.shape[0]):
-        weight[j] = none
-
-
-@compiled
 def pair_line(shapes, i, others, weight, out, row):
     """Add force and torque on cluster i by others, by moments, to row ``row`` of ``out``."""
     width = others.shape[1]
@@ -348,7 +329,7 @@ def _cross(x, y, u, v):
 
 
 @compiled
-def near_pairs(points, others, extent, i, own, weight, near, line):
+def near_pairs(points, others, soft, i, own, weight, near, line):
     """The same for clusters without weight, point by point, but those from own[0] to own[1].
 
     ``near`` (14, l) is room for their points, bounds and numbers; ``line`` has shape (6, l).
@@ -362,7 +343,7 @@ def near_pairs(points, others, extent, i, own, weight, near, line):
         for q in range(4):
             for k in range(3):
                 near[3 * q + k, count] = others[j, q, k]
-        near[12, count] = (SOFT * max(extent[i], extent[j])) ** 4
+        near[12, count] = max(soft[i], soft[j]) ** 4
         near[13, count] = j
         count += 1
     width = near.shape[1]

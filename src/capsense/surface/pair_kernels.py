@@ -21,10 +21,6 @@ LIFTED = 1e-5
 _WIDE = 4.0
 """Sides of a cluster, over its distance from a flat design, from which on its images are bounded:
 four points are good to 0.1 % of their mean up to there."""
-SOFT = 0.15
-"""Distance, as a part of the larger extent, below which 1/r of two points is bounded: flat clusters
-that coincide then have less energy between them than each has alone. Coarse ones that are bent may
-not; ``solve_kernels`` raises the diagonal then."""
 
 
 @compiled
@@ -38,7 +34,7 @@ def leaf_pairs(leaves, floor):
     Returns:
         Shape (l, l) [1/m].
     """
-    points, extent, owner = leaves.points, leaves.extent, leaves.owner
+    points, extent, owner, soft = leaves.points, leaves.extent, leaves.owner, leaves.soft
     n = points.shape[0]
     out = np.empty((n, n), np.float32)
     image = np.empty((n, 4, 3))
@@ -47,7 +43,7 @@ def leaf_pairs(leaves, floor):
             image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
-    flat, below = _flat(points, extent), _flat(image, extent)
+    flat, below = _flat(points, soft), _flat(image, soft)
     line, room = np.empty(n, np.float32), np.empty((15, n), np.float32)
     behind = 0  # clusters of bodies before this one's
     for i in range(n):
@@ -89,9 +85,9 @@ def _add_lifted(leaves, out):
     for i in range(n):
         for j in range(i):
             if (lifted[i] or lifted[j]) and leaves.owner[i] == leaves.owner[j]:
-                size = max(leaves.extent[i], leaves.extent[j])
-                more = mean_inverse(points[i], points[j], size)
-                more -= mean_inverse(true[i], true[j], size)
+                soft = max(leaves.soft[i], leaves.soft[j])
+                more = mean_inverse(points[i], points[j], soft)
+                more -= mean_inverse(true[i], true[j], soft)
                 out[i, j] += more
                 out[j, i] += more
 
@@ -182,14 +178,14 @@ def _far_means(shapes, i, others, out):
 
 
 @compiled
-def _flat(points, extent):
-    """Coordinates of the four points and extent of each cluster, a column each, shape (13, l)."""
+def _flat(points, soft):
+    """Coordinates of the four points of each cluster, and its bound of 1/r: columns, (13, l)."""
     out = np.empty((13, points.shape[0]), np.float32)
     for j in range(points.shape[0]):
         for q in range(4):
             for i in range(3):
                 out[3 * q + i, j] = points[j, q, i]
-        out[12, j] = extent[j]
+        out[12, j] = soft[j]
     return out
 
 
@@ -201,7 +197,7 @@ def _near_means(flat, i, others, out, room):
         if out[j] < 0.0:
             for k in range(12):
                 room[k, count] = others[k, j]
-            bound = np.float32(SOFT) * max(flat[12, i], others[12, j])
+            bound = max(flat[12, i], others[12, j])
             room[12, count], room[13, count] = (
                 bound * bound * bound * bound + np.float32(1e-24),
                 0.0,
@@ -222,9 +218,12 @@ def _near_means(flat, i, others, out, room):
 
 
 @compiled
-def mean_inverse(first, second, extent):
-    """Mean of a bounded 1/r [1/m] over four points of each of two clusters, shapes (4, 3)."""
-    bound = np.float32((SOFT * extent) ** 4 + 1e-24)
+def mean_inverse(first, second, soft):
+    """Mean of 1/r [1/m] over four points of each of two clusters, shapes (4, 3).
+
+    Distances count as ``soft`` [m] where they are much smaller.
+    """
+    bound = np.float32(soft**4 + 1e-24)
     total = np.float32(0.0)
     for p in range(4):
         for q in range(4):

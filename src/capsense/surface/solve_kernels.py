@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capsense._dense import WIDTH, cholesky, multiply_part, substitute
 from capsense._jit import compiled
-from capsense._simd import at, integers, madd, put_span, singles, span
+from capsense._simd import at, madd, put_span, singles, span
 
 SHEET = 6.0
 """Impedance of a thin sheet to charge that moves from one part of a cluster to the other, times its
@@ -22,25 +22,10 @@ GAIN = 1.3
 COARSE = 0.6
 """What panels are too coarse for, by estimate, over the energy of the functions that end in them.
 ``benchmarks/limits.py`` sets the estimate beside the errors of wide boxes near a sensor."""
-
-
+_RAISE = 0.03
+"""By what part of itself a diagonal is raised first."""
 _ROWS = 4
 """Rows of a matrix whose products are taken at a time."""
-
-
-class Functions(NamedTuple):
-    """The charge functions of a cut: those solved for, then those of the estimate."""
-
-    cluster: NDArray[Any]
-    """Cluster in the cut that a function splits, -1 - cluster for the net charge, shape (f,)."""
-    number: NDArray[Any]
-    """Its number among the functions of the shape, shape (f,)."""
-    body: NDArray[Any]
-    """Its body, shape (f,)."""
-    ends: NDArray[Any]
-    """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,)."""
-    solved: int
-    """How many are solved for."""
 
 
 class System(NamedTuple):
@@ -72,50 +57,6 @@ class Reduced(NamedTuple):
 
 
 @compiled
-def functions_of(bodies, cut):
-    """List the charge functions of a cut, those to be solved for first."""
-    count = bodies.shape[0]
-    for a in range(cut.node.shape[0]):
-        if cut.kids[a, 0] >= 0:
-            count += 1
-    cluster, number, body = (
-        np.empty(count, np.int64),
-        np.empty(count, np.int64),
-        np.empty(count, np.int64),
-    )
-    ends = np.zeros(count)
-    f = solved = 0
-    for rest in range(2):
-        for a in range(cut.node.shape[0]):
-            b = cut.body[a]
-            if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral:
-                cluster[f], number[f], body[f] = -1 - a, 0, b
-                f += 1
-            if cut.kids[a, 0] >= 0 and (cut.fade[a] == 0.0) == (rest == 1):
-                # functions are numbered breadth first, as clusters are
-                cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
-                ends[f] = _panels(bodies[b], cut.node[a])
-                f += 1
-        if rest == 0:
-            solved = f
-    return Functions(cluster[:f], number[:f], body[:f], ends[:f], solved)
-
-
-@compiled
-def _function(body, node):
-    return integers(body.function)[node]
-
-
-@compiled
-def _panels(body, node):
-    kids, out = integers(body.kids), 0.0
-    for c in range(2):
-        if kids[2 * kids[2 * node + c]] < 0:
-            out += 0.5
-    return out
-
-
-@compiled
 def _differences(cut, functions, values, out):
     """Integrals with the first functions, (f, m), of what has these means on clusters, (k, m)."""
     for f in range(out.shape[0]):
@@ -134,12 +75,14 @@ def _climb(cut, values):
     """Fill the means (k, m) of all clusters of a cut from those of its leaves."""
     for a in range(cut.node.shape[0] - 1, -1, -1):
         if cut.kids[a, 0] >= 0:
-            p = np.float32(cut.share[a])
-            q = np.float32(1.0) - p
+            whole = np.float32(cut.whole[a])
+            p = (np.float32(1.0) - whole) * np.float32(cut.share[a])
+            q = np.float32(1.0) - whole - p
             x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
             row = values[a]
             for i in range(values.shape[1]):
-                row[i] = p * x[i] + q * y[i]
+                own = whole * row[i] if whole > 0.0 else np.float32(0.0)
+                row[i] = own + (p * x[i] + q * y[i])
 
 
 @compiled
@@ -343,7 +286,7 @@ def _factorise(matrix, root, own, factor):
     """Cholesky factor of √t A √t with A's own diagonal.
 
     Where bodies lie within each other or within the sensor, approximate energies may leave no
-    definite matrix. The diagonal is then raised, by as little as it takes.
+    definite matrix. The diagonal is then raised, by so much that the energy left is not small.
 
     Returns:
         By how much it was raised, relative to itself; -1 where there is no factor.
@@ -358,7 +301,7 @@ def _factorise(matrix, root, own, factor):
             factor[f, f] = matrix[f, f] + shift * abs(own[f])
         if cholesky(factor):
             return shift
-        shift = max(1e-3, 2.0 * shift)
+        shift = max(_RAISE, 2.0 * shift)
     return -1.0
 
 
@@ -412,11 +355,13 @@ def leaf_charges(cut, functions, x, leaves):
                 charge[cut.kids[a, 1], i] -= x[f, i]
     out = np.empty((leaves, m))
     for a in range(clusters):
+        if cut.leaf[a] >= 0:
+            for i in range(m):
+                out[cut.leaf[a], i] = cut.whole[a] * charge[a, i]
         if cut.kids[a, 0] >= 0:
+            p = (1.0 - cut.whole[a]) * cut.share[a]
+            q = 1.0 - cut.whole[a] - p
             for i in range(m):
-                charge[cut.kids[a, 0], i] += cut.share[a] * charge[a, i]
-                charge[cut.kids[a, 1], i] += (1.0 - cut.share[a]) * charge[a, i]
-        else:
-            for i in range(m):
-                out[cut.leaf[a], i] = charge[a, i]
+                charge[cut.kids[a, 0], i] += p * charge[a, i]
+                charge[cut.kids[a, 1], i] += q * charge[a, i]
     return out

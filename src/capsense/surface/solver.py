@@ -28,8 +28,6 @@ from capsense.surface.step import Solution, potential_change, solve, solve_lossy
 Array = NDArray[np.float64]
 
 
-DOUBTFUL = 0.03
-"""Readings are in doubt where the matrix's diagonal was raised by more than this part of it."""
 _OF_MANY = 0.4
 """Panels of one part of a large mesh, over those of a body."""
 _LARGE = 0.4
@@ -221,7 +219,7 @@ class SurfaceSolver:
         other or within the sensor so that the matrix had to be changed, it is all of that entry.
         """
         doubt = np.abs(np.diag(solution.left).real) + solution.coarse
-        if solution.shift > DOUBTFUL:
+        if solution.shift > 0.0:
             doubt = np.abs(np.diag(solution.delta).real)
         return UNIT * solution.delta, UNIT * float(doubt.max())
 

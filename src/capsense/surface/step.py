@@ -15,16 +15,14 @@ from capsense._jit import compiled, pasted
 from capsense.elements.rigid import INSIDE
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
-from capsense.surface.choose_kernels import Cut, chosen
+from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs
 from capsense.surface.solve_kernels import (
     COARSE,
     GAIN,
-    Functions,
     System,
     assembled,
-    functions_of,
     leaf_charges,
     reduced,
 )
@@ -45,6 +43,8 @@ class Solution(NamedTuple):
     """Four points of each leaf [m], shape (l, 4, 3)."""
     extent: NDArray[Any]
     """Extent of each leaf [m], shape (l,)."""
+    soft: NDArray[Any]
+    """Distance below which 1/r from its points is bounded [m], shape (l,)."""
     owner: NDArray[Any]
     """Body of each leaf, shape (l,)."""
     size: int
@@ -93,7 +93,7 @@ def solve(
     size = functions.solved if shift >= 0.0 else -1
     return Solution(
         delta[:m, :m], left[:m, :m], coarse[:m], charge,
-        leaves.points, leaves.extent, leaves.owner, size, shift,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, size, shift,
     )  # fmt: skip
 
 
@@ -185,7 +185,7 @@ def solve_lossy(
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     return Solution(
         0.5 * (delta + delta.T), np.ascontiguousarray(left.real), coarse, charge,
-        leaves.points, leaves.extent, leaves.owner, n, 0.0,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, n, 0.0,
     )  # fmt: skip
 
 

@@ -1,0 +1,105 @@
+"""Kernels run by Python itself: ``NUMBA_DISABLE_JIT=1 python -m pytest ...``.
+
+Mutations of kernels are checked so: nothing is compiled, and indices out of bounds are errors.
+Twins of what :mod:`capsense._simd` writes in LLVM stand in for it, and bodies are records with
+attributes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from typing import Any
+
+import numpy as np
+
+ON = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+Array = np.ndarray
+
+
+def _flat(x: Array) -> Array:
+    assert x.flags.c_contiguous
+    return x.reshape(-1)
+
+
+def at(x: Array, k: int) -> Any:
+    assert k >= 0
+    return _flat(x)[k]
+
+
+def span(x: Array, k: int) -> Array:
+    out = _flat(x)[k : k + 8].copy()
+    assert k >= 0
+    assert len(out) == 8
+    return out
+
+
+def put_span(x: Array, k: int, value: Array) -> None:
+    assert k >= 0
+    _flat(x)[k : k + 8] = value
+
+
+def splat(value: Any) -> Array:
+    return np.full(8, value)
+
+
+def madd(scalar: Any, value: Array, addend: Array) -> Array:
+    return value.dtype.type(scalar) * value + addend
+
+
+def rsqrt(value: Any) -> Any:
+    return (np.float32(1.0) / np.sqrt(value)).astype(np.float32)
+
+
+def _pointer(kind: Any) -> Any:
+    return lambda address: ctypes.cast(int(address), ctypes.POINTER(kind))
+
+
+TWINS = {
+    "at": at, "span": span, "put_span": put_span, "splat": splat, "madd": madd, "rsqrt": rsqrt,
+    "vadd": lambda u, v: u + v, "vmadd": lambda u, v, w: u * v + w,
+    "muladd": lambda a, b, c: a * b + c, "horizontal_sum": lambda v: v.sum(),
+    "where_above": lambda u, v, x, y: np.where(u > v, x, y),
+    "singles": _pointer(ctypes.c_float), "doubles": _pointer(ctypes.c_double),
+    "integers": _pointer(ctypes.c_int64),
+}  # fmt: skip
+
+
+def fewer(panels: int) -> int:
+    """How many panels to ask for."""
+    return panels // 10 if ON else panels
+
+
+def limit(fine: float, coarse: float) -> float:
+    """What errors are held against: clusters of fewer panels meet less exactly."""
+    return coarse if ON else fine
+
+
+def thinned(green: Any) -> Any:
+    """A Green's function of few sources and weak modes: no design's, but good for comparisons."""
+    if not ON:
+        return green
+    import dataclasses
+
+    near, far = (np.linspace(0, len(s) - 1, 40).astype(int) for s in (
+        green.near_sources, green.far_sources))  # fmt: skip
+    parts = {"near": (near, 16), "far": (far, 8)}
+    tables = {}
+    for name, (kept, modes) in parts.items():
+        scale = np.float32(len(getattr(green, f"{name}_sources")) / len(kept))
+        tables[f"{name}_sources"] = getattr(green, f"{name}_sources")[kept].copy()
+        tables[f"{name}_phi"] = scale * getattr(green, f"{name}_phi")[kept]
+        tables[f"{name}_modes"] = 2.0 * getattr(green, f"{name}_modes")[kept, :modes]
+    return dataclasses.replace(green, **tables)
+
+
+def start() -> None:
+    """Put the twins in place, before any kernel is imported."""
+    np.seterr(divide="ignore", invalid="ignore", over="ignore", under="ignore")
+    from capsense import _simd
+
+    for name, twin in TWINS.items():
+        setattr(_simd, name, twin)
+    from capsense.elements import rigid
+
+    rigid.BODY = np.dtype((np.record, rigid.BODY))
