@@ -118,6 +118,22 @@ def test_threads_that_share_a_robots_skin(
     assert all(set(readings) == {"a", "b"} for readings in at_once(lambda _: skin.read()))
 
 
+def test_threads_that_share_a_robots_sensor(
+    field_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its chip is sampled by one thread at a time."""
+    mujoco = pytest.importorskip("mujoco", reason='needs pip install "capsense[mujoco]"')
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><site name='a'/></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    simulator = cs.Simulator(tiny_design(), settings=SETTINGS, cache_dir=field_cache)
+    sensor = cs.mujoco.attach(model, data, "a", simulator, readout="fdc1004")
+    monkeypatch.setattr(sensor.readout, "sample", alone(sensor.readout.sample))
+    assert all(reading.counts is not None for reading in at_once(lambda _: sensor.read(0.1)))
+
+
 def test_threads_that_share_a_fleet(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its chips are sampled, and its bodies changed, by one thread at a time."""
     fleet = cs.Fleet("six_patch", [cs.Body(cs.Sphere(0.02))], 2)

@@ -255,6 +255,36 @@ class Table:
             out.append(number)
         return out if many else out[0]
 
+    def pairs(self, key: str, what: str, names: Sequence[str], owner: str) -> list[tuple[str, str]]:
+        """An optional list of pairs of electrodes; ``what`` describes it, for messages."""
+        value = self.data.get(key)
+        if value is None:
+            return []
+        if not isinstance(value, list) or not value:
+            raise self.error(f"{key} = {shorten(value)} must be {what}")
+        for number, pair in enumerate(value):
+            at = f"{key}[{number}] = {shorten(pair)}"
+            if not isinstance(pair, list) or [type(name) for name in pair] != [str, str]:
+                raise self.error(f"{at} must be two electrode names")
+            for name in pair:
+                if name not in names:
+                    raise self.error(
+                        f"{at} names no electrode {name!r} of {owner}; {suggest(name, names)}"
+                    )
+        return [(one, two) for one, two in value]
+
+    def unit_quaternions(self, key: str) -> list[tuple[float, ...]]:
+        """A quaternion (x, y, z, w), or a list of such, each of length 1 to a thousandth."""
+        rows = self.vectors(key, 4, "[x, y, z, w]")
+        for row in rows:
+            norm = math.hypot(*row)
+            if abs(norm - 1.0) > 1e-3:
+                raise self.error(
+                    f"{key} = {list(row)} has length {norm:.4g}; give a unit quaternion "
+                    "[x, y, z, w]"
+                )
+        return rows
+
     def tables(self, key: str) -> list[Any]:
         """An optional array of tables."""
         value = self.data.get(key, [])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -45,6 +46,58 @@ def test_a_wrong_place_is_told(place: Any, message: str, shapes_in: SensorIn) ->
         sensor = shapes_in(ball_at(*place), cs.Pose())
     (found,) = sensor.check()
     assert any(fix in found for fix in ("exclude=[", "quaternion (1, 0, 0, 0)", "exclude, groups"))
+
+
+@pytest.mark.parametrize(("height", "told"), [(0.05, False), (0.041, False), (0.02, True)])
+def test_electrodes_within_their_own_link(
+    height: float, told: bool, tiny_simulator: cs.Simulator
+) -> None:
+    """On the flange of a KUKA, 4 mm under its face, and in the middle of the last link.
+
+    The link is not seen, so nothing else would tell.
+    """
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    import pybullet_data
+
+    client = p.connect(p.DIRECT)
+    file = f"{pybullet_data.getDataPath()}/kuka_iiwa/model.urdf"
+    body = p.loadURDF(file, useFixedBase=True, physicsClientId=client)
+    pad = "lbr_iiwa_link_7", cs.Pose((0, 0, height))
+    found = cs.pybullet.attach(client, body, *pad, tiny_simulator).check()
+    buried = [text for text in found if "on the link that carries the sensor" in text]
+    assert bool(buried) == told
+    skin = cs.pybullet.attach_skin(client, body, {"tip": pad}, tiny_simulator)
+    assert skin.check() == {"tip": found}
+    if told:
+        fix = r"lie up to \d+ mm deep inside '.*link_7.*Move .* or, .* exclude=\['(.*)'\]$"
+        match = re.search(fix, buried[0])
+        assert match
+        with pytest.warns(UserWarning, match="deep inside"):
+            cs.pybullet.attach(client, body, *pad, tiny_simulator)
+        hollow = cs.pybullet.attach(client, body, *pad, tiny_simulator, exclude=[match[1]])
+        assert not any("deep inside" in text for text in hollow.check())
+    p.disconnect(physicsClientId=client)
+
+
+def test_a_cover_of_plastic_screens_nothing(tiny_simulator: cs.Simulator) -> None:
+    """Nor do shapes that a sensor sees anyway tell twice."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="link"><geom name="shell" type="box" size=".1 .1 .05"/>'
+        '<site name="pad"/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+
+    def found(**options: Any) -> list[str]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return cs.mujoco.attach(model, data, "pad", tiny_simulator, **options).check()
+
+    assert [("deep inside" in text) for text in found()] == [False, True]
+    assert not any("deep inside" in text for text in found(materials={"shell": "PLA"}))
+    (seen,) = found(exclude_own=False)
+    assert "deep inside" not in seen
 
 
 def test_bodies_one_in_another_are_one_finding(shapes_in: SensorIn) -> None:

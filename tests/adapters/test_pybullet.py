@@ -124,8 +124,8 @@ def test_shapes_of_one_link(client: int, attach: Callable[..., Any]) -> None:
     ball, box = attach().scene()
     same(ball.shape, cs.Sphere(0.01))
     same(box.shape, cs.Box((0.01, 0.01, 0.01)))
-    assert ball.pose.position == pytest.approx((0.01, 0, 0.04))
-    assert box.pose.position == pytest.approx((-0.01, 0, 0.05))
+    assert ball.pose.position == pytest.approx((0.01, 0, 0.04), abs=1e-12)
+    assert box.pose.position == pytest.approx((-0.01, 0, 0.05), abs=1e-12)
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (0.6, 0, 0.8), (0, 1, 0)])

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
-from capsense.adapters.placement import blind, nothing_seen, placement, sees, turned_round
+from capsense.adapters.placement import (
+    blind,
+    buried,
+    nothing_seen,
+    placement,
+    sees,
+    turned_round,
+)
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
@@ -132,8 +139,9 @@ class AttachedSensor(ABC):
     def check(self) -> list[str]:
         """What is wrong with where the sensor sits and what it sees at the present state.
 
-        Electrodes inside a body or touching one, a sensor that faces the wrong way or sees
-        nothing, meshes and images too coarse, cameras that are set wrongly.
+        Electrodes inside a body or touching one, or deep inside the link that carries them; a
+        sensor that faces the wrong way or sees nothing; meshes and images too coarse; cameras
+        that are set wrongly.
 
         Returns:
             A sentence for each finding, with its fix; none where all is well.
@@ -280,14 +288,27 @@ class GeometrySensor(AttachedSensor):
 
     def check(self) -> list[str]:
         frames = self._now(None)
-        found = super().check()
+        found, hidden = super().check(), buried(self._link(frames), self._design)
         if not blind(found):
-            return found
+            return found + hidden
         turn = Pose((0, 0, 0), frames.sensor_quaternion) @ Pose((0, 0, 0), (1, 0, 0, 0))
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
         own = self.world.names(self.source.robot(self._carrier))
         others = [str(b.name) for b in behind if b.name not in own]
-        return [turned_round(others)] if others else found
+        return ([turned_round(others)] if others else found) + hidden
+
+    def _link(self, frames: Frames) -> Scene:
+        """The bodies of the link that carries the sensor, where these are not seen."""
+        own = self._own_frame()
+        if own is None:
+            return Scene()
+        try:
+            with warnings.catch_warnings():  # readings do without these bodies
+                warnings.simplefilter("ignore")
+                solids = [s for s in self.source.solids(None) if s.frame == own]
+        except SceneError:
+            return Scene()
+        return World(solids, self._design.domain).scene(frames)
 
     def refresh(self) -> None:
         """Take the world's solids over again, after their shapes, sizes or number changed.

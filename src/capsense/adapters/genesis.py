@@ -21,7 +21,7 @@ from capsense.adapters.rules import Rules, split_rules
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.fleet import FleetReading
-from capsense.scene import Body, Pose, Shape
+from capsense.scene import Shape
 
 _ORDER = [1, 2, 3, 0]
 """From quaternions (w, x, y, z) to (x, y, z, w)."""
@@ -74,10 +74,11 @@ class GenesisSensors(ParallelSensors):
         for entity in self._solver.entities:
             for link in entity.links:
                 for geom in link.geoms:
-                    body = _body(geom, link.name, rules)
-                    if body is None:
+                    shape = _shape(geom, link.name, rules)
+                    if shape is None:
                         left.append(link.name)
                         continue
+                    body = rules.body(shape, (link.name,))
                     where = geom.active_envs_mask
                     each = body if where is None else [body if x else None for x in where.tolist()]
                     parts.append(WorldShape((link.name,), link.idx, each))
@@ -110,15 +111,6 @@ class GenesisSensors(ParallelSensors):
         poses = poses.reshape(self.fleet.count, -1, 7).contiguous()
         self._follow(wp.from_torch(poses, dtype=wp.transform))
         return self._read(time)
-
-
-def _body(geom: Any, name: str, rules: Rules) -> Body | None:
-    """The body of a geom, None where it cannot be seen."""
-    shape = _shape(geom, name, rules)
-    if shape is None:
-        return None
-    names = (name,)
-    return Body(shape, Pose(), rules.material_of(names, None), rules.tie_of(names, None).grounding)
 
 
 def _shape(geom: Any, name: str, rules: Rules) -> Shape | None:

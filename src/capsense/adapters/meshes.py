@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
+from capsense.scene.surface import Faces, connected_parts, read_triangles
 
 Array = NDArray[np.float64]
 
@@ -68,7 +69,7 @@ def solid_mesh(vertices: ArrayLike, faces: ArrayLike, label: str, *, hull: bool 
         ) from None
 
 
-def load_triangles(path: str | Path, scale: ArrayLike, label: str) -> tuple[Array, Array]:
+def load_triangles(path: str | Path, scale: ArrayLike, label: str) -> tuple[Array, Faces]:
     """Vertices [m] and faces of a mesh file, all its parts together.
 
     Args:
@@ -79,22 +80,16 @@ def load_triangles(path: str | Path, scale: ArrayLike, label: str) -> tuple[Arra
     Raises:
         SceneError: The file is missing or unreadable, or holds no triangles.
     """
-    import trimesh
-
     file = Path(path)
     if not file.is_file():
         raise SceneError(
             f"{label!r}: there is no mesh file {file}; exclude it, or correct its path"
         )
     try:
-        mesh = trimesh.load_mesh(file, process=False)
-        if isinstance(mesh, trimesh.Scene):
-            mesh = mesh.to_mesh()
-    except Exception as error:  # trimesh's readers raise whatever they meet
-        raise UnusableShape(f"{label!r}: {file} cannot be read: {error}") from None
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise SceneError(f"{label!r}: {file} holds no triangles")
-    return np.asarray(mesh.vertices) * np.asarray(scale, dtype=float), np.asarray(mesh.faces)
+        vertices, faces = read_triangles(file)
+    except SceneError as error:
+        raise UnusableShape(f"{label!r}: {file} {error}") from None
+    return vertices * np.asarray(scale, dtype=float), faces
 
 
 def is_flat(vertices: ArrayLike) -> bool:
@@ -200,19 +195,12 @@ def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Arr
     Raises:
         SceneError: No part has a volume.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     v, f = np.asarray(vertices, dtype=float), np.asarray(faces)
-    _, same = np.unique(v.round(9), axis=0, return_inverse=True)
-    corner = same.reshape(-1)[f]
-    rows, columns = corner[:, [0, 1]].ravel(), corner[:, [1, 2]].ravel()
-    n = int(corner.max()) + 1
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    _, part = connected_components(graph, directed=False)
+    places, same = np.unique(v.round(9), axis=0, return_inverse=True)
+    part = connected_parts(same.reshape(-1)[f], len(places))
     all_vertices, all_faces, count = [], [], 0
-    for k in np.unique(part[corner[:, 0]]):
-        points = v[np.unique(f[part[corner[:, 0]] == k])]
+    for k in range(part.max() + 1):
+        points = v[np.unique(f[part == k])]
         try:
             points, triangles = _hull(points, label)
         except SceneError:

@@ -21,7 +21,7 @@ from capsense.adapters.parallel import (
 from capsense.adapters.rules import Rules, split_rules
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.scene import Body, Pose, Shape
+from capsense.scene import Body, Shape
 
 
 class SensorCapacitance(ParallelSensors):
@@ -150,11 +150,8 @@ class _Reader:
         kind, size = int(self._type[shape]), tuple(self._scale[shape].tolist())
         key = (label, kind, size, id(self._source[shape]))
         if key not in self._made:
-            names = (label,)
-            self._made[key] = Body(
-                self._shape(shape, kind, size, label), Pose(),
-                self._rules.material_of(names, None), self._rules.tie_of(names, None).grounding,
-            )  # fmt: skip
+            made = self._shape(shape, kind, size, label)
+            self._made[key] = self._rules.body(made, (label,))
         return self._made[key]
 
     def _shape(self, shape: int, kind: int, size: tuple[float, ...], label: str) -> Shape:

@@ -18,14 +18,47 @@ Array = NDArray[np.float64]
 
 _COARSE = 0.05
 """Panels of a body wider than this [m] say little of a sensor."""
+_DEEP = 5e-3
+"""Deeper than this [m] in the link that carries it, an electrode is not on the link's surface; a
+cover, or a collision shape that is rounder than the real link, is thinner."""
 _NOTHING = "nothing is in view, so that every change is exactly 0"
 
 
 def placement(scene: Scene, simulator: Simulator) -> list[str]:
     """What is wrong with the bodies of a scene, given in the sensor frame."""
-    points = {e.name: points_on(e.surface.triangles) for e in simulator.design.electrodes}
     panels = PRESETS[simulator.preset].panels
-    return _contacts(scene, points) + [text for body in scene for text in _coarse(body, panels)]
+    contacts = _contacts(scene, _points(simulator.design))
+    return contacts + [text for body in scene for text in _coarse(body, panels)]
+
+
+def buried(link: Scene, design: Design) -> list[str]:
+    """The finding for electrodes deep within the link that carries them, which is left out.
+
+    Args:
+        link: The bodies of that link, in the sensor frame.
+        design: The sensor.
+    """
+    found: dict[str, list[str]] = {}
+    depth = 0.0
+    for name, points in _points(design).items():
+        for body in link:
+            least = -float(distances(body, points).max())
+            if least > _DEEP and body.material.is_conductor():
+                found.setdefault(name, []).append(str(body.name))
+                depth = max(depth, least)
+    if not found:
+        return []
+    return [
+        f"{_electrodes(found, 'lies', 'lie')} up to {1e3 * depth:.0f} mm deep inside "
+        f"{_bodies(found)}, on the link that carries the sensor. That link is not seen, so "
+        "readings are as if it did not cover them; a real one would screen them. Move the sensor's "
+        f"frame out to the link's surface, or, if the link is hollow there, {_leave_out(found)}"
+    ]
+
+
+def _points(design: Design) -> dict[str, Array]:
+    """Points on each electrode [m]."""
+    return {e.name: points_on(e.surface.triangles) for e in design.electrodes}
 
 
 def sees(simulator: Simulator, scene: Scene) -> bool:
@@ -77,12 +110,12 @@ def _contacts(scene: Scene, electrodes: dict[str, Array]) -> list[str]:
     if inside:
         out.append(
             f"{_electrodes(inside, 'lies', 'lie')} inside {_bodies(inside)}, up to "
-            f"{1e3 * depth:.2g} mm deep, and readings mean nothing; {_mend(inside, depth)}"
+            f"{1e3 * depth:.2g} mm deep, and readings mean nothing; {_fix(inside, depth)}"
         )
     if touching:
         out.append(
             f"{_electrodes(touching, 'touches', 'touch')} {_bodies(touching)}, as a short circuit "
-            f"would; {_mend(touching, 1e-3)}"
+            f"would; {_fix(touching, 1e-3)}"
         )
     return out
 
@@ -97,13 +130,15 @@ def _bodies(found: dict[str, list[str]]) -> str:
     return ", ".join(map(repr, met[:4])) + f" and {len(met) - 4} more" * (len(met) > 4)
 
 
-def _mend(found: dict[str, list[str]], depth: float) -> str:
+def _fix(found: dict[str, list[str]], depth: float) -> str:
+    move = f"move the sensor's frame at least {1e3 * max(depth, 1e-3):.2g} mm out of it"
+    return f"{move}, or {_leave_out(found)}"
+
+
+def _leave_out(found: dict[str, list[str]]) -> str:
     met = _met(found)
     more = ", …" * (len(met) > 4)
-    return (
-        f"move the sensor's frame at least {1e3 * max(depth, 1e-3):.2g} mm out of it, or leave it "
-        f"out with exclude=[{', '.join(map(repr, met[:4]))}{more}]"
-    )
+    return f"leave it out with exclude=[{', '.join(map(repr, met[:4]))}{more}]"
 
 
 def _coarse(body: Body, panels: int) -> list[str]:

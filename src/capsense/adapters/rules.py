@@ -12,7 +12,7 @@ import numpy as np
 from capsense._validate import suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.scene import Material, material
+from capsense.scene import Body, Material, Pose, Shape, material
 from capsense.scene.scene import Grounding, checked_grounding
 
 Names = tuple[str, ...]
@@ -141,6 +141,10 @@ class Rules:
             if matches(pattern, names):
                 return Tie(value, f"pattern {pattern}")
         return Tie(self.default_grounding, "default") if own is None else own
+
+    def body(self, shape: Shape, names: Names) -> Body:
+        """A shape as a body at the origin, where the model says nothing of its own."""
+        return Body(shape, Pose(), self.material_of(names), self.tie_of(names).grounding)
 
     def excludes(self, names: Names) -> bool:
         """Whether something of these names is left out."""

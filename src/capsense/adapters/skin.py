@@ -88,12 +88,12 @@ class AttachedSkin:
             found = self.check()
         except SceneError:  # which the first reading will raise, too
             return
-        unseen = {name for name, texts in found.items() if blind(texts)}
+        unseen = sum(blind(texts) for texts in found.values())
         listed = [
             f"sensor {name!r}: {text}"
             for name, texts in found.items()
-            if name not in unseen or len(unseen) == len(self)
             for text in texts
+            if not blind([text]) or unseen == len(self)
         ]
         if listed:
             more = f";\nand {len(listed) - 4} more, see check()" if len(listed) > 4 else ""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.scene.shapes import Shape, ShapeKind, as_points
+from capsense.scene.surface import checked_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -152,8 +153,6 @@ class Layers(Shape):
         return trimesh.Trimesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), process=False)
 
 
-Ints = NDArray[np.int64]
-
 _ROOM = 4
 
 
@@ -269,42 +268,3 @@ def _checked_resolution(resolution: object) -> tuple[int, int]:
             "pixels"
         )
     return rows, columns
-
-
-def checked_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, Ints]:
-    """Check the arrays of a surface, open or closed.
-
-    Raises:
-        SceneError: Wrong shapes or types, a vertex that is not finite, an index out of range.
-    """
-    f = np.asarray(faces)
-    if f.ndim != 2 or f.shape[1] != 3 or not len(f):
-        raise SceneError(f"faces have shape {f.shape}; give (m, 3), triangles only")
-    if f.dtype.kind not in "iu":
-        raise SceneError(f"faces have type {f.dtype}; give integer vertex indices")
-    v = checked_vertices(vertices)
-    low, high = int(f.min()), int(f.max())
-    if low < 0 or high >= len(v):
-        raise SceneError(
-            f"faces name vertices {low} to {high}, but there are {len(v)}; indices run from 0 to "
-            f"{len(v) - 1}"
-        )
-    return v, np.ascontiguousarray(f, dtype=np.int64)
-
-
-def checked_vertices(vertices: ArrayLike) -> Array:
-    """Check the vertices of a surface.
-
-    Raises:
-        SceneError: Wrong shape or type, or a vertex that is not finite.
-    """
-    try:
-        v = np.array(vertices, dtype=float, order="C")
-    except (TypeError, ValueError, OverflowError):
-        raise SceneError("vertices are not numbers; give shape (n, 3), metres") from None
-    if v.ndim != 2 or v.shape[1] != 3:
-        raise SceneError(f"vertices have shape {v.shape}; give (n, 3), metres")
-    if not np.isfinite(v).all():
-        bad = int(np.flatnonzero(~np.isfinite(v).all(axis=1))[0])
-        raise SceneError(f"vertex {bad} is {v[bad].tolist()}, not finite")
-    return v

@@ -12,13 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._frozen import Frozen
 from capsense.errors import SceneError
-from capsense.scene.layers import checked_mesh, checked_vertices
 from capsense.scene.materials import Material
 from capsense.scene.materials import material as find_material
 from capsense.scene.pose import Pose
 from capsense.scene.scene import Body, Grounding, checked_grounding
 from capsense.scene.shapes import Shape, ShapeKind, as_points
-from capsense.scene.surface import clean_surface, connected_parts, enclosed_volume, is_closed
+from capsense.scene.surface import (
+    checked_mesh,
+    checked_vertices,
+    clean_surface,
+    connected_parts,
+    enclosed_volume,
+    is_closed,
+)
 
 if TYPE_CHECKING:
     import trimesh

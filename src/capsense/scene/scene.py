@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -177,6 +178,8 @@ Array = NDArray[np.float64]
 
 _SHOWN = 8
 """Bodies that are listed when a scene is printed."""
+_HUGE = 25
+"""A body whose smallest side is so many domains was meant in millimetres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +261,23 @@ class Scene:
             known = ", ".join(repr(b.name) for b in self.bodies if b.name is not None)
             raise KeyError(f"no body named {key!r}; named bodies: {known or 'none'}")
         return self.bodies[key]
+
+    def warn_of_units(self, domain: float) -> None:
+        """Warn of a scene that was given in millimetres: all of it is far too large.
+
+        Args:
+            domain: Width of what the sensor sees [m].
+        """
+        sizes = (np.ptp(body.shape.bounds(), axis=0) for body in self.bodies)
+        if self.bodies and all(size.min() > _HUGE * domain for size in sizes):
+            first = self.bodies[0]
+            sides = " × ".join(f"{side:g}" for side in np.ptp(first.shape.bounds(), axis=0))
+            warnings.warn(
+                f"{first.name or 'bodies[0]'} is {sides} m, far more than the {domain:g} m that "
+                "the sensor sees, as are all other bodies, and nothing changes its readings; "
+                "lengths are metres, so multiply millimetres by 1e-3",
+                stacklevel=3,
+            )
 
     def pack(self) -> PackedScene:
         """Lay the geometry out as flat arrays for the solver's kernels."""

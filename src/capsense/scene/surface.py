@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +46,13 @@ def clean_surface(vertices: ArrayLike, faces: ArrayLike) -> CleanSurface:
         SceneError: Wrong shapes or types, a number that is not finite, an index out of range,
             or an extent above 10 m.
     """
-    v, f = _checked_arrays(vertices, faces)
+    v, f = checked_mesh(vertices, faces)
+    extent = float(np.ptp(v[f].reshape(-1, 3), axis=0).max())
+    if extent > _MAX_EXTENT:
+        raise SceneError(
+            f"TriMesh: the mesh is {extent:g} m long; units are metres, so scale a file in "
+            f"millimetres with vertices * 1e-3 (longest allowed: {_MAX_EXTENT:g} m)"
+        )
     v, f = _merged(v, f)
     edge, count = _edges(f, len(v))
     if not _is_balanced(f, edge):
@@ -73,6 +80,25 @@ def clean_surface(vertices: ArrayLike, faces: ArrayLike) -> CleanSurface:
     return CleanSurface(v, f[:, ::-1].copy() if volume < 0 else f, "")
 
 
+def read_triangles(path: Path) -> tuple[Array, Faces]:
+    """Vertices, shape (n, 3), and faces, shape (m, 3), of all parts of a file, in its own unit.
+
+    Raises:
+        SceneError: The file, of which the message says no more, cannot be read or is empty.
+    """
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        if isinstance(mesh, trimesh.Scene):
+            mesh = mesh.to_mesh()
+    except Exception as error:  # trimesh's readers raise whatever they meet
+        raise SceneError(f"cannot be read: {error}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise SceneError("holds no triangles")
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+
+
 def enclosed_volume(vertices: Array, faces: Faces) -> float:
     """Volume [m³] that a closed surface encloses, positive where normals point out."""
     a, b, c = np.moveaxis(vertices[faces] - vertices[0], 1, 0)
@@ -97,35 +123,43 @@ def connected_parts(faces: Faces, n: int) -> Faces:
     return out.reshape(-1).astype(np.int64)
 
 
-def _checked_arrays(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, Faces]:
-    try:
-        v = np.array(vertices, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise SceneError("TriMesh: vertices are not numbers; give shape (n, 3), metres") from None
+def checked_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, Faces]:
+    """Check the arrays of a surface, open or closed.
+
+    Raises:
+        SceneError: Wrong shapes or types, a vertex that is not finite, an index out of range.
+    """
     f = np.asarray(faces)
-    if v.ndim != 2 or v.shape[1] != 3:
-        raise SceneError(f"TriMesh: vertices have shape {v.shape}; give (n, 3), metres")
     if f.ndim != 2 or f.shape[1] != 3 or not len(f):
-        raise SceneError(f"TriMesh: faces have shape {f.shape}; give (m, 3), triangles only")
+        raise SceneError(f"faces have shape {f.shape}; give (m, 3), triangles only")
     if f.dtype.kind not in "iu":
-        raise SceneError(f"TriMesh: faces have type {f.dtype}; give integer vertex indices")
-    f = f.astype(np.int64)
-    bad = np.flatnonzero(~np.isfinite(v).all(axis=1))
-    if len(bad):
-        raise SceneError(f"TriMesh: vertex {bad[0]} is {v[bad[0]].tolist()}, not finite")
-    bad = np.flatnonzero(((f < 0) | (f >= len(v))).any(axis=1))
-    if len(bad):
+        raise SceneError(f"faces have type {f.dtype}; give integer vertex indices")
+    v = checked_vertices(vertices)
+    low, high = int(f.min()), int(f.max())
+    if low < 0 or high >= len(v):
         raise SceneError(
-            f"TriMesh: face {bad[0]} is {f[bad[0]].tolist()}, but there are {len(v)} vertices; "
-            f"indices run from 0 to {len(v) - 1}"
+            f"faces name vertices {low} to {high}, but there are {len(v)}; indices run from 0 to "
+            f"{len(v) - 1}"
         )
-    extent = float(np.ptp(v[f].reshape(-1, 3), axis=0).max())
-    if extent > _MAX_EXTENT:
-        raise SceneError(
-            f"TriMesh: the mesh is {extent:g} m long; units are metres, so scale a file in "
-            f"millimetres with vertices * 1e-3 (longest allowed: {_MAX_EXTENT:g} m)"
-        )
-    return v, f
+    return v, np.ascontiguousarray(f, dtype=np.int64)
+
+
+def checked_vertices(vertices: ArrayLike) -> Array:
+    """Check the vertices of a surface.
+
+    Raises:
+        SceneError: Wrong shape or type, or a vertex that is not finite.
+    """
+    try:
+        v = np.array(vertices, dtype=float, order="C")
+    except (TypeError, ValueError, OverflowError):
+        raise SceneError("vertices are not numbers; give shape (n, 3), metres") from None
+    if v.ndim != 2 or v.shape[1] != 3:
+        raise SceneError(f"vertices have shape {v.shape}; give (n, 3), metres")
+    if not np.isfinite(v).all():
+        bad = int(np.flatnonzero(~np.isfinite(v).all(axis=1))[0])
+        raise SceneError(f"vertex {bad} is {v[bad].tolist()}, not finite")
+    return v
 
 
 def _merged(v: Array, f: Faces) -> tuple[Array, Faces]:
