@@ -21,9 +21,9 @@ from capsense.fleet.fleet import Fleet, FleetReading
 from capsense.plotting.runs import plot
 from capsense.reading import Reading, StepStats
 from capsense.readout.calibration import calibrate
-from capsense.readout.chips import available_chips
 from capsense.readout.config import load_readout
 from capsense.readout.counts import Counts
+from capsense.readout.presets import available_chips
 from capsense.readout.readout import Readout
 from capsense.recording.reader import open_recording, replay
 from capsense.recording.recorder import Recorder, record

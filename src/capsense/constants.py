@@ -1,7 +1,4 @@
-"""Physical constants (CODATA 2018) and fixed conventions of the package."""
+"""Physical constants (CODATA 2018)."""
 
 EPS0 = 8.8541878128e-12
 """Vacuum permittivity [F/m]."""
-
-MM = 1e-3
-"""One millimetre [m]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from inspect import cleandoc
 from pathlib import Path
 
 import pytest
@@ -115,7 +116,8 @@ def test_help_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         assert stopped.value.code == 0
         text = capsys.readouterr().out
         assert "exit codes:" in text
-        examples = [e.split("   ")[0].split() for e in command.examples.splitlines()]
+        _, _, lines = cleandoc(command.execute.__doc__ or "").partition("examples:\n")
+        examples = [line.strip().split("   ")[0].split() for line in lines.splitlines()]
         assert len(examples) >= 2
         for words in examples:
             assert words[:2] == ["capsense", command.name]

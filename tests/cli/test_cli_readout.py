@@ -17,7 +17,7 @@ from capsense.cli.console import BAD_INPUT, OK
 from capsense.cli.main import main
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, mutual_patterns, self_patterns
-from capsense.readout.chips import CHIPS
+from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout
 from capsense.readout.recording import load_recording
 

@@ -146,6 +146,7 @@ RECTANGLE = {"shape": "rectangle", "size": [0.02, 0.02]}
     ("keys", "rest", "words"),
     [
         ({"size": [0.32, 0.02]}, {}, ["E1", "more than the way round", "0.1571"]),
+        ({"size": [0.02, 0.02], "center": [0.15, 0]}, {}, ["E1", "more than the way round"]),
         ({"z": -0.06}, {}, ["E1", "z = -0.06", "at or below the axis"]),
         ({}, {"bend": {"radius": -1.0}}, ["bend", "radius"]),
         ({}, {"bend": {"radius": 0.05, "axis": "y"}}, ["bend", "axis"]),

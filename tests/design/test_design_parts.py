@@ -105,6 +105,13 @@ def test_turned_box_has_its_corners_there():
         ([{**BALL, "file": "shell.stl"}], {"size": [0.008, 0.008]}),  # in the cavity
         ([{**DISC, "z": 0.0015}, {"size": [0.1, 0.1], "z": [-0.002, 0.0]}], {}),  # shared faces
         ([{**DISC, "z": 0.0015}, {**BOX, "z": -0.001, "rotation": 30}], {}),
+        (
+            [
+                {**DISC, "z": 0.03},  # beside its rim, within its bounding box
+                {"size": [0.004, 0.004], "z": [0.029, 0.031], "center": [0.0135, 0.0135]},
+            ],
+            {},
+        ),
     ],
 )
 def test_what_may_touch(folder, layers, pad):
@@ -122,6 +129,8 @@ def test_what_may_touch(folder, layers, pad):
         ([DISC, DISC], {"z": 0.03}, "overlaps"),
         ([BOX, {**BOX, "rotation": 90}], {"z": 0.03}, "overlaps"),  # a cross, no corner in either
         ([BOX, {"size": [0.01, 0.1], "z": [-0.0005, 0.0005]}], {"z": 0.03}, "overlaps"),
+        ([{"size": [0.01, 0.01], "z": [0.01, 0.02]}, {"size": [0.01, 0.01], "z": [0.015, 0.03],
+           "center": [0.004, 0]}], {}, r"overlaps .* at .*0\.002, 0, 0\.0175"),
         ([{**BALL, "file": "half.stl"}], {}, r"it has \d+ boundary edges.*dielectric part"),
         ([{**BALL, "file": "two.stl"}], {"z": 0.03}, r"itself, near \(.*part of its own"),
         ([{**BALL, "file": "tower.stl", "tilt": [20, 30, 0]}], {"z": 0.03}, "or touches itself"),
@@ -167,6 +176,10 @@ def test_hash_knows_the_shape_and_recordings_keep_it(folder):
     upright = design(None, {**BOX, "z": 0.05})
     turned = design(None, {**BOX, "z": 0.05, "rotation": 10})
     assert upright.content_hash() != turned.content_hash()
+    square = {**BOX, "size": [0.03, 0.03, 0.003], "z": 0.05}
+    across = [design(None, {**square, "rotation": a}) for a in (30, 60)]  # in one bounding box
+    np.testing.assert_allclose(*(d.layers[0].upper for d in across))
+    assert len({d.content_hash() for d in across}) == 2
     ball = design(folder, {**BALL, "center": [0, 0, 0.05]})
     back = codec.design_from_json(codec.design_to_json(ball))
     assert back.content_hash() == ball.content_hash()

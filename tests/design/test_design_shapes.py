@@ -122,7 +122,10 @@ def test_box_is_closed() -> None:
     """A box has six facets, twelve rims, outward normals and its own volume (analytic)."""
     box = surface("box", size=[0.02, 0.03, 0.04], center=[0.01, 0.02, 0.05], rotation=90)
     assert box.area == pytest.approx(2 * (6e-4 + 8e-4 + 12e-4), rel=1e-12)
-    assert len(box.rims) == 12
+    ends = {tuple(np.round(p, 9)) for p in box.rims.reshape(-1, 3)}
+    assert ends == {(x, y, z) for x in (-0.005, 0.025) for y in (0.01, 0.03) for z in (0.03, 0.07)}
+    lengths = np.linalg.norm(box.rims[:, 0] - box.rims[:, 1], axis=1)
+    assert sorted(lengths) == pytest.approx(4 * [0.02] + 4 * [0.03] + 4 * [0.04])
     assert box.bounds == pytest.approx(np.array([[-0.005, 0.01, 0.03], [0.025, 0.03, 0.07]]))
     volume = 0.0
     for facet in box.facets:
@@ -131,9 +134,10 @@ def test_box_is_closed() -> None:
     assert volume == pytest.approx(0.02 * 0.03 * 0.04, rel=1e-12)
 
 
-def test_rotation_turns_counterclockwise() -> None:
-    """+90° takes local +x to sensor +y."""
-    got = surface("polygon", points=[[0, 0], [0.02, 0], [0.02, 0.01]], rotation=90)
+@pytest.mark.parametrize("rotation", [90, -270])
+def test_rotation_turns_counterclockwise(rotation: float) -> None:
+    """+90° takes local +x to sensor +y, and so do whole turns more or less."""
+    got = surface("polygon", points=[[0, 0], [0.02, 0], [0.02, 0.01]], rotation=rotation)
     want = {(0.0, 0.0), (0.0, 0.02), (-0.01, 0.02)}
     assert {(round(x, 9) + 0.0, round(y, 9)) for x, y, _ in ring_vertices(got.facets[0])[0]} == want
 
@@ -210,6 +214,14 @@ def test_clearance_may_leave_several_pieces_and_holes() -> None:
     got = design(stripe, ring, conductor=[{**POUR, "clearance": 0.001}]).conductors[0].surface
     assert len(got.facets) == 3
     assert sorted(len(f.polygon.interiors) for f in got.facets) == [0, 0, 1]
+
+
+@pytest.mark.parametrize(("width", "pieces"), [(8e-6, 1), (1.2e-5, 2)])
+def test_slivers_that_a_clearance_leaves_are_dropped(width: float, pieces: int) -> None:
+    """Limits: what is left beside the gap is narrower, or wider, than 10 µm."""
+    stripe = {"shape": "rectangle", "size": [0.01, 0.2], "center": [0.05 - 0.006 - width, 0]}
+    got = design(stripe, conductor=[{**POUR, "clearance": 0.001}]).conductors[0].surface
+    assert len(got.facets) == pieces
 
 
 def test_clearance_keeps_its_distance_in_a_tilted_plane() -> None:

@@ -287,6 +287,18 @@ def test_metres_read_as_millimetres(tmp_path: Path) -> None:
     refused(lambda: stl(tmp_path), 'electrode "E"', "0.03 mm across", 'did you mean unit = "m"')
 
 
+def test_imprints_of_a_box_that_is_off_the_middle(tmp_path: Path) -> None:
+    """Invariant: wherever the file has the box, the parts come to the same place."""
+    mesh = trimesh.load(PUBLISHED / "stripe_geom.stl")
+    mesh.apply_translation([30.0, -20.0, 7.0]).export(tmp_path / "stripe_geom.stl")
+    found, wanted = (
+        parse_design(imprint("stripe_geom.stl"), source="t.toml", folder=folder).electrodes
+        for folder in (tmp_path, PUBLISHED)
+    )
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one.surface.bounds, other.surface.bounds, atol=1e-6)
+
+
 def test_imprints_are_placed_as_the_domain_or_refused(tmp_path: Path) -> None:
     """Imprinted boxes must be the domain; their parts are picked one by one."""
     keys = {"file": "stripe_geom.stl", "folder": PUBLISHED}
@@ -303,6 +315,7 @@ def test_imprints_are_placed_as_the_domain_or_refused(tmp_path: Path) -> None:
 
     refused(group(unit="in"), "electrodes_from_stl", "12.7 m", '"mm"')
     refused(group(name="E"), "electrodes_from_stl", "'E'", '"E{}"')
+    refused(group(name="{}{}"), "electrodes_from_stl", "'{}{}'", '"E{}"')
     refused(group(part=1), "electrodes_from_stl", "'part'", "valid are file, unit, name")
     small = imprint("stripe_geom.stl")
     small["domain"]["size"] = [0.5, 0.5, 0.6]

@@ -45,14 +45,16 @@ def test_disc_alone_has_the_capacitance_of_the_textbook(sim, boxed):
 @pytest.mark.parametrize("z", [0.05, 0.1, 0.2, 0.35])
 @pytest.mark.parametrize("b", [0.005, 0.015])
 def test_small_ball_sees_the_potential_of_a_disc(sim, z, b):
-    """ΔC = 4π eps0 b φ² / (1 − b g), φ = (2/π) atan(a/z) at the ball's middle.
+    """ΔC = 4π eps0 [b φ² / (1 − b g) + b³ E²], φ = (2/π) atan(a/z) and E = −φ' in its middle.
 
-    g, the disc's answer at the ball, is near φ² / (8 a/4π) for a ball far away.
+    g, the disc's answer at the ball, is near φ² / (8 a/4π) for a ball far away. The second term is
+    the dipole's.
     """
     ball = cs.Body(cs.Sphere(b), cs.Pose((0, 0, z)), "steel")
     phi = 2 / math.pi * math.atan(RADIUS / z)
     own = b * phi**2 / (2 * RADIUS / math.pi)
-    expected = 4 * math.pi * EPS0 * b * phi**2 / (1 - own)
+    slope = 2 / math.pi * RADIUS / (RADIUS**2 + z**2)
+    expected = 4 * math.pi * EPS0 * (b * phi**2 / (1 - own) + b**3 * slope**2)
     found = sim.step(cs.Scene([ball])).delta[0, 0]
     assert found == pytest.approx(expected, rel=0.02)
 

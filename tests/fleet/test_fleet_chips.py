@@ -10,9 +10,9 @@ import capsense as cs
 from capsense.errors import ReadoutError
 from capsense.fleet import Fleet
 from capsense.readout.channels import self_patterns
-from capsense.readout.chips import CHIPS
 from capsense.readout.front_end import Wiring
 from capsense.readout.noise import allan_deviation
+from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout
 from capsense.readout.side_by_side import SideBySide
 

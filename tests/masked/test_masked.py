@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from capsense.errors import FieldError, SolveError
+from capsense.masked import MeshSensor
 from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.masked.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, kuhn_tets
@@ -49,7 +50,7 @@ def assert_physical(matrix: NDArray[np.float64]) -> None:
 
 @pytest.mark.parametrize("solver", ["cg", "lu"])
 def test_empty_domain_is_the_reference(mesh, solver):
-    masked = MaskedSolver(mesh, STRIPES, solver=solver)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES), solver=solver)
     got = masked.step(np.full(mesh.n_tets, -1), [])
     reference = capacitance_p1(mesh, 1.0, STRIPES)
     np.testing.assert_allclose(got, reference, atol=1e-8 * reference.max())
@@ -59,7 +60,7 @@ def test_empty_domain_is_the_reference(mesh, solver):
 @pytest.mark.parametrize("solver", ["cg", "lu"])
 def test_grounded_bar_shields(mesh, bar, solver):
     """Differential: the same mask solved by the reference with the bar's nodes on ground."""
-    masked = MaskedSolver(mesh, STRIPES, solver=solver)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES), solver=solver)
     empty = masked.step(np.full(mesh.n_tets, -1), [])
     near = masked.step(bar, [GROUNDED])
     assert_physical(near)
@@ -76,7 +77,7 @@ def test_grounded_bar_shields(mesh, bar, solver):
 
 @pytest.mark.parametrize("eps_r", [3.0, 80.0, 1e4])
 def test_dielectric_bar_matches_the_reference(mesh, bar, eps_r):
-    masked = MaskedSolver(mesh, STRIPES)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES))
     got = masked.step(bar, [eps_r])
     assert_physical(got)
     reference = capacitance_p1(mesh, np.where(bar == 0, eps_r, 1.0), STRIPES)
@@ -94,7 +95,7 @@ def test_bodies_are_told_apart_and_background_layers_kept(mesh):
     left = box(mesh, (-0.08, -0.06, 0.02), (0.0, 0.06, 0.06))
     right = box(mesh, (0.0, -0.06, 0.02), (0.08, 0.06, 0.06))
     inside[left], inside[right] = 1, 0
-    masked = MaskedSolver(mesh, STRIPES, eps_background=background)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES, eps_r=background))
     got = masked.step(inside, [5.0, 50.0])
     eps_r = background.copy()
     eps_r[left], eps_r[right] = 50.0, 5.0
@@ -105,7 +106,7 @@ def test_bodies_are_told_apart_and_background_layers_kept(mesh):
 def test_a_step_equals_a_fresh_solve_of_the_same_scene(mesh):
     """A random walk of two bodies, conductors and dielectrics, never drifts."""
     rng = np.random.default_rng(7)
-    masked = MaskedSolver(mesh, STRIPES, tolerance=1e-6)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES), tolerance=1e-6)
     for _ in range(25):
         inside = np.full(mesh.n_tets, -1)
         for body in (0, 1):
@@ -113,14 +114,14 @@ def test_a_step_equals_a_fresh_solve_of_the_same_scene(mesh):
             inside[box(mesh, tuple(low), tuple(low + 0.04))] = body
         properties = [float(rng.choice([2.0, 80.0, GROUNDED])), 1e3]
         walked = masked.step(inside, properties)
-    fresh = MaskedSolver(mesh, STRIPES, tolerance=1e-6).step(inside, properties)
+    fresh = MaskedSolver(MeshSensor(mesh, STRIPES), tolerance=1e-6).step(inside, properties)
     np.testing.assert_allclose(walked, fresh, atol=1e-10 * fresh.max())
     masked.reset()
     np.testing.assert_array_equal(masked.step(inside, properties), fresh)
 
 
 def test_warm_start_saves_iterations(mesh, bar):
-    masked = MaskedSolver(mesh, STRIPES)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES))
     masked.step(bar, [80.0])
     cold = masked.stats.iterations
     masked.step(bar, [80.0])
@@ -131,23 +132,25 @@ def test_warm_start_saves_iterations(mesh, bar):
 
 def test_without_a_warm_start_every_step_is_the_first(mesh, bar):
     """Invariant: same iterations and result, whatever was solved before."""
-    masked = MaskedSolver(mesh, STRIPES, warm_start=False)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES), warm_start=False)
     first, iterations = masked.step(bar, [80.0]), masked.stats.iterations
     masked.step(np.full(mesh.n_tets, -1), [])
     np.testing.assert_allclose(masked.step(bar, [80.0]), first, rtol=1e-12)
     assert abs(masked.stats.iterations - iterations) <= 1
-    np.testing.assert_allclose(first, MaskedSolver(mesh, STRIPES).step(bar, [80.0]), rtol=1e-7)
+    np.testing.assert_allclose(
+        first, MaskedSolver(MeshSensor(mesh, STRIPES)).step(bar, [80.0]), rtol=1e-7
+    )
 
 
 def test_an_electrode_inside_a_conductor_keeps_its_potential(mesh):
     inside = np.where(box(mesh, (-0.06, -0.045, -0.01), (0.06, -0.015, 0.01)), 0, -1)
-    got = MaskedSolver(mesh, STRIPES).step(inside, [GROUNDED])
+    got = MaskedSolver(MeshSensor(mesh, STRIPES)).step(inside, [GROUNDED])
     assert_physical(got)
     assert got[0, 0] > 1.2 * got[2, 2]
 
 
 def test_wrong_input_is_refused(mesh, bar):
-    masked = MaskedSolver(mesh, STRIPES)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES))
     with pytest.raises(SolveError, match="inside must hold"):
         masked.step(bar[:-1], [2.0])
     with pytest.raises(SolveError, match="inside must hold"):
@@ -161,14 +164,14 @@ def test_wrong_input_is_refused(mesh, bar):
     with pytest.raises(FieldError, match="eps_r"):
         masked.step_cells(np.ones(3))
     with pytest.raises(SolveError, match="unknown solver 'qr'"):
-        MaskedSolver(mesh, STRIPES, solver="qr")  # type: ignore[arg-type]
+        MaskedSolver(MeshSensor(mesh, STRIPES), solver="qr")  # type: ignore[arg-type]
     with pytest.raises(SolveError, match="tolerance"):
-        MaskedSolver(mesh, STRIPES, tolerance=0.0)
+        MaskedSolver(MeshSensor(mesh, STRIPES), tolerance=0.0)
     with pytest.raises(SolveError, match="max_iterations"):
-        MaskedSolver(mesh, STRIPES, max_iterations=0)
+        MaskedSolver(MeshSensor(mesh, STRIPES), max_iterations=0)
 
 
 def test_no_convergence_is_an_error(mesh, bar):
-    masked = MaskedSolver(mesh, STRIPES, max_iterations=3)
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES), max_iterations=3)
     with pytest.raises(SolveError, match="CG stopped after 3 iterations"):
         masked.step(bar, [80.0])

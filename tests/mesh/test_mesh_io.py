@@ -269,7 +269,7 @@ def test_options_that_do_not_fit(mesh, tmp_path):
 
 def test_missing_meshio_names_the_install(mesh, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "meshio", None)
-    with pytest.raises(MissingDependencyError, match=r'pip install "capsense\[mesh\]"'):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'capsense\[mesh\]'"):
         save_mesh(mesh, tmp_path / "a.vtu")
     save_mesh(mesh, tmp_path / "a.msh")
     save_mesh(mesh, tmp_path / "a.mat")

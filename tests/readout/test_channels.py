@@ -45,6 +45,7 @@ PATTERNS = [
     Pattern("C", rest="floating"),
     Pattern("D", floating=("A", "E")),
     Pattern("B", {"A": 1.0}),
+    Pattern("B", {"A": -1.0}, name="inverted"),
     Pattern("B", {"A": 1.0, "C": -1.0}, name="difference"),
     Pattern("E", {"A": 1.0, "B": 1.0}, floating=("C",)),
     Pattern("E", {"D": 2.0}, rest="floating", name="E, others open"),

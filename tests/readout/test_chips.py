@@ -10,11 +10,10 @@ from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.channels import Pattern, mutual_patterns
-from capsense.readout.chips import CHIPS, Status
 from capsense.readout.converter import Range
 from capsense.readout.front_end import Wiring
 from capsense.readout.noise import allan_deviation
-from capsense.readout.presets import ReadoutOptions, charge_for, schedule_of
+from capsense.readout.presets import CHIPS, ReadoutOptions, Status, schedule_of
 from capsense.readout.presets import build as build_chip
 from capsense.readout.readout import Readout
 
@@ -146,13 +145,13 @@ def test_saturation_reaches_the_flags():
 def test_charge_set_up():
     """The MPR121's charge is chosen so that the expected capacitance reads near 90 %."""
     for capacitance in np.geomspace(0.6e-12, 2e-9, 40):
-        law = charge_for(capacitance)
+        law = CHIPS["mpr121"].law.set_for(capacitance)
         code = float(law.level(np.array(capacitance)))
         assert law.low <= code <= law.high
         if 10e-12 < capacitance < 800e-12:
             assert code == near(law.low + 0.9 * (law.high - law.low), rel=0.05)
     with pytest.raises(ReadoutError, match="outside of what an MPR121 can charge"):
-        charge_for(1e-14)
+        CHIPS["mpr121"].law.set_for(1e-14)
 
 
 def test_touch_of_a_chip():

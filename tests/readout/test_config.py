@@ -11,12 +11,13 @@ from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor, calibrate
+from capsense.readout.checks import phasors, require
 from capsense.readout.config import choose_readout, load_readout, parse_readout
 from capsense.readout.converter import ResonanceLaw, ShuntLaw
 from capsense.readout.detector import ExponentialTracker, SteppingTracker
 from capsense.readout.front_end import ShuntFrontEnd
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
-from capsense.readout.presets import charge_for
+from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout
 
 NAMES = ("E1", "E2", "E3")
@@ -104,6 +105,60 @@ def test_everything_is_taken_over():
     patterns = readout.bank.patterns
     assert (patterns[0].rest, patterns[0].shield, patterns[1].shield) == ("guard", 1.0, 0.0)
     assert dict(patterns[1].drive) == {"E1": 1.0, "E2": -1.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "low", "high"),
+    [
+        ('chip = "fdc1004"', "seed", 0, 2**63 - 1),
+        ('chip = "fdc1004"', "nonlinearity", -0.1, 0.1),
+        ('chip = "sdr"\n[front_end]', "full_scale", 1e-9, 1e6),
+        ('chip = "sdr"\n[front_end]', "gain", 1e-6, 1e9),
+        ('chip = "sdr"\n[front_end]', "bits", 2, 32),
+        ('chip = "fdc1004"\n[climate]', "temperature", -273.15, 1000.0),
+        ('chip = "fdc1004"\n[climate]', "gain_per_kelvin", -1.0, 1.0),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"', "shield", -1e3, 1e3),
+    ],
+)
+def test_numbers_up_to_their_limits(text, key, low, high):
+    """Limits: what lies beyond is refused by its key, the ends are not."""
+    step = 1 if isinstance(low, int) else 1e-6 * high
+    for value in (low, high):
+        assert f"{key} = " not in told(f"{text}\n{key} = {value!r}\n")
+    for value in (low - step, high + step):
+        assert f"{key} = " in told(f"{text}\n{key} = {value!r}\n")
+
+
+def told(text):
+    """What a file is refused with, if it is."""
+    try:
+        parse(text)
+    except ReadoutError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("low", "wanted"),
+    [
+        (-np.inf, "a finite number$"),
+        (0.0, "a number at least 0 F$"),
+        (2.0, "a number at least 2 F$"),
+    ],
+)
+def test_what_a_number_must_be_is_told(low, wanted):
+    """Errors name the bound, where there is one."""
+    with pytest.raises(ReadoutError, match=rf"chip: x is nan; give {wanted}"):
+        require("chip", "x", np.nan, low, "F")
+
+
+def test_complex_numbers_stay_so():
+    """Real ones are floats; texts are refused."""
+    lossy = np.array([1.0 + 2.0j])
+    assert phasors("values", lossy) is lossy
+    assert phasors("values", [1, 2]).dtype == float
+    with pytest.raises(ReadoutError, match=r"values: .* no real numbers"):
+        phasors("values", ["a"])
 
 
 def test_a_calibration_goes_through_a_file():
@@ -235,7 +290,7 @@ def test_choosing_by_name_or_file(tmp_path):
     readout = choose_readout("mpr121", NAMES, empty)
     assert not readout([0.0, 1.0], np.stack([matrix, matrix])).flags.any()
     least = Reading(1e-15 * np.eye(3), np.full(3, 1e-15))  # less than any setting charges
-    assert choose_readout("MPR121", NAMES, least).law == charge_for(0.2e-12)
+    assert choose_readout("MPR121", NAMES, least).law == CHIPS["mpr121"].law.set_for(0.2e-12)
     path = tmp_path / "mine.toml"
     path.write_text('chip = "fdc1004"\nrate = 400\n', encoding="utf-8")
     assert choose_readout(path, NAMES, empty).schedule.conversion == near(2.5e-3, rel=1e-12)

@@ -70,6 +70,8 @@ def test_stepping_tracker():
     assert watch(detector, [100, 104])[0].tolist() == [100, 104]  # 4 = 2 · max_half_delta
     baseline, _ = watch(detector, [100] + [105] * 7)
     assert baseline.tolist() == [100, 100, 100, 100, 100, 103, 105, 105]
+    baseline, _ = watch(detector, [100] + [120] * 18)  # counts anew after each step
+    assert np.flatnonzero(np.diff(baseline)).tolist() == [4, 9, 14]
     baseline, _ = watch(detector, [100] + [80] * 4)
     assert baseline.tolist() == [100, 95, 90, 85, 80]
 

@@ -14,12 +14,12 @@ from relative import near
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import ChannelBank, Pattern, self_patterns
-from capsense.readout.chips import CHIPS
 from capsense.readout.converter import CapDac, LinearLaw, ShuntLaw
 from capsense.readout.counts import Counts, join
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
 from capsense.readout.front_end import ShuntFrontEnd, Wiring
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
+from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
 
@@ -470,6 +470,10 @@ def test_held_values_are_of_fixed_size() -> None:
             else:
                 assert np.isinf(held.age[k])
     assert np.isfinite(held.age).all()
+    whole = replace(join(seen), until=None)
+    last = whole.last()
+    np.testing.assert_allclose(whole.held().age[last.channel], last.time.max() - last.time)
+    assert np.isinf(replace(seen[0][:0], until=None).held().age).all()
     chip.reset()
     assert np.isinf(chip.sample(0.0, np.zeros((3, 3))).held().age).all()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capsense.readout.calibration import cross_correlation
-from capsense.reproduce.store import (
+from capsense.reproduce.harness import (
     correlation_of_change,
     raw_correlation,
     rmse,

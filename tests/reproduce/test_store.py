@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capsense.reproduce.store import Store
+from capsense.reproduce.harness import Store
 
 
 def test_resumes_after_an_interruption(tmp_path: Path) -> None:

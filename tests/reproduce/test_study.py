@@ -9,20 +9,19 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
+from capsense import reproduce
 from capsense.cli.main import main
-from capsense.reproduce import harness
+from capsense.reproduce import STUDIES, load_study
 from capsense.reproduce.harness import (
     MAX_ROWS,
-    STUDIES,
     Outcome,
     Report,
     ReportTable,
     Row,
+    Store,
     judged,
-    load_study,
     write_outcome,
 )
-from capsense.reproduce.store import Store
 
 
 def sample_study(folder: Path, *, reduced: bool, report: Report) -> Outcome:
@@ -140,7 +139,7 @@ def test_missing_package(
     study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It is named, with the line that installs it, before any study begins."""
-    monkeypatch.setattr(harness, "find_spec", lambda name: None if name == "mujoco" else name)
+    monkeypatch.setattr(reproduce, "find_spec", lambda name: None if name == "mujoco" else name)
     assert main(["reproduce", study, "-o", str(tmp_path / "out")]) == 2
     assert "pip install 'capsense[mujoco]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

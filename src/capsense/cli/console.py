@@ -35,13 +35,10 @@ class Command:
     """What is typed after ``capsense``."""
     help: str
     """One line for ``capsense --help``."""
-    description: str
-    """Opening of ``capsense NAME --help``."""
-    examples: str
-    """Its end: commands that work."""
     add_arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
-    """Does it, and returns the exit code."""
+    """Does it, and returns the exit code. Its docstring is what ``capsense NAME --help`` says: a
+    description, and after the line ``examples:`` commands that work."""
 
 
 def say(message: str) -> None:

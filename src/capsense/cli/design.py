@@ -46,7 +46,16 @@ def _design_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _design(args: argparse.Namespace) -> int:
-    """Print, and draw if asked to, and return the exit code."""
+    """Print what a sensor design is made of, the figures of its field, and its baseline: the
+    capacitance matrix with nothing in front of it. The field is computed at a design's first
+    use and kept in the user's cache; --no-build leaves it alone.
+
+    examples:
+      capsense design --list
+      capsense design six_patch
+      capsense design stripe --no-build -o stripe.png     draw it: top view and stack
+      capsense design my/sensor.toml
+    """
 
     if args.list:
         print(_listing())
@@ -166,17 +175,6 @@ def describe_field(simulator: Simulator) -> str:
 DESIGN = Command(
     "design",
     "print a sensor design with its field's figures and baseline, or draw it",
-    """\
-Print what a sensor design is made of, the figures of its field, and its baseline: the
-capacitance matrix with nothing in front of it. The field is computed at a design's first
-use and kept in the user's cache; --no-build leaves it alone.
-""",
-    """\
-  capsense design --list
-  capsense design six_patch
-  capsense design stripe --no-build -o stripe.png     draw it: top view and stack
-  capsense design my/sensor.toml
-""",
     _design_arguments,
     _design,
 )

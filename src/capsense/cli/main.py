@@ -8,15 +8,16 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from inspect import cleandoc
 from typing import Any
 
-from capsense.cli import design, optimise, recordings, run, serve, studies
+from capsense.cli import design, recordings, run, serve, studies
 from capsense.cli.console import BAD_INPUT, FAILED, INTERRUPTED, OK, Interrupt, say
 from capsense.errors import CapSenseError, FieldError, SolveError
 
 COMMANDS = (
     run.RUN, run.RECORD, recordings.REPLAY, recordings.EXPORT, design.DESIGN, recordings.READOUT,
-    studies.DATASET, optimise.OPTIMISE, studies.BENCH, studies.REPRODUCE, serve.SERVE, serve.VIEW,
+    studies.DATASET, studies.OPTIMISE, studies.BENCH, studies.REPRODUCE, serve.SERVE, serve.VIEW,
 )  # fmt: skip
 """The subcommands, in the order of ``--help``. A new one is written as a
 :class:`~capsense.cli.console.Command` and listed here."""
@@ -58,11 +59,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, help="print the version and exit")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in COMMANDS:
+        description, _, examples = cleandoc(command.execute.__doc__ or "").partition("examples:\n")
         sub = commands.add_parser(
             command.name,
             help=command.help,
-            description=command.description,
-            epilog=f"examples:\n{command.examples}\n{EXIT_CODES}",
+            description=description,
+            epilog=f"examples:\n{examples}\n\n{EXIT_CODES}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )

@@ -27,8 +27,8 @@ from capsense.errors import ReadoutError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from capsense.readout.chips import Chip
     from capsense.readout.counts import Counts
+    from capsense.readout.presets import Chip
     from capsense.readout.readout import Readout
     from capsense.readout.recording import CapacitanceRecord
     from capsense.recording.reader import Replay
@@ -50,7 +50,20 @@ def _replay_recording_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _replay_recording(args: argparse.Namespace) -> int:
-    """Replay the recording and return the exit code."""
+    """Simulate a recording again, from the design, settings and bodies in it, and compare every
+    reading bit for bit; and the counts of a readout given by a chip's name or a file. The first
+    difference is printed.
+
+    Exit code 0: all the same. 3: something differs. 2: the file is no recording, or damaged.
+
+    Another processor, or another version of numba or NumPy, may change the last digits;
+    --tolerance allows for that. A recording that was cut short is compared as far as it goes.
+
+    examples:
+      capsense replay hand.mcap
+      capsense replay hand.mcap --tolerance 1e-19    differences up to 0.1 aF are allowed
+      capsense replay old.mcap --method surface      recorded by a version with other methods
+    """
     from tqdm import tqdm
 
     from capsense.recording.reader import open_recording, replay
@@ -96,21 +109,6 @@ def _replay_report(found: Replay) -> str:
 REPLAY = Command(
     "replay",
     "simulate a recording again and verify that every reading is the same",
-    """\
-Simulate a recording again, from the design, settings and bodies in it, and compare every reading
-bit for bit; and the counts of a readout given by a chip's name or a file. The first difference
-is printed.
-
-Exit code 0: all the same. 3: something differs. 2: the file is no recording, or damaged.
-
-Another processor, or another version of numba or NumPy, may change the last digits;
---tolerance allows for that. A recording that was cut short is compared as far as it goes.
-""",
-    """\
-  capsense replay hand.mcap
-  capsense replay hand.mcap --tolerance 1e-19    differences up to 0.1 aF are allowed
-  capsense replay old.mcap --method surface      recorded by a version with other methods
-""",
     _replay_recording_arguments,
     _replay_recording,
 )
@@ -130,7 +128,19 @@ def _export_recording_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _export_recording(args: argparse.Namespace) -> int:
-    """Export the recording and return the exit code."""
+    """Turn a recording into another file. The ending chooses the format:
+      .csv, .parquet   the columns of readings.csv of capsense run, and the episode
+      .npz             the arrays of readings.npz, the episode, and the counts of a readout;
+                       capsense readout takes it
+      .mcap            the recording again; one whose recorder was killed gets its index
+      .json            a layout in which Foxglove shows the recording
+
+    examples:
+      capsense export hand.mcap -o hand.parquet
+      capsense export hand.mcap -o counts.csv --counts
+      capsense export killed.mcap -o whole.mcap
+      capsense export hand.mcap -o layout.json
+    """
     from capsense.recording.export import export
     from capsense.recording.files import check_target
     from capsense.recording.reader import open_recording
@@ -148,20 +158,6 @@ def _export_recording(args: argparse.Namespace) -> int:
 EXPORT = Command(
     "export",
     "turn a recording into .csv, .npz or .parquet, or make one whole that was cut short",
-    """\
-Turn a recording into another file. The ending chooses the format:
-  .csv, .parquet   the columns of readings.csv of capsense run, and the episode
-  .npz             the arrays of readings.npz, the episode, and the counts of a readout;
-                   capsense readout takes it
-  .mcap            the recording again; one whose recorder was killed gets its index
-  .json            a layout in which Foxglove shows the recording
-""",
-    """\
-  capsense export hand.mcap -o hand.parquet
-  capsense export hand.mcap -o counts.csv --counts
-  capsense export killed.mcap -o whole.mcap
-  capsense export hand.mcap -o layout.json
-""",
     _export_recording_arguments,
     _export_recording,
 )
@@ -195,7 +191,22 @@ def _read_out_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _read_out(args: argparse.Namespace) -> int:
-    """Read out, write or draw, and return the exit code."""
+    """Turn the capacitances of a recording into what a chip reports: one channel after another,
+    late, noisy, quantised, within its range.
+
+    A recording is the output folder of capsense run, or readings.npz or readings.csv in it.
+    Beside it, or in the folder given with -o, is written
+      counts_CHIP.csv   one row per conversion: time stamp, channel, code, capacitance, flags
+
+    Between samples of the recording capacitances are interpolated linearly.
+
+    examples:
+      capsense readout --list                               the chips, with sources of their figures
+      capsense readout out/ --chip fdc1004
+      capsense readout out/ --chip fdc1004 --rate 400 --seed 3 -o counts/
+      capsense readout out/ --config my_chip.toml           options from a file
+      capsense readout out/ --chip all --plot chips.png     all chips side by side, no tables
+    """
 
     if args.list:
         print(_chips(args.chip))
@@ -207,7 +218,7 @@ def _read_out(args: argparse.Namespace) -> int:
     recording = load_recording(args.recording)
     readouts = _build(args, recording)
     if args.plot is not None:
-        from capsense.plotting.chips import plot_chips
+        from capsense.plotting.designs import plot_chips
 
         plot_chips(recording, readouts, args.electrode).savefig(args.plot, dpi=150)
         print(f"drawn to {args.plot}")
@@ -252,7 +263,7 @@ def _build(args: argparse.Namespace, recording: CapacitanceRecord) -> dict[str, 
 
     if args.config is not None:
         return {args.config.stem: load_readout(args.config, recording.electrodes)}
-    from capsense.readout.chips import CHIPS
+    from capsense.readout.presets import CHIPS
 
     names = list(CHIPS) if "all" in args.chip else args.chip
     out = {}
@@ -299,8 +310,7 @@ def _readout_report(readout: Readout, counts: Counts, path: Path) -> str:
 
 
 def _chips(chosen: list[str]) -> str:
-    from capsense.readout.chips import CHIPS
-    from capsense.readout.presets import chip_of
+    from capsense.readout.presets import CHIPS, chip_of
 
     if chosen and "all" not in chosen:
         return "\n\n".join(_figures(chip_of(name)) for name in chosen)
@@ -318,25 +328,5 @@ def _figures(chip: Chip) -> str:
 
 
 READOUT = Command(
-    "readout",
-    "turn recorded capacitances into what a chip reports",
-    """\
-Turn the capacitances of a recording into what a chip reports: one channel after another, late,
-noisy, quantised, within its range.
-
-A recording is the output folder of capsense run, or readings.npz or readings.csv in it. Beside it,
-or in the folder given with -o, is written
-  counts_CHIP.csv   one row per conversion: time stamp, channel, code, capacitance, flags
-
-Between samples of the recording capacitances are interpolated linearly.
-""",
-    """\
-  capsense readout --list                               the chips, with sources of their figures
-  capsense readout out/ --chip fdc1004
-  capsense readout out/ --chip fdc1004 --rate 400 --seed 3 -o counts/
-  capsense readout out/ --config my_chip.toml           options from a file
-  capsense readout out/ --chip all --plot chips.png     all chips side by side, no tables
-""",
-    _read_out_arguments,
-    _read_out,
+    "readout", "turn recorded capacitances into what a chip reports", _read_out_arguments, _read_out
 )

@@ -28,8 +28,8 @@ from capsense.cli.console import (
 from capsense.errors import RecordingError
 
 if TYPE_CHECKING:
-    from capsense.cli.recorder import RunWriter
     from capsense.recording.recorder import Recorder
+    from capsense.recording.tables import RunWriter
     from capsense.scenario import Sample, Scenario
     from capsense.simulator import Simulator
 
@@ -70,8 +70,23 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Run the scenario and return the exit code."""
-    from capsense.cli.recorder import RunWriter, prepare_folder
+    """Simulate a scenario: a sensor, bodies that move in front of it, and how it is sampled.
+
+    The output folder receives
+      readings.csv   one row per sample: time and capacitances, written as they are computed
+      readings.npz   the same as arrays, with full matrices and the bodies' poses
+      summary.json   what was computed, how long it took, versions
+      plot.png       the signals, and the bodies' way over the electrodes
+
+    Ctrl-C finishes the sample at hand and keeps what was computed.
+    The field of a design is computed once, at its first use, and kept in the user's cache.
+
+    examples:
+      capsense run examples/hand_approach.toml -o out/
+      capsense run examples/steel_bar_triangle.toml -o out/ --force
+      capsense run my.toml -o quick/ --rate 2        a quick look: two samples a second
+    """
+    from capsense.recording.tables import RunWriter, prepare_folder
     from capsense.scene import Scene
 
     scenario = _load(args)
@@ -113,8 +128,13 @@ def _run(args: argparse.Namespace) -> int:
             f"{recorder.count} before it are in {args.output}"
         )
         raise failure
-    if interrupt.requested and recorder.count < scenario.count:
-        say(f"interrupted after {recorder.count} of {scenario.count} samples, which are kept")
+    return _ending(interrupt, recorder.count, scenario.count)
+
+
+def _ending(interrupt: Interrupt, count: int, planned: int) -> int:
+    """The exit code of what was played so far; says so if it was interrupted."""
+    if interrupt.requested and count < planned:
+        say(f"interrupted after {count} of {planned} samples, which are kept")
         return INTERRUPTED
     return OK
 
@@ -177,7 +197,7 @@ def _write(recorder: RunWriter, summary: dict[str, Any]) -> None:
 
 def _run_report(summary: dict[str, Any], folder: Path) -> str:
     """The summary for people."""
-    from capsense.cli.recorder import FILES
+    from capsense.recording.tables import FILES
 
     field = ", ".join(f"{grouped(value)} {key}" for key, value in summary["field"].items())
     samples = f"{summary['samples']} of {summary['samples_planned']}"
@@ -221,29 +241,7 @@ def _channel_row(channel: dict[str, Any]) -> list[str]:
     return [channel["name"], *(f"{v * 1e12:.5f}" for v in (level, low, high)), *share]
 
 
-RUN = Command(
-    "run",
-    "simulate a scenario file and write its readings",
-    """\
-Simulate a scenario: a sensor, bodies that move in front of it, and how it is sampled.
-
-The output folder receives
-  readings.csv   one row per sample: time and capacitances, written as they are computed
-  readings.npz   the same as arrays, with full matrices and the bodies' poses
-  summary.json   what was computed, how long it took, versions
-  plot.png       the signals, and the bodies' way over the electrodes
-
-Ctrl-C finishes the sample at hand and keeps what was computed.
-The field of a design is computed once, at its first use, and kept in the user's cache.
-""",
-    """\
-  capsense run examples/hand_approach.toml -o out/
-  capsense run examples/steel_bar_triangle.toml -o out/ --force
-  capsense run my.toml -o quick/ --rate 2        a quick look: two samples a second
-""",
-    _run_arguments,
-    _run,
-)
+RUN = Command("run", "simulate a scenario file and write its readings", _run_arguments, _run)
 
 
 def _record_arguments(parser: argparse.ArgumentParser) -> None:
@@ -263,7 +261,18 @@ def _record_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _record(args: argparse.Namespace) -> int:
-    """Record the scenario and return the exit code."""
+    """Simulate a scenario, and record every step in an MCAP file of ROS 2 messages: bodies and
+    their poses, capacitance matrices, transforms, markers, and the counts of a readout. Foxglove
+    and 'ros2 bag' open it; 'capsense replay' simulates it again and compares; 'capsense export'
+    makes tables of it.
+
+    Every half second all that was computed is put into the file. Whatever ends the process, the
+    rest can be read.
+
+    examples:
+      capsense record examples/hand_approach.toml -o hand.mcap
+      capsense record examples/hand_approach.toml -o hand.mcap --readout fdc1004 --force
+    """
     from capsense.recording.files import check_target
     from capsense.recording.recorder import Recorder, check_name, make_readout
     from capsense.recording.ros import require
@@ -297,14 +306,10 @@ def _record(args: argparse.Namespace) -> int:
             raise
     if not args.quiet:
         print(_record_report(scenario, recorder))
-    if interrupt.requested and recorder.count < scenario.count:
-        say(f"interrupted after {recorder.count} of {scenario.count} samples, which are kept")
-        return INTERRUPTED
-    return OK
+    return _ending(interrupt, recorder.count, scenario.count)
 
 
 def _record_report(scenario: Scenario, recorder: Recorder) -> str:
-
     size = recorder.path.stat().st_size
     return facts(
         [
@@ -319,19 +324,6 @@ def _record_report(scenario: Scenario, recorder: Recorder) -> str:
 RECORD = Command(
     "record",
     "simulate a scenario file and record every step as MCAP, for ROS 2 and Foxglove",
-    """\
-Simulate a scenario, and record every step in an MCAP file of ROS 2 messages: bodies and their
-poses, capacitance matrices, transforms, markers, and the counts of a readout. Foxglove and
-'ros2 bag' open it; 'capsense replay' simulates it again and compares; 'capsense export' makes
-tables of it.
-
-Every half second all that was computed is put into the file. Whatever ends the process, the
-rest can be read.
-""",
-    """\
-  capsense record examples/hand_approach.toml -o hand.mcap
-  capsense record examples/hand_approach.toml -o hand.mcap --readout fdc1004 --force
-""",
     _record_arguments,
     _record,
 )

@@ -69,7 +69,19 @@ _LIMITS = {
 
 
 def _serve(args: argparse.Namespace) -> int:
-    """Serve until told to stop, and return the exit code."""
+    """Serve sensors over a WebSocket: clients send depth images or bodies, and receive
+    capacitances.
+
+    Logs one JSON object a line on stderr. GET /health on the same port answers how it is. Ctrl-C,
+    or a request to terminate, finishes what is in work, closes all connections and ends with exit
+    code 0; a second one stops at once.
+
+    examples:
+      capsense serve --design six_patch
+      capsense serve --design six_patch --design my.toml --readout fdc1004
+      capsense serve --design stripe --host 0.0.0.0 --token-file token.txt
+      capsense serve --design stripe --origin http://localhost:3000      for a web page
+    """
     import asyncio
 
     from capsense.server.connection import ServerOptions
@@ -151,23 +163,7 @@ def _logger(*, quiet: bool) -> logging.Logger:
 
 
 SERVE = Command(
-    "serve",
-    "serve sensors to Unity, browsers and other programs",
-    """\
-Serve sensors over a WebSocket: clients send depth images or bodies, and receive capacitances.
-
-Logs one JSON object a line on stderr. GET /health on the same port answers how it is. Ctrl-C, or a
-request to terminate, finishes what is in work, closes all connections and ends with exit code 0; a
-second one stops at once.
-""",
-    """\
-  capsense serve --design six_patch
-  capsense serve --design six_patch --design my.toml --readout fdc1004
-  capsense serve --design stripe --host 0.0.0.0 --token-file token.txt
-  capsense serve --design stripe --origin http://localhost:3000      for a web page
-""",
-    _serve_arguments,
-    _serve,
+    "serve", "serve sensors to Unity, browsers and other programs", _serve_arguments, _serve
 )
 
 
@@ -198,7 +194,21 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(args: argparse.Namespace) -> int:
-    """Show it until told to stop, and return the exit code."""
+    """Show a sensor in a web browser: its electrodes coloured by their signals, the bodies, the
+    potential on a plane, charts of the channels, and the matrix. Time can be paused, stepped and
+    moved about in.
+
+    A scenario is simulated as it is shown; --replay shows a recording; --connect watches what
+    clients of a running 'capsense serve --watch' do.
+
+    No display is needed: the page is served, by default to browsers on this machine, and needs
+    nothing from the internet. Ctrl-C, or a request to terminate, ends it with exit code 0.
+
+    examples:
+      capsense view examples/hand_approach.toml
+      capsense view --replay hand.mcap --port 9000
+      capsense view --connect ws://127.0.0.1:8765
+    """
     from capsense.viewer.view import LiveView, check_address
 
     _check_view(args)
@@ -294,24 +304,4 @@ def _announce(view: LiveView, args: argparse.Namespace) -> None:
     print(view.url, flush=True)  # last: whoever waits for it may stop the view at once
 
 
-VIEW = Command(
-    "view",
-    "show a sensor at work, live in a web browser",
-    """\
-Show a sensor in a web browser: its electrodes coloured by their signals, the bodies, the potential
-on a plane, charts of the channels, and the matrix. Time can be paused, stepped and moved about in.
-
-A scenario is simulated as it is shown; --replay shows a recording; --connect watches what clients
-of a running 'capsense serve --watch' do.
-
-No display is needed: the page is served, by default to browsers on this machine, and needs nothing
-from the internet. Ctrl-C, or a request to terminate, ends it with exit code 0.
-""",
-    """\
-  capsense view examples/hand_approach.toml
-  capsense view --replay hand.mcap --port 9000
-  capsense view --connect ws://127.0.0.1:8765
-""",
-    _view_arguments,
-    _view,
-)
+VIEW = Command("view", "show a sensor at work, live in a web browser", _view_arguments, _view)

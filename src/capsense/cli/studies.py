@@ -1,4 +1,4 @@
-"""``capsense dataset``, ``bench`` and ``reproduce``: many steps at once, and what came of them."""
+"""``capsense dataset``, ``optimise``, ``bench`` and ``reproduce``: many steps at once."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from capsense.cli.console import (
 from capsense.errors import ScenarioError
 
 if TYPE_CHECKING:
+    from capsense.learning.optimise import Bound, DesignTask
     from capsense.reproduce.harness import Study
 
 
@@ -58,7 +59,20 @@ def _part(text: str) -> tuple[int, int]:
 
 
 def _dataset(args: argparse.Namespace) -> int:
-    """Make the data set and return the exit code."""
+    """Draw random scenes as a file describes them, and write capacitance matrices, the counts of a
+    readout and labels as Parquet files with a manifest. A file that names an environment is of
+    episodes, which become a LeRobot data set.
+
+    A scene depends on the file, its seed and the scene's number alone, and so does an episode, so
+    that any shard can be made on any machine. A shard appears once it is complete, and what is
+    complete is not made again: after an interruption, run the same command.
+
+    examples:
+      capsense dataset examples/datasets/forearms.toml -o forearms/
+      capsense dataset examples/datasets/follow.toml -o follow/
+      capsense dataset spec.toml -o /shared/set --shard 17/1000
+      capsense dataset spec.toml -o /shared/set --scheduler tcp://10.0.0.1:8786
+    """
     from tqdm import tqdm
 
     from capsense.learning.shards import load_data_set, missing, require_pyarrow, run
@@ -86,21 +100,6 @@ def _dataset(args: argparse.Namespace) -> int:
 DATASET = Command(
     "dataset",
     "make a data set of random scenes or episodes for learning",
-    """\
-Draw random scenes as a file describes them, and write capacitance matrices, the counts of a
-readout and labels as Parquet files with a manifest. A file that names an environment is of
-episodes, which become a LeRobot data set.
-
-A scene depends on the file, its seed and the scene's number alone, and so does an episode, so that
-any shard can be made on any machine. A shard appears once it is complete, and what is complete is
-not made again: after an interruption, run the same command.
-""",
-    """\
-  capsense dataset examples/datasets/forearms.toml -o forearms/
-  capsense dataset examples/datasets/follow.toml -o follow/
-  capsense dataset spec.toml -o /shared/set --shard 17/1000
-  capsense dataset spec.toml -o /shared/set --scheduler tcp://10.0.0.1:8786
-""",
     _dataset_arguments,
     _dataset,
 )
@@ -124,7 +123,16 @@ def _new_file(text: str) -> Path:
 
 
 def _bench(args: argparse.Namespace) -> int:
-    """Measure, print, write, and return the exit code."""
+    """Measure import, start, step times and batches on this machine, with the error of a step
+    against a converged reference; within a minute.
+
+    Times are by the clock, and other programs that run meanwhile lengthen them: their load is
+    stated, and "processor" is what the processor's time alone gives.
+
+    examples:
+      capsense bench
+      capsense bench -o bench.json
+    """
     from capsense.bench import measure
 
     figures = measure(args.steps)
@@ -169,28 +177,12 @@ def _bench_report(figures: dict[str, Any]) -> str:
     return "\n\n".join([facts(head), table(columns, rows), batch])
 
 
-BENCH = Command(
-    "bench",
-    "measure this machine: start, step times, error",
-    """\
-Measure import, start, step times and batches on this machine, with the error of a step against
-a converged reference; within a minute.
-
-Times are by the clock, and other programs that run meanwhile lengthen them: their load is
-stated, and "processor" is what the processor's time alone gives.
-""",
-    """\
-  capsense bench
-  capsense bench -o bench.json
-""",
-    _bench_arguments,
-    _bench,
-)
+BENCH = Command("bench", "measure this machine: start, step times, error", _bench_arguments, _bench)
 
 
 def _reproduce_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    from capsense.reproduce.harness import STUDIES
+    from capsense.reproduce import STUDIES
 
     parser.add_argument("study", choices=[*STUDIES, "all"], help="what to re-run")
     parser.add_argument(
@@ -201,8 +193,24 @@ def _reproduce_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _reproduce(args: argparse.Namespace) -> int:
-    """Run the studies, write each as it is done, and return the exit code."""
-    from capsense.reproduce.harness import STUDIES, load_study
+    """Re-run the evaluation of Schöffmann et al. 2022, and what goes beyond it: each study prints a
+    table of figures with their targets and verdicts.
+
+    DIR/STUDY receives
+      report.md   the figures, with plots and short tables
+      rows.json   the figures as data
+      *.csv       tables and curves
+      *.png       plots
+      parts/      what was computed, unit by unit: a run that was interrupted continues there
+
+    Exits with 3 if it ran and a figure missed its target.
+
+    examples:
+      capsense reproduce scenario1
+      capsense reproduce all -o reproduced/
+      capsense reproduce all --reduced         a check in little time; coarser
+    """
+    from capsense.reproduce import STUDIES, load_study
 
     names = list(STUDIES) if args.study == "all" else [args.study]
     studies = {name: load_study(name) for name in names}
@@ -256,26 +264,100 @@ def _listed(names: list[str]) -> str:
 
 
 REPRODUCE = Command(
-    "reproduce",
-    "re-run the evaluation of Schöffmann et al. 2022",
-    """\
-Re-run the evaluation of Schöffmann et al. 2022, and what goes beyond it: each study prints a
-table of figures with their targets and verdicts.
+    "reproduce", "re-run the evaluation of Schöffmann et al. 2022", _reproduce_arguments, _reproduce
+)
 
-DIR/STUDY receives
-  report.md   the figures, with plots and short tables
-  rows.json   the figures as data
-  *.csv       tables and curves
-  *.png       plots
-  parts/      what was computed, unit by unit: a run that was interrupted continues there
 
-Exits with 3 if it ran and a figure missed its target.
-""",
-    """\
-  capsense reproduce scenario1
-  capsense reproduce all -o reproduced/
-  capsense reproduce all --reduced         a check in little time; coarser
-""",
-    _reproduce_arguments,
-    _reproduce,
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("task", metavar="TASK.toml", type=Path, help="what is to be found")
+    parser.add_argument(
+        "-o", "--output", metavar="DESIGN.toml", type=Path, required=True,
+        help="the design that was found",
+    )  # fmt: skip
+    parser.add_argument(
+        "--evaluations", metavar="N", type=int, help="candidates to try, instead of the task's"
+    )
+    parser.add_argument(
+        "--no-check", action="store_true", help="leave out the check at full accuracy"
+    )
+    add_quiet(parser)
+
+
+def _execute(args: argparse.Namespace) -> int:
+    """Choose sizes and gaps of electrodes so that they tell the pose of a limb best. TASK.toml
+    holds a design whose lengths are expressions of parameters, the parameters' ranges, where
+    the limb will be, and the noise of a channel. A candidate is judged by the Cramér-Rao bound
+    of lateral and vertical position, pitch and yaw: the least errors that this sensor and this
+    noise allow. Each candidate takes some seconds, for its field is built anew, coarsely; what
+    is found is checked at full accuracy, beside the start, and written as a design file.
+
+    examples:
+      capsense optimise examples/designs/forearm_pads.toml -o pads.toml
+      capsense optimise task.toml -o pads.toml --evaluations 200
+      capsense optimise task.toml -o pads.toml --evaluations 20 --no-check
+    """
+    from dataclasses import replace
+
+    from capsense.learning.optimise import load_task, search, to_toml
+
+    if args.output.suffix.lower() != ".toml" or not args.output.parent.is_dir():
+        raise ScenarioError(
+            f"--output {args.output}: give a name that ends in .toml, in a folder that is there"
+        )
+    task = load_task(args.task)
+    if args.evaluations is not None:
+        if args.evaluations < 1:
+            raise ScenarioError(f"--evaluations {args.evaluations}: give 1 or more")
+        task = replace(task, evaluations=args.evaluations)
+    count = 0
+
+    def each(values: Any, bound: Bound) -> None:
+        nonlocal count
+        count += 1
+        if not args.quiet:
+            print(f"{count:4d}  {_parameters(task, values)}  cost {bound.cost:.4f}",
+                  file=sys.stderr, flush=True)  # fmt: skip
+
+    values, coarse = search(task, each)
+    found = task.content(values)
+    head = f"# {task.name}: found by `capsense optimise {args.task.name}`, {count} candidates.\n"
+    args.output.write_text(head + to_toml(found) + "\n", encoding="utf-8")
+    if not args.quiet:
+        rows = {"found": (values, coarse)}
+        if not args.no_check:
+            rows = {
+                "start": (task.start, task.bound(task.start, 1.0, "fine")),
+                "found": (values, task.bound(values, 1.0, "fine")),
+            }
+        _print(task, rows, "the search" if args.no_check else "full accuracy")
+        print(f"\nthe search had {coarse.cost:.4f}; written to {args.output}")
+    return OK
+
+
+def _parameters(task: DesignTask, values: Any) -> str:
+    return "  ".join(
+        f"{name} {1e3 * value:.2f}" for name, value in zip(task.parameters, values, strict=True)
+    )
+
+
+def _print(task: DesignTask, rows: dict[str, tuple[Any, Bound]], accuracy: str) -> None:
+    """What was found beside the start."""
+    import numpy as np
+
+    lines = []
+    for name, (values, bound) in rows.items():
+        lateral, vertical, pitch, yaw = bound.pose
+        numbers = (1e3 * lateral, 1e3 * vertical, np.degrees(pitch), np.degrees(yaw))
+        told = [*(f"{1e3 * v:.2f}" for v in values), *(f"{v:.2f}" for v in numbers)]
+        lines.append([name, *told, f"{bound.cost:.4f}"])
+    header = [
+        f"least errors, {accuracy}", *(f"{n} [mm]" for n in task.parameters), "lateral [mm]",
+        "vertical [mm]", "pitch [°]", "yaw [°]", "cost",
+    ]  # fmt: skip
+    print(table(header, lines))
+
+
+OPTIMISE = Command(
+    "optimise", "choose sizes and gaps of electrodes for a task", _arguments, _execute
 )

@@ -18,10 +18,8 @@ from itertools import pairwise
 import numpy as np
 import shapely
 import shapely.affinity
-import shapely.geometry.polygon
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon, box
-from shapely.geometry import box as rectangle_between
 from shapely.geometry.polygon import orient
 
 from capsense.design.geometry import TOUCH, Facet, Surface, boundary_segments
@@ -62,7 +60,7 @@ def _rounded(outline: Polygon, radius: float) -> Polygon:
 
 
 def _bar(width: float, height: float, x: float = 0.0, y: float = 0.0) -> Polygon:
-    return rectangle_between(x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+    return box(x - width / 2, y - height / 2, x + width / 2, y + height / 2)
 
 
 def rectangle(table: DesignTable) -> list[Polygon]:
@@ -99,7 +97,7 @@ def polygon(table: DesignTable) -> list[Polygon]:
         raise table.error(
             f"points enclose an area of {shape.area:g} m²; give corners that enclose an area"
         )
-    return [shapely.geometry.polygon.orient(shape)]
+    return [orient(shape)]
 
 
 def disc(table: DesignTable) -> list[Polygon]:

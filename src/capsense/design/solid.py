@@ -7,6 +7,7 @@ import math
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.polygon import orient
 
 from capsense._jit import kernel
 from capsense._thread_pool import filled
@@ -166,7 +167,7 @@ def _middles(facets: tuple[Facet, ...]) -> Array:
 
 def _mirrored(facet: Facet) -> Facet:
     flipped = shapely.transform(facet.polygon, lambda uv: uv * [-1.0, 1.0])
-    outline = shapely.geometry.polygon.orient(flipped)
+    outline = orient(flipped)
     return Facet(outline, facet.origin, facet.axes * [[-1.0], [1.0], [-1.0]])
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-import shapely.geometry.polygon
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
+from shapely.geometry.polygon import orient
 
 from capsense.design.geometry import Facet, Surface
 from capsense.errors import DesignError
@@ -239,10 +239,10 @@ def _region_facets(mesh: SheetMesh, region: list[int]) -> list[Facet]:
         axes, origin = np.array([u, np.cross(normal, u), normal]), center
     flat = (corners - origin) @ axes[:2].T
     if len(region) == 1:
-        return [Facet(shapely.geometry.polygon.orient(Polygon(flat[0])), origin, axes)]
+        return [Facet(orient(Polygon(flat[0])), origin, axes)]
     united = shapely.union_all(shapely.polygons(flat), grid_size=WELD).simplify(mesh.flatness)
     parts = [p for p in shapely.get_parts(united) if isinstance(p, Polygon)]
-    return [Facet(shapely.geometry.polygon.orient(p), origin, axes) for p in parts]
+    return [Facet(orient(p), origin, axes) for p in parts]
 
 
 def _straighten(mesh: SheetMesh, edges: Ints) -> Array:

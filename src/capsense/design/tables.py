@@ -84,18 +84,6 @@ def axis_rotation(axis: int, degrees: float) -> Array:
     return out
 
 
-def quaternion_matrix(quaternion: Sequence[float]) -> Array:
-    """Rotation matrix of a unit quaternion (x, y, z, w), shape (3, 3)."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def read_placement(table: DesignTable) -> Placement:
     """Read ``center``, ``z``, ``rotation``, ``tilt`` and ``quaternion`` of an item.
 
@@ -121,14 +109,12 @@ def read_placement(table: DesignTable) -> Placement:
                     f"{key} = {table.data[key]!r} and quaternion both turn the shape; "
                     "keep one of them"
                 )
-        quaternion = table.numbers("quaternion", (4,), "[x, y, z, w]")
-        norm = math.sqrt(sum(q * q for q in quaternion))
-        if abs(norm - 1.0) > 1e-3:
-            raise table.error(
-                f"quaternion = {list(quaternion)} has length {norm:.4g}; give a unit quaternion "
-                "[x, y, z, w]"
-            )
-        rotation = quaternion_matrix([q / norm for q in quaternion])
+        from scipy.spatial.transform import Rotation
+
+        quaternion, *more = table.unit_quaternions("quaternion")
+        if more:
+            raise table.error(f"quaternion holds {1 + len(more)} orientations; give one")
+        rotation = Rotation.from_quat(quaternion).as_matrix()
     elif "tilt" in table:
         angles = table.numbers("tilt", (3,), "[rx, ry, rz] in degrees")
         for angle in angles:

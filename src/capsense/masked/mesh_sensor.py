@@ -315,10 +315,7 @@ class MaskedScenes:
         self._points = sensor.mesh.points[sensor.mesh.group_nodes(held)]
         self._mesh = sensor.mesh
         self._centroids = sensor.mesh.centroids
-        self._solver = MaskedSolver(
-            sensor.mesh, sensor.names, sensor.ground, sensor.eps_r, profiles=sensor.profiles,
-            warm_start=warm_start,
-        )  # fmt: skip
+        self._solver = MaskedSolver(sensor, warm_start=warm_start)
         self.empty: Array = self._solver.step(np.full(self._mesh.n_tets, -1), [])
         """Maxwell matrix of the empty mesh [F], shape (terminals, terminals)."""
 

@@ -13,9 +13,9 @@ it is then floating, and CG needs more iterations the larger the contrast.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,7 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SolveError
 from capsense.masked.stiffness import StiffnessMap, check_eps_r, unit_potentials
-from capsense.mesh.tetmesh import TetMesh
+
+if TYPE_CHECKING:
+    from capsense.masked.mesh_sensor import MeshSensor
 
 Array = NDArray[np.float64]
 
@@ -66,36 +68,26 @@ class MaskedSolver:
 
     def __init__(
         self,
-        mesh: TetMesh,
-        electrode_groups: Sequence[str],
-        ground_groups: Iterable[str] = ("ground",),
-        eps_background: ArrayLike = 1.0,
+        sensor: MeshSensor,
         *,
         solver: Literal["cg", "lu"] = "cg",
         tolerance: float = 1e-5,
         max_iterations: int = 5000,
         warm_start: bool = True,
-        profiles: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         """Assemble the empty domain.
 
         Args:
-            mesh: The fixed mesh.
-            electrode_groups: Node groups of the electrodes in matrix order, shape (M,).
-            ground_groups: Node groups held at 0 V.
-            eps_background: Relative permittivity of the empty domain: one number, or one per
-                tetrahedron, (k,).
+            sensor: The fixed mesh, its M electrodes and what else is held.
             solver: "cg" or "lu".
             tolerance: Relative residual that ends CG.
             max_iterations: CG iterations after which a step fails.
             warm_start: Whether CG starts from the potentials of the step before, or from zero.
-            profiles: Potential [V] of each node of an electrode that is driven with 1 V, by its
-                group, each of shape (g,); 1 where none is given.
 
         Raises:
             MeshError: If a group is unknown or empty, electrodes share nodes, or a profile does not
                 fit.
-            FieldError: If `eps_background` does not fit the mesh.
+            FieldError: If the permittivity of the empty domain does not fit the mesh.
             SolveError: If a setting is out of range.
         """
         if solver not in ("cg", "lu"):
@@ -104,16 +96,15 @@ class MaskedSolver:
             raise SolveError(f"tolerance must lie between 0 and 1, not {tolerance}")
         if max_iterations < 1:
             raise SolveError(f"max_iterations must be positive, not {max_iterations}")
-        self.mesh = mesh
-        self.electrode_groups = tuple(electrode_groups)
+        self.mesh = mesh = sensor.mesh
         self.solver = solver
         self.tolerance = tolerance
         self.max_iterations = max_iterations
         self.warm_start = warm_start
         self._dirichlet, self._free = unit_potentials(
-            mesh, electrode_groups, ground_groups, profiles
+            mesh, sensor.names, sensor.ground, sensor.profiles
         )
-        self._background = check_eps_r(mesh, eps_background)
+        self._background = check_eps_r(mesh, sensor.eps_r)
         self._map = StiffnessMap(mesh)
         self._stats = MaskedStats(0, 0, 0, 0.0)
         self.reset()

@@ -6,19 +6,17 @@ may end the process.
 
 from __future__ import annotations
 
-import importlib
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.errors import MeshError, MissingDependencyError
+from capsense.errors import MeshError, MissingDependencyError, require_package
 from capsense.mesh.msh import MshVersion, parse_msh, write_msh
 from capsense.mesh.tetmesh import GROUND, IntArray, TetMesh
 
@@ -192,16 +190,6 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
-def _meshio() -> ModuleType:
-    try:
-        return importlib.import_module("meshio")
-    except ImportError as error:
-        raise MissingDependencyError(
-            "reading and writing .vtu files needs meshio; install it with: "
-            'pip install "capsense[mesh]"'
-        ) from error
-
-
 def _compact(
     points: NDArray[np.float64],
     tets: NDArray[np.integer],
@@ -241,7 +229,9 @@ def _tetrahedra(data: Any) -> NDArray[np.integer]:
 
 
 def _load_vtu(path: Path, scale: float) -> TetMesh:
-    meshio = _meshio()
+    require_package("meshio", "meshio, which .vtu files need,", "mesh")
+    import meshio
+
     if b"vtkLZMADataCompressor" in path.read_bytes():
         raise MeshError("it is compressed by LZMA, to a size that nothing tells; save it by zlib")
     data = meshio.read(path)
@@ -271,7 +261,9 @@ def _save_vtu(
     point_data: Mapping[str, ArrayLike],
     cell_data: Mapping[str, ArrayLike],
 ) -> None:
-    meshio = _meshio()
+    require_package("meshio", "meshio, which .vtu files need,", "mesh")
+    import meshio
+
     stored: dict[str, dict[str, NDArray[Any]]] = {}
     for kind, prefix, groups, extra, count in (
         ("point", _NODE_PREFIX, mesh.node_groups, point_data, mesh.n_points),

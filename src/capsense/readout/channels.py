@@ -7,7 +7,7 @@ electrode read, per volt of the transmitter.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
@@ -78,6 +78,17 @@ class Pattern:
     def is_self(self) -> bool:
         """Whether the electrode read is the one driven."""
         return self.sense in self.drive
+
+    @property
+    def excitation(self) -> Hashable:
+        """What the electrodes do: patterns of which it is the same can be measured at once.
+
+        Receivers are held at ground, as the rest is. Where the rest floats or is driven, what
+        another pattern reads would have to float or be driven: such a pattern is measured alone.
+        """
+        alone = "" if self.rest == "grounded" else self.name
+        driven = frozenset(self.drive.items())
+        return driven, frozenset(self.floating), self.shield, alone
 
 
 def _default_name(sense: str, drive: Mapping[str, float]) -> str:

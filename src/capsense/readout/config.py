@@ -12,11 +12,10 @@ from capsense._validate import read_toml, suggest
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
-from capsense.readout.chips import CHIPS, Chip
 from capsense.readout.converter import Law, ResonanceLaw, ShuntLaw
 from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
 from capsense.readout.front_end import Wiring
-from capsense.readout.presets import ReadoutOptions, build, chip_of, expected_of
+from capsense.readout.presets import CHIPS, Chip, ReadoutOptions, build, chip_of, expected_of
 from capsense.readout.readout import ReadingLike, Readout
 
 TOP_KEYS = (
@@ -185,27 +184,12 @@ def _patterns(top: ReadoutTable, mode: str, electrodes: Sequence[str]) -> tuple[
         if "pairs" in top:
             raise top.error('pairs is for mode = "mutual"; remove one')
         return self_patterns(electrodes, rest=rest)
+    what = 'a list of [transmitter, receiver] names, like [["E1", "E2"]]'
     try:
-        return mutual_patterns(electrodes, _pairs(top, electrodes), rest=rest)
+        pairs = top.pairs("pairs", what, electrodes, "the sensor")
+        return mutual_patterns(electrodes, pairs, rest=rest)
     except ReadoutError as error:
         raise top.error(str(error)) from None
-
-
-def _pairs(top: ReadoutTable, electrodes: Sequence[str]) -> list[tuple[str, str]]:
-    what = 'a list of [transmitter, receiver] names, like [["E1", "E2"]]'
-    if "pairs" not in top:
-        return []
-    value = top.raw("pairs", what)
-    if not isinstance(value, list) or not value:
-        raise top.error(f"pairs = {value!r} must be {what}")
-    for number, pair in enumerate(value):
-        if not (
-            isinstance(pair, list) and len(pair) == 2 and all(isinstance(n, str) for n in pair)
-        ):
-            raise top.error(f"pairs[{number}] = {pair!r} must be {what}")
-        for name in pair:
-            _require_electrode(top, f"pairs[{number}]", name, electrodes)
-    return [(tx, rx) for tx, rx in value]
 
 
 def _pattern(table: ReadoutTable, electrodes: Sequence[str]) -> Pattern:

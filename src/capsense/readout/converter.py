@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import Literal, Protocol
 
@@ -140,6 +140,24 @@ class ReciprocalLaw:
         """Capacitance of a code [F]; infinite at code 0."""
         with np.errstate(divide="ignore"):
             return self._product / np.asarray(code, dtype=float)
+
+    def set_for(self, capacitance: float) -> ReciprocalLaw:
+        """The same with an MPR121's current and time that bring a capacitance [F] near 90 %.
+
+        Raises:
+            ReadoutError: No setting brings it into the range.
+        """
+        settings = [(k * 1e-6, 0.5e-6 * 2**power) for power in range(7) for k in range(1, 64)]
+        laws = [replace(self, current=current, time=time) for current, time in settings]
+        wanted = np.array(capacitance)
+        fitting = [law for law in laws if law.low <= float(law.level(wanted)) <= law.high]
+        if not fitting:
+            raise ReadoutError(
+                f"expected = {capacitance:g} F is outside of what an MPR121 can charge; give "
+                "0.2e-12 to 2800e-12 F"
+            )
+        goal = self.low + 0.9 * (self.high - self.low)
+        return min(fitting, key=lambda law: abs(float(law.level(wanted)) - goal))
 
 
 @dataclass(frozen=True)

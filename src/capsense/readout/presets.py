@@ -1,25 +1,163 @@
-"""Readouts built from a chip's figures and a few options."""
+"""What a chip is: its converter, its timing and noise; and readouts built from its figures.
+
+The chips that are known stand in ``chips.toml``, which says how well each figure is known.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
 
-import numpy as np
-
-from capsense._validate import suggest
+from capsense._validate import as_number, read_toml, suggest
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
 from capsense.readout.checks import Array, require
-from capsense.readout.chips import CHIPS, Chip
-from capsense.readout.converter import CapDac, Law, LinearLaw, ReciprocalLaw, ShuntLaw
-from capsense.readout.detector import Detector
-from capsense.readout.front_end import Wiring
+from capsense.readout.converter import (
+    CapDac,
+    Law,
+    LinearLaw,
+    ReciprocalLaw,
+    ResonanceLaw,
+    ShuntLaw,
+)
+from capsense.readout.detector import Detector, SteppingTracker
+from capsense.readout.front_end import ShuntFrontEnd, Wiring
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, Stage, White
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule, idle_of
+
+Mode = Literal["self", "mutual"]
+
+
+class Status(StrEnum):
+    """How well a figure is known."""
+
+    CONFIRMED = "confirmed"
+    """Read in the source named."""
+    COMPUTED = "computed"
+    """Follows from confirmed figures."""
+    REMEMBERED = "remembered"
+    """Commonly stated, also as from the data sheet; not read there. Check before relying on it."""
+    ASSUMED = "assumed"
+    """No source states it; a plausible value, to be fitted to one's own sensor."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One figure of a chip."""
+
+    quantity: str
+    value: str
+    status: Status
+    source: str
+
+
+@dataclass(frozen=True)
+class Rate:
+    """One setting of the output rate."""
+
+    per_second: float
+    """Conversions per second of one converter [Hz]."""
+    rms: float
+    """Noise of one conversion [F]."""
+
+
+@dataclass(frozen=True)
+class Chip:
+    """A converter chip with its figures."""
+
+    name: str
+    title: str
+    mode: Mode
+    law: Law
+    rates: tuple[Rate, ...]
+    """The first one is the default."""
+    facts: tuple[Fact, ...]
+    inputs: int | None = None
+    """Channels of one chip, scanned in turn; None where a switch brings any number to it."""
+    order: Literal["scan", "together", "by transmitter"] = "scan"
+    """Channels one after another; all at once; or all receivers of one transmitter at once."""
+    gap: float = 0.0
+    """Time to switch over before a conversion [s]."""
+    dac: CapDac | None = None
+    relative_noise: float = 0.0
+    """Noise in proportion to the capacitance."""
+    flicker: float = 0.0
+    """Allan deviation of the floor [F]."""
+    offset_per_kelvin: float = 0.0
+    """[F/K]"""
+    gain_per_kelvin: float = 0.0
+    """[1/K]"""
+    detector: Detector | None = None
+    """The chip's own logic; None where there is none or it is left to the host."""
+
+    def rate(self, per_second: float | None) -> Rate:
+        """The setting of an output rate, the default one for None.
+
+        Raises:
+            ReadoutError: There is no such setting.
+        """
+        if per_second is None:
+            return self.rates[0]
+        wanted = as_number(per_second)
+        for rate in self.rates:
+            if abs(rate.per_second - wanted) <= 0.01 * rate.per_second:
+                return rate
+        rates = ", ".join(f"{r.per_second:.4g}" for r in self.rates)
+        raise ReadoutError(
+            f"{self.name} has no rate of {per_second!r} conversions per second; it has {rates}"
+        )
+
+
+_LAWS = {
+    "linear": LinearLaw, "reciprocal": ReciprocalLaw, "resonance": ResonanceLaw, "shunt": ShuntLaw,
+}  # fmt: skip
+
+
+def _chip(name: str, data: Mapping[str, Any]) -> Chip:
+    """A chip of ``chips.toml``; the classes refuse figures that they do not know."""
+    given = {k: v for k, v in data.items() if k not in ("rates", "conversions", "noise")}
+    law = dict(given["law"])
+    kind = _LAWS[law.pop("kind")]
+    if "front_end" in law:
+        law["front_end"] = ShuntFrontEnd(**law["front_end"])
+    if "dac" in given:
+        dac = given["dac"]
+        given["dac"] = CapDac(**{**dac, "bit_errors": tuple(dac.get("bit_errors", ()))})
+    if "detector" in given:
+        detector = given["detector"]
+        tracker = {"stepping": SteppingTracker}[detector["tracker"]]()
+        given["detector"] = Detector(**{**detector, "tracker": tracker})
+    facts = tuple(Fact(what, value, Status(k), source) for what, value, k, source in data["facts"])
+    return Chip(name, **{**given, "law": kind(**law), "rates": _rates(data), "facts": facts})
+
+
+def _rates(data: Mapping[str, Any]) -> tuple[Rate, ...]:
+    """The settings of a chip, from rates or conversion times, and their noise."""
+    noise = data["noise"]
+    steps = data["rates"] if "rates" in data else data["conversions"]
+    if isinstance(noise, dict):  # white: it falls with the square root of the averaging time
+        at = noise["at"]
+        ratios = [s / at if "rates" in data else at / s for s in steps]
+        noise = [noise["rms"] * math.sqrt(ratio) for ratio in ratios]
+    per_second = steps if "rates" in data else [1 / s for s in steps]
+    return tuple(Rate(*pair) for pair in zip(per_second, noise, strict=True))
+
+
+_TABLES = read_toml(Path(__file__).with_name("chips.toml"), "chip", ReadoutError)
+CHIPS: dict[str, Chip] = {name: _chip(name, data) for name, data in _TABLES.items()}
+"""The known chips by name."""
+
+
+def available_chips() -> tuple[str, ...]:
+    """Names of the chips that a readout can be made of, sorted."""
+    return tuple(sorted(CHIPS))
+
 
 EXPECTED = 10e-12
 """Capacitance that chips which adapt to it are set up for by default [F]."""
@@ -123,11 +261,6 @@ def build(
     patterns = tuple(chosen.patterns) or default_patterns(part, electrodes)
     bank = ChannelBank(patterns, electrodes)
     rate = part.rate(chosen.rate)
-    if rate is None:
-        rates = ", ".join(f"{r.per_second:.4g}" for r in part.rates)
-        raise ReadoutError(
-            f"{part.name} has no rate of {chosen.rate!r} conversions per second; it has {rates}"
-        )
     plan = schedule_of(part, patterns, 1.0 / rate.per_second - part.gap)
     idle = idle_of(chosen.period, plan.period)
     out = Readout(
@@ -151,26 +284,11 @@ def default_patterns(chip: Chip, electrodes: Sequence[str]) -> tuple[Pattern, ..
 
 def schedule_of(chip: Chip, patterns: Sequence[Pattern], conversion: float) -> Schedule:
     """The order in which a chip takes its channels; ``conversion`` in seconds."""
-    count = len(patterns)
     if chip.order == "together":
-        return Schedule.simultaneous(count, conversion)
+        return Schedule.simultaneous(len(patterns), conversion)
     if chip.order == "by transmitter":
-        groups: dict[Hashable, list[int]] = {}
-        for number, pattern in enumerate(patterns):
-            groups.setdefault(_excitation(pattern), []).append(number)
-        return Schedule(tuple(tuple(g) for g in groups.values()), conversion, chip.gap)
-    return Schedule.sequential(count, conversion, inputs=chip.inputs, gap=chip.gap)
-
-
-def _excitation(pattern: Pattern) -> Hashable:
-    """What the electrodes do: patterns of which it is the same can be measured at once.
-
-    Receivers are held at ground, as the rest is. Where the rest floats or is driven, what another
-    pattern reads would have to float or be driven: such a pattern is measured by itself.
-    """
-    alone = "" if pattern.rest == "grounded" else pattern.name
-    driven = frozenset(pattern.drive.items())
-    return driven, frozenset(pattern.floating), pattern.shield, alone
+        return Schedule.grouped([p.excitation for p in patterns], conversion, gap=chip.gap)
+    return Schedule.sequential(len(patterns), conversion, inputs=chip.inputs, gap=chip.gap)
 
 
 def law_of(chip: Chip, options: ReadoutOptions, channels: int) -> Law:
@@ -194,7 +312,7 @@ def law_of(chip: Chip, options: ReadoutOptions, channels: int) -> Law:
     if options.law is None and isinstance(law, ReciprocalLaw):
         expected = EXPECTED if options.expected is None else options.expected
         require("readout", "expected", expected, 0.0, "F", open_=True)
-        return charge_for(expected)
+        return law.set_for(expected)
     return law
 
 
@@ -215,27 +333,6 @@ def expected_of(empty: Array) -> float:
     The least of them: one setting serves all channels, and codes rise as capacitance falls.
     """
     return max(float(empty.min()), LEAST_EXPECTED)
-
-
-def charge_for(capacitance: float) -> ReciprocalLaw:
-    """MPR121 current and time with which a capacitance [F] reads nearest to 90 % of the range.
-
-    Raises:
-        ReadoutError: No setting brings it into the range.
-    """
-    usual = CHIPS["mpr121"].law
-    assert isinstance(usual, ReciprocalLaw)
-    settings = [(k * 1e-6, 0.5e-6 * 2**power) for power in range(7) for k in range(1, 64)]
-    laws = [dataclasses.replace(usual, current=current, time=time) for current, time in settings]
-    wanted = np.array(capacitance)
-    fitting = [law for law in laws if law.low <= float(law.level(wanted)) <= law.high]
-    if not fitting:
-        raise ReadoutError(
-            f"expected = {capacitance:g} F is outside of what an MPR121 can charge; give 0.2e-12 "
-            "to 2800e-12 F"
-        )
-    goal = fitting[0].low + 0.9 * (fitting[0].high - fitting[0].low)
-    return min(fitting, key=lambda law: abs(float(law.level(wanted)) - goal))
 
 
 def _stages(chip: Chip, rms: float, options: ReadoutOptions) -> list[Stage]:

@@ -161,21 +161,9 @@ def _load_arrays(path: Path) -> CapacitanceRecord:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         names = tuple(str(n) for n in arrays["electrode_names"])
-        matrix, baseline = arrays["capacitance"], arrays["baseline"]
-        channels = [str(n) for n in arrays["channel_names"]]
-        columns = {
-            f"C_{a}_{b}": matrix[:, i, j] for i, a in enumerate(names) for j, b in enumerate(names)
-        }
-        empty = {
-            f"C_{a}_{b}": float(baseline[i, j])
-            for i, a in enumerate(names)
-            for j, b in enumerate(names)
-        }
-        alone = [f"C_{name}" for name in names]
-        columns.update(zip(alone, arrays["self_capacitance"].T, strict=True))
-        empty.update(zip(alone, arrays["self_baseline"].tolist(), strict=True))
-        columns.update(zip(channels, arrays["channels"].T, strict=True))
-        empty.update(zip(channels, arrays["channel_baseline"].tolist(), strict=True))
+        columns = _columns(names, arrays, "capacitance", "self_capacitance", "channels")
+        levels = _columns(names, arrays, "baseline", "self_baseline", "channel_baseline")
+        empty = {name: float(level) for name, level in levels.items()}
         return CapacitanceRecord(path, arrays["time"], names, columns, empty)
     except ReadoutError:
         raise
@@ -185,6 +173,20 @@ def _load_arrays(path: Path) -> CapacitanceRecord:
         ) from None
     except Exception as error:  # zip, inflate and numpy's reader each complain differently
         raise ReadoutError(f"{path} is no readings.npz of capsense run: {error}") from None
+
+
+def _columns(
+    names: tuple[str, ...], arrays: dict[str, Array], matrix: str, own: str, channels: str
+) -> dict[str, Array]:
+    """Arrays of matrices, self capacitances and channels by the names of their columns."""
+    out = {
+        f"C_{a}_{b}": arrays[matrix][..., i, j]
+        for i, a in enumerate(names)
+        for j, b in enumerate(names)
+    }
+    out.update(zip([f"C_{name}" for name in names], arrays[own].T, strict=True))
+    out.update(zip(map(str, arrays["channel_names"]), arrays[channels].T, strict=True))
+    return out
 
 
 def _load_table(path: Path) -> CapacitanceRecord:

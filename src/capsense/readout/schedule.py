@@ -9,7 +9,7 @@ neglected term is T²/24 times the second derivative of the capacitance, T being
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -91,6 +91,14 @@ class Schedule:
         require_whole("schedule", "the number of channels", channels, 1)
         require("schedule", "conversion", conversion, 0.0, "s", open_=True)
         return cls((tuple(range(channels)),), conversion, 0.0, idle_of(period, conversion))
+
+    @classmethod
+    def grouped(cls, keys: Sequence[Hashable], conversion: float, *, gap: float = 0.0) -> Schedule:
+        """Channels of the same key at once, the groups one after another."""
+        groups: dict[Hashable, list[int]] = {}
+        for channel, key in enumerate(keys):
+            groups.setdefault(key, []).append(channel)
+        return cls(tuple(map(tuple, groups.values())), conversion, gap)
 
     @cached_property
     def period(self) -> float:

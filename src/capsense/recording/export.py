@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Sequence
+from importlib import resources
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._style import COLOURS
-from capsense.errors import MissingDependencyError, RecordingError
+from capsense.errors import RecordingError, require_package
 from capsense.readout.counts import Counts, join
 from capsense.recording.reader import Recording, Step
 from capsense.recording.session import Session
 from capsense.recording.tables import (
     Run,
     column_meanings,
+    counts_columns,
     csv_row,
     replacing,
     write_counts,
@@ -28,7 +30,8 @@ from capsense.scenario.model import Channel
 
 MAX_LINES = 8
 """So many channels are drawn in a chart, the strongest."""
-_VIEW, _FOV = 0.5, 45.0
+_LAYOUT = resources.files("capsense.recording") / "layout.json"
+"""What Foxglove is told of every recording: the scene, and how a chart looks."""
 
 
 def layout(name: str, channels: Sequence[Channel], peaks: NDArray[np.float64]) -> str:
@@ -39,13 +42,16 @@ def layout(name: str, channels: Sequence[Channel], peaks: NDArray[np.float64]) -
         channels: Those in its ``signals``.
         peaks: Their largest changes [F], shape (K,).
     """
-    panels: dict[str, Any] = {"3D!sensor": _scene(name)}
+    data = json.loads(_LAYOUT.read_text(encoding="utf-8").replace("NAME", name))
+    panels: dict[str, Any] = {"3D!sensor": data["scene"]}
     for key, title, own in (("own", "electrodes", True), ("pairs", "pairs", False)):
         found = [k for k, c in enumerate(channels) if (c.row == c.column) == own]
         strongest = sorted(sorted(found, key=lambda k: -peaks[k])[:MAX_LINES])
         if strongest:
             drawn = [channels[k] for k in strongest]
-            panels[f"Plot!{key}"] = _chart(name, f"{title}, change [fF]", drawn)
+            paths = [_path(name, channel, COLOURS[k]) for k, channel in enumerate(drawn)]
+            head = {"foxglovePanelTitle": f"{title}, change [fF]", "paths": paths}
+            panels[f"Plot!{key}"] = head | data["chart"]
     return json.dumps(
         {
             "configById": panels,
@@ -66,42 +72,15 @@ def _beside(charts: Sequence[str]) -> Any:
     return {"direction": "row", "first": "3D!sensor", "second": right, "splitPercentage": 55}
 
 
-def _scene(name: str) -> dict[str, Any]:
+def _path(name: str, channel: Channel, colour: str) -> dict[str, Any]:
+    """A line of a chart."""
     return {
-        "cameraState": {
-            "perspective": True, "distance": _VIEW, "phi": 60.0, "thetaOffset": 30.0,
-            "target": [0.0, 0.0, 0.0], "targetOffset": [0.0, 0.0, 0.1 * _VIEW],
-            "targetOrientation": [0.0, 0.0, 0.0, 1.0], "fovy": _FOV, "near": 1e-3, "far": 100.0,
-        },
-        "followMode": "follow-none", "followTf": name, "scene": {}, "transforms": {},
-        "topics": {f"/{name}/{topic}": {"visible": True} for topic in ("electrodes", "markers")},
-        "layers": {
-            "grid": {
-                "layerId": "foxglove.Grid", "instanceId": "grid", "label": "10 mm",
-                "visible": True, "frameLocked": True, "frameId": name, "size": 0.4,
-                "divisions": 40, "lineWidth": 1, "color": "#8a8f9440",
-                "position": [0.0, 0.0, 0.0], "rotation": [0.0, 0.0, 0.0],
-            }
-        },
-    }  # fmt: skip
-
-
-def _chart(name: str, title: str, channels: Sequence[Channel]) -> dict[str, Any]:
-    paths = [
-        {
-            "value": f'/{name}/signals.channels[:]{{name=="{channel.column_name}"}}.change',
-            "label": channel.label,
-            "color": COLOURS[k % len(COLOURS)],
-            "enabled": True,
-            "timestampMethod": "receiveTime",
-        }
-        for k, channel in enumerate(channels)
-    ]
-    return {
-        "foxglovePanelTitle": title, "paths": paths, "xAxisVal": "timestamp", "isSynced": True,
-        "showLegend": True, "legendDisplay": "top", "showPlotValuesInLegend": True,
-        "showXAxisLabels": True, "showYAxisLabels": True, "sidebarDimension": 240,
-    }  # fmt: skip
+        "value": f'/{name}/signals.channels[:]{{name=="{channel.column_name}"}}.change',
+        "label": channel.label,
+        "color": colour,
+        "enabled": True,
+        "timestampMethod": "receiveTime",
+    }
 
 
 Array = NDArray[np.float64]
@@ -139,7 +118,7 @@ def export(recording: Recording, path: Path, *, counts: bool = False) -> int:
     if counts and ending not in (".csv", ".parquet"):
         raise RecordingError("counts alone go to .csv or .parquet; .npz has them beside the rest")
     if ending == ".parquet":
-        _require_pyarrow()
+        require_package("pyarrow.parquet", "pyarrow, which Parquet needs,", "record")
     writers: dict[str, Callable[[Recording, Path], int]] = {
         ".csv": _counts_csv if counts else _csv,
         ".parquet": _counts_parquet if counts else _parquet,
@@ -207,7 +186,7 @@ def _npz(recording: Recording, path: Path) -> int:
     arrays["episode"] = np.array([s.episode for s in steps])
     counts = [c for c in (s.reading.counts for s in steps) if c is not None]
     if counts:
-        arrays.update({f"counts_{k}": v for k, v in _columns(join(counts)).items()})
+        arrays.update({f"counts_{k}": v for k, v in counts_columns(join(counts)).items()})
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     return len(steps)
@@ -232,22 +211,8 @@ def _counts_parquet(recording: Recording, path: Path) -> int:
     import pyarrow.parquet as pq
 
     counts = _all_counts(recording)
-    pq.write_table(pa.table(_columns(counts)), path)
+    pq.write_table(pa.table(counts_columns(counts)), path)
     return len(counts)
-
-
-def _columns(counts: Counts) -> dict[str, NDArray[Any]]:
-    """Columns of a table of counts."""
-    out: dict[str, NDArray[Any]] = {
-        "time_s": counts.time,
-        "channel": np.array(counts.channel_names)[counts.channel],
-        "code": counts.code,
-        "capacitance_F": counts.capacitance,
-        "flags": counts.flags,
-    }
-    if counts.baseline is not None and counts.touched is not None:
-        out.update(baseline=counts.baseline, touched=counts.touched)
-    return out
 
 
 def _layout(recording: Recording, path: Path) -> int:
@@ -290,12 +255,3 @@ def _mcap(recording: Recording, path: Path) -> int:
                     writer.add_metadata(r.name, r.metadata)
         writer.finish()
     return n
-
-
-def _require_pyarrow() -> None:
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError:
-        raise MissingDependencyError(
-            "Parquet needs pyarrow; pip install 'capsense[record]', or export to .csv or .npz"
-        ) from None

@@ -19,10 +19,9 @@ from capsense.reading import Reading
 from capsense.readout.config import file_content, parse_readout
 from capsense.readout.readout import Readout
 from capsense.recording.files import McapFile
-from capsense.recording.live import LiveTopics
 from capsense.recording.ros import require
 from capsense.recording.session import DESIGN, NAME, SESSION, Session, describe
-from capsense.recording.steps import Moment, StepMessages
+from capsense.recording.steps import LiveTopics, Moment, StepMessages
 from capsense.scenario.model import Excitation, Scenario
 from capsense.scene import DepthFrame, Scene
 from capsense.simulator import Simulator

@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
-from capsense.errors import MissingDependencyError, RecordingError
+from capsense.errors import RecordingError, require_package
 from capsense.scene import Box, Capsule, Cylinder, DepthFrame, Ellipsoid, Pose, Shape, Sphere
 from capsense.scene.scene import Body
 
@@ -32,13 +32,8 @@ def require() -> None:
     Raises:
         MissingDependencyError: One of them is not installed.
     """
-    try:
-        import mcap.writer  # noqa: F401
-        import rosbags.typesys  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"recordings need {error.name}; pip install 'capsense[record]'"
-        ) from None
+    for module in ("mcap.writer", "rosbags.typesys"):
+        require_package(module, f"{module}, which recordings need,", "record")
 
 
 @cache
@@ -231,15 +226,13 @@ class Composer:
 
     def electrodes(self, stamp: int, design: Design, colours: Array) -> Any:
         """Electrodes for drawing, in colours from 0 to 1, shape (M, 3)."""
-        markers = [
-            self._marker(
-                stamp, self.name, electrode.name, k, _TRIANGLES, (*colour, 1.0),
-                points=electrode.surface.triangles.reshape(-1, 3),
-            )
-            for k, (electrode, colour) in enumerate(
-                zip(design.electrodes, colours.tolist(), strict=True)
-            )
-        ]  # fmt: skip
+        markers = []
+        for k, (electrode, (r, g, b)) in enumerate(
+            zip(design.electrodes, colours.tolist(), strict=True)
+        ):
+            part = Part(_TRIANGLES, points=electrode.surface.triangles.reshape(-1, 3))
+            header = self.header(stamp)
+            markers.append(self._marker(header, electrode.name, k, part, (r, g, b, 1.0)))
         return self._make("visualization_msgs/msg/MarkerArray", markers=markers)
 
     def signals(self, stamp: int, names: Sequence[str], values: Array, changes: Array) -> Any:
@@ -254,20 +247,18 @@ class Composer:
 
     def markers(self, stamp: int, bodies: Sequence[tuple[str, Body]]) -> Any:
         """Bodies for drawing; each moves with the frame it is given with."""
-        out = [self._marker(stamp, self.name, "", 0, _CUBE, METAL, action=_DELETE_ALL)]
+        out = [self._marker(self.header(stamp), "", 0, Part(_CUBE), METAL, _DELETE_ALL)]
         for frame, body in bodies:
             colour = METAL if body.material.is_conductor() else PLASTIC
             out += [
-                self._marker(stamp, frame, frame, k, kind, colour, **options)
-                for k, (kind, options) in enumerate(_solids(body.shape))
+                self._marker(self.header(stamp, frame), frame, k, part, colour)
+                for k, part in enumerate(_parts(body.shape))
             ]
         return self._make("visualization_msgs/msg/MarkerArray", markers=out)
 
     def _marker(
-        self, stamp: int, frame: str, group: str, number: int, kind: int, colour: Colour, *,
-        action: int = 0, size: Sequence[float] = (1.0, 1.0, 1.0), height: float = 0.0,
-        points: Array | None = None,
-    ) -> Any:  # fmt: skip
+        self, header: Any, group: str, number: int, part: Part, colour: Colour, action: int = 0
+    ) -> Any:
         make, v = self._make, self._vector
         zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
         texture = make(
@@ -276,11 +267,11 @@ class Composer:
         )  # fmt: skip
         r, g, b, a = colour
         return make(
-            "visualization_msgs/msg/Marker", header=self.header(stamp, frame), ns=group, id=number,
-            type=kind, action=action, pose=self.pose(Pose((0.0, 0.0, height))),
-            scale=v("Vector3", size), color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
+            "visualization_msgs/msg/Marker", header=header, ns=group, id=number,
+            type=part.kind, action=action, pose=self.pose(Pose((0.0, 0.0, part.height))),
+            scale=v("Vector3", part.size), color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
             lifetime=zero, frame_locked=True,
-            points=[] if points is None else [v("Point", p) for p in points.tolist()], colors=[],
+            points=[v("Point", p) for p in part.points.tolist()], colors=[],
             texture_resource="", texture=texture, uv_coordinates=[], text="", mesh_resource="",
             mesh_file=make(
                 "visualization_msgs/msg/MeshFile", filename="", data=np.empty(0, np.uint8)
@@ -297,22 +288,29 @@ class Composer:
         return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def _solids(shape: Shape) -> list[tuple[int, dict[str, Any]]]:
-    """Kinds of markers that make up a shape, each with its size and place."""
+class Part(NamedTuple):
+    """A marker: its kind, sizes [m], place along z [m], or the corners of triangles [m], (n, 3)."""
+
+    kind: int
+    size: Sequence[float] = (1.0, 1.0, 1.0)
+    height: float = 0.0
+    points: Array = np.empty((0, 3))
+
+
+def _parts(shape: Shape) -> list[Part]:
+    """What a shape is drawn as."""
     match shape:
         case Box(size):
-            return [(_CUBE, {"size": size})]
+            return [Part(_CUBE, size)]
         case Sphere(radius):
-            return [(_SPHERE, {"size": (2 * radius,) * 3})]
+            return [Part(_SPHERE, (2 * radius,) * 3)]
         case Ellipsoid(radii):
-            return [(_SPHERE, {"size": tuple(2 * r for r in radii)})]
+            return [Part(_SPHERE, tuple(2 * r for r in radii))]
         case Cylinder(radius, length):
-            return [(_CYLINDER, {"size": (2 * radius, 2 * radius, length)})]
+            return [Part(_CYLINDER, (2 * radius, 2 * radius, length))]
         case Capsule(radius, length):
-            cap = {"size": (2 * radius,) * 3}
-            middle = {"size": (2 * radius, 2 * radius, length)}
-            ends = [(_SPHERE, {**cap, "height": s * 0.5 * length}) for s in (-1.0, 1.0)]
-            return [(_CYLINDER, middle), *ends]
+            ends = [Part(_SPHERE, (2 * radius,) * 3, s * 0.5 * length) for s in (-1.0, 1.0)]
+            return [Part(_CYLINDER, (2 * radius, 2 * radius, length)), *ends]
         case _:
             mesh = shape.to_trimesh()
-            return [(_TRIANGLES, {"points": mesh.vertices[mesh.faces].reshape(-1, 3)})]
+            return [Part(_TRIANGLES, points=mesh.vertices[mesh.faces].reshape(-1, 3))]

@@ -23,8 +23,7 @@ from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.bench import moving_bar, reference_bar, time_steps
 from capsense.field.background import BuildSettings
 from capsense.masked.mesh_sensor import plan_axes
-from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
-from capsense.reproduce.store import Store
+from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, Store, judged, notes
 from capsense.simulator import Method, PresetName
 
 if TYPE_CHECKING:
@@ -160,7 +159,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         tuple(_rows(points)),
         {"fig8": _table(points), "fig8_paper": _paper_table()},
         {"fig8": _plot(points)},
-        NOTES,
+        notes("fig8"),
         store.told(),
     )
 
@@ -229,18 +228,3 @@ def _plot(points: list[Point]) -> Figure:
     dress(errors, size, "largest error of ΔC$_{ii}$,\ngaps 5 to 100 mm [%]")
     figure.legend(loc="outside lower center", ncols=3, **LEGEND)
     return figure
-
-
-NOTES = (
-    "The paper's times are read off its Fig. 8: three electrodes, one step of residual update and "
-    "solve, an i7 at 3.40 GHz. CapSense's are whole calls of `Simulator.step` on this machine: "
-    "bodies in, six electrodes, full matrix out. Both of this machine's are what the processor "
-    "spent, which is what the clock shows where nothing else runs.",
-    'The paper\'s scheme is `method="fem_masked"`: every tetrahedron whose centroid lies in the '
-    "bar is held at 0 V, and Jacobi-CG solves the whole problem for one electrode after the other, "
-    "from the last step's solution. At many steps the bar passes no centroid, the staircase stays "
-    "as it was and there is nothing to solve: then the median is the time of finding that out.",
-    "CapSense has no mesh: its unknowns are functions of charge on the surfaces of bodies, so that "
-    "sizes of the two cannot be compared, only times and errors.",
-    "Parts hold measured times, and are taken up again on the machine that measured them only.",
-)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, judged
+from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, Store, judged, notes
 from capsense.reproduce.limb_curves import (
     ARM,
     BACKINGS,
@@ -34,7 +34,6 @@ from capsense.reproduce.limb_curves import (
     slopes,
     zero_distance,
 )
-from capsense.reproduce.store import Store
 
 
 def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
@@ -62,7 +61,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         (*_rows(first, cases, in_boxes, curves[CHECK]), *_arm_rows(fits)),
         _tables(first, cases, in_boxes) | ({"human_arm": _arm_table(fits)} if fits else {}),
         {"limb_approach": plot_approach(cases, in_boxes)},
-        NOTES,
+        notes("limb_approach"),
         store.told(),
     )
 
@@ -202,15 +201,3 @@ def _tables(
 def _cells(values: list[float]) -> tuple[str, ...]:
     """Slopes as text; a dash where the tared reading is not positive throughout."""
     return tuple("–" if np.isnan(v) else f"{v:.2f}" for v in values)
-
-
-NOTES = (
-    "The hardware's figures are those of the fits k/d − b in the code published with Erickson et "
-    "al. 2018. Its electrode, its holder and the height of its tare are not stated, and its unit "
-    "is a count; so shapes are compared, not sizes.",
-    "Slopes depend on what is behind the electrode more than on the electrode: a ground "
-    "plane 10 mm behind takes most of the far field. Beyond 10 cm they depend on the tare and on "
-    "the box.",
-    "Counts are those of an AD7147 model; large electrodes drive it beyond its range near "
-    "the skin.",
-)

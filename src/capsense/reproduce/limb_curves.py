@@ -27,7 +27,7 @@ import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.design.loader import parse_design
 from capsense.field.background import BuildSettings
-from capsense.reproduce.store import Store
+from capsense.reproduce.harness import Store
 from capsense.scene.scene import Grounding
 
 if TYPE_CHECKING:

@@ -15,7 +15,19 @@ from matplotlib.figure import Figure
 
 from capsense._style import COLOURS, FAINT, INK, LABELS, LEGEND, TITLES, bare
 from capsense.readout.calibration import cross_correlation
-from capsense.reproduce.harness import Outcome, Report, ReportTable, Row, judged
+from capsense.reproduce.harness import (
+    Outcome,
+    Report,
+    ReportTable,
+    Row,
+    Store,
+    correlation_of_change,
+    correlations,
+    judged,
+    notes,
+    raw_correlation,
+    rmse,
+)
 from capsense.reproduce.scenario1_setup import (
     TRIANGLE,
     ZIGZAG,
@@ -29,13 +41,6 @@ from capsense.reproduce.scenario1_setup import (
     matrices,
     mutual,
     normalised,
-)
-from capsense.reproduce.store import (
-    Store,
-    correlation_of_change,
-    correlations,
-    raw_correlation,
-    rmse,
 )
 from capsense.simulator import Simulator
 
@@ -223,7 +228,7 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         ),
     }
     title = "Scenario 1: a steel bar over stripe, patch and meander electrodes"
-    return Outcome(title, rows, tables, plots, NOTES, store.told())
+    return Outcome(title, rows, tables, plots, notes("scenario1"), store.told())
 
 
 def _compare(
@@ -295,19 +300,3 @@ def _curve(curve: Curve) -> ReportTable:
     columns = (curve.times, curve.reading, curve.noisy)
     rows = zip(range(1, len(curve.times) + 1), *(c.tolist() for c in columns), strict=True)
     return ReportTable(("sample", "time [s]", "reading", "reading with noise"), tuple(rows))
-
-
-NOTES = (
-    "**What was fitted.** Seventeen figures, listed under *fitted*, to 974 samples: the measured "
-    "curves of three panels. Both boards and all ways share distance, tilt, sample rate, rest and "
-    "stray capacitance. A panel's own are the shape of its way, the stripe triangle's level and "
-    "the patch triangle's pace; a board's own is the patch board's height. Pairs were chosen "
-    "among 36.",
-    "**What this shows.** That the geometry read off the paper's pictures, and a physical model "
-    "with few free figures, follow the hardware closer than the paper's simulation does. For these "
-    "three panels that is a fit, not a blind prediction.",
-    "**What is predicted.** The patch board's zig-zag, `patch_T4_0.116.csv`: nothing was fitted to "
-    "it, and it is compared with nothing here. So are T1, T3, the meander and the slow speed; the "
-    "corners of T1 and T3 are read from a sketch without dimensions. Fig. 9 does not say its "
-    "speed; at another one, sample rate and rest scale with it.",
-)

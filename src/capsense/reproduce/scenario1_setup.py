@@ -6,7 +6,7 @@ import csv
 import dataclasses
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.design import Design, Role, load_design
-from capsense.errors import ScenarioError
 from capsense.readout.calibration import base_capacitance, relative_to
 from capsense.readout.channels import ChannelBank, mutual_patterns
 from capsense.readout.converter import ShuntLaw
@@ -23,7 +22,6 @@ from capsense.readout.front_end import ShuntFrontEnd, Wiring
 from capsense.readout.noise import White
 from capsense.readout.readout import Readout
 from capsense.readout.schedule import Schedule
-from capsense.scenario.loader import ScenarioTable
 from capsense.scenario.model import Trajectory
 from capsense.scene import Body, Box, Pose, Scene
 from capsense.simulator import Simulator
@@ -108,7 +106,7 @@ class Zigzag:
 class Scenario1Setup:
     """Everything that scenario 1 depends on; SI units, tilt in degrees."""
 
-    speeds: tuple[float, ...]
+    speeds: Sequence[float]
     panel_speed: float
     sample_rate: float
     level: float
@@ -123,7 +121,7 @@ class Scenario1Setup:
     tilt: float
     offset: float
     rest: float
-    trajectories: Mapping[str, tuple[tuple[float, float], ...]]
+    trajectories: Mapping[str, Sequence[Sequence[float]]]
     """Corners of T1 to T3, as multiples of :attr:`half_line` and of a board's depth."""
     zigzag: Zigzag
     stray: float
@@ -206,98 +204,19 @@ class Scenario1Setup:
 
 
 def load_setup() -> Scenario1Setup:
-    """Read the packaged file.
-
-    Raises:
-        ScenarioError: A key is missing, unknown or wrong.
-    """
-    return parse_setup(tomllib.loads((DATA / FILE).read_text(encoding="utf-8")))
-
-
-_TOP = ("speeds", "panel_speed", "sample_rate", "level", "frequency", "pour", "bar", "path",
-        "zigzag", "trajectories", "front_end", "board", "panel", "uncertainty")  # fmt: skip
-_PATH = {"half_line": 1.0, "gap": 1.0, "tilt": 45.0, "offset": 1.0, "rest": 1e3}
-_FRONT_END = {"stray": 1e-9, "shunt": 1e9, "full_scale": 1e3, "conversion": 10.0, "noise": 1e-9}
-_ZIGZAG = {"depth": 1.0, "pitch": 1.0, "lift": 1.0, "start": 1.0}
-
-
-def parse_setup(data: Mapping[str, Any]) -> Scenario1Setup:
-    """Read the content of such a file.
-
-    Raises:
-        ScenarioError: A key is missing, unknown or wrong.
-    """
-    top = ScenarioTable(data, FILE, "scenario 1")
-    top.only(_TOP)
-
-    def part(name: str) -> ScenarioTable:
-        return ScenarioTable(top.raw(name, "a table"), FILE, name)
-
-    path, front, bar, ways, teeth = (
-        part(n) for n in ("path", "front_end", "bar", "trajectories", "zigzag")
-    )
-    speeds = top.series("speeds", 1e-6, 1e3, "m/s")
-    a, b, c = bar.sizes("size", 3, "[x, y, z] in metres")
-    boards = [
-        _board(ScenarioTable(raw, FILE, f"board {n}")) for n, raw in enumerate(top.tables("board"))
-    ]
-    panels = [
-        _panel(ScenarioTable(raw, FILE, f"panel {n}"), [board.design for board in boards])
-        for n, raw in enumerate(top.tables("panel"))
-    ]
-    setup = Scenario1Setup(
-        speeds=tuple(speeds) if isinstance(speeds, list) else (speeds,),
-        panel_speed=top.number("panel_speed", 1e-6, 1e3, unit="m/s"),
-        sample_rate=top.number("sample_rate", 1e-3, 1e6, unit="Hz"),
-        level=top.number("level", 0.0, 10.0),
-        excitation_frequency=top.number("frequency", 1.0, 1e12, unit="Hz"),
-        pour=top.choice("pour", (Role.GROUND, Role.FLOATING)),
-        size=(a, b, c),
-        material=bar.string("material"),
-        **{key: path.number(key, -limit, limit) for key, limit in _PATH.items()},
-        trajectories={
-            name: tuple((x, z) for x, z in ways.vectors(name, 2, "[x, z]")) for name in ways.data
-        },
-        zigzag=Zigzag(
-            teeth.integer("teeth", 1, 1000),
-            **{key: teeth.number(key, -limit, limit) for key, limit in _ZIGZAG.items()},
-        ),
-        **{key: front.number(key, 0.0, limit) for key, limit in _FRONT_END.items()},
+    """What the packaged file states; the classes refuse keys that they do not know."""
+    data = tomllib.loads((DATA / FILE).read_text(encoding="utf-8"))
+    boards = [Board(**{**raw, "pair": tuple(raw["pair"])}) for raw in data.pop("board")]
+    panels = [Panel(**raw) for raw in data.pop("panel")]
+    zigzag = Zigzag(**data.pop("zigzag"))
+    for part in ("bar", "path", "front_end"):
+        data.update(data.pop(part))
+    data["size"] = tuple(data["size"])
+    return Scenario1Setup(
+        **data,
+        zigzag=zigzag,
         boards={board.design: board for board in boards},
         panels={panel.name: panel for panel in panels},
-        uncertainty={key: part("uncertainty").number(key, 0.0, 1e3) for key in data["uncertainty"]},
-    )
-    for key in setup.uncertainty:
-        try:
-            setup.value(key)
-        except KeyError:
-            raise ScenarioError(f"{FILE}: uncertainty: there is no figure {key!r}") from None
-    return setup
-
-
-def _board(table: ScenarioTable) -> Board:
-    table.only([f.name for f in dataclasses.fields(Board)])
-    pair = table.raw("pair", '["E1", "E2"]')
-    if not (isinstance(pair, list) and len(pair) == 2):
-        raise table.error(f'pair = {pair!r} must be two electrodes, like ["E1", "E2"]')
-    return Board(
-        table.string("design"),
-        (str(pair[0]), str(pair[1])),
-        table.number("height", -1.0, 1.0, unit="m"),
-        table.number("depth", 1e-3, 1.0, unit="m"),
-        table.number("gain", 1e-6, 1e9),
-    )
-
-
-def _panel(table: ScenarioTable, boards: list[str]) -> Panel:
-    table.only([f.name for f in dataclasses.fields(Panel)])
-    return Panel(
-        table.choice("board", boards),
-        table.string("trajectory"),
-        table.integer("samples", 1, 1_000_000),
-        table.number("level", 0.0, 10.0) if "level" in table else None,
-        table.number("pace", 1e-3, 1e3, 1.0),
-        table.text("file"),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from capsense import _validate
-from capsense._validate import MAX_LENGTH, UNITS, read_toml, suggest
+from capsense._validate import MAX_LENGTH, UNITS, read_toml
 from capsense.codec import SHAPES, lengths_of
 from capsense.design import Design, load_design
 from capsense.errors import DesignError, MeshError, ScenarioError, SceneError
@@ -30,6 +29,7 @@ from capsense.scene import (
     TriMesh,
 )
 from capsense.scene.scene import Grounding
+from capsense.scene.surface import read_triangles
 
 if TYPE_CHECKING:
     from capsense.simulator import Method
@@ -100,7 +100,12 @@ def _read_mesh(table: ScenarioTable, folder: Path) -> TriMesh:
         raise table.error(
             f"file = {file!r}: there is no file {path}; paths are relative to the scenario file"
         )
-    vertices, faces = _triangles(table, path)
+    if path.suffix.lower() not in (".stl", ".obj", ".ply", ".off"):
+        raise table.error(f"file = {file!r} is of no known kind; give .stl, .obj, .ply or .off")
+    try:
+        vertices, faces = read_triangles(path)
+    except SceneError as error:
+        raise table.error(f"file = {file!r} {error}") from None
     extent = float(np.ptp(vertices, axis=0).max()) * scale
     if extent > MAX_LENGTH:
         raise table.error(
@@ -108,23 +113,6 @@ def _read_mesh(table: ScenarioTable, folder: Path) -> TriMesh:
             f"than {MAX_LENGTH:g} m; give the unit that the file is in"
         )
     return TriMesh(vertices * scale, faces)
-
-
-def _triangles(table: ScenarioTable, path: Path) -> tuple[Any, Any]:
-    """Vertices, shape (n, 3), and faces, shape (m, 3), of a file in its own unit."""
-    if path.suffix.lower() not in (".stl", ".obj", ".ply", ".off"):
-        raise table.error(
-            f"file = {table.data['file']!r} is of no known kind; give .stl, .obj, .ply or .off"
-        )
-    import trimesh
-
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh's readers raise whatever they meet
-        raise table.error(f"file = {table.data['file']!r} cannot be read: {error}") from None
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise table.error(f"file = {table.data['file']!r} holds no triangles")
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def read_material(table: ScenarioTable) -> Material | str:
@@ -171,15 +159,7 @@ def _rotations(table: ScenarioTable) -> list[Pose]:
                 raise table.error(f"euler = {list(row)} must be within ±360 degrees")
         return [Pose.from_euler((0, 0, 0), row, degrees=True) for row in angles]
     if "quaternion" in table:
-        rows = table.vectors("quaternion", 4, "[x, y, z, w]")
-        for row in rows:
-            norm = math.hypot(*row)
-            if abs(norm - 1.0) > 1e-3:
-                raise table.error(
-                    f"quaternion = {list(row)} has length {norm:.4g}; give a unit quaternion "
-                    "[x, y, z, w]"
-                )
-        return [Pose((0, 0, 0), row) for row in rows]
+        return [Pose((0, 0, 0), row) for row in table.unit_quaternions("quaternion")]
     return []
 
 
@@ -343,30 +323,18 @@ def _read_pairs(
                 'use excitation = "self"'
             )
         return ()
-    what = 'a list of pairs of electrode names, like [["E1", "E2"]]'
-    value = top.raw("pairs", what)
     if excitation is not Excitation.MUTUAL:
         raise top.error(f'pairs is for excitation = "mutual", not "{excitation}"; remove one')
-    if not isinstance(value, list) or not value:
-        raise top.error(f"pairs = {value!r} must be {what}")
+    what = 'a list of pairs of electrode names, like [["E1", "E2"]]'
     out: list[tuple[str, str]] = []
-    for number, pair in enumerate(value):
-        if not (
-            isinstance(pair, list) and len(pair) == 2 and all(isinstance(n, str) for n in pair)
-        ):
-            raise top.error(f"pairs[{number}] = {pair!r} must be two electrode names")
+    names, owner = design.electrode_names, f"design {design.name!r}"
+    for number, pair in enumerate(top.pairs("pairs", what, names, owner)):
         one, two = pair
-        for electrode in pair:
-            if electrode not in design.electrode_names:
-                raise top.error(
-                    f"pairs[{number}] = {pair!r} names no electrode {electrode!r} of design "
-                    f"{design.name!r}; {suggest(electrode, design.electrode_names)}"
-                )
         if one == two:
-            raise top.error(f"pairs[{number}] = {pair!r} must name two different electrodes")
-        if (one, two) in out or (two, one) in out:
-            raise top.error(f"pairs[{number}] = {pair!r} is listed twice; remove one")
-        out.append((one, two))
+            raise top.error(f"pairs[{number}] = {[*pair]} must name two different electrodes")
+        if pair in out or (two, one) in out:
+            raise top.error(f"pairs[{number}] = {[*pair]} is listed twice; remove one")
+        out.append(pair)
     return tuple(out)
 
 

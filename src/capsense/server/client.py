@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.errors import MissingDependencyError, ProtocolError
+from capsense.errors import ProtocolError, require_package
 from capsense.server.frames import (
     PROTOCOL,
     DepthMessage,
@@ -52,13 +52,7 @@ class Client:
         self, url: str = "ws://127.0.0.1:8765", *, token: str = "", timeout: float = 10.0,
         name: str = "python",
     ) -> None:  # fmt: skip
-        try:
-            import websockets.sync.client  # noqa: F401
-        except ImportError as error:
-            raise MissingDependencyError(
-                'the client needs websockets; install it with: pip install "capsense[serve]"'
-            ) from error
-
+        require_package("websockets", "websockets, which the client needs,", "serve")
         self.timeout = timeout
         self.sensors: dict[int, RemoteSensor] = {}
         """Open sensors, by number."""

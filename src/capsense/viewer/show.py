@@ -18,7 +18,7 @@ from capsense.reading import Reading
 from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import DepthFrame, Pose, Shape
 from capsense.viewer.player import FIELD_PERIOD
-from capsense.viewer.source import Frame, Stream, green_of
+from capsense.viewer.source import Frame, Simulated, Stream
 
 if TYPE_CHECKING:
     from capsense.viewer.charts import Plane
@@ -161,7 +161,7 @@ class Follower:
             self._field_taken = now
 
 
-class SensorStream:
+class SensorStream(Simulated):
     """What a sensor reads, as it is put in. A :class:`~capsense.viewer.source.Stream`.
 
     Args:
@@ -169,12 +169,10 @@ class SensorStream:
     """
 
     def __init__(self, sensor: AttachedSensor) -> None:
-        simulator = sensor.simulator
-        self.title, self.design = f"{simulator.design.name}, on a robot", simulator.design
+        super().__init__(sensor.simulator.copy())
+        self.title, self.empty = f"{self.design.name}, on a robot", sensor.simulator.empty
         self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
-        self.empty, self.green = simulator.empty, green_of(simulator)
         self.frames: queue.Queue[Frame] = queue.Queue()
-        self._simulator = simulator.copy()
 
     def next(self, timeout: float) -> Frame | None:
         """See :class:`~capsense.viewer.source.Stream`."""
@@ -182,14 +180,6 @@ class SensorStream:
             return self.frames.get(timeout=timeout)
         except queue.Empty:
             return None
-
-    def potentials(self, frame: Frame, plane: Plane) -> Array:
-        """See :class:`~capsense.viewer.source.Stream`."""
-        self._simulator.step(frame.scene)
-        return self._simulator.potentials(plane.points)
-
-    def close(self) -> None:
-        """Nothing is held."""
 
 
 class Show:

@@ -107,7 +107,28 @@ class Seekable(Source, Protocol):
         """
 
 
-class ScenarioSource:
+class Simulated:
+    """What sources have in common that ask a simulator of their own.
+
+    Args:
+        simulator: Potentials come from it.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.design = simulator.design
+        self.green = simulator.background.green if simulator.method == "surface" else None
+        self._simulator = simulator
+
+    def potentials(self, frame: Frame, plane: Plane) -> Array:
+        """See :class:`Stream`."""
+        self._simulator.step(frame.scene)
+        return self._simulator.potentials(plane.points)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class ScenarioSource(Simulated):
     """Simulates a scenario, sample by sample as they are asked for.
 
     Args:
@@ -116,11 +137,10 @@ class ScenarioSource:
     """
 
     def __init__(self, scenario: Scenario, simulator: Simulator) -> None:
-        self.title, self.design = scenario.name, scenario.design
+        super().__init__(simulator)
+        self.title, self._scenario = scenario.name, scenario
         self.times, self.channels = scenario.times, scenario.channels
-        self._scenario, self._simulator = scenario, simulator
         self.empty = simulator.empty
-        self.green = green_of(simulator)
 
     def frame(self, index: int, plane: Plane | None = None) -> Frame:
         """See :class:`Seekable`."""
@@ -132,11 +152,8 @@ class ScenarioSource:
         found = self._simulator.potentials(plane.points)
         return Frame(index, time, scene, reading, plane, found, self._simulator.charges())
 
-    def close(self) -> None:
-        """Nothing is held."""
 
-
-class RecordingSource:
+class RecordingSource(Simulated):
     """Shows what a recording holds; the simulator is asked for potentials only.
 
     Those of a recording of a method that is gone come from ``"surface"``.
@@ -154,15 +171,14 @@ class RecordingSource:
         self, recording: Recording, progress: Callable[[str, float], None] | None = None
     ) -> None:
         session = recording.session
+        gone = session.method in GONE
         self._steps = list(recording.steps())
         if not self._steps:
             raise RecordingError(f"{recording.path} holds no steps; record some")
-        self.title, self.design = session.title or session.name, session.design
+        super().__init__(session.simulator(method="surface" if gone else None, progress=progress))
+        self.title = session.title or session.name
         self.times = np.array([step.clock for step in self._steps])
         self.channels, self.empty = session.channels, session.empty
-        gone = session.method in GONE
-        self._simulator = session.simulator(method="surface" if gone else None, progress=progress)
-        self.green = green_of(self._simulator)
 
     def frame(self, index: int, plane: Plane | None = None) -> Frame:
         """See :class:`Seekable`."""
@@ -170,17 +186,8 @@ class RecordingSource:
         frame = Frame(index, float(self.times[index]), step.scene, step.reading)
         if plane is None:
             return frame
-        self._simulator.step(step.scene)
-        found = self._simulator.potentials(plane.points)
+        found = self.potentials(frame, plane)
         return replace(frame, plane=plane, potentials=found, charges=self._simulator.charges())
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-def green_of(simulator: Simulator) -> GreenFunction | None:
-    """Green's function of a simulator that gives potentials; None if it does not."""
-    return simulator.background.green if simulator.method == "surface" else None
 
 
 Address = tuple[int, int]
@@ -190,7 +197,7 @@ RETRY = 0.5
 """While there is nothing to watch, the server is asked so often [s]."""
 
 
-class Watched:
+class Watched(Simulated):
     """Watches a sensor that a client of a server opened. A :class:`~capsense.viewer.source.Stream`.
 
     Nothing is sent to the server but the wish to watch. Times are those of arrival, since clients
@@ -218,14 +225,13 @@ class Watched:
         self._client: Client | None = self._connect()
         told = self._wait(self._client, waiting)
         self._open = _opened(told)
-        self.design = design_from_json(json.dumps(told["design"]))
+        design = design_from_json(json.dumps(told["design"]))
+        super().__init__(Simulator(design, progress=progress))
         self.title = f"{self.design.name}, sensor {told['client']}:{told['sensor']} of {url}"
         self.channels = channels_of(Excitation.MATRIX, self.design.electrode_names)
         baseline = np.array(told["baseline"])
         nothing = np.zeros_like(baseline)
         self.empty = reading_of(self.design, baseline, nothing, nothing[0])
-        self._simulator = Simulator(self.design, progress=progress)
-        self.green = green_of(self._simulator)
         self._began, self._count = time.monotonic(), 0
         self._seen: DepthMessage | dict[str, Any] | None = None
         self._scene = Scene()
@@ -239,11 +245,6 @@ class Watched:
         except (ProtocolError, ServerError):
             self.close()
             raise
-
-    def potentials(self, frame: Frame, plane: Plane) -> Array:
-        """See :class:`~capsense.viewer.source.Stream`."""
-        self._simulator.step(frame.scene)
-        return self._simulator.potentials(plane.points)
 
     def close(self) -> None:
         """Close the connection."""
