@@ -26,6 +26,7 @@ from scenario1_fit import (
 )
 
 from capsense.readout.calibration import cross_correlation
+from capsense.reproduce.harness import rmse
 from capsense.reproduce.scenario1_setup import (
     Array,
     Scenario1Setup,
@@ -35,7 +36,6 @@ from capsense.reproduce.scenario1_setup import (
     mutual,
     normalised,
 )
-from capsense.reproduce.store import rmse
 from capsense.simulator import Simulator
 
 BOARDS = ("stripe", "patch")

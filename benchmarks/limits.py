@@ -4,6 +4,7 @@
   against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels do not
   help there.
 - wide boxes in parallel with the sensor, against 2,800 panels, and what their readings tell of it.
+- boxes that come down in steps of 0.02 mm: by how much a large entry falls in a step, at most.
 - dielectrics in depth images of 128 × 128 pixels with front and back, against the shapes.
 - sheets of a dielectric as deforming surfaces of 800 triangles, against boxes as thick.
 - bodies that reach into the sensor: error estimates over the largest entry.
@@ -90,6 +91,26 @@ def wide(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         yield f"gap {1e3 * gap:g} mm", table.ravel().tolist()
 
 
+def falls(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Largest fall in a step from 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, each preset.
+
+    Of entries above a tenth of the scene's largest, relative.
+    """
+    sims = [cs.Simulator(DESIGN, preset=p, background=sim.background) for p in PRESETS]
+    gaps = np.arange(3e-3, 0.0, -2e-5)
+    for size in ((0.04, 0.04, 0.02), (0.15, 0.04, 0.02), (0.15, 0.15, 0.02), (0.15, 0.15, 0.01)):
+        out = []
+        for each in sims:
+            scenes = [low(cs.Box(size), gap, (0.004, 0.003)) for gap in gaps]
+            read = np.array([np.diag(each.step(cs.Scene([body])).delta) for body in scenes])
+            large = (read > 0.1 * read.max(axis=1, keepdims=True))[1:]
+            fall = np.where(large, -np.diff(np.log(read), axis=0), 0.0).clip(0.0).max(axis=1)
+            out += [
+                part.max() for part in np.split(fall, np.searchsorted(-gaps[1:], (-1e-3, -3e-4)))
+            ]
+        yield "box " + " x ".join(f"{1e3 * s:g}" for s in size) + " mm", out
+
+
 def images(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     """Errors of depth images of dielectrics at 5, 10, 20, 50 mm."""
     for name, shape in (("ball", cs.Sphere(0.03)), ("box", cs.Box((0.08, 0.06, 0.04)))):
@@ -132,6 +153,7 @@ def inside(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
 PARTS = {
     "contact, presets learning, standard, fine, and 2,800 panels": contact,
     "wide boxes: median and largest error, and median estimate, of each preset": wide,
+    "falls in a step: 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, of each preset": falls,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
     "deforming sheets of dielectrics, gaps of 5, 10, 20, 50 mm": cloth,
     "in the sensor: error estimate with lowest points at 1, 0, -1, -5 mm": inside,

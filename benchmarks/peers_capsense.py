@@ -7,6 +7,7 @@ from peers_iterative import TOLERANCE
 from peers_task import DESIGN, SIZE, Array, bar_corners, design, within
 
 import capsense as cs
+from capsense.masked import MeshSensor
 from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor, plan_axes
 from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh
@@ -54,9 +55,8 @@ class PaperScheme:
     def __init__(self, mesh: TetMesh, warm_start: bool) -> None:
         tolerance = TOLERANCE if warm_start else PUBLISHED_TOLERANCE
         self.name, self.settings = _named("the paper's scheme", warm_start, tolerance)
-        self._solver = MaskedSolver(
-            mesh, design().electrode_names, tolerance=tolerance, warm_start=warm_start
-        )
+        sensor = MeshSensor(mesh, design().electrode_names)
+        self._solver = MaskedSolver(sensor, tolerance=tolerance, warm_start=warm_start)
         x, y, z = (np.ascontiguousarray(c) for c in mesh.centroids.T)
         self._centroids = (x, y, z)
         self.n_tets, self.unknowns = mesh.n_tets, mesh.n_points

@@ -89,7 +89,8 @@ def plot(results: dict[str, Any], path: Path) -> None:
         for row in rows(results, group).values():
             if row["name"] in STYLES:
                 series.setdefault(row["name"], {}).setdefault(_key(row), row)
-    figure, axes = plt.subplots(figsize=(9.0, 5.0), layout="constrained")
+    plt.style.use("capsense.plotting.capsense")
+    figure, axes = plt.subplots(figsize=(7.5, 4.2), layout="constrained")
     for name, (marker, colour) in STYLES.items():
         found = [row for _, row in sorted(series.get(name, {}).items())]
         if name == "CapSense":
@@ -105,18 +106,14 @@ def plot(results: dict[str, Any], path: Path) -> None:
                           textcoords="offset points", fontsize=8, color=colour)  # fmt: skip
     axes.axhline(100 * GOOD, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
     axes.annotate(f"{100 * GOOD:g} %", (0.995, 100 * GOOD), xycoords=("axes fraction", "data"),
-                  ha="right", va="bottom", color="0.4")  # fmt: skip
+                  ha="right", va="bottom", fontsize=8, color="0.4")  # fmt: skip
     axes.set_xlabel("time of a step, median, one core [ms]")
     axes.set_ylabel("largest error of ΔC$_{ii}$, gaps 5 to 100 mm [%]")
-    axes.set_title("A bar moves over six electrodes. Small: tetrahedra, or preset",
-                   loc="left", fontsize=10)  # fmt: skip
-    axes.grid(which="major", color="0.92")
+    axes.set_title("A bar moves over six electrodes. Small: tetrahedra, or preset")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    figure.savefig(path, dpi=120)
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    figure.savefig(path)
     plt.close(figure)
 
 

@@ -11,8 +11,8 @@ import time
 
 import numpy as np
 
-from capsense.readout.chips import CHIPS
 from capsense.readout.imaging import back_projection, landweber, tikhonov
+from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout
 
 NAMES = tuple(f"E{k}" for k in range(6))

@@ -3,7 +3,7 @@
     python benchmarks/smoothness.py --method surface --bodies finger ball
 
 Over ``six_patch_bare``, in steps of 0.05 mm (0.05° where the body turns), for a finger, a
-fingertip, a forearm, a ball and a tilted box:
+fingertip, a forearm, a ball, a tilted box, and for bodies that overlap: a bent arm and a hand:
 
 - approach: lowest point from 60 to 8 mm above the electrodes. "2nd diff": the largest second
   difference of log ΔC_ii, of entries that are above 3 % of the scene's largest at all three
@@ -24,10 +24,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from accuracy_map import parse_settings
@@ -50,14 +52,42 @@ SHOWN, FALLING = 0.03, 0.10
 WRONG_BY = 1e-3
 """Of the largest entry: what an eigenvalue may lack to zero, and symmetry to exactness."""
 Shape = cs.Box | cs.Sphere | cs.Capsule
-BODIES: dict[str, tuple[Shape, tuple[float, float, float]]] = {
-    "finger": (cs.Capsule(0.008, 0.060), (0.3, 0.5, 0.0)),
-    "fingertip": (cs.Capsule(0.008, 0.008), (0.3, 0.5, 0.0)),
-    "forearm": (cs.Capsule(0.040, 0.250), (0.4, 1.5, 0.0)),
-    "ball": (cs.Sphere(0.030), (0.0, 0.0, 0.0)),
-    "tilted box": (cs.Box((0.1, 0.08, 0.05)), (0.3, 0.25, 0.15)),
+Angles = tuple[float, float, float]
+"""Turns about z, then the new y, then the new x [rad]."""
+
+
+class Part(NamedTuple):
+    """A body of a group that moves as one."""
+
+    shape: Shape
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Place of its centre in the frame of the group [m]."""
+    angles: Angles = (0.0, 0.0, 0.0)
+
+
+_FINGER = cs.Capsule(0.008, 0.060)
+_ACROSS = (0.0, math.pi / 2, 0.0)
+BODIES: dict[str, tuple[list[Part], Angles]] = {
+    "finger": ([Part(_FINGER)], (0.3, 0.5, 0.0)),
+    "fingertip": ([Part(cs.Capsule(0.008, 0.008))], (0.3, 0.5, 0.0)),
+    "forearm": ([Part(cs.Capsule(0.040, 0.250))], (0.4, 1.5, 0.0)),
+    "ball": ([Part(cs.Sphere(0.030))], (0.0, 0.0, 0.0)),
+    "tilted box": ([Part(cs.Box((0.1, 0.08, 0.05)))], (0.3, 0.25, 0.15)),
+    "bent arm": (
+        [
+            Part(cs.Capsule(0.040, 0.250), (-0.120, 0.0, 0.0), _ACROSS),
+            Part(cs.Sphere(0.045)),
+            Part(cs.Capsule(0.035, 0.250), (0.060, 0.100, 0.020), (1.0, math.pi / 2, 0.0)),
+        ],
+        (0.2, 0.1, 0.0),
+    ),
+    "hand": (
+        [Part(cs.Box((0.09, 0.08, 0.03)), (-0.06, 0.0, 0.0))]
+        + [Part(_FINGER, (0.02, y, -0.005), _ACROSS) for y in (-0.03, -0.01, 0.01, 0.03)],
+        (0.3, 0.1, 0.1),
+    ),
 }
-"""Shapes, and turns about z, then the new y, then the new x [rad]."""
+"""Bodies, and how they are turned."""
 
 
 def reach_down(shape: Shape, turn: Rotation) -> float:
@@ -71,28 +101,41 @@ def reach_down(shape: Shape, turn: Rotation) -> float:
 
 
 class Mover:
-    """Places one body over the sensor and reads it."""
+    """Places bodies over the sensor, as one, and reads them."""
 
     def __init__(self, sim: cs.Simulator, name: str) -> None:
         self.sim = sim
-        self.shape, angles = BODIES[name]
+        self.parts, angles = BODIES[name]
         self.turn = Rotation.from_euler("ZYX", angles)
-        self.body = cs.Body(self.shape)
+        self.bodies = [cs.Body(part.shape) for part in self.parts]
 
-    def scene(self, gap: float, x: float = 0.0, extra: Rotation | None = None) -> cs.Scene:
-        """Lowest point at ``gap`` [m], shifted along x [m], turned further in the sensor frame."""
-        turn = self.turn if extra is None else extra * self.turn
-        position = (PLACE[0] + x, PLACE[1], gap + reach_down(self.shape, turn))
-        return cs.Scene([self.body.moved(cs.Pose(position, tuple(turn.as_quat())))])
+    def deepest(self, turn: Rotation) -> float:
+        """How far they reach below their origin [m]."""
+        return max(
+            reach_down(p.shape, turn * Rotation.from_euler("ZYX", p.angles)) - turn.apply(p.at)[2]
+            for p in self.parts
+        )
+
+    def posed(self, position: tuple[float, float, float], turn: Rotation) -> cs.Scene:
+        """The bodies there, turned."""
+        placed = []
+        for body, part in zip(self.bodies, self.parts, strict=True):
+            own = turn * Rotation.from_euler("ZYX", part.angles)
+            at = np.array(position) + turn.apply(part.at)
+            placed.append(body.moved(cs.Pose(tuple(at), tuple(own.as_quat()))))
+        return cs.Scene(placed)
+
+    def scene(self, gap: float, x: float = 0.0) -> cs.Scene:
+        """Lowest point at ``gap`` [m], shifted along x [m]."""
+        return self.posed((PLACE[0] + x, PLACE[1], gap + self.deepest(self.turn)), self.turn)
 
     def turned(self, axis: str, degrees: float) -> cs.Scene:
-        """Turned about its centre, which stays where the worst angle leaves ``TURN_GAP`` free."""
+        """Turned about the origin, which stays where the worst angle leaves ``TURN_GAP`` free."""
         angles = np.linspace(-TURN_TO, TURN_TO, 61)
         turns = Rotation.from_euler(axis, angles[:, None], degrees=True)
-        deepest = max(reach_down(self.shape, extra * self.turn) for extra in turns)
+        deepest = max(self.deepest(extra * self.turn) for extra in turns)
         turn = Rotation.from_euler(axis, degrees, degrees=True) * self.turn
-        position = (*PLACE, TURN_GAP + deepest)
-        return cs.Scene([self.body.moved(cs.Pose(position, tuple(turn.as_quat())))])
+        return self.posed((*PLACE, TURN_GAP + deepest), turn)
 
     def read(self, scenes: list[cs.Scene]) -> Array:
         """ΔC [F] of scenes in turn, each after the one before, (n, 6, 6)."""

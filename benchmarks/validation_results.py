@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from capsense.reproduce.harness import STUDIES
+from capsense.reproduce import STUDIES
 
 BOARDS = "python benchmarks/boards.py stripe patch"
 SMOOTHNESS = "python benchmarks/smoothness.py -o out/smoothness.json"

@@ -224,18 +224,30 @@ def test_files_that_inflate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         load_mesh(tmp_path / "a.vtu")
 
 
-@pytest.mark.parametrize("told", [0, 100])
-def test_a_chunk_of_zeros(tmp_path: Path, told: int) -> None:
-    """Ten million records without content, in some kilobytes; told to be smaller than it is."""
+def chunk_of(path: Path, zeros: bytes, told: int) -> Path:
+    """A recording of one chunk, which says that it inflates to ``told`` bytes."""
     import zstandard
 
-    zeros = bytes(90_000_000)
     data = zstandard.compress(zeros)
     head = struct.pack("<QQQI", 0, 0, told or len(zeros), zlib.crc32(zeros) if told else 0)
     chunk = head + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(data)) + data
-    path = tmp_path / "a.mcap"
     path.write_bytes(files.MAGIC + struct.pack("<BQ", 6, len(chunk)) + chunk)
+    return path
+
+
+@pytest.mark.parametrize("told", [0, 100])
+def test_a_chunk_of_zeros(tmp_path: Path, told: int) -> None:
+    """Ten million records without content, in some kilobytes; told to be smaller than it is."""
+    path = chunk_of(tmp_path / "a.mcap", bytes(90_000_000), told)
     with pytest.raises(errors.RecordingError, match="a record of kind 0"):
+        cs.open_recording(path)
+
+
+def test_a_chunk_that_says_too_little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit is on what it inflates to, not on what it says."""
+    monkeypatch.setattr(files, "_MOST", 1000)
+    path = chunk_of(tmp_path / "a.mcap", bytes(5000), 100)
+    with pytest.raises(errors.RecordingError, match="5,000 bytes of memory"):
         cs.open_recording(path)
 
 

@@ -6,6 +6,7 @@ import re
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import capsense as cs
@@ -36,9 +37,9 @@ def test_hand_approach() -> None:
     ]
     assert peaks[0] < peaks[1] < peaks[2]
     assert peaks[3] < peaks[4] < peaks[5]
-    far, near = samples[0].reading.delta[0, 0], samples[-1].reading.delta[0, 0]
-    assert far == pytest.approx(near, rel=0.2)
-    assert max(s.reading.delta[0, 0] for s in samples) > 100 * far
+    first, last = (np.diag(samples[k].reading.delta) for k in (0, -1))
+    np.testing.assert_allclose(first, last[::-1], rtol=0.02)  # half a turn about z
+    assert max(s.reading.delta[0, 0] for s in samples) > 100 * first[0]
 
 
 def test_steel_bar_triangle() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 import subprocess
@@ -70,11 +69,11 @@ def test_documented_contract() -> None:
 
 def test_no_two_classes_have_one_name() -> None:
     counts = Counter(
-        node.name
+        name
         for file in Path(cs.__file__).parent.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ClassDef)
+        for name in re.findall(r"^ *class (\w+)[(:\[]", file.read_text(encoding="utf-8"), re.M)
     )
+    assert counts["Simulator"] == counts["Recorder"] == 1
     assert not {name for name, count in counts.items() if count > 1}
 
 

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from capsense.reproduce.harness import STUDIES
+from capsense.reproduce import STUDIES
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
@@ -94,7 +94,7 @@ def test_maps(validation: ModuleType) -> None:
     text = validation.presets(["standard"])
     found = [cells(line) for line in text.splitlines()[2:]]
     assert [int(row[2]) for row in found] == [89, 60, 9]
-    for row, (rms, worst) in zip(found, ((0.55, 2.5), (1.0, 4.7), (2.0, 7.0)), strict=True):
+    for row, (rms, worst) in zip(found, ((0.55, 2.5), (1.0, 4.7), (2.0, 7.5)), strict=True):
         assert float(row[3]) < rms
         assert float(row[5]) < worst
     assert_on_page(text, 0.05)
