@@ -105,13 +105,15 @@ def draw(curves: dict[str, np.ndarray], folder: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
+    plt.style.use("capsense.plotting.capsense")
     folder.mkdir(parents=True, exist_ok=True)
     x = np.linspace(-150, 150, STEPS)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8))
     for title, style in (("arm in a sleeve", "-"), ("bare arm", ":"), ("sleeve alone", "--")):
         left.plot([], [], style, color="0.3", label=title)
         for k in range(3):
-            left.plot(x, curves[title][:, k] * 1e15, style, color=f"C{k}")
+            on_top = {"color": "0.2", "linewidth": 0.9} if style == "--" else {"color": f"C{k}"}
+            left.plot(x, curves[title][:, k] * 1e15, style, **on_top)
     covered = curves["arm in a sleeve"] * 1e15
     for k in range(3):
         top = int(covered[:, k].argmax())
@@ -119,10 +121,9 @@ def draw(curves: dict[str, np.ndarray], folder: Path) -> None:
             f"E{k + 1}", (x[top], covered[top, k]), xytext=(0, 4), textcoords="offset points",
             ha="center", color=f"C{k}",
         )  # fmt: skip
-    left.set(xlabel="arm's position, mm", ylabel="change of capacitance, fF")
+    left.set(xlabel="arm's position [mm]", ylabel="change of capacitance [fF]")
     left.set_ylim(top=1.6 * covered.max())
     left.legend(loc="upper left")
-    left.grid(alpha=0.3)
     middle = STEPS // 2
     points = sleeve_vertices(middle, where(middle)).reshape(ALONG, AROUND, 3) * 1e3
     for ring in points:
@@ -130,7 +131,7 @@ def draw(curves: dict[str, np.ndarray], folder: Path) -> None:
     for row in points.transpose(1, 0, 2):
         right.plot(*row[:, 1:].T, color="0.6", linewidth=0.7)
     right.plot([-42.5, 42.5], [0, 0], color="C1", linewidth=4)
-    right.set(xlabel="y, mm", ylabel="z, mm", aspect="equal", title="the sleeve over the sensor")
+    right.set(xlabel="y [mm]", ylabel="z [mm]", aspect="equal", title="the sleeve over the sensor")
     figure.tight_layout()
     figure.savefig(folder / "sleeve.png", dpi=130)
     plt.close(figure)
