@@ -301,6 +301,18 @@ class ChangingBody:
         self.record = record
 
 
+def _lengths(shape: Shape) -> tuple[float, float, float]:
+    """How long a shape is [m] along the axes that it can be cut along, else 0."""
+    if isinstance(shape, Box):
+        return shape.size
+    return (0.0, 0.0, shape.length) if isinstance(shape, Cylinder | Capsule) else (0.0, 0.0, 0.0)
+
+
+def longer(shape: Shape, reach: float) -> bool:
+    """Whether :func:`windowed` cuts a shape."""
+    return max(_lengths(shape)) > reach
+
+
 def windowed(shape: Shape, middle: Array, reach: float) -> tuple[Shape, Array]:
     """Cut a box, cylinder or capsule to a length that reaches through the domain.
 
@@ -314,19 +326,17 @@ def windowed(shape: Shape, middle: Array, reach: float) -> tuple[Shape, Array]:
     Returns:
         The part, and its centre in the shape's frame [m], shape (3,).
     """
-    if isinstance(shape, Box):
-        size = np.array(shape.size)
-    elif isinstance(shape, Cylinder | Capsule):
-        size = np.array([0.0, 0.0, shape.length])
-    else:
+    if not longer(shape, reach):
         return shape, np.zeros(3)
-    if size.max() <= reach:
-        return shape, np.zeros(3)
+    size = np.array(_lengths(shape))
     part = np.minimum(size, reach)
     at = np.clip(middle, 0.5 * (part - size), 0.5 * (size - part))
     held = shape.__dict__.get("_window")
     if held is None or held[0] != reach:
         x, y, z = part.tolist()
-        cut = Box((x, y, z)) if isinstance(shape, Box) else type(shape)(shape.radius, z)
-        held = shape.__dict__["_window"] = reach, cut
+        if isinstance(shape, Cylinder | Capsule):
+            held = reach, type(shape)(shape.radius, z)
+        else:
+            held = reach, Box((x, y, z))
+        shape.__dict__["_window"] = held
     return held[1], at

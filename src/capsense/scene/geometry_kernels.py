@@ -273,3 +273,21 @@ def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
             middle = position[k] + r[k, 0] * centre[0] + r[k, 1] * centre[1] + r[k, 2] * centre[2]
             bounds[i, 0, k] = middle - half
             bounds[i, 1, k] = middle + half
+
+
+@njit(cache=True, error_model="numpy")
+def overlapping(bounds: Array, low: Array, high: Array) -> NDArray[np.int64]:
+    """Which boxes overlap one with corners ``low`` and ``high`` [m], each of shape (3,), ascending.
+
+    Args:
+        bounds: Lower and upper corners [m], shape (n, 2, 3).
+    """
+    out, count = np.empty(bounds.shape[0], np.int64), 0
+    for i in range(bounds.shape[0]):
+        apart = False
+        for k in range(3):
+            apart = apart or not (bounds[i, 1, k] > low[k] and bounds[i, 0, k] < high[k])
+        if not apart:
+            out[count] = i
+            count += 1
+    return out[:count]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
-from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces, windowed
+from capsense.elements.pieces import ChangingBody, layer_pieces, longer, mesh_pieces, windowed
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.elements.store import rigid
 from capsense.errors import SceneError, SolveError
@@ -21,6 +22,7 @@ from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.contact import Sheets
+from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.step import Solution, potential_change, solve, solve_lossy
@@ -82,6 +84,35 @@ class PackedBodies:
     """From the bodies' origins to those of the parts of them that are solved for [m], (n, 3)."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Laid:
+    """Records of bodies but for where they stand, which is all that changes at most steps."""
+
+    whole: Matter
+    """What the bodies are made of,"""
+    places: list[int]
+    """body of each part, its functions and its size [m]: what the records follow from."""
+    found: list[tuple[RigidShape | ChangingBody, float]]
+    records: NDArray[np.void]
+    matter: Matter
+    """What the parts are made of."""
+    shapes: list[RigidShape | ChangingBody]
+
+    def holds(self, whole: Matter, places: list[int], found: list[Any]) -> bool:
+        """Whether records of these are the same."""
+        return self.whole is whole and self.places == places and self.found == found
+
+
+def _laid_out(
+    whole: Matter, places: list[int], found: list[tuple[RigidShape | ChangingBody, float]]
+) -> _Laid:
+    shapes, matter = [shape for shape, _ in found], whole.repeated(places)
+    records = np.array([s.record for s in shapes], BODY)
+    records["scale"] = [size for _, size in found]
+    matter.write(records, shapes)
+    return _Laid(whole, places, found, records, matter, shapes)
+
+
 class SurfaceSolver:
     """Solves scenes, each by itself.
 
@@ -107,7 +138,9 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain [m], as :func:`windowed` takes them."""
+        self._room = self.green.room[0], self.green.room[1]
         self._last: tuple[View, Solution] | None = None
+        self._laid: _Laid | None = None
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
@@ -133,12 +166,11 @@ class SurfaceSolver:
 
     def _meets_electrodes(self, view: View) -> bool:
         """Whether an electrode lies inside a body, or touches a conductor."""
-        low, high = self._sheets.bounds
-        bounds = view.packed.bounds[view.met]
-        near = ((bounds[:, 1] > low) & (bounds[:, 0] < high)).all(axis=1)
-        return any(
-            self._sheets.meet(view.scene[int(view.met[k])], bool(view.matter.conducting[k]))
-            for k in np.flatnonzero(near).tolist()
+        near = set(overlapping(view.packed.bounds, *self._sheets.bounds).tolist())
+        return bool(near) and any(
+            self._sheets.meet(view.scene[k], bool(view.matter.conducting[place]))
+            for place, k in enumerate(view.met.tolist())
+            if k in near
         )
 
     def potentials(self, points: Array) -> Array:
@@ -173,9 +205,7 @@ class SurfaceSolver:
     def look(self, scene: Scene) -> View:
         """Find the bodies of a scene that reach into the domain."""
         packed = scene.pack()
-        low, high = packed.bounds[:, 0], packed.bounds[:, 1]
-        room = self.green.room
-        met = np.flatnonzero(((high > room[0]) & (low < room[1])).all(axis=1))
+        met = overlapping(packed.bounds, *self._room)
         matter = matter_of([scene[k] for k in met.tolist()], self.excitation_frequency)
         return View(scene, packed, met, matter)
 
@@ -218,9 +248,9 @@ class SurfaceSolver:
         The error is an estimate of that of the largest entry [F]; where bodies lie within each
         other or within the sensor so that the matrix had to be changed, it is all of that entry.
         """
-        doubt = np.abs(np.diag(solution.left).real) + solution.coarse
+        doubt = np.abs(solution.left.diagonal()) + solution.coarse
         if solution.shift > 0.0:
-            doubt = np.abs(np.diag(solution.delta).real)
+            doubt = np.abs(solution.delta.diagonal().real)
         return UNIT * solution.delta, UNIT * float(doubt.max())
 
     def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
@@ -253,22 +283,25 @@ class SurfaceSolver:
         matter, packed = self._joined(view), view.packed
         found: list[tuple[RigidShape | ChangingBody, float]] = []
         places: list[int] = []
-        offsets: list[Array] = []
-        for place, k in enumerate(view.met.tolist()):
-            parts, share = self._parts(view, place)
-            for part, at in parts:
+        offsets: list[tuple[int, Array]] = []
+        for place in range(len(view.met)):
+            parts, share, at = self._parts(view, place)
+            if at is not None:
+                offsets.append((len(places), at))
+            for part in parts:
                 found.append(self.functions_of(part, share))
                 places.append(place)
-                offsets.append(packed.rotation[k] @ at)
-        chosen, shapes = view.met[places], [shape for shape, _ in found]
-        shift = np.array(offsets).reshape(-1, 3)
-        records = np.array([s.record for s in shapes], BODY)
-        records["scale"] = [size for _, size in found]
-        records["rotation"] = packed.rotation[chosen]
-        records["position"] = packed.position[chosen] + shift
-        matter = matter.repeated(places)
-        matter.write(records, shapes)
-        return PackedBodies(records, chosen, matter, shapes, shift)
+        laid = self._laid
+        if laid is None or not laid.holds(matter, places, found):
+            laid = self._laid = _laid_out(matter, places, found)
+        records, chosen = laid.records.copy(), view.met[places]
+        records["rotation"] = rotation = packed.rotation[chosen]
+        records["position"] = packed.position[chosen]
+        shift = np.zeros((len(chosen), 3))
+        for i, at in offsets:
+            shift[i] = rotation[i] @ at
+            records["position"][i] += shift[i]
+        return PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
 
     def _joined(self, view: View) -> Matter:
         """What bodies are made of, with conductors that touch as one.
@@ -283,32 +316,38 @@ class SurfaceSolver:
         joined = whole.repeated(used.tolist()).joined(view.scene, view.packed, used)
         return joined.repeated(places.tolist())
 
-    def _parts(self, view: View, place: int) -> tuple[list[tuple[Shape, Array]], float]:
-        """Parts of a body to be solved for, where they are in its frame [m], and panels for each.
+    def _parts(self, view: View, place: int) -> tuple[Sequence[Shape], float, Array | None]:
+        """Parts of a body to be solved for.
 
         Long bodies are cut, see :func:`windowed`. Each connected part of a large mesh has charge
         functions of its own, if it reaches into the domain; current between them is not followed,
         so that lossy meshes stay whole.
 
         Returns:
-            Parts and their places, and the share of the usual panels that each is given.
+            Parts, the share of the usual panels that each is given, and where the only one is in
+            the body's frame [m] if that is not its origin.
         """
         k, matter = int(view.met[place]), view.matter
-        shape, rotation = view.scene[k].shape, view.packed.rotation[k]
-        position = view.packed.position[k]
+        shape = view.packed.shapes[k]
+        if not isinstance(shape, TriMesh):
+            if not longer(shape, self.reach):
+                return (shape,), 1.0, None
+            middle = (self.middle - view.packed.position[k]) @ view.packed.rotation[k]
+            part, at = windowed(shape, middle, self.reach)
+            return (part,), 1.0, at
         if (
-            not isinstance(shape, TriMesh)
-            or np.ptp(shape.bounds(), axis=0).max() < _LARGE
+            np.ptp(shape.bounds(), axis=0).max() < _LARGE
             or not (matter.conducting[place] or matter.eps[place].imag == 0)
             or shape.parts == 1
         ):
-            return [windowed(shape, (self.middle - position) @ rotation, self.reach)], 1.0
+            return (shape,), 1.0, None
+        rotation = view.packed.rotation[k]
         low, high = shape.piece_bounds
-        middle = position + 0.5 * (low + high) @ rotation.T
+        middle = view.packed.position[k] + 0.5 * (low + high) @ rotation.T
         half = 0.5 * (high - low) @ np.abs(rotation.T)
         room = self.green.room
         near = ((middle + half > room[0]) & (middle - half < room[1])).all(axis=1)
-        return [(shape.pieces[i], np.zeros(3)) for i in np.flatnonzero(near).tolist()], _OF_MANY
+        return [shape.pieces[i] for i in np.flatnonzero(near).tolist()], _OF_MANY, None
 
     def functions_of(
         self, shape: Shape, share: float = 1.0
