@@ -36,7 +36,9 @@ class _Cache(FunctionCache):
 
 def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
+        dispatcher = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(
+            function
+        )
         dispatcher._cache = _Cache(function)
         return dispatcher
 

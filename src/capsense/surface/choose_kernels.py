@@ -245,7 +245,7 @@ def choose(bodies, first, scores, threshold, width):
     fades, above = np.zeros(total), np.zeros(total)
     for k in range(total):
         state[k] = place[k] = -1
-    count = leaves = 0
+    count = leaves = np.int64(0)  # not the literal, for which Numba would compile another version
     for b in range(bodies.shape[0]):
         kids = integers(bodies[b].kids)
         o = first[b]

@@ -115,7 +115,7 @@ def bound_images(leaves, rows, pairs, green):
             inverse += 0.25 / max(points[j, q, 2] - green.box[1, 2], 1e-9)
             image[q, 0], image[q, 1] = points[j, q, 0], points[j, q, 1]
             image[q, 2] = 2.0 * green.floor - points[j, q, 2]
-        side = math.sqrt(12.0 * _arm(points[j], 1) * _arm(points[j], 2))
+        side = math.sqrt(12.0 * _arm(points[j][0], points[j][1]) * _arm(points[j][0], points[j][2]))
         if inverse * side < _WIDE or points[j, :, 2].min() < green.box[1, 2]:
             continue
         met = mean_inverse(points[j], image, 0.0)
@@ -240,7 +240,7 @@ def mean_inverse(first, second, soft):
 def _near_mean(first, second, extent, other, same):
     """Mean of 1/r [1/m] between two rectangles of one surface, given by their four points."""
     if same:
-        return _self_mean(_arm(first, 1), _arm(first, 2))
+        return _self_mean(_arm(first[0], first[1]), _arm(first[0], first[2]))
     x = 0.5 * (first[0, 0] + first[3, 0] - second[0, 0] - second[3, 0])
     y = 0.5 * (first[0, 1] + first[3, 1] - second[0, 1] - second[3, 1])
     z = 0.5 * (first[0, 2] + first[3, 2] - second[0, 2] - second[3, 2])
@@ -261,11 +261,11 @@ def _near_mean(first, second, extent, other, same):
 
 
 @compiled
-def _arm(corners, which):
+def _arm(first, second):
     """Half the distance [m] between two of the four points."""
     total = 0.0
     for i in range(3):
-        total += (corners[0, i] - corners[which, i]) ** 2
+        total += (first[i] - second[i]) ** 2
     return 0.5 * math.sqrt(total)
 
 
@@ -273,7 +273,7 @@ def _arm(corners, which):
 def _mean_potential(outer, inner):
     """Mean over the points of one rectangle of the potential of unit charge on the other [1/m]."""
     root = math.sqrt(3.0)
-    short, long = _arm(inner, 1) + 1e-9, _arm(inner, 2) + 1e-9
+    short, long = _arm(inner[0], inner[1]) + 1e-9, _arm(inner[0], inner[2]) + 1e-9
     b, a = root * short, root * long
     total = 0.0
     for q in range(4):
