@@ -74,7 +74,7 @@ def test_batches_at_once(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) ->
 
     def copy(self: cs.Simulator) -> cs.Simulator:
         made = make(self)
-        monkeypatch.setattr(made._solver, "solve", alone(made._solver.solve))
+        monkeypatch.setattr(made._solver, "solve_each", alone(made._solver.solve_each))
         return made
 
     monkeypatch.setattr(cs.Simulator, "copy", copy)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,10 @@ from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
 from capsense.errors import BatchError, SceneError, SolveError
+from capsense.field.change import Change
+from capsense.masked.mesh_sensor import MaskedScenes
+from capsense.surface import solver
+from capsense.surface.solver import SurfaceSolver, View
 
 
 @pytest.fixture
@@ -46,6 +51,7 @@ def test_each_reading_is_that_of_a_step_from_rest(tiny: cs.Simulator, threads: i
             np.testing.assert_array_equal(a.delta, b.delta)
             np.testing.assert_array_equal(a.self_capacitance, b.self_capacitance)
             assert a.stats.unknowns == b.stats.unknowns
+            assert a.stats.solver_error == pytest.approx(b.stats.solver_error, rel=1e-12)
         views, expected = views[::-1], expected[::-1]
 
 
@@ -70,14 +76,14 @@ def test_a_failing_scene_does_not_lose_the_others(
 ) -> None:
     """The error names it by its number and holds the readings of the others."""
     views = scenes(6)
-    step = cs.Simulator.step
+    look = SurfaceSolver.look
 
-    def fail(self: cs.Simulator, scene: cs.Scene) -> cs.Reading:
+    def fail(self: SurfaceSolver, scene: cs.Scene) -> View:
         if scene is views[2]:
             raise SolveError("no convergence")
-        return step(self, scene)
+        return look(self, scene)
 
-    monkeypatch.setattr(cs.Simulator, "step", fail)
+    monkeypatch.setattr(SurfaceSolver, "look", fail)
     with pytest.raises(BatchError, match=r"1 of 6 scenes failed; 2: no convergence;") as caught:
         tiny.step_batch(views, threads=2)
     assert list(caught.value.readings) == [0, 1, 3, 4, 5]
@@ -86,9 +92,58 @@ def test_a_failing_scene_does_not_lose_the_others(
     assert len(tiny.step_batch(views, threads=2)) == 6, "and the next batch is sound"
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_scenes_without_a_solution(
+    tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    """Those whose matrix has no factor, or is not finite, fail alone, as they do in a step."""
+    views = scenes(40)
+    hollow = solver.solve_each
+
+    def broken(*args: Any) -> Any:
+        delta, error, size = hollow(*args)
+        for k in np.flatnonzero(size > 0)[:1]:  # where it is 0, no body was in sight
+            delta[k, 0, 0], size[k] = (np.nan, size[k]) if size[k] % 2 else (1.0, -1)
+        return delta, error, size
+
+    monkeypatch.setattr(solver, "solve_each", broken)
+    with pytest.raises(BatchError, match="look for bodies that coincide") as caught:
+        tiny.step_batch(views, threads=threads)
+    failures = caught.value.failures
+    assert len(failures) >= min(2, threads)
+    assert sorted([*failures, *caught.value.readings]) == list(range(40))
+    for number, reading in caught.value.readings.items():
+        np.testing.assert_array_equal(reading.delta, tiny.step(views[number]).delta)
+
+
+def test_the_scheme_of_the_paper(field_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each scene from rest too, and one that fails does not lose the others."""
+    masked = cs.Simulator(
+        tiny_design(), settings=SETTINGS, cache_dir=field_cache, method="fem_masked"
+    )
+    views = [cs.Scene([cs.Body(cs.Sphere(0.01), cs.Pose((0, 0, z)))]) for z in (0.02, 0.03, 0.04)]
+    expected = []
+    for view in views:
+        masked.reset()
+        expected.append(masked.step(view).delta)
+    for reading, delta in zip(masked.step_batch(views, threads=2), expected, strict=True):
+        np.testing.assert_array_equal(reading.delta, delta)
+    solve = MaskedScenes.solve
+
+    def fail(self: MaskedScenes, scene: cs.Scene) -> Change:
+        if scene is views[1]:
+            raise SolveError("no convergence")
+        return solve(self, scene)
+
+    monkeypatch.setattr(MaskedScenes, "solve", fail)
+    with pytest.raises(BatchError, match="1 of 3 scenes failed; 1: no convergence;") as caught:
+        masked.step_batch(views, threads=2)
+    assert list(caught.value.readings) == [0, 2]
+
+
 def test_refused_before_any_work(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
     """By name, with the fix."""
-    monkeypatch.setattr(cs.Simulator, "step", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr(SurfaceSolver, "look", lambda *_: pytest.fail("worked"))
     with pytest.raises(SceneError, match=r"scenes\[2\]: a batch holds a Scene .*, not list"):
         tiny.step_batch([cs.Scene(), cs.Scene(), []])  # type: ignore[list-item]
     with pytest.raises(SceneError, match="threads is 0"):

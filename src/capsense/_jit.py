@@ -35,10 +35,10 @@ class _Cache(FunctionCache):
 
 
 def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    options["no_cfunc_wrapper"] = True  # nothing calls kernels by address
+
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(
-            function
-        )
+        dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
         dispatcher._cache = _Cache(function)
         return dispatcher
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.errors import BatchError, FieldError, ReadoutError, SceneError
+from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError, SceneError
 from capsense.field.background import BackgroundField, BuildSettings
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
@@ -35,11 +35,19 @@ Array = NDArray[np.float64]
 Method = Literal["surface", "fem_masked"]
 PresetName = Literal["standard", "learning", "fine"]
 
+_TURNS = 4
+"""Parts of a batch, for each thread, at least: no thread then waits long for another."""
+
 
 class _Solver(Protocol):
     """What a method offers."""
 
+    together: int
+    """How many scenes of a batch a thread takes at a time, at most."""
+
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change: ...
+
+    def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]: ...
 
     def potentials(self, points: Array) -> Array: ...
 
@@ -136,7 +144,7 @@ class Simulator:
         self._background = background
         self._solver, rest = self._make_solver()
         self._one = OneAtATime()
-        self._idle: deque[Simulator] = deque()  # sensors for the threads of batches
+        self._idle: deque[_Solver] = deque()  # for the threads of batches
         self._names = self.design.electrode_names
         self._terminals = Terminals(self.design, rest)
         n = self._terminals.electrodes
@@ -207,8 +215,11 @@ class Simulator:
         Raises:
             ReadoutError: There is no such chip or file, or the file is wrong.
         """
-        self.readout = make_readout(readout, self)
-        if self.readout is not None:
+        self.readout = None
+        if readout is not None:
+            from capsense.readout.config import make_readout
+
+            self.readout = make_readout(readout, self)
             self.readout.reset(start=start)
 
     def step(
@@ -240,15 +251,14 @@ class Simulator:
             scene = scene.scene()
         with self._one:
             self.steps += 1
-            reading = self._of(self._solver.solve(scene, jacobian=jacobian), start)
-            if not reading.delta.any():
-                scene.warn_of_units(max(self.design.domain.size))
+            found = self._solver.solve(scene, jacobian=jacobian)
+            reading = self._of(found, scene, perf_counter() - start)
             if self.readout is None or time is None:
                 return reading
             return replace(reading, counts=self.readout.sample(time, reading))
 
-    def _of(self, found: Change, start: float) -> Reading:
-        """The reading that a solver's result makes, of a step that began at ``start`` [s]."""
+    def _of(self, found: Change, scene: Scene, seconds: float) -> Reading:
+        """The reading that a solver's result makes, which took some time [s]."""
         terminals = self._terminals
         change: NDArray[Any] = terminals.screened(found.matrix)
         error = max(found.error, float((found.matrix - change).max()))
@@ -257,8 +267,10 @@ class Simulator:
         slope = None if found.jacobian is None else terminals.slope(change, found.jacobian)
         change = terminals.change(change)
         error = min(error, float(np.abs(terminals.empty + change).max()))
-        stats = StepStats(error, perf_counter() - start, found.unknowns, found.iterations)
+        stats = StepStats(error, seconds, found.unknowns, found.iterations)
         reading = self._reading(change.real, stats, slope)
+        if not reading.delta.any():
+            scene.warn_of_units(max(self.design.domain.size))
         if found.loss is None:
             return reading
         n = terminals.electrodes
@@ -300,23 +312,39 @@ class Simulator:
         for number, scene in enumerate(scenes):
             _check_view(f"scenes[{number}]: a batch holds", scene)
 
-        def from_rest(scene: Scene | DepthFrame) -> Reading:
-            try:
-                sensor = self._idle.popleft()
-            except IndexError:
-                sensor = self.copy()
-            try:
-                sensor.reset()
-                return sensor.step(scene)
-            finally:
-                self._idle.append(sensor)
-
-        readings, failures = ThreadPool(threads).run(
-            {k: partial(from_rest, scene) for k, scene in enumerate(scenes)}
-        )
+        pool = ThreadPool(threads)
+        size = min(self._solver.together, -(-len(scenes) // (_TURNS * pool.threads)))
+        starts = range(0, len(scenes), max(size, 1))
+        parts, lost = pool.run({k: partial(self._each, scenes[k : k + size]) for k in starts})
+        readings: dict[int, Reading] = {}
+        failures: dict[int, CapSenseError] = {}
+        for k in starts:
+            for number, found in enumerate(parts.get(k) or size * [lost[k]], k):
+                if isinstance(found, Reading):
+                    readings[number] = found
+                else:
+                    failures[number] = found
         if failures:
             raise BatchError(some_failed("scenes", failures, len(scenes)), readings, failures)
         return list(readings.values())
+
+    def _each(self, scenes: Sequence[Scene | DepthFrame]) -> list[Reading | CapSenseError]:
+        """Readings of scenes, each from rest, or what was wrong with them."""
+        start = perf_counter()
+        plain = [s.scene() if isinstance(s, DepthFrame) else s for s in scenes]
+        try:
+            solver = self._idle.popleft()
+        except IndexError:
+            solver = self.copy()._solver
+        try:
+            found = solver.solve_each(plain)
+        finally:
+            self._idle.append(solver)
+        seconds = (perf_counter() - start) / len(plain)
+        return [
+            f if isinstance(f, CapSenseError) else self._of(f, scene, seconds)
+            for f, scene in zip(found, plain, strict=True)
+        ]
 
     def potentials(self, points: ArrayLike) -> Array:
         """Potentials of the last step at points in front of the sensor [V], for drawing.
@@ -388,24 +416,6 @@ class Simulator:
             "boundary panels": self.background.n_panels,
             "point charges": len(green.near_sources), "modes": green.n_modes,
         }  # fmt: skip
-
-
-def make_readout(readout: Readout | str | Path | None, simulator: Simulator) -> Readout | None:
-    """The readout given, or that of a chip or a file for a simulator's electrodes.
-
-    Raises:
-        ReadoutError: There is no such chip or file, or the file is wrong.
-    """
-    if readout is None:
-        return None
-    from capsense.readout.config import choose_readout
-    from capsense.readout.readout import Readout
-
-    if isinstance(readout, Readout):
-        return readout
-    if not isinstance(readout, str | Path):
-        raise ReadoutError(f"readout is {readout!r}; give a chip's name, a file, or a Readout")
-    return choose_readout(readout, simulator.electrode_names, simulator.empty)
 
 
 def _check_view(where: str, scene: object) -> None:

@@ -26,9 +26,10 @@ from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.reading import Reading
+from capsense.readout.config import make_readout
 from capsense.readout.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
-from capsense.simulator import Simulator, make_readout
+from capsense.simulator import Simulator
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ class AttachedSensor(ABC):
         Raises:
             ReadoutError: There is no such chip or file, or the file is wrong.
         """
-        self.readout = make_readout(readout, self.simulator)
+        self.readout = None if readout is None else make_readout(readout, self.simulator)
         self._restart_readout(None)
 
     def _restart_readout(self, seed: int | None) -> None:

@@ -36,11 +36,12 @@ from capsense.adapters.rules import (
 )
 from capsense.design.model import Design
 from capsense.errors import AdapterError, SceneError
+from capsense.readout.config import make_readout
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
 from capsense.scene.scene import Grounding
-from capsense.simulator import Simulator, make_readout
+from capsense.simulator import Simulator
 
 __all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]
 
@@ -160,7 +161,7 @@ def attach(
         _check_own(vision_sensor, {**options, "pose_in_object": pose_in_object})
     simulator = make_simulator(design)
     image = Image.of(other, simulator.design)
-    chip = make_readout(readout, simulator)
+    chip = None if readout is None else make_readout(readout, simulator)
     material = as_material(rules.default_material) if "default_material" in options else None
     paint = None
     if vision_sensor is None:  # all is checked: only now the scene is changed

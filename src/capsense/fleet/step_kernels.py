@@ -11,7 +11,7 @@ from capsense._jit import compiled
 from capsense.elements.matter import SHUT
 from capsense.field.green_kernels import Green
 from capsense.surface.gradient_kernels import jacobian
-from capsense.surface.step import solve
+from capsense.surface.step import estimate, solve
 
 
 class Bodies(NamedTuple):
@@ -94,11 +94,8 @@ def step_rows(start, stop, bodies, poses, sensor, found):
             if count == 0 or found.lossy[e, s]:
                 continue
             out = solve(room[:count], green, sensor.threshold, sensor.width, slopes)
+            found.error[e, s] = estimate(out)
             for i in range(m):
-                doubt = abs(out.left[i, i]) + out.coarse[i]
-                if out.shift > 0.0:
-                    doubt = abs(out.delta[i, i])
-                found.error[e, s] = max(found.error[e, s], doubt)
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.size >= 0 else np.nan
             if slopes and out.size >= 0:

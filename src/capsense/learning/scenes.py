@@ -7,8 +7,9 @@ from typing import Any
 from capsense.errors import SceneError, SolveError
 from capsense.learning.settle import settled, settling
 from capsense.learning.spec import Spec
+from capsense.readout.config import make_readout
 from capsense.readout.readout import Readout
-from capsense.simulator import Simulator, make_readout
+from capsense.simulator import Simulator
 
 COLUMNS = {
     "scene": "number of the scene",
@@ -50,7 +51,7 @@ def spec_readout(spec: Spec, simulator: Simulator) -> Readout | None:
     choice = spec.readout
     if isinstance(choice, str) and choice.endswith(".toml"):
         choice = spec.folder / choice
-    return make_readout(choice, simulator)
+    return None if choice is None else make_readout(choice, simulator)
 
 
 def _row(spec: Spec, number: int, simulator: Simulator, readout: Readout | None) -> dict[str, Any]:

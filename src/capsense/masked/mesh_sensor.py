@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Design, Domain, Electrode
 from capsense.design.stl import sheet_surface, weld
-from capsense.errors import DesignError, MeshError, SceneError
+from capsense.errors import CapSenseError, DesignError, MeshError, SceneError
 from capsense.field.boundary import terminals
 from capsense.field.change import Change
 from capsense.masked.solver import GROUNDED, MaskedSolver
@@ -306,6 +306,9 @@ class MaskedScenes:
 
     FLOATING_EPS_R = 1e4
 
+    together = 1
+    """How many scenes of a batch a thread takes at a time."""
+
     def __init__(
         self, sensor: MeshSensor, excitation_frequency: float, *,
         electrodes: Sequence[str] | None = None, warm_start: bool = True,
@@ -333,6 +336,17 @@ class MaskedScenes:
 
     def charges(self) -> None:
         """Not offered."""
+
+    def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]:
+        """Return what each of many scenes changes, from rest, or what was wrong with it."""
+        out: list[Change | CapSenseError] = []
+        for scene in scenes:
+            self.reset()
+            try:
+                out.append(self.solve(scene))
+            except CapSenseError as error:
+                out.append(error)
+        return out
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
         """Return what a scene changes, from the last one's potentials; there is no Jacobian."""

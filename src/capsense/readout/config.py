@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 from capsense import _validate
 from capsense._validate import read_toml, suggest
@@ -64,6 +64,29 @@ def choose_readout(choice: str | Path, electrodes: Sequence[str], empty: Reading
     """
     content = file_content(choice, electrodes, empty)
     return parse_readout(content, electrodes, source=Path(choice).name)
+
+
+class _Sensor(Protocol):
+    """A simulator, as far as a chip has to know it."""
+
+    @property
+    def electrode_names(self) -> tuple[str, ...]: ...
+
+    @property
+    def empty(self) -> ReadingLike: ...
+
+
+def make_readout(readout: Readout | str | Path, sensor: _Sensor) -> Readout:
+    """The readout given, or that of a chip or a file for a sensor's electrodes.
+
+    Raises:
+        ReadoutError: There is no such chip or file, or the file is wrong.
+    """
+    if isinstance(readout, Readout):
+        return readout
+    if not isinstance(readout, str | Path):
+        raise ReadoutError(f"readout is {readout!r}; give a chip's name, a file, or a Readout")
+    return choose_readout(readout, sensor.electrode_names, sensor.empty)
 
 
 def file_content(

@@ -16,7 +16,7 @@ from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
 from capsense.elements.pieces import ChangingBody, layer_pieces, longer, mesh_pieces, windowed
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.elements.store import rigid
-from capsense.errors import SceneError, SolveError
+from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.change import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
@@ -25,13 +25,14 @@ from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
-from capsense.surface.step import Solution, potential_change, solve, solve_lossy
+from capsense.surface.step import Solution, potential_change, solve, solve_each, solve_lossy
 
 Array = NDArray[np.float64]
 
 
 _OF_MANY = 0.4
 """Panels of one part of a large mesh, over those of a body."""
+_NO_SOLUTION = "the charges of the bodies cannot be told apart; look for bodies that coincide"
 _LARGE = 0.4
 """Meshes that are longer than this [m] are solved for part by part."""
 
@@ -123,6 +124,9 @@ class SurfaceSolver:
         preset: How finely scenes are resolved.
     """
 
+    together = 32
+    """How many scenes of a batch a thread takes at a time, at most."""
+
     def __init__(
         self,
         green: GreenFunction,
@@ -138,6 +142,7 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain [m], as :func:`windowed` takes them."""
+        self._nothing: Array = np.zeros((self.green.terminals, self.green.terminals))
         self._room = self.green.room[0], self.green.room[1]
         self._last: tuple[View, Solution] | None = None
         self._laid: _Laid | None = None
@@ -155,14 +160,51 @@ class SurfaceSolver:
         bodies, solution = self.solution(view, jacobian=jacobian)
         slope = self.jacobian(view, bodies, solution) if jacobian else None
         if solution is None:
-            nothing = np.zeros((self.green.terminals, self.green.terminals))
-            return Change(nothing, 0.0, jacobian=slope)
+            return self._change(view, self._nothing, 0.0, 0, slope)
         self._last = view, solution
-        matrix, error = self.in_farads(solution)
+        return self._change(view, *self.in_farads(solution), solution.size, slope)
+
+    def _change(
+        self, view: View, matrix: NDArray[Any], error: float, size: int, slope: Array | None
+    ) -> Change:
+        """What a scene changes, by its matrix [F] and the error of that."""
         if self._meets_electrodes(view):
             error = math.inf
         loss = -matrix.imag if np.iscomplexobj(matrix) else None
-        return Change(matrix.real, error, unknowns=solution.size, loss=loss, jacobian=slope)
+        return Change(matrix.real, error, unknowns=size, loss=loss, jacobian=slope)
+
+    def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]:
+        """Return what each of many scenes changes, or what was wrong with it.
+
+        Results are those of :meth:`solve`; those without losses are solved in one call.
+        """
+        out: dict[int, Change | CapSenseError] = {}
+        plain: list[tuple[int, View, PackedBodies]] = []
+        for k, scene in enumerate(scenes):
+            try:
+                view = self.look(scene)
+                if view.matter.lossy:
+                    out[k] = self.solve(scene)
+                else:
+                    plain.append((k, view, self.pack(view)))
+            except CapSenseError as error:
+                out[k] = error
+        if plain:
+            counts = [0, *(len(bodies.records) for _, _, bodies in plain)]
+            records = np.concatenate([bodies.records for _, _, bodies in plain])
+            preset = self.preset
+            with first_use():
+                delta, doubt, size = solve_each(
+                    records, np.cumsum(counts), self.green, preset.threshold, preset.width
+                )
+            delta, doubt = UNIT * delta, UNIT * doubt
+            sound = (size >= 0) & np.isfinite(delta).all(axis=(1, 2))
+            for i, (k, view, _) in enumerate(plain):
+                if sound[i]:
+                    out[k] = self._change(view, delta[i], float(doubt[i]), int(size[i]), None)
+                else:
+                    out[k] = SolveError(_NO_SOLUTION)
+        return [out[k] for k in range(len(scenes))]
 
     def _meets_electrodes(self, view: View) -> bool:
         """Whether an electrode lies inside a body, or touches a conductor."""
@@ -235,9 +277,7 @@ class SurfaceSolver:
             else:
                 out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
         if out.size < 0 or not np.isfinite(out.delta).all():
-            raise SolveError(
-                "the charges of the bodies cannot be told apart; look for bodies that coincide"
-            )
+            raise SolveError(_NO_SOLUTION)
         return bodies, out
 
     def in_farads(self, solution: Solution) -> tuple[NDArray[Any], float]:

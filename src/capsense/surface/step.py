@@ -98,6 +98,47 @@ def solve(
 
 
 @compiled
+def estimate(solution: Solution) -> float:
+    """Estimated error of the largest entry [m], of a scene without losses.
+
+    Where bodies lie within each other or within the sensor so that the matrix had to be changed, it
+    is all of that entry.
+    """
+    out = 0.0
+    for i in range(solution.coarse.shape[0]):
+        doubt = abs(solution.left[i, i]) + solution.coarse[i]
+        out = max(out, abs(solution.delta[i, i]) if solution.shift > 0.0 else doubt)
+    return out
+
+
+@compiled
+def solve_each(
+    bodies: NDArray[np.void], first: NDArray[np.int64], green: Green, threshold: float, width: float
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.int64]]:
+    """Solve k scenes without losses, one after another.
+
+    Args:
+        bodies: Records of all, scene after scene.
+        first: First body of each scene, and their number, shape (k + 1,).
+        green, threshold, width: As in :func:`prepared`.
+
+    Returns:
+        Changes of the Maxwell matrix [m], (k, m, m), their :func:`estimate` [m], (k,), and the
+        functions solved for, -1 where there is no solution, (k,).
+    """
+    k, m = first.shape[0] - 1, green.terminals
+    delta, error, size = np.zeros((k, m, m)), np.zeros(k), np.zeros(k, np.int64)
+    for scene in range(k):
+        if first[scene] < first[scene + 1]:
+            found = solve(bodies[first[scene] : first[scene + 1]], green, threshold, width, False)
+            size[scene], error[scene] = found.size, estimate(found)
+            for i in range(m):
+                for j in range(m):
+                    delta[scene, i, j] = found.delta[i, j]
+    return delta, error, size
+
+
+@compiled
 def eliminate(matrix: NDArray[np.complex128], sides: NDArray[np.complex128]) -> None:
     """Replace right-hand sides (n, m) by the solution for a symmetric complex matrix (n, n), lost.
 

@@ -15,8 +15,8 @@ from gymnasium.utils import RecordConstructorArgs
 from capsense.adapters import mujoco as adapter
 from capsense.errors import SceneError
 from capsense.learning.envs.signals import Signals
+from capsense.readout.config import make_readout
 from capsense.scene import Pose
-from capsense.simulator import make_readout
 from capsense.skin import AnyDesign
 
 __all__ = ["CapacitiveObservation", "write_model"]
@@ -101,8 +101,8 @@ class CapacitiveObservation(gymnasium.ObservationWrapper, RecordConstructorArgs)
         how = self._how.copy()
         readout = how.pop("readout")
         self.skin = adapter.attach_skin(inner.model, inner.data, **how, threads=1)
-        chips = {n: make_readout(readout, s.simulator) for n, s in self.skin.sensors.items()}
-        self.signals = Signals({n: chip for n, chip in chips.items() if chip is not None})
+        sensors = {} if readout is None else self.skin.sensors
+        self.signals = Signals({n: make_readout(readout, s.simulator) for n, s in sensors.items()})
 
 
 def write_model(env_id: str, body: str, pose: Pose, path: str | Path, name: str = "pad") -> str:
