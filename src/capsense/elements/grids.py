@@ -175,28 +175,46 @@ def _revolve(rho: Array, z: Array, nodes: NDArray[np.int64]) -> Array:
 
     Trapezoids between rings of equal numbers, else triangles, which repeat their last corner.
     """
+    turn = 2 * math.pi * np.arange(nodes.max())
     rings = []
-    for r, h, n in zip(rho, z, nodes, strict=True):
-        t = 2 * math.pi * np.arange(n) / n
-        rings.append(np.stack([r * np.cos(t), r * np.sin(t), np.full(n, h)], axis=1))
-    out = []
+    for r, h, n in zip(rho.tolist(), z.tolist(), nodes.tolist(), strict=True):
+        ring = np.empty((n, 3))
+        t = turn[:n] / n
+        ring[:, 0], ring[:, 1], ring[:, 2] = r * np.cos(t), r * np.sin(t), h
+        rings.append(ring)
+    bands = []
     for low, top in pairwise(rings):
         few, many = (low, top) if len(low) <= len(top) else (top, low)
-        few_next, many_next = np.roll(few, -1, axis=0), np.roll(many, -1, axis=0)
+        few_next, many_next = few[_next(len(few))], many[_next(len(many))]
         if len(few) == len(many):
-            band = np.stack([few, few_next, many_next, many], axis=1)
+            band = _quads(few, few_next, many_next, many)
         elif len(few) == 1:
-            tip = np.repeat(few, len(many), axis=0)
-            band = np.stack([many, many_next, tip, tip], axis=1)
+            band = _quads(many, many_next, few, few)
         else:
-            a, middle, b = many[::2], many[1::2], np.roll(many[::2], -1, axis=0)
+            a, middle, b = many[::2], many[1::2], many_next[1::2]
             fans = ((few, a, middle), (few, middle, few_next), (few_next, middle, b))
-            band = np.concatenate([np.stack([p, q, r, r], axis=1) for p, q, r in fans])
-        normal = np.cross(band[:, 1] - band[:, 0], band[:, 2] - band[:, 0])
-        inward = np.einsum("ij,ij->i", normal, band.mean(axis=1)) < 0
-        band[inward] = _turned(band[inward])
-        out.append(band)
-    return np.concatenate(out)
+            band = np.concatenate([_quads(p, q, r, r) for p, q, r in fans])
+        bands.append(band)
+    out = np.concatenate(bands)
+    normal = np.cross(out[:, 1] - out[:, 0], out[:, 2] - out[:, 0])
+    inward = np.einsum("ij,ij->i", normal, out.mean(axis=1)) < 0
+    out[inward] = _turned(out[inward])
+    return out
+
+
+def _next(n: int) -> NDArray[np.int64]:
+    """Numbers of the nodes that follow those of a ring, shape (n,)."""
+    out = np.arange(1, n + 1)
+    out[-1] = 0
+    return out
+
+
+def _quads(*corners: Array) -> Array:
+    """Polygons (n, 4, 3) of four corners each, shapes (n, 3) or (1, 3)."""
+    out = np.empty((len(corners[0]), 4, 3))
+    for k, corner in enumerate(corners):
+        out[:, k] = corner
+    return out
 
 
 def _turned(polygons: Array) -> Array:

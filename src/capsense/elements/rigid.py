@@ -298,5 +298,8 @@ def split(features: Array, charge: Array) -> Clusters:
 
 def _of_functions(tree: Tree, block: Array) -> Array32:
     """Change a symmetric block of panels to one of charge functions, symmetric to the last bit."""
-    lower = np.tril(tree.to_functions(tree.to_functions(block).T).astype(np.float32))
-    return lower + np.tril(lower, -1).T
+    out = np.empty(block.shape, np.float32)
+    tree_kernels.energies_of_functions(
+        tree.to_functions(block), tree.kids, tree.panel, tree.charge, tree.function, out
+    )
+    return out

@@ -6,8 +6,10 @@ import numpy as np
 
 from capsense._jit import compiled
 
-_COLUMNS = 128
+_COLUMNS = 64
 """Columns of a matrix that are taken at a time."""
+_BLOCK = 64
+"""Rows and columns of a table that are turned at a time."""
 _TIE = 1e-6
 """Cuts that halve a cluster equally well, to this part of it, are taken in turns: were it always
 the first, symmetric shapes would be resolved better on one side."""
@@ -171,6 +173,35 @@ def to_functions(values, kids, panel, charge, function, out):
                     line[start + c] = first[c] - second[c]
         for c in range(width):
             out[0, start + c] = means[0, c]
+
+
+@compiled
+def energies_of_functions(rows, kids, panel, charge, function, out):
+    """Integrate rows of panel values with every charge function, to a symmetric table.
+
+    Args:
+        rows: What :func:`to_functions` makes of a symmetric table of panels, shape (n, n).
+        kids, panel, charge, function: As there.
+        out: Filled, symmetric to the last bit, single precision, shape (n, n).
+    """
+    n = rows.shape[0]
+    mean = np.empty(kids.shape[0])
+    for f in range(n):
+        line = out[f]
+        for k in range(kids.shape[0] - 1, -1, -1):
+            a, b = kids[k, 0], kids[k, 1]
+            if a < 0:
+                mean[k] = rows[f, panel[k]]
+            else:
+                share = charge[a] / charge[k]
+                mean[k] = share * mean[a] + (1.0 - share) * mean[b]
+                line[function[k]] = mean[a] - mean[b]
+        line[0] = mean[0]
+    for start in range(0, n, _BLOCK):  # blocks stay in the cache while they are turned
+        for low in range(0, start + 1, _BLOCK):
+            for i in range(start, min(start + _BLOCK, n)):
+                for j in range(low, min(low + _BLOCK, i)):
+                    out[i, j] = out[j, i]
 
 
 @compiled
