@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from capsense.elements import panel_kernels as kernels
 from capsense.elements import reference
-from capsense.elements.blocks import _frames, flux_block, free_block, impedance
+from capsense.elements.blocks import flux_block, free_block, impedance, panel_frames
 from capsense.elements.panels import SurfacePanels, panels_of
 from capsense.errors import SceneError
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
@@ -73,7 +73,7 @@ def polarisability(panels, free, z, eps: float, axis: int, volume: float) -> flo
 @pytest.mark.parametrize("shape", [Sphere(1.0), Box((1.0, 0.7, 0.3))], ids=repr)
 def test_potential_and_solid_angle_of_a_panel(shape):
     panels = panels_of(shape, 200)
-    frames = _frames(panels)
+    frames = panel_frames(panels)
     rng = np.random.default_rng(3)
     for k in rng.choice(len(panels), 6, replace=False):
         size = math.sqrt(panels.areas[k])

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 import capsense as cs
-from capsense.elements.matter import _distance, _touch
+from capsense.elements.matter import segment_distance, touch
 
 
 def test_distance_of_segments() -> None:
@@ -29,8 +29,8 @@ def test_distance_of_segments() -> None:
             minimize(apart, start, bounds=[(0, 1), (0, 1)], options={"ftol": 1e-15}).fun
             for start in ((0.1, 0.1), (0.9, 0.1), (0.1, 0.9), (0.9, 0.9))
         )
-        assert _distance(first, second) == pytest.approx(best, abs=2e-4)
-        assert _distance(first, second) <= best + 1e-9
+        assert segment_distance(first, second) == pytest.approx(best, abs=2e-4)
+        assert segment_distance(first, second) <= best + 1e-9
 
 
 BALL, CAPSULE = cs.Sphere(0.02), cs.Capsule(0.01, 0.05)
@@ -49,5 +49,5 @@ def test_bodies_one_above_the_other(one: cs.Shape, other: cs.Shape, reach: float
     for gap, expected in ((-1e-3, True), (1e-7, True), (1e-4, False)):
         first = cs.Body(one, turn @ cs.Pose((0, 0, 0)))
         second = cs.Body(other, turn @ cs.Pose((0, 0, reach + gap)))
-        assert _touch(first, second) is expected
-        assert _touch(second, first) is expected
+        assert touch(first, second) is expected
+        assert touch(second, first) is expected
