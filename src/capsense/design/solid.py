@@ -209,7 +209,7 @@ def self_crossing(mesh: SheetMesh) -> Array | None:
     neighbour.
     """
     triangles = mesh.vertices[mesh.faces]
-    points, stops = np.moveaxis(mesh.vertices[mesh.pair_edges], 1, 0)
+    points, stops = np.ascontiguousarray(np.moveaxis(mesh.vertices[mesh.pair_edges], 1, 0))
     pierces = filled(
         _fill_piercing, np.empty(len(points)), mesh.pair_edges, points, stops - points, mesh.faces,
         triangles,
