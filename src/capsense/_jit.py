@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
-from numba import config, njit
+from numba import njit
 from numba.core.caching import FunctionCache
 from numba.core.compiler_lock import global_compiler_lock
 
@@ -66,8 +66,8 @@ class _Cache(FunctionCache):
 def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
-        if config.DISABLE_JIT:
-            return dispatcher  # the function itself
+        if dispatcher is function:  # NUMBA_DISABLE_JIT=1
+            return function
         dispatcher._cache = cache = _Cache(function)
         compile_any = dispatcher.compile
 
