@@ -55,7 +55,8 @@ def _time_to_good(results: dict[str, Any]) -> list[str]:
     theirs, group = min(good, key=lambda found: found[0]["median_ms"])
     both = [theirs, rows(results, group).get("capsense")]
     out = [
-        f"    {row['name']}, {_size(row)}, {row['median_ms']:.2f} ms, {100 * row['worst']:.1f} %"
+        f"    {row['name']}, {size_label(row)}, {row['median_ms']:.2f} ms, "
+        f"{100 * row['worst']:.1f} %"
         for row in both
         if row is not None
     ]
@@ -88,7 +89,7 @@ def plot(results: dict[str, Any], path: Path) -> None:
     for group in results:
         for row in rows(results, group).values():
             if row["name"] in STYLES:
-                series.setdefault(row["name"], {}).setdefault(_key(row), row)
+                series.setdefault(row["name"], {}).setdefault(point_key(row), row)
     plt.style.use("capsense.plotting.capsense")
     figure, axes = plt.subplots(figsize=(7.5, 4.2), layout="constrained")
     for name, (marker, colour) in STYLES.items():
@@ -102,7 +103,7 @@ def plot(results: dict[str, Any], path: Path) -> None:
                     markersize=11 if marker == "*" else 7, linewidth=1.2 + (name == "CapSense"),
                     zorder=4 if name == "CapSense" else 3)  # fmt: skip
         for row, a, b in zip(found if name in SIZED else [], x, y, strict=False):
-            axes.annotate(_size(row), (a, b), SIZED[name],
+            axes.annotate(size_label(row), (a, b), SIZED[name],
                           textcoords="offset points", fontsize=8, color=colour)  # fmt: skip
     axes.axhline(100 * GOOD, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
     axes.annotate(f"{100 * GOOD:g} %", (0.995, 100 * GOOD), xycoords=("axes fraction", "data"),
@@ -117,12 +118,12 @@ def plot(results: dict[str, Any], path: Path) -> None:
     plt.close(figure)
 
 
-def _key(row: Row) -> tuple[int, str]:
+def point_key(row: Row) -> tuple[int, str]:
     """What tells the points of a method from each other: its mesh, or CapSense's preset."""
     return row["tetrahedra"], "" if row["tetrahedra"] else row["settings"]
 
 
-def _size(row: Row) -> str:
+def size_label(row: Row) -> str:
     """A number of tetrahedra in thousands or millions, or CapSense's preset."""
     count = row["tetrahedra"]
     if not count:

@@ -76,28 +76,53 @@ LAYERS = {
     "test_kernel_cache.py test_pages.py test_simulator_estimate.py test_simulator_examples.py "
     "test_troubleshooting.py test_tutorials.py test_validation_page.py",
 }
-"""Folders and files of each layer; single tests may be marked otherwise where they stand."""
+"""Folders and files of each layer; a mark moves a single test to a later one."""
 _PLACES = {place: layer for layer, places in LAYERS.items() for place in places.split()}
+_ORDER = [*LAYERS, "slow"]
+_HERE = Path(__file__).parent
 
 
-def _layer(path: str) -> str:
-    return _PLACES.get(path) or _PLACES.get(path.split("/")[0]) or "physics"
+def _layer(path: Path) -> str:
+    place = path.relative_to(_HERE)
+    return _PLACES.get(place.as_posix()) or _PLACES.get(place.parts[0]) or "physics"
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Give each test its layer, and leave out what was not asked for.
+def _wanted(config: pytest.Config) -> list[str]:
+    """Layers that a run may have tests of.
 
     Without a marker expression slow tests are left out, and of the whole suite the end-to-end tests
     as well: ``pytest tests/cli`` runs all but slow ones.
     """
-    here = Path(__file__).parent
+    asked = config.option.markexpr
+    if asked in LAYERS:
+        return [asked]
+    if asked or any("::" in a for a in config.args):
+        return _ORDER
+    whole = [config.rootpath / a for a in config.args] in ([_HERE], [config.rootpath])
+    return ["unit", "physics"] if whole else list(LAYERS)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no file that has only tests of later layers than those that are wanted."""
+    if collection_path.name.startswith("test_"):
+        last = max(_ORDER.index(layer) for layer in _wanted(config))
+        if _ORDER.index(_layer(collection_path)) > last:
+            return True
+    return None
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Give each test its layer, and leave out what was not asked for."""
     for item in items:
-        if not any(item.get_closest_marker(m) for m in (*LAYERS, "slow")):
-            item.add_marker(_layer(item.path.relative_to(here).as_posix()))
-    if config.option.markexpr or any("::" in a for a in config.args):
+        own = [mark for mark in _ORDER if item.get_closest_marker(mark)]
+        layer = _layer(item.path)
+        if not own:
+            item.add_marker(layer)
+        elif _ORDER.index(own[0]) < _ORDER.index(layer):
+            raise pytest.UsageError(f"{item.nodeid} is marked {own[0]}, but its file is {layer}")
+    if config.option.markexpr:
         return
-    whole = [config.rootpath / a for a in config.args] in ([here], [config.rootpath])
-    left = {"slow", "e2e"} if whole else {"slow"}
+    left = set(_ORDER).difference(_wanted(config))
     out = [i for i in items if any(i.get_closest_marker(m) for m in left)]
     config.hook.pytest_deselected(items=out)
     items[:] = [i for i in items if i not in set(out)]

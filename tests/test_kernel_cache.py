@@ -11,6 +11,14 @@ import pytest
 
 import capsense
 
+
+def _path() -> str:
+    """Where programs find this package."""
+    return os.pathsep.join(
+        [str(Path(capsense.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    )
+
+
 PROGRAM = """
 import os, sys, tempfile
 from numba.core import caching
@@ -36,10 +44,9 @@ def test_a_container_without_a_writable_place(option: list[str]) -> None:
     if option and not Path("/dev/shm").is_dir():
         pytest.skip("no file system in memory")
     keep = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    path = os.pathsep.join([str(Path(capsense.__file__).parents[1]), keep.get("PYTHONPATH", "")])
     found = subprocess.run(
         [sys.executable, "-c", PROGRAM, *option],
-        env={**keep, "PYTHONPATH": path}, capture_output=True, text=True, timeout=120,
+        env={**keep, "PYTHONPATH": _path()}, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert found.returncode == 0, found.stderr
     assert "set NUMBA_CACHE_DIR to a folder that can" in found.stderr
@@ -82,10 +89,7 @@ def outer(n):
 def test_kernels_that_cannot_be_kept_and_those_that_were(tmp_path: Path) -> None:
     """A full disk loses no result; bits are the same compiled, kept, and read from the files."""
     (tmp_path / "kept_kernels.py").write_text(KERNELS)
-    path = os.pathsep.join(
-        [str(Path(capsense.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
-    )
-    env = {**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    env = {**os.environ, "PYTHONPATH": _path(), "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     found = []
     for option in (["full"], [], []):
         run = [sys.executable, "-c", CODE, str(tmp_path), *option]
@@ -94,3 +98,43 @@ def test_kernels_that_cannot_be_kept_and_those_that_were(tmp_path: Path) -> None
         found.append((done.stdout, len(list((tmp_path / "kernels").rglob("*.nbc")))))
     assert [kept for _, kept in found] == [0, 2, 2]
     assert len({value for value, _ in found}) == 1
+
+
+COUNTED = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from numba.core import event
+import kept_kernels
+
+class Slow(event.Listener):
+    count = 0
+
+    def on_start(self, started):
+        self.count += started.data["dispatcher"] in (kept_kernels.inner, kept_kernels.outer)
+        time.sleep(0.5)
+
+    def on_end(self, ended):
+        pass
+
+slow = Slow()
+event.register("numba:compile", slow)
+value = kept_kernels.outer(3.0).hex()
+print(value, slow.count)
+"""
+
+
+def test_processes_that_start_together_compile_each_kernel_once(tmp_path: Path) -> None:
+    """One compiles, the others wait and read its files; they leave no lock behind."""
+    (tmp_path / "kept_kernels.py").write_text(KERNELS)
+    folder = tmp_path / "kernels"
+    env = {**os.environ, "PYTHONPATH": _path(), "NUMBA_CACHE_DIR": str(folder)}
+    command = [sys.executable, "-c", COUNTED, str(tmp_path)]
+    running = [
+        subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) for _ in range(3)
+    ]
+    found = [process.communicate(timeout=120)[0].split() for process in running]
+    assert [process.returncode for process in running] == [0, 0, 0]
+    assert sum(int(count) for _, count in found) == 2
+    assert len({value for value, _ in found}) == 1
+    assert len(list(folder.rglob("*.nbc"))) == 2
+    assert not list(folder.rglob("*.lock"))

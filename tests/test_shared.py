@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,10 @@ from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
 from capsense.adapters import skin as skin_module
+from capsense.fleet.bodies import BodyTable
+from capsense.masked.mesh_sensor import MaskedScenes
+from capsense.readout.side_by_side import SideBySide
+from capsense.surface.solver import SurfaceSolver
 
 
 @pytest.fixture(params=["surface", "fem_masked"])
@@ -47,6 +52,20 @@ def alone(work: Callable[..., Any]) -> Callable[..., Any]:
     return watched
 
 
+def each_alone(patch: pytest.MonkeyPatch, owner: type, name: str) -> None:
+    """Make a method :func:`alone`, for each object of its class by itself."""
+    work = getattr(owner, name)
+    watched: dict[int, Callable[..., Any]] = {}
+
+    def method(self: Any, *args: Any, **options: Any) -> Any:
+        return watched.setdefault(id(self), alone(partial(work, self)))(*args, **options)
+
+    patch.setattr(owner, name, method)
+
+
+SOLVERS = {"surface": SurfaceSolver, "fem_masked": MaskedScenes}
+
+
 def at_once(work: Callable[[int], Any], count: int = 12) -> list[Any]:
     """What ``work`` gives for the numbers below ``count``, from four threads."""
     with ThreadPoolExecutor(4) as pool:
@@ -60,7 +79,7 @@ def test_threads_that_share_a_simulator(
     scenes = balls(12)
     expected = [tiny.copy().step(scene).delta for scene in scenes]
     for name in ("solve", "reset"):
-        monkeypatch.setattr(tiny._solver, name, alone(getattr(tiny._solver, name)))
+        each_alone(monkeypatch, SOLVERS[tiny.method], name)
     readings = at_once(lambda k: (tiny.step(scenes[k]), tiny.reset() if k % 4 == 3 else None)[0])
     for reading, delta in zip(readings, expected, strict=True):
         np.testing.assert_allclose(reading.delta, delta, rtol=1e-4, atol=1e-17)
@@ -70,14 +89,7 @@ def test_batches_at_once(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) ->
     """Two batches of one sensor never use the same copy together."""
     batches = [balls(4, 0.002 * k) for k in range(4)]
     expected = [tiny.copy().step_batch(batch, threads=1) for batch in batches]
-    make = cs.Simulator.copy
-
-    def copy(self: cs.Simulator) -> cs.Simulator:
-        made = make(self)
-        monkeypatch.setattr(made._solver, "solve_each", alone(made._solver.solve_each))
-        return made
-
-    monkeypatch.setattr(cs.Simulator, "copy", copy)
+    each_alone(monkeypatch, SOLVERS[tiny.method], "solve_each")
     found = at_once(lambda k: tiny.step_batch(batches[k], threads=2), 4)
     for readings, others in zip(found, expected, strict=True):
         for a, b in zip(readings, others, strict=True):
@@ -140,8 +152,8 @@ def test_threads_that_share_a_fleet(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet.use_readout("fdc1004")
     poses = np.array([[[0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0]]] * 2)
     expected = fleet.step(poses, time=0.0).delta
-    monkeypatch.setattr(fleet._chips, "sample", alone(fleet._chips.sample))
-    monkeypatch.setattr(fleet._table, "change", alone(fleet._table.change))
+    each_alone(monkeypatch, SideBySide, "sample")
+    each_alone(monkeypatch, BodyTable, "change")
 
     def work(k: int) -> np.ndarray:
         fleet.change(0, cs.Body(cs.Sphere(0.02)))

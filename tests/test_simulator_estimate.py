@@ -9,7 +9,7 @@ import pytest
 
 import capsense as cs
 from capsense.design.model import Domain
-from capsense.surface.solver import Preset, SurfaceSolver
+from capsense.surface.solver import PRESETS, Preset
 
 Pair = tuple[cs.Simulator, cs.Simulator]
 
@@ -18,9 +18,9 @@ Pair = tuple[cs.Simulator, cs.Simulator]
 def pair(request: pytest.FixtureRequest, simulators: Callable[..., cs.Simulator]) -> Pair:
     """A sensor, and one that solves for all charge functions that count to a thousandth of it."""
     sim = simulators(request.param)
-    whole = sim.copy()
-    whole._solver = SurfaceSolver(sim.background.green, sim.design, preset=Preset(threshold=1e-5))
-    return sim, whole
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "standard", Preset(threshold=1e-5))
+        return sim, sim.copy()
 
 
 def a_scene(rng: np.random.Generator, domain: Domain) -> cs.Scene:

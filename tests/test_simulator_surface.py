@@ -21,6 +21,7 @@ from random_scenes import random_scene
 from reference_scenes import MAP, MORE, diagonal_errors, other_errors, reference_scenes
 
 import capsense as cs
+from capsense.surface.solver import PRESETS
 
 Array = np.ndarray
 
@@ -415,12 +416,9 @@ def test_what_crosses_a_wall_out_of_sight_costs_little(sim):
     far = cs.Body(cs.Box((0.6, 0.3, 0.05)), cs.Pose((0.25, 0.1, 0.4)))
     near, both = (sim.step(cs.Scene(bodies)) for bodies in ([ball], [ball, far]))
     assert both.stats.unknowns < near.stats.unknowns + 12
-    preset = sim._solver.preset
-    try:
-        sim._solver.preset = replace(preset, threshold=1e-4)
-        exact = sim.step(cs.Scene([ball, far])).delta
-    finally:
-        sim._solver.preset = preset
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, sim.preset, replace(PRESETS[sim.preset], threshold=1e-4))
+        exact = sim.copy().step(cs.Scene([ball, far])).delta
     np.testing.assert_allclose(both.delta, exact, rtol=0, atol=0.01 * exact.max())
 
 

@@ -11,11 +11,14 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
 from numba import njit
 from numba.core.caching import FunctionCache
+from numba.core.compiler_lock import global_compiler_lock
 
 _log = logging.getLogger("capsense")
 
@@ -25,13 +28,39 @@ _done = False
 
 
 class _Cache(FunctionCache):
-    """Numba's, but that a kernel which cannot be kept, on a full disk say, is used all the same."""
+    """Numba's, for processes that start together and for full disks."""
 
     def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled kernel; where that cannot be done, it is used all the same."""
         try:
             super().save_overload(sig, data)
         except OSError as error:
             _log.info("a compiled kernel cannot be kept: %s", error)
+
+    @contextmanager
+    def alone(self, sig: Any, context: Any) -> Iterator[None]:
+        """Keep other processes from compiling the kernel, if its code is not kept yet.
+
+        They wait, and find it kept. Numba itself lets all compile it, and may lose or mix up what
+        they keep of one kernel for different types.
+        """
+        if self._index_key(sig, context.codegen()) in self._cache_file._load_index():
+            yield
+            return
+        path = Path(self.cache_path, f"{self._impl.filename_base}.lock")
+        lock = FileLock(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock.acquire(poll_interval=0.02)
+        except (OSError, NotImplementedError) as error:
+            _log.info("processes may compile the same kernel: %s", error)
+        try:
+            yield
+        finally:
+            if lock.is_locked:
+                with suppress(OSError):
+                    path.unlink()  # before others can have it; those who wait see that it is gone
+                lock.release()
 
 
 def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -39,7 +68,17 @@ def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
-        dispatcher._cache = _Cache(function)
+        if dispatcher is function:  # NUMBA_DISABLE_JIT=1
+            return function
+        dispatcher._cache = cache = _Cache(function)
+        compile_any = dispatcher.compile
+
+        def compile_once(sig: Any) -> Any:
+            # Numba's lock comes first: a thread must not wait for it with a file locked
+            with global_compiler_lock, cache.alone(sig, dispatcher.targetctx):
+                return compile_any(sig)
+
+        dispatcher.compile = compile_once
         return dispatcher
 
     return decorate

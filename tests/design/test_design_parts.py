@@ -13,7 +13,15 @@ import capsense as cs
 from capsense import codec
 from capsense.cli.design import describe
 from capsense.design.loader import parse_design
-from capsense.design.solid import _cut, crossing, depths, inside, overlap, self_crossing, thickness
+from capsense.design.solid import (
+    crossing,
+    cut_lines,
+    depths,
+    inside,
+    overlap,
+    self_crossing,
+    thickness,
+)
 from capsense.design.stl import weld
 from capsense.errors import MeshError
 from capsense.mesh.gmsh_mesher import mesh_design
@@ -210,7 +218,7 @@ def test_lines_are_cut_where_they_meet_a_surface():
     box = design(None, {**BOX, "z": 0.1}).layers[0].surface.triangles
     line = np.array([[0.001, 0.002, 0.094], [0.001, 0.002, 0.114]])
     beside = line + np.array([0.1, 0.0, 0.0])
-    found = _cut(line[None], box)[:, 2]
+    found = cut_lines(line[None], box)[:, 2]
     for height in (0.094, 0.0965, 0.1, 0.1075, 0.114):
         assert np.abs(found - height).min() < 1e-9
-    assert np.sort(_cut(beside[None], box)[:, 2]) == pytest.approx([0.094, 0.104, 0.114])
+    assert np.sort(cut_lines(beside[None], box)[:, 2]) == pytest.approx([0.094, 0.104, 0.114])

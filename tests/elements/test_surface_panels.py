@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from capsense.elements.grids import _panels, _revolve, _ring_counts
+from capsense.elements.grids import panel_count, revolve, ring_counts
 from capsense.elements.panels import SurfacePanels, panels_of
 from capsense.elements.reference import polygon_points
 from capsense.errors import SceneError
@@ -123,13 +123,13 @@ def test_rings_and_the_number_of_their_panels(widest, cap, step):
     """Invariant: poles of one node, neighbours equal or twice; panels as many as predicted."""
     angle = np.linspace(0.0, 0.5 * np.pi, cap)
     rho = np.concatenate([np.sin(angle), np.ones(3), np.sin(angle)[::-1]])
-    nodes = _ring_counts(rho, np.full(len(rho), step), widest)
+    nodes = ring_counts(rho, np.full(len(rho), step), widest)
     assert nodes[0] == nodes[-1] == 1
     inner = nodes[1:-1]
     assert inner.max() == max(12, 4 * round(widest / 4))
     assert inner.min() >= 5
     assert set(np.maximum(inner[1:], inner[:-1]) / np.minimum(inner[1:], inner[:-1])) <= {1.0, 2.0}
-    assert _panels(nodes) == len(_revolve(rho, np.arange(float(len(rho))), nodes))
+    assert panel_count(nodes) == len(revolve(rho, np.arange(float(len(rho))), nodes))
 
 
 def test_centroids_and_moments_against_quadrature():

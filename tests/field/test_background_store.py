@@ -9,42 +9,37 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_field import SETTINGS, arrays, digest, tiny_design
+from tiny_field import arrays, digest
 
 from capsense.errors import FieldError
 from capsense.field import store
-from capsense.field.background import BackgroundField, build_background
+from capsense.field.background import BackgroundField
 from capsense.field.store import load_background, read_arrays, save_background, write_arrays
 
 
-@pytest.fixture(scope="module")
-def field() -> BackgroundField:
-    return build_background(tiny_design(), SETTINGS)
-
-
-def test_a_field_comes_back_to_the_last_bit(field: BackgroundField, tmp_path: Path) -> None:
-    save_background(field, tmp_path / "a.npz", "key")
+def test_a_field_comes_back_to_the_last_bit(built: BackgroundField, tmp_path: Path) -> None:
+    save_background(built, tmp_path / "a.npz", "key")
     back = load_background(tmp_path / "a.npz", "key")
-    assert digest(back) == digest(field)
-    assert (back.terminals, back.n_panels) == (field.terminals, field.n_panels)
+    assert digest(back) == digest(built)
+    assert (back.terminals, back.n_panels) == (built.terminals, built.n_panels)
     for name, array in arrays(back).items():
         assert array.flags.c_contiguous, name
     assert os.listdir(tmp_path) == ["a.npz"]
 
 
-def test_a_compact_field_is_the_same_and_smaller(field: BackgroundField, tmp_path: Path) -> None:
-    save_background(field, tmp_path / "exact.npz", "key")
-    save_background(field, tmp_path / "compact.npz", "key", compact=True)
+def test_a_compact_field_is_the_same_and_smaller(built: BackgroundField, tmp_path: Path) -> None:
+    save_background(built, tmp_path / "exact.npz", "key")
+    save_background(built, tmp_path / "compact.npz", "key", compact=True)
     back = load_background(tmp_path / "compact.npz", "key")
-    assert digest(back) == digest(field)
+    assert digest(back) == digest(built)
     sizes = [(tmp_path / f"{name}.npz").stat().st_size for name in ("compact", "exact")]
     assert sizes[0] < 0.95 * sizes[1]  # measured: 0.93
 
 
-def test_numpy_reads_the_file(field: BackgroundField, tmp_path: Path) -> None:
-    save_background(field, tmp_path / "a.npz", "key")
+def test_numpy_reads_the_file(built: BackgroundField, tmp_path: Path) -> None:
+    save_background(built, tmp_path / "a.npz", "key")
     with np.load(tmp_path / "a.npz") as archive:
-        assert np.array_equal(archive["capacitance"], field.capacitance)
+        assert np.array_equal(archive["capacitance"], built.capacitance)
 
 
 def test_every_damaged_byte_is_noticed(tmp_path: Path) -> None:
@@ -63,10 +58,10 @@ def test_every_damaged_byte_is_noticed(tmp_path: Path) -> None:
 
 
 def test_files_of_others_are_refused(
-    field: BackgroundField, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    built: BackgroundField, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.npz"
-    save_background(field, path, "one key")
+    save_background(built, path, "one key")
     with pytest.raises(FieldError, match="has key 'one key', expected 'another'"):
         load_background(path, "another")
     with pytest.raises(FieldError, match="has kind 'field', expected 'charges'"):
@@ -86,14 +81,14 @@ def test_files_of_others_are_refused(
 @pytest.mark.parametrize("name", ["capacitance", "near_sources", "near_modes", "far_phi"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_what_is_not_finite_is_never_stored(
-    field: BackgroundField, tmp_path: Path, name: str, value: float
+    built: BackgroundField, tmp_path: Path, name: str, value: float
 ) -> None:
-    part = field if name == "capacitance" else field.green
+    part = built if name == "capacitance" else built.green
     bad = getattr(part, name).copy()
     bad.flat[1] = value
     wrong = replace(part, **{name: bad})
     if name != "capacitance":
-        wrong = replace(field, green=wrong)
+        wrong = replace(built, green=wrong)
     for compact in (False, True):
         with pytest.raises(FieldError, match="not finite"):
             save_background(wrong, tmp_path / "a.npz", compact=compact)

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_field import SETTINGS, tiny_data, tiny_design
 
 from capsense.design.loader import parse_design
 from capsense.design.model import Design
 from capsense.errors import FieldError
-from capsense.field.background import build_background
+from capsense.field.background import BackgroundField
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
 from capsense.field.green import (
     TABLES,
@@ -267,26 +266,24 @@ def test_spread_takes_the_farthest_point_every_time() -> None:
     assert reach.max() <= closest
 
 
-def test_stored_to_the_last_bit(tmp_path: Path) -> None:
-    field = build_background(tiny_design(), SETTINGS)
+def test_stored_to_the_last_bit(built: BackgroundField, tmp_path: Path) -> None:
     for compact in (False, True):
-        save_background(field, tmp_path / "a.npz", compact=compact)
+        save_background(built, tmp_path / "a.npz", compact=compact)
         back = load_background(tmp_path / "a.npz").green
-        for name, values in to_arrays(field.green).items():
+        for name, values in to_arrays(built.green).items():
             found = getattr(back, name)
             assert np.array_equal(found, values), name
             assert np.asarray(found).dtype == values.dtype, name
             assert np.asarray(found).flags.c_contiguous, name
-    assert {getattr(field.green, name).dtype for name in TABLES} == {np.dtype(np.float32)}
-    again = from_arrays(to_arrays(field.green))
-    assert to_arrays(again).keys() == to_arrays(field.green).keys()
+    assert {getattr(built.green, name).dtype for name in TABLES} == {np.dtype(np.float32)}
+    again = from_arrays(to_arrays(built.green))
+    assert to_arrays(again).keys() == to_arrays(built.green).keys()
 
 
-def test_what_is_not_finite_is_never_stored(tmp_path: Path) -> None:
-    field = build_background(parse_design(tiny_data(electrode=[square("A", 0.0)])), SETTINGS)
+def test_what_is_not_finite_is_never_stored(built: BackgroundField, tmp_path: Path) -> None:
     for name in (*TABLES, "box"):
-        bad = getattr(field.green, name).copy()
+        bad = getattr(built.green, name).copy()
         bad.flat[0] = np.nan
-        wrong = replace(field, green=replace(field.green, **{name: bad}))
+        wrong = replace(built, green=replace(built.green, **{name: bad}))
         with pytest.raises(FieldError, match="not finite"):
             save_background(wrong, tmp_path / f"{name}.npz", compact=True)

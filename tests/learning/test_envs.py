@@ -234,10 +234,10 @@ def test_side_by_side_on_warp_readings_stay() -> None:
     pytest.importorskip("warp")
     envs = together(FOLLOW, 1, device="warp:cpu", design="arm_segment")
     envs.reset(seed=5)
-    reading = envs._skin.read([0])[0]["pad"]
+    reading = envs.skin.read([0])[0]["pad"]
     before = reading.self_capacitance.copy()
     envs.step(envs.action_space.sample())
-    assert (envs._skin.read([0])[0]["pad"].self_capacitance != before).any()
+    assert (envs.skin.read([0])[0]["pad"].self_capacitance != before).any()
     np.testing.assert_array_equal(reading.self_capacitance, before)
 
 

@@ -11,11 +11,11 @@ from capsense.errors import ReadoutError
 from capsense.readout.calibration import (
     CalibrationWarning,
     LinearSensor,
-    _flicker_covariance,
-    _least_squares,
     base_capacitance,
     calibrate,
     cross_correlation,
+    flicker_covariance,
+    least_squares,
     relative_to,
     tare,
     unit_range,
@@ -205,7 +205,7 @@ def test_flicker_covariance_is_its_definition():
     taus, variance = Flicker(1e-15).poles(float(np.median(np.diff(time))))
     lag = np.abs(time[:, None] - time)
     matrix = variance * sum(np.exp(-lag / tau) for tau in taus)
-    found, trace = _flicker_covariance(columns, time, 1e-15)
+    found, trace = flicker_covariance(columns, time, 1e-15)
     assert found == pytest.approx(matrix @ columns, rel=1e-9, abs=1e-42)
     assert trace == near(np.trace(matrix), rel=1e-12)
 
@@ -333,9 +333,9 @@ def test_white_noise_is_what_flicker_leaves_of_the_residuals():
     time = np.arange(40) * 0.1
     design = np.column_stack([rng.uniform(1.0, 2.0, 40), np.ones(40)])
     seen = design @ [1.1, 0.3] + rng.normal(0.0, 0.1, 40)
-    figures, covariance, explained = _least_squares(design, seen, 0, time, 0.02)
+    figures, covariance, explained = least_squares(design, seen, 0, time, 0.02)
     q = np.linalg.qr(design)[0]
-    covered, total = _flicker_covariance(q, time, 0.02)
+    covered, total = flicker_covariance(q, time, 0.02)
     left = total - np.trace(q.T @ covered)
     assert explained == pytest.approx(left)
     squares = ((seen - design @ figures) ** 2).sum()

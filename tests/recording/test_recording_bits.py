@@ -27,7 +27,7 @@ from capsense.codec import (
 from capsense.errors import RecordingError
 from capsense.recording.ros import PACKAGE, Messages
 from capsense.recording.session import describe
-from capsense.recording.steps import StepMessages
+from capsense.recording.steps import Moment, StepMessages
 from capsense.scene import RestSurface, SurfaceMesh
 
 MESSAGES = Messages()
@@ -106,16 +106,17 @@ def test_steps_of_a_deforming_surface(sim: cs.Simulator) -> None:
     rests: dict[int, RestSurface] = {}
     for k in range(3):
         foil.vertices = np.eye(3) * (1 + k)
-        out: list[tuple[str, Any]] = []
-        (number,) = writer._introduce(cs.Scene([foil.body()]), out)
+        out = writer.of(Moment(k, 0, 0.0), cs.Scene([foil.body()]), sim.empty, None, None)
+        (number,) = out[-1][1].bodies
         for topic, m in out:
             if topic == "/sensor/bodies":
                 assert m.id == number
                 bodies.append(read_body(m, shapes))
-            elif m.kind == "rest":
-                rests[m.id] = read_rest(m)
-            else:
-                shapes[m.id] = read_shape(m, rests)
+            elif topic == "/sensor/shapes":
+                if m.kind == "rest":
+                    rests[m.id] = read_rest(m)
+                else:
+                    shapes[m.id] = read_shape(m, rests)
         kinds.append([m.kind for topic, m in out if topic == "/sensor/shapes"])
     assert kinds == [["rest", "surface"], ["surface"], ["surface"]]
     for k, body in enumerate(bodies):

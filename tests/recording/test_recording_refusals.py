@@ -15,6 +15,7 @@ import recorded_scenes
 import capsense as cs
 from capsense.errors import MissingDependencyError, ReadoutError, RecordingError
 from capsense.scene import Shape
+from capsense.surface.solver import SurfaceSolver
 
 
 @pytest.fixture
@@ -57,13 +58,13 @@ def test_a_step_that_fails_needs_a_reset(
 ) -> None:
     """What a failed step leaves in the solver is not known to a replay."""
 
-    def fail(_: object, *, jacobian: bool = False) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise cs.SolveError("the residual is 1e-3")
 
     with cs.record(path, sim) as run:
         run.step(scene(), 0.0)
         with monkeypatch.context() as patch:
-            patch.setattr(sim._solver, "solve", fail)
+            patch.setattr(SurfaceSolver, "solve", fail)
             with pytest.raises(cs.SolveError):
                 run.step(scene(1), 0.1)
         with pytest.raises(RecordingError, match="reset"):

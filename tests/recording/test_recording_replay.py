@@ -76,8 +76,8 @@ def test_counts_that_differ(sim: cs.Simulator, tmp_path: Path) -> None:
     path = tmp_path / "counts.mcap"
     with cs.record(path, sim, readout="fdc1004") as run:
         for k in range(4):
-            if k == 2 and run._readout is not None:
-                run._readout.reset(seed=7)
+            if k == 2 and run.readout is not None:
+                run.readout.reset(seed=7)
             run.step(recorded_scenes.scene_at(k), 0.1 * k)
     found = cs.replay(path)
     assert found.first is not None

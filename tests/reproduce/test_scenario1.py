@@ -192,7 +192,7 @@ def test_reduced_run_meets_the_targets(tmp_path: Path, monkeypatch: pytest.Monke
     def refuse(*_: object) -> None:
         raise AssertionError("nothing was to be simulated")
 
-    monkeypatch.setattr(scenario1, "_simulator", refuse)
+    monkeypatch.setattr(scenario1, "matrices", refuse)
     before = (folder / "rows.json").read_bytes()
     assert main(arguments) == 0
     assert (folder / "rows.json").read_bytes() == before

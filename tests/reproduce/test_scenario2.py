@@ -92,12 +92,12 @@ def test_codes_follow_the_capacitance() -> None:
     """Tared codes are changes over 0.244 fF, but for noise; every run has noise of its own."""
     ways = rides("1", 2)
     changes = np.linspace(0.0, 50e-15, 2 * 21 * 6).reshape(2, 21, 6)
-    codes = scenario2._codes(changes, ways, "1", "depth")
+    codes = scenario2.tared_codes(changes, ways, "1", "depth")
     apart = codes - changes / (16e-12 / 2**16)
     assert np.abs(apart).max() < 7
     assert 0.3 < apart.std() < 1.6
-    assert np.array_equal(codes, scenario2._codes(changes, ways, "1", "depth"))
-    assert not np.array_equal(codes, scenario2._codes(changes, ways, "1", "paper"))
+    assert np.array_equal(codes, scenario2.tared_codes(changes, ways, "1", "depth"))
+    assert not np.array_equal(codes, scenario2.tared_codes(changes, ways, "1", "paper"))
 
 
 @pytest.fixture(scope="module")

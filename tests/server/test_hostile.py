@@ -262,7 +262,7 @@ def test_client_that_vanishes(served: RunningServer, witness: None, dome: np.nda
         client.open()
         for _ in range(10):
             client.sensors[0].send(dome)
-        client._connection.socket.shutdown(socket.SHUT_RDWR)
+        client.connection.socket.shutdown(socket.SHUT_RDWR)
     deadline = time.monotonic() + 5
     while served.get("/health")[1]["clients"] > before and time.monotonic() < deadline:
         time.sleep(0.02)

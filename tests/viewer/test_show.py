@@ -11,6 +11,7 @@ from PIL import Image
 
 pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
 
+from view_nodes import nodes_of
 from view_sources import Counting, until
 
 import capsense as cs
@@ -37,8 +38,8 @@ def test_the_robot_in_mujoco() -> None:
             mujoco.mj_step(model, data)
             reading = page.read()
         assert reading.delta.diagonal().min() > 0
-        until(lambda: page._player.newest is not None and page._player.newest.index == 9)
-        frame = page._player.newest
+        until(lambda: page.player.newest is not None and page.player.newest.index == 9)
+        frame = page.player.newest
         assert frame is not None
         assert frame.time == pytest.approx(data.time)
         (carrier, at), (limb, there) = frame.around
@@ -46,8 +47,8 @@ def test_the_robot_in_mujoco() -> None:
         np.testing.assert_allclose(at.position, (0, 0, -0.006), atol=1e-12)
         assert isinstance(limb, cs.Capsule)
         np.testing.assert_allclose(there.position, (-data.site_xpos[0, 0], 0, 0.094), atol=1e-9)
-        page._view.refresh()
-        drawn = page._view._stage._scene._handle_from_node_name
+        page.view.refresh()
+        drawn = nodes_of(page.view.server)
         assert {"/robot/0", "/robot/1"} <= set(drawn)
         assert not any(name.startswith("/bodies/") for name in drawn)
 
@@ -64,8 +65,8 @@ def test_the_robot_in_pybullet() -> None:
     sensor = cs.pybullet.attach(client, robot, link=-1, pose_in_link=cs.Pose((0, 0, 0.006)))
     with cs.show(sensor, port=0) as page:
         page.read()
-        until(lambda: page._player.newest is not None)
-        frame = page._player.newest
+        until(lambda: page.player.newest is not None)
+        frame = page.player.newest
         assert frame is not None
         assert [type(shape) for shape, _ in frame.around] == [cs.Box, cs.Sphere]
     p.disconnect(client)

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
 
 from recorded_scenes import SLAB, bodies, frame_at, scene_at
+from view_nodes import nodes_of
 from view_sources import Queued, until
 
 import capsense as cs
@@ -34,7 +35,7 @@ def server() -> Iterator[Any]:
 
 
 def nodes(server: Any, under: str) -> list[str]:
-    return sorted(n for n in server.scene._handle_from_node_name if n.startswith(under))
+    return sorted(n for n in nodes_of(server) if n.startswith(under))
 
 
 @pytest.mark.parametrize("name", ["six_patch", "meander", "stripe", "arm_segment"])
@@ -60,11 +61,11 @@ def test_bodies_of_every_shape(server: Any) -> None:
     scene = scene_at(0)
     stage.show_bodies(scene)
     assert len(nodes(server, "/bodies/")) == len(bodies())
-    handles = dict(server.scene._handle_from_node_name)
+    handles = nodes_of(server)
     moved = cs.Scene([b.moved(cs.Pose((0.01, 0.02, 0.1), b.pose.quaternion)) for b in scene])
     stage.show_bodies(moved)
     for k, body in enumerate(moved):
-        handle = server.scene._handle_from_node_name[f"/bodies/{k}"]
+        handle = nodes_of(server)[f"/bodies/{k}"]
         assert handle is handles[f"/bodies/{k}"]
         np.testing.assert_allclose(handle.position, (0.01, 0.02, 0.1))
         np.testing.assert_allclose(handle.wxyz, np.roll(body.pose.quaternion, 1))
@@ -83,7 +84,7 @@ def test_depth_images(server: Any) -> None:
     stage.show_bodies(scene)
     found = 0
     for k, body in enumerate(scene):
-        handle = server.scene._handle_from_node_name[f"/bodies/{k}"]
+        handle = nodes_of(server)[f"/bodies/{k}"]
         points = body.pose.apply(handle.points.astype(float))
         distance = body.shape.signed_distance(handle.points.astype(float))
         assert np.abs(distance).max() < 2e-3
@@ -91,7 +92,7 @@ def test_depth_images(server: Any) -> None:
         found += len(points)
     assert found == np.isfinite(frame.depth).sum()
     stage.show_bodies(cs.Scene([cs.Body(SLAB, material="steel")]))
-    assert len(server.scene._handle_from_node_name["/bodies/0"].points) == 48
+    assert len(nodes_of(server)["/bodies/0"].points) == 48
 
 
 def test_deforming_surfaces(server: Any) -> None:
@@ -102,7 +103,7 @@ def test_deforming_surfaces(server: Any) -> None:
     for k in range(2):
         foil.vertices = np.eye(3) * (0.1 + 0.1 * k)
         stage.show_bodies(cs.Scene([foil.body()]))
-        handle = server.scene._handle_from_node_name["/bodies/0"]
+        handle = nodes_of(server)["/bodies/0"]
         np.testing.assert_allclose(handle.vertices, foil.vertices, rtol=1e-6)
         assert handle.side == "double"
 
@@ -113,12 +114,12 @@ def test_signals(server: Any) -> None:
     stage = SceneDrawing(server, cs.load_design("patch"))
     stage.show_signals(np.array([0.0, 0.5, 1.0, 7.0]))
     shown = {
-        n: h.glb_data for n, h in server.scene._handle_from_node_name.items()
+        n: h.glb_data for n, h in nodes_of(server).items()
         if n.startswith("/electrodes/") and h.visible
     }  # fmt: skip
     assert sorted(shown) == [f"/electrodes/{k}-{s}" for k, s in enumerate((0, 16, SHADES, SHADES))]
     stage.show_signals(np.zeros(4))
-    assert not server.scene._handle_from_node_name[f"/electrodes/2-{SHADES}"].visible
+    assert not nodes_of(server)[f"/electrodes/2-{SHADES}"].visible
     for data, colour in ((shown["/electrodes/0-0"], QUIET), (shown["/electrodes/2-31"], LOUD)):
         length = int.from_bytes(data[12:16], "little")
         (material,) = json.loads(data[20 : 20 + length])["materials"]
@@ -136,11 +137,11 @@ def test_plane(server: Any) -> None:
     plane = Plane(simulator.background.green, region(simulator.design), 1, 0.0)
     simulator.step(cs.Scene())
     stage.show_plane(plane, simulator.potentials(plane.points)[:, 1])
-    lines = server.scene._handle_from_node_name["/potential"]
+    lines = nodes_of(server)["/potential"]
     assert len(lines.points) > 1000
     assert np.abs(lines.points[..., 1].astype(float)).max() == 0
     stage.hide("/potential")
-    assert "/potential" not in server.scene._handle_from_node_name
+    assert "/potential" not in nodes_of(server)
     stage.hide("/potential")
 
 
@@ -157,7 +158,7 @@ def test_charges(server: Any) -> None:
     assert charges is not None
     stage.show_bodies(scene)
     stage.show_charges(charges, 1)
-    cloud = server.scene._handle_from_node_name["/charge"]
+    cloud = nodes_of(server)["/charge"]
     points = cloud.points.astype(float)
     radius = np.linalg.norm(points - ball.pose.position, axis=1)
     np.testing.assert_allclose(radius, 0.02, atol=1.5e-3)  # a mesh stands for the sphere
@@ -167,7 +168,7 @@ def test_charges(server: Any) -> None:
     simulator.step(cs.Scene())
     assert simulator.charges() is None
     stage.show_charges(None, 1)
-    assert "/charge" not in server.scene._handle_from_node_name
+    assert "/charge" not in nodes_of(server)
 
 
 def test_live_controls() -> None:
@@ -180,19 +181,19 @@ def test_live_controls() -> None:
         stream.put(7)
         until(lambda: player.span == (0, 6))
         view.refresh()
-        controls = view._time
-        assert (controls._play.label, controls._slider.max, controls._slider.value) == (
+        controls = view.time
+        assert (controls.play.label, controls.slider.max, controls.slider.value) == (
             "Hold",
             6,
             6,
         )
-        assert "sample 6 of 6" in view._status.content
+        assert "sample 6 of 6" in view.status.content
         player.go(2)
         view.refresh()
-        assert (controls._play.label, controls._slider.value) == ("Follow", 2)
+        assert (controls.play.label, controls.slider.value) == ("Follow", 2)
         player.failure = ProtocolError("<b>gone</b>")
         view.refresh()
-        assert "&lt;b&gt;gone" in view._status.content
+        assert "&lt;b&gt;gone" in view.status.content
     finally:
         view.stop()
         player.stop()

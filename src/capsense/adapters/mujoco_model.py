@@ -315,7 +315,7 @@ class ModelSource(WorldSource):
                 "or gentler controls, and call reset()"
             )
         self._follow()
-        return self.data.xpos, self.data.xquat[:, _SCALAR_LAST]
+        return self.data.xpos, np.take(self.data.xquat, _SCALAR_LAST, axis=1)
 
     def _follow(self) -> None:
         """Take over geoms that were moved on their bodies, or resized, since the last reading."""

@@ -209,7 +209,7 @@ def self_crossing(mesh: SheetMesh) -> Array | None:
     neighbour.
     """
     triangles = mesh.vertices[mesh.faces]
-    points, stops = np.moveaxis(mesh.vertices[mesh.pair_edges], 1, 0)
+    points, stops = np.ascontiguousarray(np.moveaxis(mesh.vertices[mesh.pair_edges], 1, 0))
     pierces = filled(
         _fill_piercing, np.empty(len(points)), mesh.pair_edges, points, stops - points, mesh.faces,
         triangles,
@@ -266,10 +266,10 @@ def _samples(one: Array, other: Array) -> Array:
         ends = np.array([*points, *one[t]])
         first, second = np.triu_indices(len(ends), 1)
         lines.append(np.stack([ends[first], ends[second]], axis=1)[:400])
-    return _cut(np.concatenate(lines), other)
+    return cut_lines(np.concatenate(lines), other)
 
 
-def _cut(lines: Array, triangles: Array) -> Array:
+def cut_lines(lines: Array, triangles: Array) -> Array:
     """Ends of lines and the middles of the pieces that triangles' planes cut them to, (n, 3)."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     low, high = _bounds(triangles)

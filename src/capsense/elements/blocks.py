@@ -161,7 +161,7 @@ def _regions(panels: SurfacePanels) -> NDArray[np.int64]:
     solid = np.flatnonzero(volume > 0)
     solid = solid[np.argsort(volume[solid], kind="stable")]
     owner = np.arange(len(volume))
-    frames = _frames(panels)
+    frames = panel_frames(panels)
     for k in np.flatnonzero(volume <= 0):
         point = panels.centers[np.argmax(parts == k)]
         for s in solid:
@@ -179,7 +179,7 @@ class _Packed(NamedTuple):
     flat: Array
     """Centres, second moments xx, yy, zz, xy, xz, yz, and reaches; shape (10, n)."""
     frames: Array
-    """Plane and edges of every panel, see :func:`_frames`; shape (n, 34)."""
+    """Plane and edges of every panel, see :func:`panel_frames`; shape (n, 34)."""
     areas: Array
     """Areas [m²], shape (n,)."""
     coarse: Array
@@ -200,11 +200,11 @@ def _packed(panels: SurfacePanels) -> _Packed:
     flat[9] = np.sqrt(1.5 * (trace + np.sqrt(np.maximum(spread, 0.0))))
     c = panels.corners
     return _Packed(
-        flat, _frames(panels), panels.areas, _points(c, 3), _points(c, 4, _BEND), _rim(c)
+        flat, panel_frames(panels), panels.areas, _points(c, 3), _points(c, 4, _BEND), _rim(c)
     )
 
 
-def _frames(panels: SurfacePanels) -> Array:
+def panel_frames(panels: SurfacePanels) -> Array:
     """Centre, axes u and v of the plane, normal (12 numbers); start, direction and length of the
     four edges in the plane (20); twice the areas of triangles (0, 1, 2) and (0, 2, 3) (2)."""
     edge = np.roll(panels.corners, -1, axis=1) - panels.corners

@@ -73,11 +73,11 @@ def ellipsoid_polygons(radii: tuple[float, float, float], count: int) -> Array:
         rho, z = np.sin(angle), -np.cos(angle)
         rho[[0, -1]] = 0.0
         step = (math.pi / n) * np.hypot(a * z, c * rho)
-        return rho, z, _ring_counts(a * rho, np.maximum(step, 0.3 * cell), 2 * math.pi * a / cell)
+        return rho, z, ring_counts(a * rho, np.maximum(step, 0.3 * cell), 2 * math.pi * a / cell)
 
-    rho, z, nodes = profile(_best_cell(max(a, c), count, lambda h: _panels(profile(h)[2])))
+    rho, z, nodes = profile(_best_cell(max(a, c), count, lambda h: panel_count(profile(h)[2])))
     factor = _ring_factors(rho, z, nodes, 0.0, 1.0)
-    ball = _revolve(rho * factor, z * factor, nodes)
+    ball = revolve(rho * factor, z * factor, nodes)
     out = np.empty_like(ball)
     for k, axis in enumerate(order):
         out[..., axis] = radii[axis] * ball[..., k]
@@ -97,12 +97,12 @@ def capsule_polygons(radius: float, length: float, count: int) -> Array:
         z = np.concatenate([-half - radius * np.cos(angle), tube, half + radius * np.sin(angle)])
         rho[[0, -1]] = 0.0
         step = np.full(len(rho), 0.5 * math.pi * radius / n)
-        return rho, z, _ring_counts(rho, step, 2 * math.pi * radius / cell)
+        return rho, z, ring_counts(rho, step, 2 * math.pi * radius / cell)
 
-    rho, z, nodes = profile(_best_cell(half + radius, count, lambda h: _panels(profile(h)[2])))
+    rho, z, nodes = profile(_best_cell(half + radius, count, lambda h: panel_count(profile(h)[2])))
     factor = _ring_factors(rho, z, nodes, half, radius)
     axis = np.clip(z, -half, half)
-    return _revolve(rho * factor, axis + (z - axis) * factor, nodes)
+    return revolve(rho * factor, axis + (z - axis) * factor, nodes)
 
 
 def cylinder_polygons(radius: float, length: float, count: int) -> Array:
@@ -116,12 +116,12 @@ def cylinder_polygons(radius: float, length: float, count: int) -> Array:
         side = 0.5 * length * _graded(k)
         z = np.concatenate([np.full(n, side[0]), side, np.full(n, side[-1])])
         step = np.full(len(rho), 0.7 * cell)
-        return rho, z, _ring_counts(rho, step, 2 * math.pi * radius / cell)
+        return rho, z, ring_counts(rho, step, 2 * math.pi * radius / cell)
 
     size = max(radius, 0.5 * length)
-    rho, z, nodes = profile(_best_cell(size, count, lambda h: _panels(profile(h)[2])))
+    rho, z, nodes = profile(_best_cell(size, count, lambda h: panel_count(profile(h)[2])))
     chord = math.sin(math.pi / nodes.max())
-    return _revolve(rho / math.sqrt(1 - 2 / 3 * chord * chord), z, nodes)
+    return revolve(rho / math.sqrt(1 - 2 / 3 * chord * chord), z, nodes)
 
 
 def _graded(n: int) -> Array:
@@ -142,7 +142,7 @@ def _best_cell(size: float, count: int, panels: Callable[[float], int]) -> float
     return best[1]
 
 
-def _ring_counts(rho: Array, step: Array, widest: float) -> NDArray[np.int64]:
+def ring_counts(rho: Array, step: Array, widest: float) -> NDArray[np.int64]:
     """Nodes on every ring of radius ``rho`` [m]: ``widest`` on the widest, halved towards poles.
 
     Neighbours have equal numbers or twice as many. ``step`` [m] is the height of the cells.
@@ -164,13 +164,13 @@ def _ring_counts(rho: Array, step: Array, widest: float) -> NDArray[np.int64]:
     return out
 
 
-def _panels(nodes: NDArray[np.int64]) -> int:
-    """How many panels :func:`_revolve` makes."""
+def panel_count(nodes: NDArray[np.int64]) -> int:
+    """How many panels :func:`revolve` makes."""
     low, high = np.minimum(nodes[:-1], nodes[1:]), np.maximum(nodes[:-1], nodes[1:])
     return int(np.where(low == high, low, np.where(low == 1, high, 3 * low)).sum())
 
 
-def _revolve(rho: Array, z: Array, nodes: NDArray[np.int64]) -> Array:
+def revolve(rho: Array, z: Array, nodes: NDArray[np.int64]) -> Array:
     """Polygons between rings of nodes, corners of shape (n, 4, 3), counter-clockwise from outside.
 
     Trapezoids between rings of equal numbers, else triangles, which repeat their last corner.
@@ -232,7 +232,7 @@ def _ring_factors(
     Each panel asks for the factor that makes the mean of its squared distance from that stretch
     ``radius`` squared; a ring takes the mean over its panels, weighted with area.
     """
-    polygons = _revolve(rho, z, nodes)
+    polygons = revolve(rho, z, nodes)
     p = polygons.copy()
     p[..., 2] -= np.clip(p[..., 2], -half, half)
     area, square = np.zeros(len(p)), np.zeros(len(p))

@@ -115,7 +115,7 @@ class Matter:
                 & (packed.bounds[chosen, 1] >= packed.bounds[chosen[a], 0] - _TOUCH)
             ).all(axis=1) & self.conducting  # fmt: skip
             for b in np.flatnonzero(near).tolist():
-                if group[a] != group[b] and _touch(scene[int(chosen[a])], scene[int(chosen[b])]):
+                if group[a] != group[b] and touch(scene[int(chosen[a])], scene[int(chosen[b])]):
                     group[group == max(group[a], group[b])] = min(group[a], group[b])
         total = np.zeros(len(chosen))
         np.add.at(total, group, self.ground)
@@ -170,13 +170,13 @@ def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBo
     return records["scale"] * np.array([s.capacitance for s in shapes])
 
 
-def _touch(first: Body, second: Body) -> bool:
+def touch(first: Body, second: Body) -> bool:
     """Whether two solids meet; of two with edges, as far as the corners of one tell."""
     if isinstance(first.shape, _UNSEEN) or isinstance(second.shape, _UNSEEN):
         return False
     ends, others = _axis(first), _axis(second)
     if ends is not None and others is not None:
-        apart = _distance(ends[0], others[0])
+        apart = segment_distance(ends[0], others[0])
         return apart <= ends[1] + others[1] + _TOUCH
     for axis, other in ((ends, second), (others, first)):
         if axis is not None:
@@ -198,7 +198,7 @@ def _axis(body: Body) -> tuple[Array, float] | None:
     return body.pose.apply([[0.0, 0.0, -half], [0.0, 0.0, half]]), body.shape.radius
 
 
-def _distance(first: Array, second: Array) -> float:
+def segment_distance(first: Array, second: Array) -> float:
     """Distance of two line segments [m], each given by its ends, (2, 3).
 
     After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.9.

@@ -58,7 +58,7 @@ class PieceLayout:
     """Clusters of all pieces, from the form that the surface had first."""
 
 
-_CUTS: WeakKeyDictionary[RestSurface, PieceLayout] = WeakKeyDictionary()
+_LAYOUTS: WeakKeyDictionary[RestSurface, PieceLayout] = WeakKeyDictionary()
 
 
 def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, PieceArrays]:
@@ -67,10 +67,15 @@ def mesh_pieces(shape: SurfaceMesh) -> tuple[Clusters, PieceArrays]:
     Returns:
         Clusters of all pieces, the same ones at every instant; and the pieces.
     """
-    cut = _CUTS.get(shape.rest)
-    if cut is None:
-        cut = _CUTS[shape.rest] = _cut(shape.rest)
+    cut = layout_of(shape.rest)
     return cut.tree, _pieces(shape.vertices, shape.faces, cut.face, cut.shares)[0]
+
+
+def layout_of(rest: RestSurface) -> PieceLayout:
+    """How the triangles of a surface are cut into pieces; worked out once."""
+    if rest not in _LAYOUTS:
+        _LAYOUTS[rest] = _cut(rest)
+    return _LAYOUTS[rest]
 
 
 def _cut(rest: RestSurface) -> PieceLayout:

@@ -338,7 +338,7 @@ class Fleet:
 
 
 def _checked(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    poses = np.array(values, float)
+    poses = np.array(values, float, order="C")
     if poses.shape != shape:
         raise SceneError(f"{what} has shape {poses.shape}; give {shape}")
     if not np.isfinite(poses).all():

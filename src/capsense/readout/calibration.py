@@ -257,7 +257,7 @@ def calibrate(
                 f"channel {channel}: {len(at)} samples for {unknowns} unknowns; record more"
             )
         columns = np.stack([x, np.ones(len(at)), at - epoch][:unknowns], axis=1)
-        fit = _least_squares(columns, y, channel, at, floor)
+        fit = least_squares(columns, y, channel, at, floor)
         figures[channel, :unknowns], covariance[channel, :unknowns, :unknowns] = fit[:2]
         residuals[used, channel] = rest = y - columns @ fit[0]
         excess[channel] = _excess(rest, x, at, fit[2])
@@ -325,7 +325,7 @@ def _times(time: ArrayLike | None, count: int, channels: int, needed: bool) -> A
     return np.broadcast_to(t if t.ndim == 2 else t[:, None], (count, channels))
 
 
-def _least_squares(
+def least_squares(
     design: Array, seen: Array, channel: int, time: Array, floor: float
 ) -> tuple[Array, Array, float]:
     """Figures, their covariance, and squares of residuals that flicker explains [F²]."""
@@ -344,7 +344,7 @@ def _least_squares(
     squares = float(((seen - (design / scale) @ figures) ** 2).sum())
     slow, total = np.zeros((p, p)), 0.0
     if floor > 0:
-        covered, total = _flicker_covariance(q, time, floor)
+        covered, total = flicker_covariance(q, time, floor)
         slow = q.T @ covered
     # The residuals hold the white noise, and what of the flicker the fit did not follow.
     white = max(0.0, squares - total + float(np.trace(slow))) / (n - p)
@@ -352,7 +352,7 @@ def _least_squares(
     return figures / scale, covariance, total - float(np.trace(slow))
 
 
-def _flicker_covariance(columns: Array, time: Array, floor: float) -> tuple[Array, float]:
+def flicker_covariance(columns: Array, time: Array, floor: float) -> tuple[Array, float]:
     """Σ times columns, shape (n, p), and the trace of Σ, Σ being flicker's covariance [F²].
 
     ``Σ_ij = v Σ_k exp(−|t_i − t_j|/τ_k)``; each exponential is carried along, forth and back.

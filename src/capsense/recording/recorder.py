@@ -79,7 +79,8 @@ class Recorder:
         if readout is not None and source.readout is not None:
             raise ReadoutError("the sensor has a readout of its own; leave out readout=")
         empty = self._simulator.empty
-        self._readout, config = make_readout(readout, self._simulator.electrode_names, empty)
+        self.readout, config = make_readout(readout, self._simulator.electrode_names, empty)
+        """The recorder's own chip, if it was given one."""
         self.reset()
         self.session = describe(
             self._simulator, name, scenario.name if scenario else "", readout=config,
@@ -137,8 +138,8 @@ class Recorder:
     def reset(self) -> None:
         """Reset the simulator, or the sensor and its readout. Time may start anew."""
         (self._sensor or self._simulator).reset()
-        if self._readout is not None:
-            self._readout.reset()
+        if self.readout is not None:
+            self.readout.reset()
 
     def write(self, time: float, world: Scene | DepthFrame, reading: Reading) -> Reading:
         """Record the step that the simulator has just taken; for loops that step it themselves.
@@ -167,11 +168,11 @@ class Recorder:
                 raise _stepped_elsewhere(self.count)
             self._episode += 1
             self._time = -math.inf
-            if self._readout is not None:
-                self._readout.reset()
+            if self.readout is not None:
+                self.readout.reset()
         stamp = self._stamp_of(time)
-        if self._readout is not None:
-            reading = replace(reading, counts=self._readout.sample(time, reading))
+        if self.readout is not None:
+            reading = replace(reading, counts=self.readout.sample(time, reading))
         moment = Moment(stamp, self._episode, time)
         frame = world if isinstance(world, DepthFrame) else None
         pose = None if self._sensor is None else self._sensor.pose

@@ -121,8 +121,8 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
             report(RUNS[name].title, (k + i / len(people)) / len(names))
             found[name][person] = _changes(store, RUNS[name], person, ways[person])
     report("done", 1.0)
-    codes = {n: {p: _codes(found[n][p], ways[p], p, n) for p in people} for n in names}
-    codes[AGAIN] = {p: _codes(found[REFERENCE][p], ways[p], p, AGAIN) for p in people}
+    codes = {n: {p: tared_codes(found[n][p], ways[p], p, n) for p in people} for n in names}
+    codes[AGAIN] = {p: tared_codes(found[REFERENCE][p], ways[p], p, AGAIN) for p in people}
     return Outcome(
         "Scenario 2: six electrodes along human limbs",
         tuple(_rows(found, codes)),
@@ -165,7 +165,7 @@ def _simulator(method: Method, resolution: float) -> cs.Simulator:
     return cs.Simulator(DESIGN, method=method, settings=settings)
 
 
-def _codes(changes: Array, ways: list[Ride], person: str, run_name: str) -> Array:
+def tared_codes(changes: Array, ways: list[Ride], person: str, run_name: str) -> Array:
     """Tared codes of an AD7147 at the samples' times, shape (rides, samples, 6).
 
     The chip rests for a second with nothing near, then a moment at the ride's beginning; at each

@@ -56,7 +56,7 @@ class Layers(Shape):
     def __init__(self, front: ArrayLike, back: ArrayLike, size: tuple[float, float]) -> None:
         from capsense.scene.image_kernels import sort_slots
 
-        f, b = np.asarray(front, dtype=float), np.asarray(back, dtype=float)
+        f, b = (np.asarray(values, dtype=float, order="C") for values in (front, back))
         if f.ndim not in (2, 3) or not f.size:
             raise SceneError(
                 f"Layers: front has shape {f.shape}; give (rows, columns) or "

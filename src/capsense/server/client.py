@@ -65,7 +65,7 @@ class Client:
         from websockets.sync.client import connect
 
         try:
-            self._connection = connect(
+            self.connection = connect(
                 self._url, compression=None, open_timeout=self.timeout, close_timeout=1.0,
                 max_size=None,
             )  # fmt: skip
@@ -111,7 +111,7 @@ class Client:
 
     def close(self) -> None:
         """Close the connection."""
-        self._connection.close()
+        self.connection.close()
 
     def open(self, sensor: int | None = None, **options: Any) -> RemoteSensor:
         """Open a sensor.
@@ -143,7 +143,7 @@ class Client:
         if self._lost and self.sensors:
             self._connect_again()
         with suppress(ConnectionClosed):  # what the server said before it closed is yet to be read
-            self._connection.send(message)
+            self.connection.send(message)
 
     def ask(self, answer: str, **message: Any) -> dict[str, Any]:
         """Send a control message, and wait for its answer.
@@ -180,7 +180,7 @@ class Client:
 
         wait = max(self.timeout if timeout is None else timeout, 0.0)
         try:
-            message = self._connection.recv(wait)
+            message = self.connection.recv(wait)
         except TimeoutError:
             raise ProtocolError(f"no answer within {self.timeout:g} s", "timeout") from None
         except ConnectionClosed as error:

@@ -188,19 +188,21 @@ class Show:
     def __init__(self, sensor: AttachedSensor, *, host: str, port: int) -> None:
         self._sensor, self._count = sensor, 0
         self._stream = SensorStream(sensor)
-        self._player = Follower(self._stream)
+        self.player = Follower(self._stream)
+        """Takes in the samples."""
         self._solids: tuple[int, list[Solid]] = (-1, [])
         try:
             from capsense.viewer.view import LiveView
 
-            self._view = LiveView(self._player, host=host, port=port)
+            self.view = LiveView(self.player, host=host, port=port)
+            """The page."""
         except BaseException:
-            self._player.stop()
+            self.player.stop()
             raise
-        self.url = self._view.url
+        self.url = self.view.url
         """Address of the page."""
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._view.run, args=(self._stop,), daemon=True)
+        self._thread = threading.Thread(target=self.view.run, args=(self._stop,), daemon=True)
         self._thread.start()
 
     def read(self, time: float | None = None) -> Reading:
@@ -248,8 +250,8 @@ class Show:
         """Close the page."""
         self._stop.set()
         self._thread.join()
-        self._view.stop()
-        self._player.stop()
+        self.view.stop()
+        self.player.stop()
 
     def __enter__(self) -> Show:
         return self

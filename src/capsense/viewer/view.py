@@ -45,9 +45,11 @@ class TimeControls:
         self._player = player
         self._names = ("Hold", "Follow") if player.live else ("Pause", "Play")
         with gui.add_folder("time"):
-            self._play = gui.add_button(self._names[1])
+            self.play = gui.add_button(self._names[1])
+            """The button that holds and follows, or pauses and plays."""
             steps = gui.add_button_group("step", ("|<", "<", ">", ">|"))
-            self._slider: Any = gui.add_slider("sample", 0, 1, 1, 0)
+            self.slider: Any = gui.add_slider("sample", 0, 1, 1, 0)
+            """The number of the sample that is shown."""
             if not player.live:
                 speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 ×")
                 speed.on_update(lambda _: player.set_speed(SPEEDS[speed.value]))
@@ -59,24 +61,24 @@ class TimeControls:
             ">": lambda: player.step(1),
             ">|": lambda: player.go(player.span[1]),
         }
-        self._play.on_click(lambda _: player.pause() if player.playing else player.play())
+        self.play.on_click(lambda _: player.pause() if player.playing else player.play())
         steps.on_click(lambda _: moves[steps.value]())
-        self._slider.on_update(self._scrub)
+        self.slider.on_update(self._scrub)
 
     def show(self, frame: Frame) -> None:
         """Follow the player."""
         label = self._names[0] if self._player.playing else self._names[1]
-        if self._play.label != label:
-            self._play.label = label
+        if self.play.label != label:
+            self.play.label = label
         first, last = self._player.span
-        if (self._slider.min, self._slider.max) != (first, max(last, first + 1)):
-            self._slider.min, self._slider.max = first, max(last, first + 1)
-        if self._slider.value != frame.index:
-            self._slider.value = frame.index
+        if (self.slider.min, self.slider.max) != (first, max(last, first + 1)):
+            self.slider.min, self.slider.max = first, max(last, first + 1)
+        if self.slider.value != frame.index:
+            self.slider.value = frame.index
 
     def _scrub(self, event: Any) -> None:
         if event.client is not None:  # moved by somebody, not by show()
-            self._player.go(int(self._slider.value))
+            self._player.go(int(self.slider.value))
 
 
 class PlaneControls:
@@ -273,14 +275,17 @@ class LiveView:
         check_address(host, port)
         self._player = player
         with contextlib.redirect_stdout(io.StringIO()), guarded(host):  # viser's words
-            self._server = _Server(host=host, port=port, verbose=False)
-        gui, source = self._server.gui, player.source
+            self.server = _Server(host=host, port=port, verbose=False)
+            """viser's server of the page."""
+        gui, source = self.server.gui, player.source
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label("capsense")
         gui.main_panel.dock_right()
-        self._stage = SceneDrawing(self._server, source.design)
-        self._status = gui.add_html("")
-        self._time = TimeControls(gui, player)
+        self._stage = SceneDrawing(self.server, source.design)
+        self.status = gui.add_html("")
+        """The line of text about what is shown."""
+        self.time = TimeControls(gui, player)
+        """The controls of time."""
         self._plane = PlaneControls(gui, player) if source.green is not None else None
         ExportControls(gui, player)
         panel = gui.add_panel()
@@ -297,13 +302,13 @@ class LiveView:
     @property
     def url(self) -> str:
         """Address of the page."""
-        host = self._server.get_host()
-        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def run(self, stop: threading.Event) -> None:
         """Keep the page up to date until told to stop."""
         while not stop.wait(PERIOD):
-            if self._server.get_clients():
+            if self.server.get_clients():
                 self.refresh()
 
     def refresh(self) -> None:
@@ -312,8 +317,8 @@ class LiveView:
         state = (frame, player.playing, player.failure)
         if frame is not None and state != self._drawn:
             self._drawn = state
-            with self._server.atomic():
-                self._time.show(frame)
+            with self.server.atomic():
+                self.time.show(frame)
                 self._stage.show_bodies(Scene() if frame.around else frame.scene)
                 self._stage.show_around(frame.around)
                 times, changes = player.history(frame.index)
@@ -323,7 +328,7 @@ class LiveView:
                 own = np.abs(np.diag(frame.reading.delta))
                 before = np.abs(changes[:, self._own]).max(initial=0.0)
                 self._loudest = max(self._loudest, float(own.max()), float(before))
-                self._status.content = status(player, frame, self._loudest)
+                self.status.content = status(player, frame, self._loudest)
                 self._stage.show_signals(own / self._loudest)
                 self._matrix.content = heat_map(frame.reading.electrode_names, frame.reading.delta)
         self._paint()
@@ -331,7 +336,7 @@ class LiveView:
     def stop(self) -> None:
         """Close the page."""
         with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+            self.server.stop()
 
     def _paint(self) -> None:
         """Show the potential, where there is one and it is wanted."""

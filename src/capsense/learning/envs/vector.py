@@ -170,7 +170,7 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         self.single_action_space = first.action_space
         self.observation_space = batch_space(first.observation_space, num_envs)
         self.action_space = batch_space(first.action_space, num_envs)
-        self._skin = FleetSkin(self.worlds, device)
+        self.skin = FleetSkin(self.worlds, device)
         self._observations = np.zeros(self.observation_space.shape or (), np.float32)
         self._steps = np.zeros(num_envs, np.int64)
         self._over = np.zeros(num_envs, np.bool_)
@@ -241,8 +241,8 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             return
         for k in chosen:
             self.worlds[k].prepare(seeds[k])
-        self._skin.take(chosen)
-        self._tare = dict(zip(chosen, self._skin.read(chosen), strict=True))
+        self.skin.take(chosen)
+        self._tare = dict(zip(chosen, self.skin.read(chosen), strict=True))
         for k in chosen:
             self.worlds[k].present()
         self._steps[chosen], self._over[chosen] = 0, False
@@ -253,7 +253,7 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         """Read the worlds that go on and those that begin; what the latter begin with."""
         chosen = np.flatnonzero(mask).tolist()
         asked = sorted([*chosen, *going])
-        self._now = dict(zip(asked, self._skin.read(asked), strict=True))
+        self._now = dict(zip(asked, self.skin.read(asked), strict=True))
         return {k: self.worlds[k].switch_on(self._tare[k], self._now[k]) for k in chosen}
 
 
