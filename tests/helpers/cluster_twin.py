@@ -16,7 +16,7 @@ from capsense.field.green_kernels import Green
 from capsense.surface import step
 from capsense.surface.choose_kernels import Cut, functions_of
 from capsense.surface.leaf_kernels import leaf_rows, placed
-from capsense.surface.pair_kernels import leaf_pairs
+from capsense.surface.pair_kernels import bound_images, leaf_pairs
 from capsense.surface.solve_kernels import assembled, leaf_charges, reduced
 from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 
@@ -84,6 +84,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         rows = leaf_rows(leaves.points, leaves.beyond, green)
         functions = functions_of(bodies, cut)
         pairs = leaf_pairs(leaves, green.floor)
+        bound_images(leaves, rows, pairs, green)
         return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:

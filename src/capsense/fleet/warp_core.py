@@ -125,6 +125,7 @@ class WarpCore:
         self.launch(warp_cut.place, (n, views), *at, green, count, k, cut)
         self.launch(kernels.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
         self.launch(kernels.pairs, (n, n, views), green, cut, k, matrix)
+        self.launch(kernels.bound_images, (n, views), green, cut, rows, matrix)
         self.launch(kernels.to_functions, (width, views), cut, k, rows)
         self.launch(kernels.to_functions, (n, views), cut, k, matrix)
         self.launch(kernels.to_functions, (n, views), cut, k, matrix.transpose((1, 0, 2)))

@@ -106,8 +106,27 @@ class WarpCut:
     lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
 
 
+@wp.struct
+class Leaf:
+    """One cluster in the sensor frame."""
+
+    p0: wp.vec3
+    p1: wp.vec3
+    p2: wp.vec3
+    p3: wp.vec3
+    u0: wp.vec3  # the same before they were lifted off the design
+    u1: wp.vec3
+    u2: wp.vec3
+    u3: wp.vec3
+    lifted: wp.int32
+    extent: wp.float32
+    soft: wp.float32
+    beyond: wp.float32
+    near: wp.float32
+
+
 @wp.func
-def _smooth(x: float):
+def smooth(x: float):
     y = wp.clamp(x, 0.0, 1.0)
     return y * y * (3.0 - 2.0 * y)
 
@@ -259,45 +278,65 @@ def _lift(p: wp.vec3, gap: float, green: Response):
     return q
 
 
-@wp.kernel
-def place(
-    shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
-):
-    """Points of all clusters in the sensor frame, and where they stand to design and walls."""
-    i, v = wp.tid()
-    k = cut.node[i, v]
-    if k < 0:
-        return
-    b = i // clusters
-    scale = places.scale[v // sensors, b]
-    at = cut.pose[b, v]
+@wp.func
+def placed(shapes: Shapes, green: Response, at: wp.transform, scale: float, k: int):
+    """A cluster of a shape in the sensor frame, and where it stands to design and walls."""
+    out = Leaf()
     size = scale * shapes.extent[k]
-    p0 = wp.transform_point(at, scale * shapes.points[k, 0])
-    p3 = wp.transform_point(at, scale * shapes.points[k, 3])
-    c = 0.5 * (p0 + p3)
-    out = wp.length(_off(c, green.room0, green.room1))
+    out.u0 = wp.transform_point(at, scale * shapes.points[k, 0])
+    out.u1 = wp.transform_point(at, scale * shapes.points[k, 1])
+    out.u2 = wp.transform_point(at, scale * shapes.points[k, 2])
+    out.u3 = wp.transform_point(at, scale * shapes.points[k, 3])
+    c = 0.5 * (out.u0 + out.u3)
+    off = wp.length(_off(c, green.room0, green.room1))
     deep = float(0.0)
+    out.p0 = out.u0
+    out.p1 = out.u1
+    out.p2 = out.u2
+    out.p3 = out.u3
     if green.cover < 1.0:
         depth = wp.min(1.0, green.box1[2] - c[2])
         for d in range(2):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
             depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
         deep = depth - _DEEP
-    cut.beyond[i, v] = _smooth(wp.max(out, deep) / _SHORE)
-    gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
-    lifted = int(0)
-    for q in range(4):
-        p = wp.transform_point(at, scale * shapes.points[k, q])
-        cut.unlifted[i, q, v] = p
-        if green.cover < 1.0:
-            to = _lift(p, gap, green)
-            if wp.length(to - p) > _LIFTED:
-                lifted = 1
-            p = to
-        cut.points[i, q, v] = p
-    cut.lifted[i, v] = lifted
-    cut.extent[i, v] = size
-    cut.soft[i, v] = scale * shapes.soft[k]
-    middle = 0.5 * (cut.points[i, 0, v] + cut.points[i, 3, v])
-    away = wp.length(_off(middle, green.box0, green.box1))
-    cut.near[i, v] = _smooth((green.blend1 - away) / (green.blend1 - green.blend0))
+        gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
+        out.p0 = _lift(out.u0, gap, green)
+        out.p1 = _lift(out.u1, gap, green)
+        out.p2 = _lift(out.u2, gap, green)
+        out.p3 = _lift(out.u3, gap, green)
+        way = wp.max(wp.length(out.p0 - out.u0), wp.length(out.p1 - out.u1))
+        way = wp.max(way, wp.max(wp.length(out.p2 - out.u2), wp.length(out.p3 - out.u3)))
+        out.lifted = wp.where(way > _LIFTED, 1, 0)
+    out.beyond = smooth(wp.max(off, deep) / _SHORE)
+    out.extent = size
+    out.soft = scale * shapes.soft[k]
+    away = wp.length(_off(0.5 * (out.p0 + out.p3), green.box0, green.box1))
+    out.near = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
+    return out
+
+
+@wp.kernel
+def place(
+    shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
+):
+    """Place all clusters in the sensor frame."""
+    i, v = wp.tid()
+    k = cut.node[i, v]
+    if k < 0:
+        return
+    b = i // clusters
+    leaf = placed(shapes, green, cut.pose[b, v], places.scale[v // sensors, b], k)
+    cut.points[i, 0, v] = leaf.p0
+    cut.points[i, 1, v] = leaf.p1
+    cut.points[i, 2, v] = leaf.p2
+    cut.points[i, 3, v] = leaf.p3
+    cut.unlifted[i, 0, v] = leaf.u0
+    cut.unlifted[i, 1, v] = leaf.u1
+    cut.unlifted[i, 2, v] = leaf.u2
+    cut.unlifted[i, 3, v] = leaf.u3
+    cut.lifted[i, v] = leaf.lifted
+    cut.extent[i, v] = leaf.extent
+    cut.soft[i, v] = leaf.soft
+    cut.beyond[i, v] = leaf.beyond
+    cut.near[i, v] = leaf.near
