@@ -16,7 +16,7 @@ from capsense.field.green_kernels import Green
 from capsense.surface import step
 from capsense.surface.choose_kernels import Cut, functions_of
 from capsense.surface.leaf_kernels import leaf_rows, placed
-from capsense.surface.pair_kernels import bound_images, leaf_pairs
+from capsense.surface.pair_kernels import BARRIER, bound_images, leaf_pairs
 from capsense.surface.solve_kernels import assembled, leaf_charges, reduced
 from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 
@@ -28,7 +28,9 @@ def cut_of(
 ) -> Cut:
     """Clusters by what is largest against its distance from the design, ``count`` for each body.
 
-    Of clusters that are as large to 1e-5, those are split whose functions are ``favoured``.
+    Those that are not split have one function more, which is not solved for, and are represented by
+    themselves none the less. Of clusters that are as large to 1e-5, those are split whose functions
+    are ``favoured``.
     """
     rows: list[tuple] = []
     leaves: list[int] = []
@@ -46,19 +48,25 @@ def cut_of(
             split.add(k)
             for part in tree.kids[k].tolist():
                 heapq.heappush(heap, (-need[part], part))
-        used = sorted(split | {part for _, part in heap})
+        ends = {k for _, k in heap}
+        below = {part for k in ends for part in tree.kids[k].tolist() if part >= 0}
+        used = sorted(split | ends | below)
         place = {k: len(rows) + i for i, k in enumerate(used)}
         for k in used:
-            if k in split:
+            whole, fade, above = float(k not in split), float(k in split), float(k not in below)
+            leaf, kids, share = -1, (-1, -1), 0.0
+            if k in split or (k in ends and tree.kids[k, 0] >= 0):
                 x, y = tree.kids[k].tolist()
-                rows.append((b, k, place[x], place[y], tree.charge[x] / tree.charge[k], -1))
-            else:
-                rows.append((b, k, -1, -1, 0.0, len(leaves)))
+                kids, share = (place[x], place[y]), tree.charge[x] / tree.charge[k]
+            if k not in split:
+                leaf = len(leaves)
                 leaves.append(place[k])
-    body, node, first, second, share, leaf = (np.array(c) for c in zip(*rows, strict=True))
+            rows.append((b, k, *kids, share, leaf, whole, fade, above))
+    body, node, first, second, share, leaf, whole, fade, above = (
+        np.array(c) for c in zip(*rows, strict=True)
+    )
     kids = np.stack([first, second], axis=1)
-    whole, fade = (first < 0).astype(float), np.ones(len(rows))
-    return Cut(body, node, kids, share, leaf, whole, fade, fade.copy(), np.array(leaves))
+    return Cut(body, node, kids, share, leaf, whole, fade, above, np.array(leaves))
 
 
 @contextmanager
@@ -69,27 +77,37 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         A list for the numbers of the functions of each body that are taken where two clusters are
         equally large.
     """
-    trees: list = []
+    shapes: list = []
     favoured: list[Array] = []
     pack = SurfaceSolver.pack
 
     def packed(solver: SurfaceSolver, view: View) -> PackedBodies:
         out = pack(solver, view)
-        trees[:] = [shape.tree for shape in out.shapes]
+        shapes[:] = out.shapes
         return out
 
     def prepared(bodies: NDArray[np.void], green: Green, *_: float) -> tuple:
-        cut = cut_of(green, bodies, trees, count, favoured)
+        cut = cut_of(green, bodies, [shape.tree for shape in shapes], count, favoured)
         leaves = placed(bodies, cut, green, INSIDE)
         rows = leaf_rows(leaves.points, leaves.beyond, green)
         functions = functions_of(bodies, cut)
         pairs = leaf_pairs(leaves, green.floor)
         bound_images(leaves, rows, pairs, green)
-        return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
+        system = assembled(bodies, cut, functions, rows, pairs, green.lead)
+        for f in range(functions.solved, len(system.own)):
+            body, x = bodies[functions.body[f]], functions.number[f]
+            shape = shapes[functions.body[f]]
+            own = shape.energy[x, x]
+            if body["impedance"] != 0:
+                own = own + body["softness"] * shape.impedance[x, x]
+            parts = cut.leaf[cut.kids[functions.cluster[f]]]
+            system.own[f] = own / body["scale"] + BARRIER * (leaves.beyond[parts] ** 3).sum()
+        return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
         cut, leaves, functions, system = prepared(bodies, green)
-        delta, left, coarse, x, shift = reduced(cut, functions, system, others[2])
+        delta, left, coarse, x, shift = reduced(cut, functions, system, False)
+        x[functions.solved :] = 0.0  # Jacobians leave out what these add
         charge = leaf_charges(cut, functions, x, len(leaves.points))
         m = green.terminals
         return step.Solution(

@@ -94,6 +94,7 @@ class WarpCut:
     split: wp.array2d(dtype=wp.int32)  # place of the cluster that was split for this one, (n, v)
     part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
+    ends: wp.array2d(dtype=wp.float32)  # which part of its two parts are panels, (n, v)
     points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
     unlifted: wp.array3d(dtype=wp.vec3)  # the same before they were lifted off the design
     lifted: wp.array2d(dtype=wp.int32)  # whether they were, (n, v)
@@ -166,6 +167,7 @@ def choose(
     for j in range(clusters):
         cut.node[o + j, v] = -1
         cut.number[o + j, v] = -1
+    cut.ends[o, v] = 0.0
     if u < 0 or places.hidden[s, b] != 0:
         return
     at = wp.transform_multiply(wp.transform_inverse(sensors[e, s]), bodies[e, b])
@@ -196,6 +198,9 @@ def choose(
             cut.split[o + j, v] = best
             cut.part[o + j, v] = shapes.charge[x] / shapes.charge[k]
             cut.number[o + j, v] = shapes.function[k]
+            cut.ends[o + j, v] = wp.where(shapes.kids[x, 0] < 0, 0.5, 0.0) + wp.where(
+                shapes.kids[y, 0] < 0, 0.5, 0.0
+            )
             cut.node[o + best, v] = x
             cut.node[o + j, v] = y
             cut.score[o + best, v] = _need(shapes, green, at, scale, x)
