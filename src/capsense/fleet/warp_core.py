@@ -59,6 +59,7 @@ class WarpCore:
         cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
         cut.leader = room(places, views, dtype=wp.int32)
         cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
+        cut.width = room(views, dtype=wp.int32)
         self.cut = cut
         passes, t = self.green.near_table.shape[1], self.green.terminals
         self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
@@ -139,6 +140,7 @@ class WarpCore:
         self.launch(warp_cut.choose, (places, views), *at, green, bodies, sensors, k, cut)
         self.launch(warp_cut.connect, views, self.places, count, k, cut)
         self.launch(warp_cut.place, (n, views), *at, green, count, k, cut)
+        self.launch(warp_cut.widths, views, green, cut)
         self.launch(kernels.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
         self.launch(kernels.pairs, (n, n, views), green, cut, k, matrix)
         self.launch(kernels.bound_images, (n, views), green, cut, rows, matrix)
@@ -169,12 +171,14 @@ class WarpCore:
         launch, modes = self.launch, rest.sums.shape[0]
         solved = self.matrix, self.loss, self.rows, self.quadrature
         launch(left.charges, (t, views), cut, lead, *solved, rest.charge)
-        launch(left.modes, (modes, columns, views), cut, lead, self.rows, rest.charge, rest.sums)
+        parts = columns // left.COLUMNS
+        launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, rest.sums)
         for table, to in ((green.near_table, rest.near), (green.far_table, rest.far)):
-            launch(left.strengths, to.shape, cut, lead, table, rest.sums, to)
+            batches = -(-len(to) // left.SOURCES)
+            launch(left.strengths, (batches, columns, views), cut, lead, table, rest.sums, to)
         launch(left.to_clusters, (columns, views), cut, k, lead, rest.charge, rest.on)
         launch(
-            left.residuals, (n, columns // left.COLUMNS, views), self.shapes, self.places, green,
+            left.residuals, (n, parts, views), self.shapes, self.places, green,
             cut, k, rest.charge, rest.on, rest.near, rest.far, rest.residual, rest.energy,
         )  # fmt: skip
 

@@ -22,6 +22,7 @@ WIDTH = 64
 """Columns of a table that a thread works out at a time."""
 row = wp.types.vector(length=WIDTH, dtype=wp.float32)
 
+_WIDTH = wp.constant(WIDTH)
 _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
 _GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in GAP)
@@ -105,6 +106,7 @@ class WarpCut:
     leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
     tie: wp.array2d(dtype=wp.vec2)  # energy of the net charge of the leader and all others, (b, v)
     lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
+    width: wp.array(dtype=wp.int32)  # columns of φ⁰ and ψ that are not zero, (v,)
 
 
 @wp.struct
@@ -345,3 +347,14 @@ def place(
     cut.soft[i, v] = leaf.soft
     cut.beyond[i, v] = leaf.beyond
     cut.near[i, v] = leaf.near
+
+
+@wp.kernel
+def widths(green: Response, cut: WarpCut):
+    """How many columns of the tables a view needs: fewer where no cluster is near the design."""
+    v = wp.tid()
+    passes = green.far_table.shape[1]
+    for i in range(cut.node.shape[0]):
+        if cut.node[i, v] >= 0 and cut.near[i, v] > 0.0:
+            passes = green.near_table.shape[1]
+    cut.width[v] = _WIDTH * passes

@@ -37,8 +37,10 @@ def unit(p: wp.vec3, source: wp.vec3, floor: float, least: float):
 
 @wp.kernel
 def rows(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
-    """Means of φ⁰ and ψ over all clusters, (n, w, v): 64 columns a thread."""
+    """Means of φ⁰ and ψ over all clusters, (n, w, v), up to a view's width: 64 columns a thread."""
     i, part, v = wp.tid()
+    if part * _WIDTH >= cut.width[v]:
+        return
     total = row()
     if cut.node[i, v] >= 0:
         p0 = cut.points[i, 0, v]
@@ -198,7 +200,7 @@ def bound_images(
         return
     leaf.soft = 0.0
     met = _imaged(leaf, green.floor)
-    for k in range(green.lead, rows.shape[1]):
+    for k in range(green.lead, cut.width[v]):
         met += rows[i, k, v] * rows[i, k, v]
     extra = met - _mirror(2.0 / (inverse * side)) / side
     pairs[i, i, v] = pairs[i, i, v] + wp.max(extra, 0.0) * smooth(10.0 * extra / met)
@@ -283,7 +285,7 @@ def assemble(
     value = wp.vec2(wp.where(f == g, 1.0, 0.0), 0.0)
     if x >= 0 and y >= 0:
         value = wp.vec2(matrix[f, g, v], 0.0)
-        for k in range(lead, potentials.shape[1]):
+        for k in range(lead, cut.width[v]):
             value[0] -= potentials[f, k, v] * potentials[g, k, v]
         b = f // clusters
         c = g // clusters

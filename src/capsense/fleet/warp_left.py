@@ -22,9 +22,11 @@ from capsense.surface.pair_kernels import BARRIER
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-COLUMNS = 8
-"""Columns that a thread works out at a time."""
+COLUMNS, SOURCES = 8, 16
+"""Columns, and sources, that a thread works out at a time."""
 some = wp.types.vector(length=COLUMNS, dtype=wp.float32)
+many = wp.types.vector(length=SOURCES, dtype=wp.float32)
+_SOURCES = wp.constant(SOURCES)
 _COLUMNS, _WIDTH = wp.constant(COLUMNS), wp.constant(WIDTH)
 _BARRIER = wp.constant(BARRIER)
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
@@ -66,13 +68,17 @@ def modes(
     charge: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Sums of ψ over all charges, (modes, 2 lead, v)."""
-    k, c, v = wp.tid()
-    if c >= lead and cut.lossy[v] == 0:
+    k, chunk, v = wp.tid()
+    first = _COLUMNS * chunk
+    if lead + k >= cut.width[v] or (first >= lead and cut.lossy[v] == 0):
         return
-    total = float(0.0)
+    total = some()
     for f in range(rows.shape[0]):
-        total += rows[f, lead + k, v] * charge[f, c, v]
-    out[k, c, v] = total
+        value = rows[f, lead + k, v]
+        for c in range(_COLUMNS):
+            total[c] = total[c] + value * charge[f, first + c, v]
+    for c in range(_COLUMNS):
+        out[k, first + c, v] = total[c]
 
 
 @wp.kernel
@@ -81,17 +87,26 @@ def strengths(
     table: wp.array2d(dtype=wp.types.vector(length=WIDTH, dtype=wp.float32)),
     sums: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Strength of the design's sources, a terminal at 1 V and charges in place, (s, 2 lead, v)."""
-    s, c, v = wp.tid()
-    if c >= lead and cut.lossy[v] == 0:
+    """Strength of the design's sources, a terminal at 1 V and charges in place, (s, 2 lead, v).
+
+    Those of sources that a view does not need are not worked out.
+    """
+    batch, c, v = wp.tid()
+    width = table.shape[1] * _WIDTH
+    if width > cut.width[v] or (c >= lead and cut.lossy[v] == 0):
         return
-    total = float(0.0)
-    if c < lead:
-        total = table[s, c // _WIDTH][c % _WIDTH]
-    for k in range(wp.min(sums.shape[0], table.shape[1] * _WIDTH - lead)):
-        a = lead + k
-        total += table[s, a // _WIDTH][a % _WIDTH] * sums[k, c, v]
-    out[s, c, v] = total
+    first = _SOURCES * batch
+    last = table.shape[0] - 1
+    total = many()
+    for k in range(lead, width):
+        value = sums[k - lead, c, v]
+        for s in range(_SOURCES):
+            total[s] = total[s] + table[wp.min(first + s, last), k // _WIDTH][k % _WIDTH] * value
+    for s in range(_SOURCES):
+        if first + s <= last:
+            if c < lead:
+                total[s] = total[s] + table[first + s, c // _WIDTH][c % _WIDTH]
+            out[first + s, c, v] = total[s]
 
 
 @wp.kernel
