@@ -14,10 +14,10 @@ import capsense as cs
 from capsense.elements.rigid import INSIDE
 from capsense.field.green_kernels import Green
 from capsense.surface import step
-from capsense.surface.choose_kernels import Cut, functions_of
+from capsense.surface.choose_kernels import Cut, Functions, functions_of
 from capsense.surface.leaf_kernels import leaf_rows, placed
 from capsense.surface.pair_kernels import BARRIER, bound_images, leaf_pairs
-from capsense.surface.solve_kernels import assembled, leaf_charges, reduced
+from capsense.surface.solve_kernels import System, assembled, leaf_charges, reduced
 from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 
 Array = NDArray[np.float64]
@@ -69,6 +69,17 @@ def cut_of(
     return Cut(body, node, kids, share, leaf, whole, fade, above, np.array(leaves))
 
 
+def _add_barrier(cut: Cut, functions: Functions, system: System, beyond: Array) -> None:
+    """Add the energy of charge that is out of reach; with pairs, in single precision, it would hide
+    1e-3 of a matrix."""
+    total, n = len(system.own), functions.solved
+    on = leaf_charges(cut, functions, np.eye(total), len(beyond)).T
+    energy = (on * BARRIER * beyond**3) @ on.T
+    system.matrix[:] += energy[:n, :n]
+    system.rest[:] += energy[n:, :n]
+    system.own[:] += np.diag(energy)
+
+
 @contextmanager
 def same_functions(count: int) -> Iterator[list[Array]]:
     """Let solvers take the charge functions that a fleet on Warp takes, ``count`` for each body.
@@ -91,7 +102,8 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         leaves = placed(bodies, cut, green, INSIDE)
         rows = leaf_rows(leaves.points, leaves.beyond, green)
         functions = functions_of(bodies, cut)
-        pairs = leaf_pairs(leaves, green.floor)
+        inside = leaves._replace(beyond=np.zeros_like(leaves.beyond))
+        pairs = leaf_pairs(inside, green.floor)
         bound_images(leaves, rows, pairs, green)
         system = assembled(bodies, cut, functions, rows, pairs, green.lead)
         for f in range(functions.solved, len(system.own)):
@@ -100,8 +112,8 @@ def same_functions(count: int) -> Iterator[list[Array]]:
             own = shape.energy[x, x]
             if body["impedance"] != 0:
                 own = own + body["softness"] * shape.impedance[x, x]
-            parts = cut.leaf[cut.kids[functions.cluster[f]]]
-            system.own[f] = own / body["scale"] + BARRIER * (leaves.beyond[parts] ** 3).sum()
+            system.own[f] = own / body["scale"]
+        _add_barrier(cut, functions, system, leaves.beyond)
         return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:

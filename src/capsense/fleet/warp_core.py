@@ -54,12 +54,12 @@ class WarpCore:
         cut.moved = room(places, views, dtype=wp.vec3)
         for name in ("node", "split", "number", "lifted"):
             setattr(cut, name, room(n, views, dtype=wp.int32))
-        for name in ("score", "part", "ends", "extent", "soft", "beyond", "near"):
+        for name in ("score", "part", "mix", "weight", "ends", "extent", "soft", "beyond", "near"):
             setattr(cut, name, room(n, views))
         cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
         cut.leader = room(places, views, dtype=wp.int32)
         cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
-        cut.width = room(views, dtype=wp.int32)
+        cut.width, cut.walled = (room(views, dtype=wp.int32) for _ in range(2))
         self.cut = cut
         passes, t = self.green.near_table.shape[1], self.green.terminals
         self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
@@ -140,13 +140,17 @@ class WarpCore:
         self.launch(warp_cut.choose, (places, views), *at, green, bodies, sensors, k, cut)
         self.launch(warp_cut.connect, views, self.places, count, k, cut)
         self.launch(warp_cut.place, (n, views), *at, green, count, k, cut)
-        self.launch(warp_cut.widths, views, green, cut)
+        self.launch(warp_cut.weigh, views, *at, green, k, cut)
         self.launch(kernels.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
+        turned = matrix.transpose((1, 0, 2))
+        self.launch(kernels.energies, (n, n, views), *at, cut, k, matrix)
+        for values in (matrix, turned):
+            self.launch(kernels.from_functions, (n, views), cut, k, values)
         self.launch(kernels.pairs, (n, n, views), green, cut, k, matrix)
         self.launch(kernels.bound_images, (n, views), green, cut, rows, matrix)
-        self.launch(kernels.to_functions, (width, views), cut, k, rows)
-        self.launch(kernels.to_functions, (n, views), cut, k, matrix)
-        self.launch(kernels.to_functions, (n, views), cut, k, matrix.transpose((1, 0, 2)))
+        self.launch(kernels.to_functions, (width, views), cut, k, 1, rows)
+        for values in (matrix, turned):
+            self.launch(kernels.to_functions, (n, views), cut, k, 0, values)
         self.launch(
             kernels.assemble, (n, n, views), *at, cut, count, k, green.lead, rows, matrix, self.loss
         )
@@ -156,7 +160,7 @@ class WarpCore:
         self.launch(solution.forward, (t, views), cut, matrix, loss, rows, quadrature)
         self._look_below(count)
         self.launch(
-            solution.change, (t, t, views), circuit, cut, matrix, loss, rows, quadrature, rest, whole
+            solution.change, (t, t, views), circuit, cut, rows, quadrature, rest, whole
         )
         self.launch(solution.eliminate, views, circuit, whole)
         self.launch(
@@ -171,6 +175,7 @@ class WarpCore:
         launch, modes = self.launch, rest.sums.shape[0]
         solved = self.matrix, self.loss, self.rows, self.quadrature
         launch(left.charges, (t, views), cut, lead, *solved, rest.charge)
+        launch(left.coarse, (t, views), cut, self.matrix, self.loss, rest.charge, rest.doubt)
         parts = columns // left.COLUMNS
         launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, rest.sums)
         for table, to in ((green.near_table, rest.near), (green.far_table, rest.far)):

@@ -14,7 +14,7 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import DEEP, GAP, SHORE, STEEP
-from capsense.surface.pair_kernels import LIFTED
+from capsense.surface.pair_kernels import BARRIER, LIFTED
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -26,7 +26,7 @@ _WIDTH = wp.constant(WIDTH)
 _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
 _GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in GAP)
-_LIFTED = wp.constant(LIFTED)
+_LIFTED, _BARRIER = wp.constant(LIFTED), wp.constant(BARRIER)
 _DEEP, _STEEP, _SHORE = wp.constant(DEEP), wp.constant(STEEP), wp.constant(SHORE)
 
 
@@ -94,6 +94,9 @@ class WarpCut:
     score: wp.array2d(dtype=wp.float32)
     split: wp.array2d(dtype=wp.int32)  # place of the cluster that was split for this one, (n, v)
     part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
+    mix: wp.array2d(dtype=wp.float32)  # the same in the functions solved for, see weigh, (n, v)
+    weight: wp.array2d(dtype=wp.float32)
+    walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
     ends: wp.array2d(dtype=wp.float32)  # which part of its two parts are panels, (n, v)
     points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
@@ -350,11 +353,37 @@ def place(
 
 
 @wp.kernel
-def widths(green: Response, cut: WarpCut):
-    """How many columns of the tables a view needs: fewer where no cluster is near the design."""
+def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: WarpCut):
+    """How many columns a view needs, and how its functions share charge among their parts.
+
+    Fewer columns do where no cluster is near the design. Where clusters are out of reach, functions
+    have so little charge on them that its energy, far above all others, hides nothing in single
+    precision: in place of the equilibrium charge, one that goes like it over that energy. Together
+    they stand for the same charges. With losses they stay as they are.
+    """
     v = wp.tid()
+    e = v // places.hidden.shape[0]
     passes = green.far_table.shape[1]
+    walled = int(0)
     for i in range(cut.node.shape[0]):
-        if cut.node[i, v] >= 0 and cut.near[i, v] > 0.0:
-            passes = green.near_table.shape[1]
+        k = cut.node[i, v]
+        if k >= 0:
+            if cut.near[i, v] > 0.0:
+                passes = green.near_table.shape[1]
+            x = cut.beyond[i, v]
+            walled = wp.where(x > 0.0 and cut.lossy[v] == 0, 1, walled)
+            stiff = _BARRIER * x * x * x * cut.extent[i, v]
+            cut.weight[i, v] = shapes.charge[k] / (1.0 + stiff)
     cut.width[v] = _WIDTH * passes
+    cut.walled[v] = walled
+    for b in range(places.group.shape[0]):
+        o = b * clusters
+        for step in range(clusters - 1):
+            j = o + clusters - 1 - step
+            if cut.number[j, v] >= 0:
+                cut.mix[j, v] = cut.part[j, v]
+                if walled != 0:
+                    i = o + cut.split[j, v]
+                    whole = cut.weight[i, v] + cut.weight[j, v]
+                    cut.mix[j, v] = cut.weight[i, v] / whole
+                    cut.weight[i, v] = whole

@@ -17,8 +17,9 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 _FAR = wp.constant(FAR)
 _BARRIER, _STIFF = wp.constant(BARRIER), wp.constant(600.0)
-"""Energy of charge that is out of reach [1/m], at most the second number [m] over the square of a
-large cluster's extent: in single precision more of it would hide what is in reach."""
+"""Energy of charge that is out of reach [1/m]; with losses at most the second number [m] over the
+square of a large cluster's extent: more of it would hide what is in reach, see ``warp_cut.weigh``.
+"""
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
 _WIDTH = wp.constant(WIDTH)
 _WIDE = wp.constant(WIDE)
@@ -160,21 +161,29 @@ def _soft(d: wp.vec3, fourth: float):
 
 @wp.kernel
 def pairs(green: Response, cut: WarpCut, clusters: int, out: wp.array3d(dtype=wp.float32)):
-    """Mean of 1/r between bodies, and of -1/r to images in the floor, (n, n, v)."""
+    """Mean of 1/r between bodies, and of -1/r to images in the floor, (n, n, v).
+
+    They are added to what :func:`energies` and :func:`from_functions` left, in views that have it.
+    """
     i, j, v = wp.tid()
     if j > i:
         return
     value = float(0.0)
     if cut.node[i, v] >= 0 and cut.node[j, v] >= 0:
         leaf = leaf_of(cut, i, v)
-        value = -mean(leaf, cut, j, v, 1.0, green.floor)
+        if cut.walled[v] != 0:
+            value = out[i, j, v]
+        value -= mean(leaf, cut, j, v, 1.0, green.floor)
         if i // clusters != j // clusters:
             value += mean(leaf, cut, j, v, 0.0, green.floor)
         elif i != j and leaf.lifted + cut.lifted[j, v] > 0:
             value += more(leaf, cut, j, v)
         if i == j:
             x = cut.beyond[i, v]
-            value += wp.min(_BARRIER, _STIFF / (cut.extent[i, v] * cut.extent[i, v])) * x * x * x
+            barrier = _BARRIER
+            if cut.walled[v] == 0:
+                barrier = wp.min(barrier, _STIFF / (cut.extent[i, v] * cut.extent[i, v]))
+            value += barrier * x * x * x
     out[i, j, v] = value
     out[j, i, v] = value
 
@@ -235,9 +244,16 @@ def _mirror(t: float):
 
 
 @wp.kernel
-def to_functions(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.float32)):
-    """Integrate what clusters have in the first index with the charge functions, in place."""
+def to_functions(
+    cut: WarpCut, clusters: int, limited: int, values: wp.array3d(dtype=wp.float32)
+):
+    """Integrate what clusters have in the first index with the charge functions, in place.
+
+    ``limited`` says that the second index is of columns, of which a view has its width.
+    """
     c, v = wp.tid()
+    if limited != 0 and c >= cut.width[v]:
+        return
     for b in range(cut.leader.shape[0]):
         o = b * clusters
         for k in range(clusters - 1):
@@ -246,7 +262,7 @@ def to_functions(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.float3
                 i = o + cut.split[o + j, v]
                 x = values[i, c, v]
                 y = values[o + j, c, v]
-                p = cut.part[o + j, v]
+                p = cut.mix[o + j, v]
                 values[i, c, v] = p * x + (1.0 - p) * y
                 values[o + j, c, v] = x - y
         leader = cut.leader[b, v]
@@ -264,6 +280,42 @@ def own(shapes: Shapes, places: Places, e: int, b: int, x: int, y: int):
     if inside[0] != 0.0 or inside[1] != 0.0:
         out += inside * shapes.impedance[place]
     return out / places.scale[e, b]
+
+
+@wp.kernel
+def energies(
+    shapes: Shapes, places: Places, cut: WarpCut, clusters: int, out: wp.array3d(dtype=wp.float32)
+):
+    """Energies of the functions of the shapes, (n, n, v), where views have others, see ``weigh``."""
+    i, j, v = wp.tid()
+    if cut.walled[v] == 0:
+        return
+    b = i // clusters
+    value = float(0.0)
+    if b == j // clusters and cut.node[b * clusters, v] >= 0:
+        x = wp.where(i % clusters == 0, 0, cut.number[i, v])
+        y = wp.where(j % clusters == 0, 0, cut.number[j, v])
+        if x >= 0 and y >= 0:
+            value = own(shapes, places, v // places.hidden.shape[0], b, x, y)[0]
+    out[i, j, v] = value
+
+
+@wp.kernel
+def from_functions(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.float32)):
+    """What clusters have of what the shapes' functions have in the first index, in place."""
+    c, v = wp.tid()
+    if cut.walled[v] == 0:
+        return
+    for b in range(cut.leader.shape[0]):
+        o = b * clusters
+        for k in range(1, clusters):
+            if cut.number[o + k, v] >= 0:
+                i = o + cut.split[o + k, v]
+                whole = values[i, c, v]
+                apart = values[o + k, c, v]
+                p = cut.part[o + k, v]
+                values[i, c, v] = whole + (1.0 - p) * apart
+                values[o + k, c, v] = whole - p * apart
 
 
 @wp.kernel
@@ -289,19 +341,21 @@ def assemble(
             value[0] -= potentials[f, k, v] * potentials[g, k, v]
         b = f // clusters
         c = g // clusters
+        apart = cut.walled[v] == 0  # else the pairs have the shapes' energies
         first = cut.leader[b, v]
         other = cut.leader[c, v]
         joined = f == b * clusters and first != b
         another = g == c * clusters and other != c
         if b == c:
-            value += own(shapes, places, e, b, x, y)
+            if apart:
+                value += own(shapes, places, e, b, x, y)
             if x == 0 and y == 0 and not joined:
                 value += cut.tie[b, v]
-        if joined and first == c:
+        if apart and joined and first == c:
             value -= own(shapes, places, e, c, 0, y)
-        if another and other == b:
+        if apart and another and other == b:
             value -= own(shapes, places, e, b, x, 0)
-        if joined and another and first == other:
+        if apart and joined and another and first == other:
             value += own(shapes, places, e, first, 0, 0)
     matrix[f, g, v] = value[0]
     if f == g:

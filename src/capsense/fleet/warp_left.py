@@ -19,6 +19,7 @@ from capsense.fleet.warp_cut import WIDTH, Leaf, Places, Response, Shapes, WarpC
 from capsense.fleet.warp_kernels import mean, more, own, unit
 from capsense.fleet.warp_solve import over, times
 from capsense.surface.pair_kernels import BARRIER
+from capsense.surface.solve_kernels import COARSE
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -28,7 +29,7 @@ some = wp.types.vector(length=COLUMNS, dtype=wp.float32)
 many = wp.types.vector(length=SOURCES, dtype=wp.float32)
 _SOURCES = wp.constant(SOURCES)
 _COLUMNS, _WIDTH = wp.constant(COLUMNS), wp.constant(WIDTH)
-_BARRIER = wp.constant(BARRIER)
+_BARRIER, _COARSE = wp.constant(BARRIER), wp.constant(COARSE)
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
 
 
@@ -60,6 +61,30 @@ def charges(
             total[0] = total[0] / pivot[0]
         out[i, t, v] = total[0]
         out[i, lead + t, v] = total[1]
+
+
+@wp.kernel
+def coarse(
+    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
+    charge: wp.array3d(dtype=wp.float32), out: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
+    """What panels are too coarse for [m], see ``solve_kernels.COARSE``, (t, v)."""
+    t, v = wp.tid()
+    total = float(0.0)
+    for f in range(matrix.shape[0]):
+        if cut.number[f, v] >= 0 and cut.ends[f, v] > 0.0:
+            energy = wp.vec2()  # from its factor
+            for k in range(f + 1):
+                entry = wp.vec2(matrix[f, k, v], 0.0)
+                if cut.lossy[v] != 0:
+                    entry[1] = wp.where(k < f, matrix[k, f, v], loss[f, v])
+                energy += times(entry, entry)
+            square = charge[f, t, v] * charge[f, t, v]
+            if cut.lossy[v] != 0:
+                imaginary = charge[f, charge.shape[1] // 2 + t, v]
+                square += imaginary * imaginary
+            total += _COARSE * cut.ends[f, v] * wp.length(energy) * square
+    out[t, v] = total
 
 
 @wp.kernel
@@ -114,7 +139,7 @@ def to_clusters(
     cut: WarpCut, clusters: int, lead: int, charge: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Charges of clusters from those of functions; these become free of joined places, in place."""
+    """Charges of clusters from those of functions; these become those of the shapes' functions."""
     c, v = wp.tid()
     if c >= lead and cut.lossy[v] == 0:
         return
@@ -133,9 +158,20 @@ def to_clusters(
             if cut.number[o + k, v] >= 0:
                 i = o + cut.split[o + k, v]
                 whole = out[i, c, v]
-                p = cut.part[o + k, v]
+                p = cut.mix[o + k, v]
                 out[i, c, v] = p * whole + apart
                 out[o + k, c, v] = (1.0 - p) * whole - apart
+        if cut.walled[v] != 0:
+            for k in range(clusters):
+                charge[o + k, c, v] = out[o + k, c, v]
+            for step in range(clusters - 1):
+                k = clusters - 1 - step
+                if cut.number[o + k, v] >= 0:
+                    i = o + cut.split[o + k, v]
+                    x = charge[i, c, v]
+                    y = charge[o + k, c, v]
+                    charge[i, c, v] = x + y
+                    charge[o + k, c, v] = x - cut.part[o + k, v] * (x + y)
 
 
 @wp.func

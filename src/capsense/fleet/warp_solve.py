@@ -10,11 +10,11 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.fleet.warp_cut import WarpCut
-from capsense.surface.solve_kernels import COARSE, GAIN
+from capsense.surface.solve_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-_GAIN, _COARSE = wp.constant(GAIN), wp.constant(COARSE)
+_GAIN = wp.constant(GAIN)
 _DROPPED = wp.constant(1e-5)
 """Functions whose pivot is so small against their own energy are left out."""
 
@@ -163,31 +163,9 @@ class Left:
     doubt: wp.array2d(dtype=wp.float32)  # estimated error of each diagonal [m], (t, v)
 
 
-@wp.func
-def _coarse(cut: WarpCut, matrix: wp.array3d(dtype=wp.float32),
-            loss: wp.array2d(dtype=wp.float32), left: Left, t: int, v: int):  # fmt: skip
-    """What panels are too coarse for, see ``solve_kernels.COARSE``."""
-    out = float(0.0)
-    for f in range(matrix.shape[0]):
-        if cut.number[f, v] >= 0 and cut.ends[f, v] > 0.0:
-            own = wp.vec2()  # from its factor
-            for k in range(f + 1):
-                entry = wp.vec2(matrix[f, k, v], 0.0)
-                if cut.lossy[v] != 0:
-                    entry[1] = wp.where(k < f, matrix[k, f, v], loss[f, v])
-                own += times(entry, entry)
-            square = left.charge[f, t, v] * left.charge[f, t, v]
-            if cut.lossy[v] != 0:
-                imaginary = left.charge[f, left.charge.shape[1] // 2 + t, v]
-                square += imaginary * imaginary
-            out += _COARSE * cut.ends[f, v] * wp.length(own) * square
-    return out
-
-
 @wp.kernel
 def change(
-    circuit: Circuit, cut: WarpCut, matrix: wp.array3d(dtype=wp.float32),
-    loss: wp.array2d(dtype=wp.float32), potentials: wp.array3d(dtype=wp.float32),
+    circuit: Circuit, cut: WarpCut, potentials: wp.array3d(dtype=wp.float32),
     quadrature: wp.array3d(dtype=wp.float32), left: Left, whole: wp.array3d(dtype=wp.vec2d),
 ):  # fmt: skip
     """Complex Maxwell matrices of all terminals [F], (t, t, v), and what is in doubt."""
@@ -214,7 +192,7 @@ def change(
         circuit.rest[i, j] + wp.float64(real), wp.float64(circuit.unit * total[1])
     )
     if i == j:
-        left.doubt[i, v] = wp.abs(more[0]) + _coarse(cut, matrix, loss, left, i, v)
+        left.doubt[i, v] = left.doubt[i, v] + wp.abs(more[0])
         if left.dropped[v] > 0:
             left.doubt[i, v] = wp.abs(total[0])
 
