@@ -23,11 +23,17 @@ from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 Array = NDArray[np.float64]
 
 
+def _smooth(x: Array) -> Array:
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
 def cut_of(
     green: Green, bodies: NDArray[np.void], trees: list, count: int, favoured: list[Array]
 ) -> Cut:
     """Clusters by what is largest against its distance from the design, ``count`` for each body.
 
+    What crosses a wall counts as larger, by twice its share of the body's length.
     Those that are not split have one function more, which is not solved for, and are represented by
     themselves none the less. Of clusters that are as large to 1e-5, those are split whose functions
     are ``favoured``.
@@ -40,6 +46,10 @@ def cut_of(
         away = np.linalg.norm(np.maximum(np.maximum(low - center, center - high), 0.0), axis=1)
         size = body["scale"] * tree.extent
         need = np.where(tree.kids[:, 0] < 0, 0.0, size / (np.maximum(away, 0.5 * size) + 1e-3))
+        room = np.minimum((center - green.room[0]).min(1), (green.room[1] - center).min(1))
+        crossing = _smooth(2.0 - 4.0 * np.abs(room) / (size + 1e-9))
+        crossing *= _smooth((size - 0.03) / 0.03) * tree.extent / tree.extent[0]
+        need += np.where(tree.kids[:, 0] < 0, 0.0, 2.0 * crossing)
         if favoured:
             need *= 1.0 + 1e-5 * np.isin(tree.function, favoured[b])
         heap, split = [(-need[0], 0)], set()

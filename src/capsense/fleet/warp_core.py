@@ -178,9 +178,8 @@ class WarpCore:
         launch(left.coarse, (t, views), cut, self.matrix, self.loss, rest.charge, rest.doubt)
         parts = columns // left.COLUMNS
         launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, rest.sums)
-        for table, to in ((green.near_table, rest.near), (green.far_table, rest.far)):
-            batches = -(-len(to) // left.SOURCES)
-            launch(left.strengths, (batches, columns, views), cut, lead, table, rest.sums, to)
+        for table, to in ((green.near_columns, rest.near), (green.far_columns, rest.far)):
+            launch(left.strengths, (table.shape[1], columns, views), cut, lead, table, rest.sums, to)
         launch(left.to_clusters, (columns, views), cut, k, lead, rest.charge, rest.on)
         launch(
             left.residuals, (n, parts, views), self.shapes, self.places, green,
@@ -271,6 +270,11 @@ def _response(solver: SurfaceSolver, device: Any) -> Any:
         parts = np.ascontiguousarray(table.reshape(len(table), -1, warp_cut.WIDTH))
         setattr(out, name, wp.array(sources, dtype=wp.vec3, device=device))
         setattr(out, f"{name}_table", wp.array(parts, dtype=warp_cut.row, device=device))
+        batches = -(-len(table) // warp_cut.SOURCES)
+        turned = np.zeros((table.shape[1], batches * warp_cut.SOURCES), np.float32)
+        turned[:, : len(table)] = table.T
+        turned = turned.reshape(table.shape[1], batches, warp_cut.SOURCES)
+        setattr(out, f"{name}_columns", wp.array(turned, dtype=warp_cut.many, device=device))
     out.lead, out.terminals, out.middle = green.lead, green.terminals, wp.vec3(*solver.middle)
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blend.tolist()

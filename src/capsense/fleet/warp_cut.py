@@ -14,6 +14,7 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import DEEP, GAP, SHORE, STEEP
+from capsense.surface.choose_kernels import _LONG as LONG
 from capsense.surface.pair_kernels import BARRIER, LIFTED
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -21,10 +22,15 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 WIDTH = 64
 """Columns of a table that a thread works out at a time."""
 row = wp.types.vector(length=WIDTH, dtype=wp.float32)
+SOURCES = 16
+"""Sources that a thread works out at a time."""
+many = wp.types.vector(length=SOURCES, dtype=wp.float32)
 
 _WIDTH = wp.constant(WIDTH)
 _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
+_CROSSING = wp.constant(2.0)
+_LONG0, _LONG1 = (wp.constant(x) for x in LONG)
 _GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in GAP)
 _LIFTED, _BARRIER = wp.constant(LIFTED), wp.constant(BARRIER)
 _DEEP, _STEEP, _SHORE = wp.constant(DEEP), wp.constant(STEEP), wp.constant(SHORE)
@@ -71,6 +77,8 @@ class Response:
     near_table: wp.array2d(dtype=row)  # (sources, passes)
     far: wp.array(dtype=wp.vec3)
     far_table: wp.array2d(dtype=row)
+    near_columns: wp.array2d(dtype=many)  # the same tables, (columns, batches of sources)
+    far_columns: wp.array2d(dtype=many)
     lead: wp.int32
     terminals: wp.int32
     floor: wp.float32
@@ -148,14 +156,25 @@ def _off(p: wp.vec3, low: wp.vec3, high: wp.vec3):
 
 
 @wp.func
-def _need(shapes: Shapes, green: Response, at: wp.transform, scale: float, node: int):
-    """Extent of a cluster over its distance from the design; 0 for a single panel."""
+def _need(
+    shapes: Shapes, green: Response, at: wp.transform, scale: float, first: int, node: int
+):  # fmt: skip
+    """Extent of a cluster over its distance from the design; 0 for a single panel.
+
+    Where it crosses a wall, ``_CROSSING`` times its share of the body's length is added.
+    """
     if shapes.kids[node, 0] < 0:
         return float(0.0)
     size = scale * shapes.extent[node]
     p = wp.transform_point(at, scale * shapes.center[node])
     away = wp.length(_off(p, green.box0, green.box1))
-    return size / (wp.max(away, _HALF * size) + _NEAREST)
+    low = p - green.room0
+    high = green.room1 - p
+    room = wp.min(wp.min(wp.min(low[0], low[1]), low[2]), wp.min(wp.min(high[0], high[1]), high[2]))
+    crossing = smooth(2.0 - 4.0 * wp.abs(room) / (size + 1e-9))
+    crossing = crossing * smooth((size - _LONG0) / (_LONG1 - _LONG0))
+    crossing = crossing * shapes.extent[node] / shapes.extent[first]
+    return size / (wp.max(away, _HALF * size) + _NEAREST) + _CROSSING * crossing
 
 
 @wp.kernel
@@ -188,7 +207,7 @@ def choose(
         return
     first = shapes.first[u]
     cut.node[o, v] = first
-    cut.score[o, v] = _need(shapes, green, at, scale, first)
+    cut.score[o, v] = _need(shapes, green, at, scale, first, first)
     for j in range(1, clusters):
         best = int(0)
         most = float(0.0)
@@ -208,8 +227,8 @@ def choose(
             )
             cut.node[o + best, v] = x
             cut.node[o + j, v] = y
-            cut.score[o + best, v] = _need(shapes, green, at, scale, x)
-            cut.score[o + j, v] = _need(shapes, green, at, scale, y)
+            cut.score[o + best, v] = _need(shapes, green, at, scale, first, x)
+            cut.score[o + j, v] = _need(shapes, green, at, scale, first, y)
         else:
             cut.score[o + j, v] = 0.0
 

@@ -15,7 +15,16 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
-from capsense.fleet.warp_cut import WIDTH, Leaf, Places, Response, Shapes, WarpCut, placed
+from capsense.fleet.warp_cut import (
+    SOURCES,
+    Leaf,
+    Places,
+    Response,
+    Shapes,
+    WarpCut,
+    many,
+    placed,
+)
 from capsense.fleet.warp_kernels import mean, more, own, unit
 from capsense.fleet.warp_solve import over, times
 from capsense.surface.pair_kernels import BARRIER
@@ -23,12 +32,11 @@ from capsense.surface.solve_kernels import COARSE
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-COLUMNS, SOURCES = 8, 16
-"""Columns, and sources, that a thread works out at a time."""
+COLUMNS = 8
+"""Columns that a thread works out at a time."""
 some = wp.types.vector(length=COLUMNS, dtype=wp.float32)
-many = wp.types.vector(length=SOURCES, dtype=wp.float32)
 _SOURCES = wp.constant(SOURCES)
-_COLUMNS, _WIDTH = wp.constant(COLUMNS), wp.constant(WIDTH)
+_COLUMNS = wp.constant(COLUMNS)
 _BARRIER, _COARSE = wp.constant(BARRIER), wp.constant(COARSE)
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
 
@@ -108,30 +116,24 @@ def modes(
 
 @wp.kernel
 def strengths(
-    cut: WarpCut, lead: int,
-    table: wp.array2d(dtype=wp.types.vector(length=WIDTH, dtype=wp.float32)),
-    sums: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
+    cut: WarpCut, lead: int, table: wp.array2d(dtype=many), sums: wp.array3d(dtype=wp.float32),
+    out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Strength of the design's sources, a terminal at 1 V and charges in place, (s, 2 lead, v).
 
     Those of sources that a view does not need are not worked out.
     """
     batch, c, v = wp.tid()
-    width = table.shape[1] * _WIDTH
+    width = table.shape[0]
     if width > cut.width[v] or (c >= lead and cut.lossy[v] == 0):
         return
-    first = _SOURCES * batch
-    last = table.shape[0] - 1
     total = many()
+    if c < lead:
+        total = table[c, batch]
     for k in range(lead, width):
-        value = sums[k - lead, c, v]
-        for s in range(_SOURCES):
-            total[s] = total[s] + table[wp.min(first + s, last), k // _WIDTH][k % _WIDTH] * value
-    for s in range(_SOURCES):
-        if first + s <= last:
-            if c < lead:
-                total[s] = total[s] + table[first + s, c // _WIDTH][c % _WIDTH]
-            out[first + s, c, v] = total[s]
+        total += sums[k - lead, c, v] * table[k, batch]
+    for s in range(wp.min(_SOURCES, out.shape[0] - _SOURCES * batch)):
+        out[_SOURCES * batch + s, c, v] = total[s]
 
 
 @wp.kernel
