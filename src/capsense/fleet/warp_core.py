@@ -159,9 +159,7 @@ class WarpCore:
         self.launch(solution.factorise_lossy, views, cut, matrix, loss, rest.dropped)
         self.launch(solution.forward, (t, views), cut, matrix, loss, rows, quadrature)
         self._look_below(count)
-        self.launch(
-            solution.change, (t, t, views), circuit, cut, rows, quadrature, rest, whole
-        )
+        self.launch(solution.change, (t, t, views), circuit, cut, rows, quadrature, rest, whole)
         self.launch(solution.eliminate, views, circuit, whole)
         self.launch(
             solution.report, (circuit.electrodes, views), circuit, self._omega, whole,
@@ -179,7 +177,9 @@ class WarpCore:
         parts = columns // left.COLUMNS
         launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, rest.sums)
         for table, to in ((green.near_columns, rest.near), (green.far_columns, rest.far)):
-            launch(left.strengths, (table.shape[1], columns, views), cut, lead, table, rest.sums, to)
+            launch(
+                left.strengths, (table.shape[1], columns, views), cut, lead, table, rest.sums, to
+            )
         launch(left.to_clusters, (columns, views), cut, k, lead, rest.charge, rest.on)
         launch(
             left.residuals, (n, parts, views), self.shapes, self.places, green,

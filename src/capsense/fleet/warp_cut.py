@@ -381,7 +381,6 @@ def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: W
     they stand for the same charges. With losses they stay as they are.
     """
     v = wp.tid()
-    e = v // places.hidden.shape[0]
     passes = green.far_table.shape[1]
     walled = int(0)
     for i in range(cut.node.shape[0]):

@@ -193,7 +193,7 @@ def bound_images(
     green: Response, cut: WarpCut, rows: wp.array3d(dtype=wp.float32),
     pairs: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Let no cluster meet its own images more than in a mirror, as ``pair_kernels.bound_images``."""
+    """Let no cluster meet its images more than in a mirror, as ``pair_kernels.bound_images``."""
     i, v = wp.tid()
     if cut.node[i, v] < 0 or green.cover > 1.0:
         return
@@ -244,9 +244,7 @@ def _mirror(t: float):
 
 
 @wp.kernel
-def to_functions(
-    cut: WarpCut, clusters: int, limited: int, values: wp.array3d(dtype=wp.float32)
-):
+def to_functions(cut: WarpCut, clusters: int, limited: int, values: wp.array3d(dtype=wp.float32)):
     """Integrate what clusters have in the first index with the charge functions, in place.
 
     ``limited`` says that the second index is of columns, of which a view has its width.
@@ -286,7 +284,7 @@ def own(shapes: Shapes, places: Places, e: int, b: int, x: int, y: int):
 def energies(
     shapes: Shapes, places: Places, cut: WarpCut, clusters: int, out: wp.array3d(dtype=wp.float32)
 ):
-    """Energies of the functions of the shapes, (n, n, v), where views have others, see ``weigh``."""
+    """Energies of the shapes' functions, (n, n, v), where views have others, see ``weigh``."""
     i, j, v = wp.tid()
     if cut.walled[v] == 0:
         return
