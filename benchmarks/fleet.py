@@ -99,6 +99,7 @@ def rate(options: dict[str, Any], count: int) -> tuple[float, float]:
 def memory(options: dict[str, Any]) -> tuple[int, int]:
     """Bytes that a sensor with one body takes on Warp, without gradients and with them."""
     from capsense.fleet.warp_cut import WarpCut
+    from capsense.fleet.warp_solve import Left
 
     sizes = []
     for count in (8, 16):
@@ -106,7 +107,9 @@ def memory(options: dict[str, Any]) -> tuple[int, int]:
         fleet.step(fingers(count, np.random.default_rng(0)), jacobian=True)
         core = fleet._warp
         parts = [
-            list(vars(core).values()), [getattr(core.cut, name) for name in WarpCut.vars],
+            list(vars(core).values()),
+            [getattr(core.cut, name) for name in WarpCut.vars]
+            + [getattr(core.left, name) for name in Left.vars],
             core._slopes,
         ]  # fmt: skip
         sizes.append([sum(getattr(x, "capacity", 0) or 0 for x in part) for part in parts])

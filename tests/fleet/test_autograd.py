@@ -13,14 +13,18 @@ torch = pytest.importorskip("torch")
 
 @pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
 def test_gradients(device):
-    """Differential: a random sum of all entries, by every pose, to 2 % or 1 % of the largest."""
+    """Differential: a random sum of all entries, by every pose, to 2 % or 1 % of the largest.
+
+    On Warp gradients leave out what functions that are not solved for add: it is little of 128.
+    """
     from capsense.fleet.autograd import change
 
     if device != "cpu":
         pytest.importorskip("warp")
     fleet = Fleet(
-        "six_patch", [BODIES[0], BODIES[2]], 2, sensors=2, preset="standard", device=device
-    )
+        "six_patch", [BODIES[0], BODIES[2]], 2, sensors=2, preset="standard",
+        device=device, budget=128,
+    )  # fmt: skip
 
     def delta(poses):
         found = fleet.step(poses, sensors).delta

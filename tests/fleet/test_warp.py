@@ -24,19 +24,37 @@ def scenes():
     return [s for s in reference_scenes() if all(isinstance(b.shape, PRIMITIVES) for b in s.scene)]
 
 
+@pytest.fixture(scope="module")
+def simulator():
+    return cs.Simulator("six_patch_bare")
+
+
 @pytest.mark.parametrize(
-    ("budget", "single", "every"), [(32, 4.0, 8.0), (64, 1.5, 2.5), (128, 0.7, 1.0)]
+    ("budget", "single", "every", "close"),
+    [(32, 1.6, 4.2, 58), (64, 0.55, 1.0, 82), (128, 0.35, 0.45, 86)],
 )
-def test_errors_over_the_reference_map(scenes, budget, single, every):
-    """Measured: rms of the diagonal [%], of single bodies from 15 mm on, and of all scenes."""
+def test_errors_over_the_reference_map(scenes, simulator, budget, single, every, close):
+    """Measured: rms of the diagonal [%], of single bodies from 15 mm on, and of all scenes; how
+    many of these are within 1 % of ``Simulator.step``; and estimates over the errors."""
     fleet, where = fleet_of(scenes, device="warp:cpu", budget=budget)
-    delta = fleet.step(where).delta.numpy()[:, 0].astype(float)
+    reading = fleet.step(where)
+    delta = reading.delta.numpy()[:, 0].astype(float)
     errors = np.array(
         [100 * diagonal_errors(d, s.delta) for d, s in zip(delta, scenes, strict=True)]
     )
     far = [len(s.scene) == 1 and s.gap > 0.0149 for s in scenes]
     assert np.sqrt((errors[far] ** 2).mean()) < single
     assert np.sqrt((errors**2).mean()) < every
+    off = np.array(
+        [
+            np.abs(d - simulator.step(s.scene).delta).max()
+            for d, s in zip(delta, scenes, strict=True)
+        ]
+    )
+    assert (off < 0.01 * np.abs(delta).max(axis=(1, 2))).sum() >= close
+    estimate = reading.error.numpy()[:, 0]
+    bad = off > 0.02 * np.abs(delta).max(axis=(1, 2))
+    assert 0.5 < np.median(estimate[bad] / off[bad]) < 5.0 if bad.any() else budget == 128
     np.testing.assert_allclose(delta, delta.transpose(0, 2, 1), rtol=0, atol=1e-18)
 
 
@@ -44,19 +62,43 @@ def test_twin(scenes):
     """Differential: the same clusters in double precision. Of two that are equally large against
     their distance, as in symmetric bodies, rounding decides: the twin then follows."""
     fleet, where = fleet_of(scenes, device="warp:cpu")
-    delta, twin = fleet.step(where).delta.numpy()[:, 0], twin_of(fleet)
+    reading, twin = fleet.step(where), twin_of(fleet)
+    delta, error = reading.delta.numpy()[:, 0], reading.error.numpy()[:, 0]
     taken = fleet._warp.cut.number.numpy().reshape(fleet.places, 64, -1)
     with same_functions(64) as favoured:
         for e, (d, s) in enumerate(zip(delta, scenes, strict=True)):
             favoured[:] = taken[: len(s.scene), 1:, e]
-            truth = twin.step(s.scene).delta
-            assert np.abs(d - truth).max() < 1e-4 * np.abs(truth).max(), s.name
+            truth = twin.step(s.scene)
+            largest = np.abs(truth.delta).max()
+            assert np.abs(d - truth.delta).max() < 2e-5 * largest, s.name
+            assert error[e] == pytest.approx(truth.stats.solver_error, rel=1e-3), s.name
+
+
+def test_wide_bodies_near_contact():
+    """Differential: a plate of 150 mm, 0.3 to 2 mm above the electrodes. Its images are bounded."""
+    plate = cs.Body(cs.Box((0.15, 0.15, 0.02)), material="steel")
+    where = np.zeros((3, 1, 7))
+    where[..., 6], where[:, 0, :2] = 1.0, (0.003, 0.026)
+    where[:, 0, 2] = [0.0103, 0.011, 0.012]
+    fleet = Fleet("six_patch_bare", [plate], 3, device="warp:cpu")
+    reading, twin = fleet.step(where), twin_of(fleet)
+    taken = fleet._warp.cut.number.numpy().reshape(1, 64, -1)
+    with same_functions(64) as favoured:
+        for e in range(3):
+            favoured[:] = taken[:, 1:, e]
+            truth = twin.step(cs.Scene([plate.moved(cs.Pose(where[e, 0, :3]))]))
+            largest = np.abs(truth.delta).max()
+            assert np.abs(reading.delta.numpy()[e, 0] - truth.delta).max() < 1e-4 * largest
+            error = reading.error.numpy()[e, 0]
+            assert error == pytest.approx(truth.stats.solver_error, rel=1e-3)
 
 
 def test_long_bodies_are_cut():
-    """Differential: bodies that reach far out of the box, and how matrices change with them. The
-    energy of charge beyond a wall is less than in double precision, which is worth 3e-3 here; with
-    as much, rounding made an error of 3 %."""
+    """Differential: bodies that reach far out of the box, and how matrices change with them.
+
+    The charge on clusters beyond a wall costs so much energy that it hides what is in reach, in
+    single precision, unless functions are chosen for it: that made 5e-3.
+    """
     fleet, (where, sensors) = Fleet("six_patch", LONG, 3, device="warp:cpu"), long_poses()
     found, twin = fleet.step(where, sensors, jacobian=True), twin_of(fleet)
     taken = fleet._warp.cut.number.numpy().reshape(3, 64, -1)
@@ -67,7 +109,7 @@ def test_long_bodies_are_cut():
             for name in ("delta", "jacobian"):
                 wanted = getattr(truth, name)
                 miss = np.abs(getattr(found, name).numpy()[e, 0] - wanted).max()
-                assert miss < 5e-3 * np.abs(wanted).max()
+                assert miss < 1e-4 * np.abs(wanted).max()
 
 
 def test_several_sensors_places_and_matter():
@@ -190,7 +232,7 @@ def test_captured_steps():
         wp.capture_launch(capture.graph)
         truth = other.step(where, frame, time=0.1 * k, jacobian=True)
         assert truth.delta.numpy().any()
-        for name in ("capacitance", "delta", "conductance", "shield_coupling", "jacobian"):
+        for name in ("capacitance", "delta", "error", "conductance", "shield_coupling", "jacobian"):
             np.testing.assert_array_equal(getattr(found, name), getattr(truth, name))
         for name in ("code", "capacitance", "age"):
             np.testing.assert_array_equal(getattr(found.held, name), getattr(truth.held, name))
@@ -232,7 +274,9 @@ def test_functions_that_add_nothing_are_left_out(lossy):
     assert found == pytest.approx(truth, rel=1e-5)
 
 
-MODULES = ["warp_cut", "warp_kernels", "warp_solve", "warp_slope", "warp_chip_kernels"]
+MODULES = [
+    "warp_cut", "warp_kernels", "warp_solve", "warp_left", "warp_slope", "warp_chip_kernels",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -38,19 +38,29 @@ def apart(rng, count=COUNT):
 
 
 def against_twin(fleet, bodies, where, sensors):
-    """Largest differences of delta and conductance to a simulator with the same functions."""
+    """Largest differences of delta, conductance and error to a simulator with the same functions.
+
+    Each is over the largest of its kind. Errors are compared where nothing is out of reach: the
+    core counts the energy of charge that is, so that its estimate means nothing there.
+    """
     reading = fleet.step(where, sensors)
-    worst = np.zeros(2)
+    worst = np.zeros(3)
     twin = twin_of(fleet)
     with same_functions(64):
         for e, s in np.ndindex(sensors.shape[:2]):
             truth = twin.step(scene(bodies, where[e], sensors[e, s]))
             loss = np.zeros((1, 1)) if truth.conductance is None else truth.conductance
+            walled = fleet._warp.cut.walled.numpy()[e * sensors.shape[1] + s]
             for k, (found, wanted) in enumerate(
-                ((reading.delta, truth.delta), (reading.conductance, loss))
-            ):
+                (
+                    (reading.delta, truth.delta), (reading.conductance, loss),
+                    (reading.error, truth.stats.solver_error),
+                )
+            ):  # fmt: skip
                 largest = max(np.abs(wanted).max(), 1e-30)
                 miss = np.abs(found.numpy()[e, s] - wanted).max() / largest
+                if k == 2 and walled:
+                    continue
                 worst[k] = max(worst[k], miss)
     return worst
 
@@ -60,7 +70,7 @@ def test_lossy_matter_on_warp():
     rng = np.random.default_rng(1)
     where, sensors = apart(rng), frames(rng, COUNT, 2)
     fleet = Fleet("six_patch", LOSSY, COUNT, sensors=2, device="warp:cpu", budget=64)
-    assert (against_twin(fleet, LOSSY, where, sensors) < 1e-4).all()
+    assert (against_twin(fleet, LOSSY, where, sensors) < [1e-4, 1e-4, 1e-3]).all()
 
 
 def test_lossy_matter_on_the_cpu():
@@ -102,7 +112,7 @@ def test_floating_conductors_of_the_design(monkeypatch):
     rng = np.random.default_rng(5)
     where, sensors = apart(rng), frames(rng, COUNT, 2)
     fleet = Fleet(design, LOSSY, COUNT, sensors=2, device="warp:cpu", budget=64)
-    assert (against_twin(fleet, LOSSY, where, sensors) < 1e-4).all()
+    assert (against_twin(fleet, LOSSY, where, sensors) < [1e-4, 1e-4, 1e-3]).all()
     assert fleet.step(where, sensors).delta.shape == (COUNT, 2, 5, 5)
 
 
@@ -137,7 +147,9 @@ def test_joined_conductors(device, kind):
             assert np.abs(found[e, 0] - truth).max() < 1e-5 * np.abs(truth).max()
     else:
         found = fleet.step(where, sensors).delta.numpy()
-        assert against_twin(fleet, bodies, where, sensors)[0] < 1e-4
+        worst = against_twin(fleet, bodies, where, sensors)
+        assert worst[0] < 1e-4
+        assert worst[2] < 1e-3
     assert (np.abs(found - alone) / np.abs(found)).max() > 0.1
 
 

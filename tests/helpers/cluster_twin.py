@@ -14,13 +14,18 @@ import capsense as cs
 from capsense.elements.rigid import INSIDE
 from capsense.field.green_kernels import Green
 from capsense.surface import step
-from capsense.surface.choose_kernels import Cut, functions_of
+from capsense.surface.choose_kernels import Cut, Functions, functions_of
 from capsense.surface.leaf_kernels import leaf_rows, placed
-from capsense.surface.pair_kernels import leaf_pairs
-from capsense.surface.solve_kernels import assembled, leaf_charges, reduced
+from capsense.surface.pair_kernels import BARRIER, bound_images, leaf_pairs
+from capsense.surface.solve_kernels import System, assembled, leaf_charges, reduced
 from capsense.surface.solver import PackedBodies, SurfaceSolver, View
 
 Array = NDArray[np.float64]
+
+
+def _smooth(x: Array) -> Array:
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
 def cut_of(
@@ -28,7 +33,10 @@ def cut_of(
 ) -> Cut:
     """Clusters by what is largest against its distance from the design, ``count`` for each body.
 
-    Of clusters that are as large to 1e-5, those are split whose functions are ``favoured``.
+    What crosses a wall counts as larger, by twice its share of the body's length.
+    Those that are not split have one function more, which is not solved for, and are represented by
+    themselves none the less. Of clusters that are as large to 1e-5, those are split whose functions
+    are ``favoured``.
     """
     rows: list[tuple] = []
     leaves: list[int] = []
@@ -38,6 +46,10 @@ def cut_of(
         away = np.linalg.norm(np.maximum(np.maximum(low - center, center - high), 0.0), axis=1)
         size = body["scale"] * tree.extent
         need = np.where(tree.kids[:, 0] < 0, 0.0, size / (np.maximum(away, 0.5 * size) + 1e-3))
+        room = np.minimum((center - green.room[0]).min(1), (green.room[1] - center).min(1))
+        crossing = _smooth(2.0 - 4.0 * np.abs(room) / (size + 1e-9))
+        crossing *= _smooth((size - 0.03) / 0.03) * tree.extent / tree.extent[0]
+        need += np.where(tree.kids[:, 0] < 0, 0.0, 2.0 * crossing)
         if favoured:
             need *= 1.0 + 1e-5 * np.isin(tree.function, favoured[b])
         heap, split = [(-need[0], 0)], set()
@@ -46,19 +58,36 @@ def cut_of(
             split.add(k)
             for part in tree.kids[k].tolist():
                 heapq.heappush(heap, (-need[part], part))
-        used = sorted(split | {part for _, part in heap})
+        ends = {k for _, k in heap}
+        below = {part for k in ends for part in tree.kids[k].tolist() if part >= 0}
+        used = sorted(split | ends | below)
         place = {k: len(rows) + i for i, k in enumerate(used)}
         for k in used:
-            if k in split:
+            whole, fade, above = float(k not in split), float(k in split), float(k not in below)
+            leaf, kids, share = -1, (-1, -1), 0.0
+            if k in split or (k in ends and tree.kids[k, 0] >= 0):
                 x, y = tree.kids[k].tolist()
-                rows.append((b, k, place[x], place[y], tree.charge[x] / tree.charge[k], -1))
-            else:
-                rows.append((b, k, -1, -1, 0.0, len(leaves)))
+                kids, share = (place[x], place[y]), tree.charge[x] / tree.charge[k]
+            if k not in split:
+                leaf = len(leaves)
                 leaves.append(place[k])
-    body, node, first, second, share, leaf = (np.array(c) for c in zip(*rows, strict=True))
+            rows.append((b, k, *kids, share, leaf, whole, fade, above))
+    body, node, first, second, share, leaf, whole, fade, above = (
+        np.array(c) for c in zip(*rows, strict=True)
+    )
     kids = np.stack([first, second], axis=1)
-    whole, fade = (first < 0).astype(float), np.ones(len(rows))
-    return Cut(body, node, kids, share, leaf, whole, fade, fade.copy(), np.array(leaves))
+    return Cut(body, node, kids, share, leaf, whole, fade, above, np.array(leaves))
+
+
+def _add_barrier(cut: Cut, functions: Functions, system: System, beyond: Array) -> None:
+    """Add the energy of charge that is out of reach; with pairs, in single precision, it would hide
+    1e-3 of a matrix."""
+    total, n = len(system.own), functions.solved
+    on = leaf_charges(cut, functions, np.eye(total), len(beyond)).T
+    energy = (on * BARRIER * beyond**3) @ on.T
+    system.matrix[:] += energy[:n, :n]
+    system.rest[:] += energy[n:, :n]
+    system.own[:] += np.diag(energy)
 
 
 @contextmanager
@@ -69,26 +98,38 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         A list for the numbers of the functions of each body that are taken where two clusters are
         equally large.
     """
-    trees: list = []
+    shapes: list = []
     favoured: list[Array] = []
     pack = SurfaceSolver.pack
 
     def packed(solver: SurfaceSolver, view: View) -> PackedBodies:
         out = pack(solver, view)
-        trees[:] = [shape.tree for shape in out.shapes]
+        shapes[:] = out.shapes
         return out
 
     def prepared(bodies: NDArray[np.void], green: Green, *_: float) -> tuple:
-        cut = cut_of(green, bodies, trees, count, favoured)
+        cut = cut_of(green, bodies, [shape.tree for shape in shapes], count, favoured)
         leaves = placed(bodies, cut, green, INSIDE)
         rows = leaf_rows(leaves.points, leaves.beyond, green)
         functions = functions_of(bodies, cut)
-        pairs = leaf_pairs(leaves, green.floor)
-        return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
+        inside = leaves._replace(beyond=np.zeros_like(leaves.beyond))
+        pairs = leaf_pairs(inside, green.floor)
+        bound_images(leaves, rows, pairs, green)
+        system = assembled(bodies, cut, functions, rows, pairs, green.lead)
+        for f in range(functions.solved, len(system.own)):
+            body, x = bodies[functions.body[f]], functions.number[f]
+            shape = shapes[functions.body[f]]
+            own = shape.energy[x, x]
+            if body["impedance"] != 0:
+                own = own + body["softness"] * shape.impedance[x, x]
+            system.own[f] = own / body["scale"]
+        _add_barrier(cut, functions, system, leaves.beyond)
+        return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
         cut, leaves, functions, system = prepared(bodies, green)
-        delta, left, coarse, x, shift = reduced(cut, functions, system, others[2])
+        delta, left, coarse, x, shift = reduced(cut, functions, system, False)
+        x[functions.solved :] = 0.0  # Jacobians leave out what these add
         charge = leaf_charges(cut, functions, x, len(leaves.points))
         m = green.terminals
         return step.Solution(

@@ -283,7 +283,7 @@ class Fleet:
         core = self._warp
         core.solve(where, at)
         return FleetReading(
-            core.capacitance, core.delta, shield_coupling=core.shields,
+            core.capacitance, core.delta, core.error, shield_coupling=core.shields,
             conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
         )  # fmt: skip
 

@@ -25,8 +25,8 @@ class FleetReading:
     """Maxwell capacitance matrices [F], shape (e, s, n, n)."""
     delta: Any
     """Their change by the bodies [F], shape (e, s, n, n)."""
-    error: Array | None = None
-    """Estimated error of the largest entry [F], shape (e, s); None on Warp."""
+    error: Any = None
+    """Estimated error of the largest entry [F], shape (e, s)."""
     shield_coupling: Any = None
     """Charge on each electrode per volt on all shields together [F], shape (e, s, n), in double
     precision."""

@@ -15,6 +15,7 @@ from capsense.errors import SceneError
 from capsense.field.change import Terminals
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
+from capsense.fleet import warp_left as left
 from capsense.fleet import warp_slope as slope
 from capsense.fleet import warp_solve as solution
 from capsense.fleet.reading import on_device
@@ -53,11 +54,12 @@ class WarpCore:
         cut.moved = room(places, views, dtype=wp.vec3)
         for name in ("node", "split", "number", "lifted"):
             setattr(cut, name, room(n, views, dtype=wp.int32))
-        for name in ("score", "part", "extent", "soft", "beyond", "near"):
+        for name in ("score", "part", "mix", "weight", "ends", "extent", "soft", "beyond", "near"):
             setattr(cut, name, room(n, views))
         cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
         cut.leader = room(places, views, dtype=wp.int32)
         cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
+        cut.width, cut.walled = (room(views, dtype=wp.int32) for _ in range(2))
         self.cut = cut
         passes, t = self.green.near_table.shape[1], self.green.terminals
         self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
@@ -67,7 +69,8 @@ class WarpCore:
             room(environments, sensors, m, m) for _ in range(3)
         )
         self.shields = room(environments, sensors, m, dtype=wp.float64)
-        self.dropped = room(views, dtype=wp.int32)
+        self.error = room(environments, sensors)
+        self.left = self._left(n, t, views)
         self.poses = room(environments, places, dtype=wp.transform)
         self.frames = room(environments, sensors, dtype=wp.transform)
         self.worlds = wp.clone(self.frames)
@@ -86,6 +89,19 @@ class WarpCore:
     def room(self, *shape: int, dtype: Any = wp.float32) -> Any:
         """An array of zeros on the device."""
         return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    def _left(self, n: int, t: int, views: int) -> Any:
+        """Room for charges and what they leave."""
+        out, green, room = solution.Left(), self.green, self.room
+        columns = 2 * green.lead
+        out.charge, out.on, out.residual = (room(n, columns, views) for _ in range(3))
+        out.sums = room(self.rows.shape[1] - green.lead, columns, views)
+        out.near, out.far = (
+            room(len(sources), columns, views) for sources in (green.near, green.far)
+        )
+        out.energy, out.doubt = room(n, views, dtype=wp.vec2), room(t, views)
+        out.dropped = room(views, dtype=wp.int32)
+        return out
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
         """Take over what stands where, in the memory that there is; new shapes take new memory."""
@@ -115,7 +131,8 @@ class WarpCore:
         count, k, places = self.counts[2], self.clusters, self.counts[1]
         bodies = as_transforms(bodies, self.poses)
         sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
-        views, n, t = self.dropped.size, self.cut.node.shape[0], self.circuit.rest.shape[0]
+        n, views = self.cut.node.shape
+        t = self.green.terminals
         green, cut, circuit = self.green, self.cut, self.circuit
         at = (self.shapes, self.places)
         rows, matrix, whole = self.rows, self.matrix, self.whole
@@ -123,48 +140,71 @@ class WarpCore:
         self.launch(warp_cut.choose, (places, views), *at, green, bodies, sensors, k, cut)
         self.launch(warp_cut.connect, views, self.places, count, k, cut)
         self.launch(warp_cut.place, (n, views), *at, green, count, k, cut)
+        self.launch(warp_cut.weigh, views, *at, green, k, cut)
         self.launch(kernels.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
+        turned = matrix.transpose((1, 0, 2))
+        self.launch(kernels.energies, (n, n, views), *at, cut, k, matrix)
+        for values in (matrix, turned):
+            self.launch(kernels.from_functions, (n, views), cut, k, values)
         self.launch(kernels.pairs, (n, n, views), green, cut, k, matrix)
-        self.launch(kernels.to_functions, (width, views), cut, k, rows)
-        self.launch(kernels.to_functions, (n, views), cut, k, matrix)
-        self.launch(kernels.to_functions, (n, views), cut, k, matrix.transpose((1, 0, 2)))
+        self.launch(kernels.bound_images, (n, views), green, cut, rows, matrix)
+        self.launch(kernels.to_functions, (width, views), cut, k, 1, rows)
+        for values in (matrix, turned):
+            self.launch(kernels.to_functions, (n, views), cut, k, 0, values)
         self.launch(
             kernels.assemble, (n, n, views), *at, cut, count, k, green.lead, rows, matrix, self.loss
         )
-        self.launch(solution.factorise, views, cut, matrix, self.dropped)
-        self.launch(solution.factorise_lossy, views, cut, matrix, self.loss, self.dropped)
-        self.launch(solution.forward, (t, views), cut, matrix, self.loss, rows, self.quadrature)
-        self.launch(solution.change, (t, t, views), circuit, rows, self.quadrature, whole)
+        rest, loss, quadrature = self.left, self.loss, self.quadrature
+        self.launch(solution.factorise, views, cut, matrix, rest.dropped)
+        self.launch(solution.factorise_lossy, views, cut, matrix, loss, rest.dropped)
+        self.launch(solution.forward, (t, views), cut, matrix, loss, rows, quadrature)
+        self._look_below(count)
+        self.launch(solution.change, (t, t, views), circuit, cut, rows, quadrature, rest, whole)
         self.launch(solution.eliminate, views, circuit, whole)
         self.launch(
             solution.report, (circuit.electrodes, views), circuit, self._omega, whole,
-            self.capacitance, self.delta, self.conductance, self.shields,
+            self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
+        )  # fmt: skip
+
+    def _look_below(self, sensors: int) -> None:
+        """Charges, and the potentials that they leave in functions that are not solved for."""
+        cut, green, rest, k = self.cut, self.green, self.left, self.clusters
+        (n, columns, views), lead, t = rest.charge.shape, green.lead, green.terminals
+        launch, modes = self.launch, rest.sums.shape[0]
+        solved = self.matrix, self.loss, self.rows, self.quadrature
+        launch(left.charges, (t, views), cut, lead, *solved, rest.charge)
+        launch(left.coarse, (t, views), cut, self.matrix, self.loss, rest.charge, rest.doubt)
+        parts = columns // left.COLUMNS
+        launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, rest.sums)
+        for table, to in ((green.near_columns, rest.near), (green.far_columns, rest.far)):
+            launch(
+                left.strengths, (table.shape[1], columns, views), cut, lead, table, rest.sums, to
+            )
+        launch(left.to_clusters, (columns, views), cut, k, lead, rest.charge, rest.on)
+        launch(
+            left.residuals, (n, parts, views), self.shapes, self.places, green,
+            cut, k, rest.charge, rest.on, rest.near, rest.far, rest.residual, rest.energy,
         )  # fmt: skip
 
     def differentiate(self) -> Any:
         """Derivatives of the last matrices [F/m], [F/rad], shape (e, s, b, n, n, 6)."""
         environments, places, sensors = self.counts
-        n, views = self.cut.node.shape[:2]
-        circuit, green, cut, k = self.circuit, self.green, self.cut, self.clusters
-        m, t, width = circuit.electrodes, circuit.rest.shape[0], self.rows.shape[1] - green.lead
+        n, views = self.cut.node.shape
+        circuit, green, cut, k, rest = self.circuit, self.green, self.cut, self.clusters, self.left
+        m, t = circuit.electrodes, green.terminals
         if self._slopes is None:
-            near, far = green.near.shape[0], green.far.shape[0]
-            shapes = (t, m, views), (width, m, views), (near, m, views), (far, m, views)
             self._slopes = [
-                *(self.room(*shape) for shape in shapes),
+                *(self.room(rows, m, views) for rows in (t, n, len(green.near), len(green.far))),
                 self.room(n, m, views, dtype=wp.spatial_vector),
                 self.room(views, places, m, m, dtype=wp.spatial_vector),
             ]
-        turn, sums, near, far, pull, out = self._slopes
-        launch, rows = self.launch, self.rows
+        turn, charge, near, far, pull, out = self._slopes
+        launch = self.launch
         launch(slope.follow, (m, views), circuit, self.whole, turn)
-        launch(slope.charges, (m, views), circuit, self.matrix, turn, rows)
-        launch(slope.modes, (width, m, views), green.lead, rows, sums)
-        for table, to in ((green.near_table, near), (green.far_table, far)):
-            launch(slope.strengths, to.shape, table, green.lead, turn, sums, to)
-        launch(slope.to_clusters, (m, views), cut, k, rows)
-        launch(slope.forces, (n, m, views), green, cut, k, rows, near, far, pull)
-        launch(slope.slopes, (places, m, views), circuit, cut, k, rows, pull, out)
+        for values, to in ((rest.on, charge), (rest.near, near), (rest.far, far)):
+            launch(slope.followed, to.shape, circuit, turn, values, to)
+        launch(slope.forces, (n, m, views), green, cut, k, charge, near, far, pull)
+        launch(slope.slopes, (places, m, views), circuit, cut, k, charge, pull, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
@@ -230,6 +270,11 @@ def _response(solver: SurfaceSolver, device: Any) -> Any:
         parts = np.ascontiguousarray(table.reshape(len(table), -1, warp_cut.WIDTH))
         setattr(out, name, wp.array(sources, dtype=wp.vec3, device=device))
         setattr(out, f"{name}_table", wp.array(parts, dtype=warp_cut.row, device=device))
+        batches = -(-len(table) // warp_cut.SOURCES)
+        turned = np.zeros((table.shape[1], batches * warp_cut.SOURCES), np.float32)
+        turned[:, : len(table)] = table.T
+        turned = turned.reshape(table.shape[1], batches, warp_cut.SOURCES)
+        setattr(out, f"{name}_columns", wp.array(turned, dtype=warp_cut.many, device=device))
     out.lead, out.terminals, out.middle = green.lead, green.terminals, wp.vec3(*solver.middle)
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blend.tolist()

@@ -14,18 +14,25 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import DEEP, GAP, SHORE, STEEP
-from capsense.surface.pair_kernels import LIFTED
+from capsense.surface.choose_kernels import _LONG as LONG
+from capsense.surface.pair_kernels import BARRIER, LIFTED
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 WIDTH = 64
 """Columns of a table that a thread works out at a time."""
 row = wp.types.vector(length=WIDTH, dtype=wp.float32)
+SOURCES = 16
+"""Sources that a thread works out at a time."""
+many = wp.types.vector(length=SOURCES, dtype=wp.float32)
 
+_WIDTH = wp.constant(WIDTH)
 _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
+_CROSSING = wp.constant(2.0)
+_LONG0, _LONG1 = (wp.constant(x) for x in LONG)
 _GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in GAP)
-_LIFTED = wp.constant(LIFTED)
+_LIFTED, _BARRIER = wp.constant(LIFTED), wp.constant(BARRIER)
 _DEEP, _STEEP, _SHORE = wp.constant(DEEP), wp.constant(STEEP), wp.constant(SHORE)
 
 
@@ -70,6 +77,8 @@ class Response:
     near_table: wp.array2d(dtype=row)  # (sources, passes)
     far: wp.array(dtype=wp.vec3)
     far_table: wp.array2d(dtype=row)
+    near_columns: wp.array2d(dtype=many)  # the same tables, (columns, batches of sources)
+    far_columns: wp.array2d(dtype=many)
     lead: wp.int32
     terminals: wp.int32
     floor: wp.float32
@@ -93,7 +102,11 @@ class WarpCut:
     score: wp.array2d(dtype=wp.float32)
     split: wp.array2d(dtype=wp.int32)  # place of the cluster that was split for this one, (n, v)
     part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
+    mix: wp.array2d(dtype=wp.float32)  # the same in the functions solved for, see weigh, (n, v)
+    weight: wp.array2d(dtype=wp.float32)
+    walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
+    ends: wp.array2d(dtype=wp.float32)  # which part of its two parts are panels, (n, v)
     points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
     unlifted: wp.array3d(dtype=wp.vec3)  # the same before they were lifted off the design
     lifted: wp.array2d(dtype=wp.int32)  # whether they were, (n, v)
@@ -104,10 +117,30 @@ class WarpCut:
     leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
     tie: wp.array2d(dtype=wp.vec2)  # energy of the net charge of the leader and all others, (b, v)
     lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
+    width: wp.array(dtype=wp.int32)  # columns of φ⁰ and ψ that are not zero, (v,)
+
+
+@wp.struct
+class Leaf:
+    """One cluster in the sensor frame."""
+
+    p0: wp.vec3
+    p1: wp.vec3
+    p2: wp.vec3
+    p3: wp.vec3
+    u0: wp.vec3  # the same before they were lifted off the design
+    u1: wp.vec3
+    u2: wp.vec3
+    u3: wp.vec3
+    lifted: wp.int32
+    extent: wp.float32
+    soft: wp.float32
+    beyond: wp.float32
+    near: wp.float32
 
 
 @wp.func
-def _smooth(x: float):
+def smooth(x: float):
     y = wp.clamp(x, 0.0, 1.0)
     return y * y * (3.0 - 2.0 * y)
 
@@ -123,14 +156,25 @@ def _off(p: wp.vec3, low: wp.vec3, high: wp.vec3):
 
 
 @wp.func
-def _need(shapes: Shapes, green: Response, at: wp.transform, scale: float, node: int):
-    """Extent of a cluster over its distance from the design; 0 for a single panel."""
+def _need(
+    shapes: Shapes, green: Response, at: wp.transform, scale: float, first: int, node: int
+):  # fmt: skip
+    """Extent of a cluster over its distance from the design; 0 for a single panel.
+
+    Where it crosses a wall, ``_CROSSING`` times its share of the body's length is added.
+    """
     if shapes.kids[node, 0] < 0:
         return float(0.0)
     size = scale * shapes.extent[node]
     p = wp.transform_point(at, scale * shapes.center[node])
     away = wp.length(_off(p, green.box0, green.box1))
-    return size / (wp.max(away, _HALF * size) + _NEAREST)
+    low = p - green.room0
+    high = green.room1 - p
+    room = wp.min(wp.min(wp.min(low[0], low[1]), low[2]), wp.min(wp.min(high[0], high[1]), high[2]))
+    crossing = smooth(2.0 - 4.0 * wp.abs(room) / (size + 1e-9))
+    crossing = crossing * smooth((size - _LONG0) / (_LONG1 - _LONG0))
+    crossing = crossing * shapes.extent[node] / shapes.extent[first]
+    return size / (wp.max(away, _HALF * size) + _NEAREST) + _CROSSING * crossing
 
 
 @wp.kernel
@@ -147,6 +191,7 @@ def choose(
     for j in range(clusters):
         cut.node[o + j, v] = -1
         cut.number[o + j, v] = -1
+    cut.ends[o, v] = 0.0
     if u < 0 or places.hidden[s, b] != 0:
         return
     at = wp.transform_multiply(wp.transform_inverse(sensors[e, s]), bodies[e, b])
@@ -162,7 +207,7 @@ def choose(
         return
     first = shapes.first[u]
     cut.node[o, v] = first
-    cut.score[o, v] = _need(shapes, green, at, scale, first)
+    cut.score[o, v] = _need(shapes, green, at, scale, first, first)
     for j in range(1, clusters):
         best = int(0)
         most = float(0.0)
@@ -177,10 +222,13 @@ def choose(
             cut.split[o + j, v] = best
             cut.part[o + j, v] = shapes.charge[x] / shapes.charge[k]
             cut.number[o + j, v] = shapes.function[k]
+            cut.ends[o + j, v] = wp.where(shapes.kids[x, 0] < 0, 0.5, 0.0) + wp.where(
+                shapes.kids[y, 0] < 0, 0.5, 0.0
+            )
             cut.node[o + best, v] = x
             cut.node[o + j, v] = y
-            cut.score[o + best, v] = _need(shapes, green, at, scale, x)
-            cut.score[o + j, v] = _need(shapes, green, at, scale, y)
+            cut.score[o + best, v] = _need(shapes, green, at, scale, first, x)
+            cut.score[o + j, v] = _need(shapes, green, at, scale, first, y)
         else:
             cut.score[o + j, v] = 0.0
 
@@ -259,45 +307,101 @@ def _lift(p: wp.vec3, gap: float, green: Response):
     return q
 
 
-@wp.kernel
-def place(
-    shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
-):
-    """Points of all clusters in the sensor frame, and where they stand to design and walls."""
-    i, v = wp.tid()
-    k = cut.node[i, v]
-    if k < 0:
-        return
-    b = i // clusters
-    scale = places.scale[v // sensors, b]
-    at = cut.pose[b, v]
+@wp.func
+def placed(shapes: Shapes, green: Response, at: wp.transform, scale: float, k: int):
+    """A cluster of a shape in the sensor frame, and where it stands to design and walls."""
+    out = Leaf()
     size = scale * shapes.extent[k]
-    p0 = wp.transform_point(at, scale * shapes.points[k, 0])
-    p3 = wp.transform_point(at, scale * shapes.points[k, 3])
-    c = 0.5 * (p0 + p3)
-    out = wp.length(_off(c, green.room0, green.room1))
+    out.u0 = wp.transform_point(at, scale * shapes.points[k, 0])
+    out.u1 = wp.transform_point(at, scale * shapes.points[k, 1])
+    out.u2 = wp.transform_point(at, scale * shapes.points[k, 2])
+    out.u3 = wp.transform_point(at, scale * shapes.points[k, 3])
+    c = 0.5 * (out.u0 + out.u3)
+    off = wp.length(_off(c, green.room0, green.room1))
     deep = float(0.0)
+    out.p0 = out.u0
+    out.p1 = out.u1
+    out.p2 = out.u2
+    out.p3 = out.u3
     if green.cover < 1.0:
         depth = wp.min(1.0, green.box1[2] - c[2])
         for d in range(2):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
             depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
         deep = depth - _DEEP
-    cut.beyond[i, v] = _smooth(wp.max(out, deep) / _SHORE)
-    gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
-    lifted = int(0)
-    for q in range(4):
-        p = wp.transform_point(at, scale * shapes.points[k, q])
-        cut.unlifted[i, q, v] = p
-        if green.cover < 1.0:
-            to = _lift(p, gap, green)
-            if wp.length(to - p) > _LIFTED:
-                lifted = 1
-            p = to
-        cut.points[i, q, v] = p
-    cut.lifted[i, v] = lifted
-    cut.extent[i, v] = size
-    cut.soft[i, v] = scale * shapes.soft[k]
-    middle = 0.5 * (cut.points[i, 0, v] + cut.points[i, 3, v])
-    away = wp.length(_off(middle, green.box0, green.box1))
-    cut.near[i, v] = _smooth((green.blend1 - away) / (green.blend1 - green.blend0))
+        gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
+        out.p0 = _lift(out.u0, gap, green)
+        out.p1 = _lift(out.u1, gap, green)
+        out.p2 = _lift(out.u2, gap, green)
+        out.p3 = _lift(out.u3, gap, green)
+        way = wp.max(wp.length(out.p0 - out.u0), wp.length(out.p1 - out.u1))
+        way = wp.max(way, wp.max(wp.length(out.p2 - out.u2), wp.length(out.p3 - out.u3)))
+        out.lifted = wp.where(way > _LIFTED, 1, 0)
+    out.beyond = smooth(wp.max(off, deep) / _SHORE)
+    out.extent = size
+    out.soft = scale * shapes.soft[k]
+    away = wp.length(_off(0.5 * (out.p0 + out.p3), green.box0, green.box1))
+    out.near = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
+    return out
+
+
+@wp.kernel
+def place(
+    shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
+):
+    """Place all clusters in the sensor frame."""
+    i, v = wp.tid()
+    k = cut.node[i, v]
+    if k < 0:
+        return
+    b = i // clusters
+    leaf = placed(shapes, green, cut.pose[b, v], places.scale[v // sensors, b], k)
+    cut.points[i, 0, v] = leaf.p0
+    cut.points[i, 1, v] = leaf.p1
+    cut.points[i, 2, v] = leaf.p2
+    cut.points[i, 3, v] = leaf.p3
+    cut.unlifted[i, 0, v] = leaf.u0
+    cut.unlifted[i, 1, v] = leaf.u1
+    cut.unlifted[i, 2, v] = leaf.u2
+    cut.unlifted[i, 3, v] = leaf.u3
+    cut.lifted[i, v] = leaf.lifted
+    cut.extent[i, v] = leaf.extent
+    cut.soft[i, v] = leaf.soft
+    cut.beyond[i, v] = leaf.beyond
+    cut.near[i, v] = leaf.near
+
+
+@wp.kernel
+def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: WarpCut):
+    """How many columns a view needs, and how its functions share charge among their parts.
+
+    Fewer columns do where no cluster is near the design. Where clusters are out of reach, functions
+    have so little charge on them that its energy, far above all others, hides nothing in single
+    precision: in place of the equilibrium charge, one that goes like it over that energy. Together
+    they stand for the same charges. With losses they stay as they are.
+    """
+    v = wp.tid()
+    passes = green.far_table.shape[1]
+    walled = int(0)
+    for i in range(cut.node.shape[0]):
+        k = cut.node[i, v]
+        if k >= 0:
+            if cut.near[i, v] > 0.0:
+                passes = green.near_table.shape[1]
+            x = cut.beyond[i, v]
+            walled = wp.where(x > 0.0 and cut.lossy[v] == 0, 1, walled)
+            stiff = _BARRIER * x * x * x * cut.extent[i, v]
+            cut.weight[i, v] = shapes.charge[k] / (1.0 + stiff)
+    cut.width[v] = _WIDTH * passes
+    cut.walled[v] = walled
+    for b in range(places.group.shape[0]):
+        o = b * clusters
+        for step in range(clusters - 1):
+            j = o + clusters - 1 - step
+            if cut.number[j, v] >= 0:
+                cut.mix[j, v] = cut.part[j, v]
+                if walled != 0:
+                    i = o + cut.split[j, v]
+                    whole = cut.weight[i, v] + cut.weight[j, v]
+                    cut.mix[j, v] = cut.weight[i, v] / whole
+                    cut.weight[i, v] = whole

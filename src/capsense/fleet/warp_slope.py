@@ -2,7 +2,8 @@
 
 The twin of these kernels is :mod:`capsense.surface.gradient_kernels`. Charges x = A⁻¹ Φ are held
 while they move in the field of the other charges, of all images and of the design; what changes
-with the share of near sources or with the lift off the design is left out, as there. Floating
+with the share of near sources or with the lift off the design is left out, as there. What functions
+that are not solved for add is left out too, which the CPU follows. Floating
 conductors of the design follow: columns are of electrodes, what floats mixed in. Lengths in
 metres, 4π eps0 = 1.
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
-from capsense.fleet.warp_cut import WIDTH, Response, WarpCut
+from capsense.fleet.warp_cut import Response, WarpCut
 from capsense.fleet.warp_kernels import bound
 from capsense.fleet.warp_solve import Circuit
 from capsense.surface.pair_kernels import FAR
@@ -21,7 +22,6 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 _FAR = wp.constant(FAR)
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
-_WIDTH = wp.constant(WIDTH)
 
 
 @wp.kernel
@@ -45,75 +45,16 @@ def follow(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d), out: wp.array3d(
 
 
 @wp.kernel
-def charges(
-    circuit: Circuit, matrix: wp.array3d(dtype=wp.float32), turn: wp.array3d(dtype=wp.float32),
-    potentials: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
-    """Replace L⁻¹ φ⁰ of the functions by their charges L⁻ᵀ L⁻¹ φ⁰ for each electrode at 1 V."""
-    j, v = wp.tid()
-    n = matrix.shape[0]
-    for f in range(n):
-        value = potentials[f, j, v]
-        for a in range(circuit.driven, turn.shape[0]):
-            value += potentials[f, a, v] * turn[a, j, v]
-        potentials[f, j, v] = value
-    for step in range(n):
-        i = n - 1 - step
-        total = potentials[i, j, v]
-        for k in range(i + 1, n):
-            total -= matrix[k, i, v] * potentials[k, j, v]
-        potentials[i, j, v] = 0.0
-        if matrix[i, i, v] > 0.0:
-            potentials[i, j, v] = total / matrix[i, i, v]
-
-
-@wp.kernel
-def modes(lead: int, rows: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):
-    """Sums of ψ over all charges, (modes, n, v)."""
-    k, j, v = wp.tid()
-    total = float(0.0)
-    for f in range(rows.shape[0]):
-        total += rows[f, lead + k, v] * rows[f, j, v]
-    out[k, j, v] = total
-
-
-@wp.kernel
-def strengths(
-    table: wp.array2d(dtype=wp.types.vector(length=WIDTH, dtype=wp.float32)), lead: int,
-    turn: wp.array3d(dtype=wp.float32), sums: wp.array3d(dtype=wp.float32),
+def followed(
+    circuit: Circuit, turn: wp.array3d(dtype=wp.float32), values: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Strength of the design's sources, electrode j at 1 V and charges in place, (s, n, v)."""
-    s, j, v = wp.tid()
-    total = float(0.0)
-    for a in range(turn.shape[0]):
-        total += table[s, a // _WIDTH][a % _WIDTH] * turn[a, j, v]
-    for k in range(wp.min(sums.shape[0], table.shape[1] * _WIDTH - lead)):
-        c = lead + k
-        total += table[s, c // _WIDTH][c % _WIDTH] * sums[k, j, v]
-    out[s, j, v] = total
-
-
-@wp.kernel
-def to_clusters(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.float32)):
-    """Charges of clusters from those of functions, in place."""
-    j, v = wp.tid()
-    for step in range(cut.leader.shape[0]):
-        b = cut.leader.shape[0] - 1 - step
-        o = b * clusters
-        leader = cut.leader[b, v]
-        if leader != b:
-            values[leader * clusters, j, v] -= values[o, j, v]
-    for b in range(cut.leader.shape[0]):
-        o = b * clusters
-        for k in range(1, clusters):
-            if cut.number[o + k, v] >= 0:
-                i = o + cut.split[o + k, v]
-                whole = values[i, j, v]
-                apart = values[o + k, j, v]
-                p = cut.part[o + k, v]
-                values[i, j, v] = p * whole + apart
-                values[o + k, j, v] = (1.0 - p) * whole - apart
+    """Columns of electrodes (x, n, v) from those of terminals, what floats mixed in."""
+    x, j, v = wp.tid()
+    total = values[x, j, v]
+    for a in range(circuit.driven, turn.shape[0]):
+        total += values[x, a, v] * turn[a, j, v]
+    out[x, j, v] = total
 
 
 @wp.func

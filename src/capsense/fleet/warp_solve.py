@@ -10,9 +10,11 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.fleet.warp_cut import WarpCut
+from capsense.surface.solve_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
+_GAIN = wp.constant(GAIN)
 _DROPPED = wp.constant(1e-5)
 """Functions whose pivot is so small against their own energy are left out."""
 
@@ -146,23 +148,53 @@ def forward(
         quadrature[i, t, v] = right[1]
 
 
+@wp.struct
+class Left:
+    """Charges, and what functions that are not solved for leave; see :mod:`warp_left`."""
+
+    charge: wp.array3d(dtype=wp.float32)  # of functions, (n, 2 lead, v)
+    on: wp.array3d(dtype=wp.float32)  # on clusters, (n, 2 lead, v)
+    sums: wp.array3d(dtype=wp.float32)  # of ψ over all charges, (modes, 2 lead, v)
+    near: wp.array3d(dtype=wp.float32)  # strengths of near sources, (s, 2 lead, v)
+    far: wp.array3d(dtype=wp.float32)
+    residual: wp.array3d(dtype=wp.float32)  # potential in the function below a cluster, as charge
+    energy: wp.array2d(dtype=wp.vec2)  # of that function, (n, v)
+    dropped: wp.array(dtype=wp.int32)  # functions solved for that were left out, (v,)
+    doubt: wp.array2d(dtype=wp.float32)  # estimated error of each diagonal [m], (t, v)
+
+
 @wp.kernel
 def change(
-    circuit: Circuit, potentials: wp.array3d(dtype=wp.float32),
-    quadrature: wp.array3d(dtype=wp.float32), whole: wp.array3d(dtype=wp.vec2d),
+    circuit: Circuit, cut: WarpCut, potentials: wp.array3d(dtype=wp.float32),
+    quadrature: wp.array3d(dtype=wp.float32), left: Left, whole: wp.array3d(dtype=wp.vec2d),
 ):  # fmt: skip
-    """Complex Maxwell matrices of all terminals [F], (t, t, v)."""
+    """Complex Maxwell matrices of all terminals [F], (t, t, v), and what is in doubt."""
     i, j, v = wp.tid()
     total = wp.vec2()
+    more = wp.vec2()
+    lead = left.residual.shape[1] // 2
     for f in range(potentials.shape[0]):
         total += times(
             wp.vec2(potentials[f, i, v], quadrature[f, i, v]),
             wp.vec2(potentials[f, j, v], quadrature[f, j, v]),
         )
+        own = left.energy[f, v]
+        if own[0] > 0.0:
+            x = wp.vec2(left.residual[f, i, v], 0.0)
+            y = wp.vec2(left.residual[f, j, v], 0.0)
+            if cut.lossy[v] != 0:
+                x[1] = left.residual[f, lead + i, v]
+                y[1] = left.residual[f, lead + j, v]
+            more += _GAIN * over(times(x, y), own)
+    total += more
     real = wp.min(circuit.unit * total[0], circuit.screened[i, j])
     whole[i, j, v] = wp.vec2d(
         circuit.rest[i, j] + wp.float64(real), wp.float64(circuit.unit * total[1])
     )
+    if i == j:
+        left.doubt[i, v] = left.doubt[i, v] + wp.abs(more[0])
+        if left.dropped[v] > 0:
+            left.doubt[i, v] = wp.abs(total[0])
 
 
 @wp.func
@@ -190,8 +222,9 @@ def report(
     circuit: Circuit, omega: float, whole: wp.array3d(dtype=wp.vec2d),
     capacitance: wp.array4d(dtype=wp.float32), delta: wp.array4d(dtype=wp.float32),
     conductance: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
+    doubt: wp.array2d(dtype=wp.float32), error: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Matrices of the electrodes [F], [S], and what shields couple to them [F]."""
+    """Matrices of the electrodes [F], [S], what shields couple to them [F], and errors [F]."""
     i, v = wp.tid()
     e = v // delta.shape[1]
     s = v % delta.shape[1]
@@ -204,3 +237,8 @@ def report(
     for j in range(circuit.electrodes, circuit.driven):
         total += whole[i, j, v][0]
     shields[e, s, i] = total
+    if i == 0:
+        largest = float(0.0)
+        for t in range(doubt.shape[0]):
+            largest = wp.max(largest, doubt[t, v])
+        error[e, s] = circuit.unit * largest

@@ -110,16 +110,15 @@ class FleetSkin:
         sensors[others, :, 2] -= 2 * _FAR
         found = self._fleet.step(poses[:, : self._places], sensors)
         # on Warp the next step writes its arrays anew
-        matrix, delta, shields = (
+        matrix, delta, error, shields = (
             a if isinstance(a, np.ndarray) else np.array(a.numpy(), float)
-            for a in (found.capacitance, found.delta, found.shield_coupling)
+            for a in (found.capacitance, found.delta, found.error, found.shield_coupling)
         )
-        error = found.error
         return [
             {
                 site: Reading(
                     matrix[n, k], delta[n, k],
-                    StepStats(0.0 if error is None else float(error[n, k]), 0.0), self._names,
+                    StepStats(float(error[n, k]), 0.0), self._names,
                     shields[n, k],
                 )
                 for k, site in enumerate(self._worlds[n].sites)
