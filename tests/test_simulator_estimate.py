@@ -118,3 +118,16 @@ def test_an_electrode_inside_a_body_cannot_be_trusted(
     reading = pair[0].step(cs.Scene([body]))
     doubted = reading.stats.solver_error >= np.abs(reading.capacitance).max()
     assert doubted == (of_steel if material == "steel" else of_wood)
+
+
+@pytest.mark.parametrize("preset", ["learning", "standard"])
+@pytest.mark.parametrize("size", [(1.0, 0.6, 0.02), (2.0, 2.0, 0.1)])
+def test_of_tables_and_floors(
+    simulators: Callable[..., cs.Simulator], preset: str, size: tuple[float, float, float]
+) -> None:
+    """What holds charge off beyond the walls is no error: it made the estimate 360 readings."""
+    table = cs.Scene([cs.Body(cs.Box(size), cs.Pose((0.1, 0.0, 0.07 + 0.5 * size[2])))])
+    reading = simulators("six_patch", preset=preset).step(table)
+    best = simulators("six_patch", preset="fine").step(table)
+    error = np.abs(reading.delta - best.delta).max()
+    assert 0.3 * error < reading.stats.solver_error < 0.2 * np.abs(best.delta).max()

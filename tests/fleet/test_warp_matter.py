@@ -40,8 +40,8 @@ def apart(rng, count=COUNT):
 def against_twin(fleet, bodies, where, sensors):
     """Largest differences of delta, conductance and error to a simulator with the same functions.
 
-    Each is over the largest of its kind. Errors are compared where nothing is out of reach: the
-    core counts the energy of charge that is, so that its estimate means nothing there.
+    Each is over the largest of its kind. Errors are compared where nothing is out of reach: where
+    something is, functions on Warp share charge otherwise, see ``warp_cut.weigh``.
     """
     reading = fleet.step(where, sensors)
     worst = np.zeros(3)

@@ -111,7 +111,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         cut = cut_of(green, bodies, [shape.tree for shape in shapes], count, favoured)
         leaves = placed(bodies, cut, green, INSIDE)
         rows = leaf_rows(leaves.points, leaves.beyond, green)
-        functions = functions_of(bodies, cut)
+        functions = functions_of(bodies, cut, leaves.beyond)
         inside = leaves._replace(beyond=np.zeros_like(leaves.beyond))
         pairs = leaf_pairs(inside, green.floor)
         bound_images(leaves, rows, pairs, green)

@@ -54,7 +54,18 @@ class WarpCore:
         cut.moved = room(places, views, dtype=wp.vec3)
         for name in ("node", "split", "number", "lifted"):
             setattr(cut, name, room(n, views, dtype=wp.int32))
-        for name in ("score", "part", "mix", "weight", "ends", "extent", "soft", "beyond", "near"):
+        for name in (
+            "score",
+            "part",
+            "mix",
+            "weight",
+            "ends",
+            "out",
+            "extent",
+            "soft",
+            "beyond",
+            "near",
+        ):
             setattr(cut, name, room(n, views))
         cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
         cut.leader = room(places, views, dtype=wp.int32)

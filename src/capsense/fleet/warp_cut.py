@@ -107,6 +107,7 @@ class WarpCut:
     walled: wp.array(dtype=wp.int32)  # whether these differ, (v,)
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
     ends: wp.array2d(dtype=wp.float32)  # which part of its two parts are panels, (n, v)
+    out: wp.array2d(dtype=wp.float32)  # how far a cluster's leaves are out of reach, (n, v)
     points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
     unlifted: wp.array3d(dtype=wp.vec3)  # the same before they were lifted off the design
     lifted: wp.array2d(dtype=wp.int32)  # whether they were, (n, v)
@@ -389,6 +390,7 @@ def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: W
             if cut.near[i, v] > 0.0:
                 passes = green.near_table.shape[1]
             x = cut.beyond[i, v]
+            cut.out[i, v] = x
             walled = wp.where(x > 0.0 and cut.lossy[v] == 0, 1, walled)
             stiff = _BARRIER * x * x * x * cut.extent[i, v]
             cut.weight[i, v] = shapes.charge[k] / (1.0 + stiff)
@@ -399,9 +401,12 @@ def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: W
         for step in range(clusters - 1):
             j = o + clusters - 1 - step
             if cut.number[j, v] >= 0:
+                i = o + cut.split[j, v]
                 cut.mix[j, v] = cut.part[j, v]
+                cut.out[i, v] = wp.max(cut.out[i, v], cut.out[j, v])
+                if cut.out[i, v] > 0.0:  # see choose_kernels.functions_of
+                    cut.ends[j, v] = 0.0
                 if walled != 0:
-                    i = o + cut.split[j, v]
                     whole = cut.weight[i, v] + cut.weight[j, v]
                     cut.mix[j, v] = cut.weight[i, v] / whole
                     cut.weight[i, v] = whole

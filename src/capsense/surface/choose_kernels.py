@@ -71,7 +71,8 @@ class Functions(NamedTuple):
     body: NDArray[Any]
     """Its body, shape (f,)."""
     ends: NDArray[Any]
-    """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,)."""
+    """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,); 0 where
+    something of the cluster is out of reach."""
     solved: int
     """How many are solved for."""
 
@@ -309,12 +310,21 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
 
 
 @compiled
-def functions_of(bodies, cut):
-    """List the charge functions of a cut, those to be solved for first."""
+def functions_of(bodies, cut, beyond):
+    """List the charge functions of a cut, those to be solved for first.
+
+    ``beyond`` is how far each leaf is out of reach. Where one is, charge is held off by an energy
+    that tells nothing of how coarse panels are, so that none of its functions counts for that.
+    """
     count = bodies.shape[0]
-    for a in range(cut.node.shape[0]):
+    reaches_out = np.zeros(cut.node.shape[0], np.bool_)
+    for a in range(cut.node.shape[0] - 1, -1, -1):
+        if cut.leaf[a] >= 0:
+            reaches_out[a] = beyond[cut.leaf[a]] > 0.0
         if cut.kids[a, 0] >= 0:
             count += 1
+            for c in range(2):
+                reaches_out[a] = reaches_out[a] or reaches_out[cut.kids[a, c]]
     cluster, number, body = (
         np.empty(count, np.int64),
         np.empty(count, np.int64),
@@ -331,7 +341,7 @@ def functions_of(bodies, cut):
             if cut.kids[a, 0] >= 0 and (cut.fade[a] == 0.0) == (rest == 1):
                 # functions are numbered breadth first, as clusters are
                 cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
-                ends[f] = _panels(bodies[b], cut.node[a])
+                ends[f] = 0.0 if reaches_out[a] else _panels(bodies[b], cut.node[a])
                 f += 1
         if rest == 0:
             solved = f

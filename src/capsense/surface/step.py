@@ -73,7 +73,7 @@ def prepared(
     rows = leaf_rows(leaves.points, leaves.beyond, green)
     pairs = leaf_pairs(leaves, green.floor)
     bound_images(leaves, rows, pairs, green)
-    functions = functions_of(bodies, cut)
+    functions = functions_of(bodies, cut, leaves.beyond)
     return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
 
 
