@@ -190,10 +190,11 @@ def test_the_place_of_a_joined_vertex(mesh: tuple[Array, Array]) -> None:
     ],
 )
 def test_which_moves_of_a_corner_are_allowed(apex: tuple[float, ...], keeps: bool) -> None:
-    """Analytic: not beyond a cosine of a quarter, not to a height of a hundredth."""
+    """Analytic: not beyond a cosine of a quarter, not to a height of a hundredth, at any size."""
     vertices = np.array([[0.5, 1.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    for shift in (0.0, 5.0):
-        assert simplify._keeps_facing(vertices + shift, 0, 1, 2, np.array(apex) + shift) == keeps
+    for size, shift in ((1.0, 0.0), (1.0, 5.0), (1e-3, 0.0), (200.0, 3.0)):
+        place = size * np.array(apex) + shift
+        assert simplify._keeps_facing(size * vertices + shift, 0, 1, 2, place) == keeps
 
 
 def slow_offsets(points: Array, normal: Array, corners: Array) -> tuple[Array, Array]:
