@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from capsense.elements import simplify, triangles
 from capsense.elements.simplify import add_offsets, collapse, fitted
@@ -355,8 +356,10 @@ def test_triangles_that_coincide_are_kept_once() -> None:
     doubled = np.concatenate([corners, corners[:7], corners[7:12, ::-1], flat])
     keep = triangles._apart(doubled)
     np.testing.assert_array_equal(keep, np.arange(len(doubled)) < len(corners))
-    crossed = corners.copy()
-    crossed[1] = corners[0][:, [1, 2, 0]] * [1, 1, 1] + 0.2 * normals(corners[:1])
+    middle = corners[0].mean(axis=0)
+    along = corners[0, 1] - corners[0, 0]
+    turn = Rotation.from_rotvec(np.radians(60.0) * along / np.linalg.norm(along))
+    crossed = np.stack([corners[0], turn.apply(corners[0] - middle) + middle])
     assert triangles._apart(crossed).all()
 
 
