@@ -1,4 +1,4 @@
-"""``capsense run`` with a stand-in for the simulator: files, refusals, interruptions."""
+"""``capsense run``, mostly with a stand-in for the simulator: files, refusals, interruptions."""
 
 from __future__ import annotations
 
@@ -81,6 +81,28 @@ def test_all_files_agree(
     assert "C_E5_E6" in text
     assert f"{COUNT} of {COUNT}" in text
     assert errors == ""  # no progress bar where there is no terminal
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-10])
+def test_the_error_is_the_largest_of_the_solver_s_estimates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], grounding: str | float
+) -> None:
+    """Differential: sample by sample against the simulator itself, whatever the ball is tied to."""
+    text = ball_scenario().replace(
+        'material = "steel"', f'material = "steel"\ngrounding = {json.dumps(grounding)}'
+    )
+    path, out = tmp_path / "ball.toml", tmp_path / "out"
+    path.write_text(text, encoding="utf-8")
+    assert main(["run", str(path), "-o", str(out)]) == 0
+    arrays, told = np.load(out / "readings.npz"), summary_of(out)["largest_error_estimate_F"]
+    sim, errors = cs.Simulator("six_patch"), []
+    for place in arrays["body_positions"][:, 0]:
+        ball = cs.Body(cs.Sphere(0.02), cs.Pose(place), "steel", grounding)  # type: ignore[arg-type]
+        errors.append(sim.step(cs.Scene([ball])).stats.solver_error)
+    np.testing.assert_allclose(arrays["error_estimate"], errors, rtol=1e-6)
+    assert max(errors) > 1.2 * min(errors)
+    assert told == pytest.approx(max(errors), rel=1e-6)
+    assert f"error      {told:.2g} F, the largest of the estimates" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("fake")

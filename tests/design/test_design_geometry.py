@@ -7,7 +7,7 @@ import pytest
 import shapely
 from scipy.spatial.transform import Rotation
 
-from capsense.design.geometry import TOUCH, Facet, Surface, box_facets, enters_box
+from capsense.design.geometry import TOUCH, Facet, Surface, box_facets, enters_box, find_contact
 from capsense.design.model import Domain, Layer
 
 LOWER, UPPER = np.array([-0.01, -0.02, 0.01]), np.array([0.03, 0.02, 0.02])
@@ -42,6 +42,26 @@ def test_a_sheet_on_a_face_is_not_inside() -> None:
                 center = middle.copy()
                 center[axis] = level[axis] + way * depth
                 assert enters(sheet(tuple(center), turn, (0.002, 0.002))) == wanted
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("over", [False, True])
+@pytest.mark.parametrize("gap", [-20.0, -0.9, 0.0, 0.5, 0.9, 1.1, 20.0])
+def test_a_corner_touches_a_sheet_within_the_tolerance(side: float, over: bool, gap: float) -> None:
+    """Limits: from above and from below, whichever way the sheet faces; gaps in tolerances."""
+    flat = Rotation.from_rotvec([np.pi, 0, 0]) if over else Rotation.identity()
+    plate = sheet((0.0, 0.0, 0.0), flat, (0.02, 0.02))
+    height = side * (0.005 * 2**0.5 + gap * TOUCH)
+    turn = Rotation.from_euler("xy", [90.0, 45.0], degrees=True)
+    mark = sheet((0.001, 0.002, height), turn, (0.01, 0.01))
+    lowest = mark.to_sensor(np.asarray(mark.polygon.exterior.coords)[:-1])
+    assert (side * lowest[:, 2]).min() == pytest.approx(gap * TOUCH, abs=1e-12)
+    one, other = (Surface((f,), np.empty((0, 2, 3))) for f in (plate, mark))
+    for pair in ((one, other), (other, one)):
+        point = find_contact(*pair)
+        assert (point is not None) == (gap < 1)
+        if point is not None:
+            np.testing.assert_allclose(point, [0.001, 0.002, 0.0], atol=2.5 * 20 * TOUCH)
 
 
 def test_sheets_that_enter_a_box_agree_with_dense_sampling() -> None:

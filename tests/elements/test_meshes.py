@@ -265,3 +265,21 @@ def test_a_copy_points_to_its_own_arrays(folder):
     assert copy.record["kids"] == copy.tree.kids.ctypes.data
     assert copy.record["energy"] != made.record["energy"]
     assert_same(copy, made)
+
+
+@pytest.mark.parametrize(("parts", "wanted"), [(1, 160), (8, 160), (10, 200), (13, 260), (40, 280)])
+def test_meshes_of_more_parts_have_more_triangles(folder, monkeypatch, parts, wanted):
+    """Analytic: a fifth of a primitive's panels for each part, from 1.6 to 2.8 times as many."""
+    asked = []
+
+    def panels(corners, count):
+        asked.append(count)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(store, "panels_of", panels)
+    one = trimesh.creation.box((0.01, 0.01, 0.01))
+    row = [one.copy().apply_translation((0.02 * k, 0, 0)) for k in range(parts)]
+    mesh = trimesh.util.concatenate(row)
+    with pytest.raises(KeyboardInterrupt):
+        store._mesh_shape(TriMesh(mesh.vertices, mesh.faces), 100, f"row of {parts}")
+    assert asked == [wanted]

@@ -293,6 +293,36 @@ def test_thin_plate_along_and_across():
     np.testing.assert_allclose(found, [0.9939, 0.9939, 0.5046], rtol=3e-3)
 
 
+LINEAR_AND_QUADRATIC = {
+    "x": (lambda x, y, z: x, lambda x, y, z: (1, 0, 0)),
+    "y": (lambda x, y, z: y, lambda x, y, z: (0, 1, 0)),
+    "z": (lambda x, y, z: z, lambda x, y, z: (0, 0, 1)),
+    "xy": (lambda x, y, z: x * y, lambda x, y, z: (y, x, 0)),
+    "xz": (lambda x, y, z: x * z, lambda x, y, z: (z, 0, x)),
+    "yz": (lambda x, y, z: y * z, lambda x, y, z: (0, z, y)),
+    "xx - yy": (lambda x, y, z: x * x - y * y, lambda x, y, z: (2 * x, -2 * y, 0)),
+    "zz - xx": (lambda x, y, z: z * z - x * x, lambda x, y, z: (-2 * x, 0, 2 * z)),
+}
+
+
+@pytest.mark.parametrize(
+    ("shape", "bound"), [(Box((1.0, 0.7, 0.3)), 1e-6), (Ellipsoid((0.05, 0.03, 0.08)), 5e-3)]
+)
+def test_linear_and_quadratic_potentials_inside(shape, bound):
+    """Analytic: Z takes the flux of each harmonic potential to 4π times it, but for a constant."""
+    panels = panels_of(shape, 200)
+    z = impedance(panels, free_block(panels))
+    for name, (potential, gradient) in LINEAR_AND_QUADRATIC.items():
+        u = np.empty(len(panels))
+        for k, corners in enumerate(panels.corners):
+            points, weights = reference.polygon_points(corners, 2, 3)
+            u[k] = weights @ potential(*points.T)
+        field = np.array([gradient(*center) for center in panels.centers])
+        flux = panels.areas * np.einsum("ij,ij->i", panels.normals, field)
+        left = z @ flux / (4 * math.pi) - u
+        assert np.ptp(left) < bound * np.ptp(u), name
+
+
 @pytest.mark.parametrize(("distance", "bound"), [(1.3, 8e-3), (2.0, 1e-3)])
 def test_point_charge_outside_a_ball(distance, bound):
     """Σ l (eps − 1) / (l (eps + 1) + 1) d^(−2l−2): patterns that are not put in by hand."""

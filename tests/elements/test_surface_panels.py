@@ -145,9 +145,9 @@ def test_centroids_and_moments_against_quadrature():
 
 def test_scaled():
     panels = panels_of(Capsule(0.01, 0.05))
-    large, twice = panels_of(Capsule(0.02, 0.1)), panels.scaled(2.0)
+    large, thrice = panels_of(Capsule(0.03, 0.15)), panels.scaled(3.0)
     for name in ("corners", "centers", "normals", "areas", "moments"):
-        np.testing.assert_allclose(getattr(twice, name), getattr(large, name), atol=1e-12)
+        np.testing.assert_allclose(getattr(thrice, name), getattr(large, name), atol=1e-12)
 
 
 def test_a_box_of_twelve_triangles_is_halved_and_a_fine_ball_reduced():

@@ -13,8 +13,8 @@ import pytest
 from capsense.design.loader import parse_design
 from capsense.design.model import Design
 from capsense.errors import FieldError
-from capsense.field.background import BackgroundField
-from capsense.field.boundary import Accuracy, BoundarySolution, terminals
+from capsense.field.background import BackgroundField, build_background
+from capsense.field.boundary import Accuracy, BoundarySolution, build_model, terminals
 from capsense.field.green import (
     TABLES,
     GreenFunction,
@@ -254,6 +254,25 @@ def test_openness_of_plates_and_housings() -> None:
     middle, aside = openness(pipe, np.array([[0.0, 0.0, -0.025], [0.06, 0.0, 0.05]]))
     assert middle == 0.0
     assert aside > 0.7
+
+
+@pytest.mark.parametrize("backplane", [0.002, 0.01])
+def test_charges_behind_a_plate_stay_above_the_floor(backplane: float) -> None:
+    """Analytic: as deep as asked for, and at most six tenths of the way to the floor."""
+    design = flat(
+        domain={"size": [0.2, 0.2, 0.2], "backplane": backplane},
+        electrode=[square("A", 0.0, 0.06)],
+    )
+    surface = Surroundings(design, build_model(design, Accuracy(4.0)))
+    chosen = np.flatnonzero(
+        (np.abs(surface.points[:, :2]).max(axis=1) < 0.02) & (surface.points[:, 2] == 0)
+    )
+    assert len(chosen) > 10
+    np.testing.assert_array_equal(surface.normals[chosen], [[0.0, 0.0, 1.0]] * len(chosen))
+    for depth in (0.1 * backplane, 0.5 * backplane, 0.7 * backplane, 1.0):
+        found = surface.behind(chosen, np.full(len(chosen), depth))
+        expected = surface.points[chosen] - [0.0, 0.0, min(depth, 0.6 * backplane)]
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_spread_takes_the_farthest_point_every_time() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from capsense.errors import FieldError, SolveError
 from capsense.masked import MeshSensor
-from capsense.masked.solver import GROUNDED, MaskedSolver
+from capsense.masked.solver import GROUNDED, MaskedSolver, MaskedStats
 from capsense.masked.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, kuhn_tets
 
@@ -173,5 +175,12 @@ def test_wrong_input_is_refused(mesh, bar):
 
 def test_no_convergence_is_an_error(mesh, bar):
     masked = MaskedSolver(MeshSensor(mesh, STRIPES), max_iterations=3)
-    with pytest.raises(SolveError, match="CG stopped after 3 iterations"):
+    with pytest.raises(SolveError, match="CG stopped after 3 iterations") as caught:
         masked.step(bar, [80.0])
+    left, wanted = map(float, re.findall(r"\d\.\de[+-]\d\d", str(caught.value)))
+    assert wanted == 1e-5
+    assert 1e-3 < left < 100
+
+
+def test_before_the_first_step_nothing_was_spent(mesh):
+    assert MaskedSolver(MeshSensor(mesh, STRIPES)).stats == MaskedStats(0, 0, 0, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import shapely
 from field_cases import patches, rectangle, sheet
 
 from capsense.design.geometry import Facet, Surface
@@ -34,6 +35,18 @@ def test_planes_follow_edges_and_faces() -> None:
     ):
         assert (np.diff(line) > 0).all()
         assert np.abs(line[:, None] - wanted).min(axis=0).max() < 1e-9
+
+
+def test_planes_follow_inner_edges_and_not_arcs() -> None:
+    """An L has planes at its inner corner, also of divided edges; one of a short edge has none."""
+    corner = rectangle((0.0, 0.0), (0.06, 0.06)).difference(rectangle((0.02, 0.02), (0.026, 0.026)))
+    divided = shapely.segmentize(corner, 0.0015)
+    notched = corner.difference(rectangle((-0.03, -0.02), (0.0016, 0.0016)))
+    for shape in (corner, divided, notched):
+        x, y, _ = plan_axes(patches(shape, size=0.3, backplane=0.02), MeshSettings())
+        for line in (x, y):
+            assert np.abs(line[:, None] - [-0.03, 0.007, 0.03]).min(axis=0).max() < 1e-9
+        assert np.abs(x + 0.0292).min() > 1e-5
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.5, 2.0])

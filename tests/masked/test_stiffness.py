@@ -7,6 +7,7 @@ import pytest
 
 from capsense.constants import EPS0
 from capsense.errors import FieldError, MeshError
+from capsense.masked import stiffness as module
 from capsense.masked.stiffness import (
     StiffnessMap,
     capacitance_p1,
@@ -202,3 +203,12 @@ def test_wrong_input_is_refused():
         capacitance_p1(mesh, 1.0, ["low", "high"], ["high"])
     with pytest.raises(MeshError, match="at least one electrode"):
         capacitance_p1(mesh, 1.0, [], ["high"])
+
+
+@pytest.mark.parametrize("status", [1, 500, -1])
+def test_iterations_that_do_not_converge_are_an_error(monkeypatch, status):
+    """Whatever the solver says but zero."""
+    monkeypatch.setattr(module.spla, "cg", lambda matrix, load, **_: (load, status))
+    mesh = faces(crooked(), 0, "low", "high")
+    with pytest.raises(FieldError, match=f"CG did not converge in {status} iterations"):
+        capacitance_p1(mesh, 1.0, ("low",), ("high",), solver="cg")

@@ -30,3 +30,55 @@ def test_sheets_meet_what_their_points_meet(shape: cs.Shape | str) -> None:
             assert sheets.meet(body, conducting=False) == expected
             met.append(expected)
     assert 5 < sum(met) < 55
+
+
+def open_box(side: float) -> cs.TriMesh:
+    """A cube about the origin without its lid, the face at the top."""
+    mesh = cs.Box((side, side, side)).to_trimesh()
+    return cs.TriMesh(mesh.vertices, mesh.faces[mesh.face_normals[:, 2] < 0.5])
+
+
+def test_an_open_box_holds_what_its_lid_would_close() -> None:
+    """Analytic: less than half of the directions leave through the opening, below its plane only.
+
+    Distances are those from the five faces, and do not depend on the pose.
+    """
+    half = 0.01
+    place = cs.Pose((0.1, -0.2, 0.3), (0.3, -0.1, 0.5, 0.8))
+    body = cs.Body(open_box(2 * half), place, "steel")
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-2 * half, 2 * half, (150, 3))
+    held = (np.abs(points) < half).all(axis=1)
+    sides = [cs.Box((2 * half, 2 * half, 1e-12)), cs.Box((2 * half, 1e-12, 2 * half))]
+    near = np.full(len(points), np.inf)
+    for axis, sign in ((2, -1), (1, -1), (1, 1), (0, -1), (0, 1)):
+        moved = points.copy()
+        moved[:, axis] -= sign * half
+        turned = moved[:, [1, 0, 2]] if axis == 0 else moved
+        near = np.minimum(near, np.abs(sides[axis != 2].signed_distance(turned)))
+    found = np.concatenate([distances(body, place.apply(p[None])) for p in points])
+    assert 10 < held.sum() < 50
+    np.testing.assert_array_equal(found < 0, held)
+    np.testing.assert_allclose(np.abs(found), near, atol=1e-8)
+    below = points[:, 2] < 0
+    together = distances(body, place.apply(points[below]))
+    np.testing.assert_allclose(together, found[below], atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [10, 100])
+def test_points_on_sheets_are_spread_by_area(count: int) -> None:
+    """Analytic: all corners, and a mean near the centroid of two triangles of unequal size."""
+    corners = np.concatenate([CORNERS, 0.2 * CORNERS + [0.1, 0.0, 0.0]])
+    points = points_on(corners, count)
+    size = np.array([1.0, 0.04])
+    spread = points[-count:]
+    second = spread[:, 0] > 0.05
+    assert second.sum() == pytest.approx(count * size[1] / size.sum(), abs=1)
+    inner = spread[~second]
+    for x in (inner[:, 0], 0.03 - inner[:, 1], 0.03 - inner[:, 0] + inner[:, 1]):
+        assert (x >= -1e-12).all()
+    np.testing.assert_allclose(inner.mean(axis=0), CORNERS[0].mean(axis=0), atol=0.04 / count**0.5)
+    gaps = np.linalg.norm(inner[:, None] - inner, axis=2) + np.eye(len(inner))
+    assert gaps.min() > 0.2 * 0.03 / count**0.5
+    apart = np.linalg.norm(points[:, None] - corners.reshape(-1, 3), axis=2).min(axis=0)
+    np.testing.assert_allclose(apart, 0.0, atol=1e-12)

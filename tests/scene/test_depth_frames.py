@@ -47,7 +47,13 @@ def test_codes_are_right_to_one_half(eps_r):
     assert abs(max(float(decode_permittivity(code)), 1.0) - eps_r) <= 0.5
 
 
-@pytest.mark.parametrize("eps_r", [0.5, -1.0, np.nan, 255.0, 999.0])
+def test_codes_at_the_ends_of_their_ranges():
+    """Analytic: air, the last number, conductors."""
+    codes = encode_permittivity([0.0, 1.0, 1.6, 254.4, 254.49, 1000.0, 1e9, np.inf])
+    assert codes.tolist() == [0, 0, 2, 254, 254, 255, 255, 255]
+
+
+@pytest.mark.parametrize("eps_r", [0.5, 0.999, -1.0, np.nan, 254.5, 255.0, 999.9])
 def test_permittivities_without_a_code(eps_r):
     with pytest.raises(SceneError, match="the red channel has no code"):
         encode_permittivity([3.0, eps_r])

@@ -145,6 +145,7 @@ def test_layers_do_not_change():
         ((np.zeros(4), np.ones(4), (1, 1)), r"front has shape \(4,\)"),
         ((np.zeros((2, 3)), np.ones((3, 2)), (1, 1)), "back has shape"),
         ((np.zeros((2, 2)), np.ones((2, 2)), (1, -1)), "size is"),
+        ((np.zeros((2, 2)), np.ones((2, 2)), (0, 1)), "size is"),
         ((np.zeros((2, 2)), np.ones((2, 2)), (1, np.nan)), "size is"),
         ((np.full((2, 2), np.nan), np.ones((2, 2)), (1, 1)), "no pixel holds an interval"),
         ((np.ones((2, 2)), np.zeros((2, 2)), (1, 1)), "no pixel holds an interval"),

@@ -101,7 +101,12 @@ def test_water_has_a_range(temperature):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((0.5, ()), "eps_inf is 0.5"),
+        ((0.999, ()), "eps_inf is 0.999"),
+        ((float("inf"), ()), "eps_inf is inf"),
+        ((2.0, ((-1e-9, 1e-9, 0.0),)), "term"),
+        ((2.0, ((1.0, 1e-9, -1e-9),)), "term"),
+        ((2.0, ((1.0, float("inf"), 0.0),)), "term"),
+        ((2.0, ((float("inf"), 1e-9, 0.0),)), "term"),
         ((2.0, ((-1.0, 1e-9, 0.0),)), "term"),
         ((2.0, ((1.0, 0.0, 0.0),)), "term"),
         ((2.0, ((1.0, 1e-9, 1.0),)), "term"),
@@ -113,6 +118,15 @@ def test_water_has_a_range(temperature):
 def test_bad_dispersions_are_refused(arguments, words):
     with pytest.raises(SceneError, match=words):
         ColeCole(*arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(1.0, ()), (1.5, (), 0.0), (2.0, ((0.0, 1e-9, 0.0),)), (2.0, ((1.0, 1e-300, 0.999),))],
+)
+def test_dispersions_at_the_ends_of_their_ranges(arguments):
+    """Analytic: they are taken, and give eps_inf where frequencies are high."""
+    assert ColeCole(*arguments).permittivity(1e30).real >= arguments[0]
 
 
 def test_what_conducts():

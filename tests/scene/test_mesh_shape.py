@@ -276,3 +276,23 @@ def test_point_to_triangle_distance():
     assert triangle_distance2(sliver, 2.0, 0.0, 4.0) == pytest.approx(16.0)
     assert triangle_distance2(sliver, 6.0, 0.0, 4.0) == pytest.approx(25.0)
     assert triangle_distance2(np.zeros((3, 3)), 3.0, 4.0, 0.0) == pytest.approx(25.0)
+
+
+def test_pieces_are_the_large_parts_and_the_others_together():
+    """Analytic: three boxes, and two specks of far less than a thousandth of the area."""
+    sizes = [(0.2, 0.1, 0.1), (0.1, 0.02, 0.02), (0.05, 0.05, 0.05), (1e-3,) * 3, (5e-4,) * 3]
+    boxes = [trimesh.creation.box(extents=size) for size in sizes]
+    for k, box in enumerate(boxes):
+        box.apply_translation((0.3 * k, 0.1 * k, 0))
+    mesh = trimesh.util.concatenate(boxes)
+    shape = TriMesh(mesh.vertices, mesh.faces)
+    assert shape.parts == 5
+    assert len(shape.pieces) == 4
+    volumes = sorted(piece.volume for piece in shape.pieces)
+    assert volumes == pytest.approx(sorted([1e-9 + 1.25e-10, 2e-3, 4e-5, 1.25e-4]))
+    found = sorted(map(tuple, shape.piece_bounds.transpose(1, 0, 2).reshape(-1, 6).round(9)))
+    wanted = [box.bounds.reshape(-1) for box in boxes[:3]]
+    low = np.minimum(boxes[3].bounds[0], boxes[4].bounds[0])
+    high = np.maximum(boxes[3].bounds[1], boxes[4].bounds[1])
+    wanted.append(np.concatenate([low, high]))
+    np.testing.assert_allclose(found, sorted(map(tuple, np.round(wanted, 9))), atol=1e-8)

@@ -184,6 +184,7 @@ def test_bad_views_are_refused():
             render_depth(*arguments, (0.1, 0.1), (4, 4), **options)
     for size, resolution, message in [
         ((0.1, -1), (4, 4), "size is"),
+        ((0.0, 0.1), (4, 4), "size is"),
         ((0.1, 0.1), (0, 4), "resolution is"),
         ((0.1, 0.1), (4.5, 4), "resolution is"),
         ((0.1, 0.1), (4000, 4000), "resolution is"),

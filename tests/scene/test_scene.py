@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -83,6 +84,18 @@ def test_pack_follows_the_bodies():
         np.testing.assert_allclose(packed.bounds[i], box, atol=1e-3)
         assert np.all(packed.bounds[i, 0] <= box[0] + 1e-12)
         assert np.all(packed.bounds[i, 1] >= box[1] - 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "told"), [((), False), ((90.0,), True), ((90.0, 50.0), True), ((90.0, 0.1), False)]
+)
+def test_scenes_in_millimetres_are_told(sizes, told):
+    """Only where every body is far larger than what the sensor sees."""
+    scene = Scene([Body(Sphere(size), name=f"b{k}") for k, size in enumerate(sizes)])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene.warn_of_units(0.5)
+    assert [str(w.message).startswith("b0 is 180 × 180 × 180 m") for w in caught] == [True] * told
 
 
 def test_an_empty_scene_packs():

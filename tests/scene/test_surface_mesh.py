@@ -86,6 +86,18 @@ def test_bounds_are_those_of_vertices_that_count():
     np.testing.assert_allclose(shape.params, [0.05, 0.05, 0])
 
 
+def test_a_sheet_is_a_millimetre_thick_unless_told():
+    assert RestSurface(*SHEET).thickness == 1e-3
+    assert RestSurface(*SHEET, thickness=2e-4).thickness == 2e-4
+    assert DeformableSurface(*SHEET).body().shape.rest.thickness == 1e-3
+
+
+@pytest.mark.parametrize("thickness", [0.0, -1e-3, np.nan, np.inf])
+def test_a_thickness_is_a_length(thickness):
+    with pytest.raises(SceneError, match="thickness is"):
+        RestSurface(*SHEET, thickness=thickness)
+
+
 def test_bad_surfaces_are_refused():
     vertices, faces = SHEET
     box = Box((0.1, 0.1, 0.1)).to_trimesh()

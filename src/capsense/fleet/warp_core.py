@@ -43,9 +43,9 @@ class WarpCore:
         clusters: int, device: Any,
     ) -> None:  # fmt: skip
         self.device, self.counts, self.clusters, self._taken = device, counts, clusters, 0
-        self._omega = 2 * np.pi * solver.excitation_frequency
         self._slopes: list[Any] | None = None
         self.green, self.circuit = _response(solver, device), _circuit(terminals, device)
+        self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         environments, places, sensors = counts
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
         room = self.room
@@ -163,7 +163,7 @@ class WarpCore:
         for values in (matrix, turned):
             self.launch(kernels.to_functions, (n, views), cut, k, 0, values)
         self.launch(
-            kernels.assemble, (n, n, views), *at, cut, count, k, green.lead, rows, matrix, self.loss
+            kernels.assemble, (n, n, views), *at, cut, k, green.lead, rows, matrix, self.loss
         )
         rest, loss, quadrature = self.left, self.loss, self.quadrature
         self.launch(solution.factorise, views, cut, matrix, rest.dropped)
@@ -173,7 +173,7 @@ class WarpCore:
         self.launch(solution.change, (t, t, views), circuit, cut, rows, quadrature, rest, whole)
         self.launch(solution.eliminate, views, circuit, whole)
         self.launch(
-            solution.report, (circuit.electrodes, views), circuit, self._omega, whole,
+            solution.report, (circuit.electrodes, views), circuit, whole,
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
         )  # fmt: skip
 
@@ -193,8 +193,7 @@ class WarpCore:
             )
         launch(left.to_clusters, (columns, views), cut, k, lead, rest.charge, rest.on)
         launch(
-            left.residuals, (n, parts, views), self.shapes, self.places, green,
-            cut, k, rest.charge, rest.on, rest.near, rest.far, rest.residual, rest.energy,
+            left.residuals, (n, parts, views), self.shapes, self.places, green, cut, k, rest,
         )  # fmt: skip
 
     def differentiate(self) -> Any:

@@ -318,7 +318,7 @@ def from_functions(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.floa
 
 @wp.kernel
 def assemble(
-    shapes: Shapes, places: Places, cut: WarpCut, sensors: int, clusters: int, lead: int,
+    shapes: Shapes, places: Places, cut: WarpCut, clusters: int, lead: int,
     potentials: wp.array3d(dtype=wp.float32), matrix: wp.array3d(dtype=wp.float32),
     loss: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
@@ -329,7 +329,7 @@ def assemble(
     f, g, v = wp.tid()
     if g > f:
         return
-    e = v // sensors
+    e = v // places.hidden.shape[0]
     x = cut.number[f, v]
     y = cut.number[g, v]
     value = wp.vec2(wp.where(f == g, 1.0, 0.0), 0.0)

@@ -26,7 +26,7 @@ from capsense.fleet.warp_cut import (
     placed,
 )
 from capsense.fleet.warp_kernels import mean, more, own, unit
-from capsense.fleet.warp_solve import over, times
+from capsense.fleet.warp_solve import Left, over, times
 from capsense.surface.pair_kernels import BARRIER
 from capsense.surface.solve_kernels import COARSE
 
@@ -179,8 +179,7 @@ def to_clusters(
 @wp.func
 def _met(
     green: Response, cut: WarpCut, leaf: Leaf, body: int, clusters: int, first: int, v: int,
-    near: wp.array3d(dtype=wp.float32), far: wp.array3d(dtype=wp.float32),
-    charge: wp.array3d(dtype=wp.float32),
+    left: Left,
 ):  # fmt: skip
     """Potentials on a cluster of a body, columns from ``first`` on, but for its body's charges."""
     out = some()
@@ -195,7 +194,7 @@ def _met(
                 + unit(leaf.p3, q, green.floor, _NEAR_LEAST)
             )  # fmt: skip
             for c in range(_COLUMNS):
-                out[c] = out[c] + value * near[s, first + c, v]
+                out[c] = out[c] + value * left.near[s, first + c, v]
     if leaf.near < 1.0 and inner > 0.0:
         for s in range(green.far.shape[0]):
             q = green.far[s]
@@ -206,7 +205,7 @@ def _met(
                 + unit(leaf.p3, q, green.floor, _FAR_LEAST)
             )  # fmt: skip
             for c in range(_COLUMNS):
-                out[c] = out[c] + value * far[s, first + c, v]
+                out[c] = out[c] + value * left.far[s, first + c, v]
     for j in range(cut.node.shape[0]):
         if cut.node[j, v] >= 0:
             value = mean(leaf, cut, j, v, 1.0, green.floor)
@@ -215,21 +214,18 @@ def _met(
             elif leaf.lifted + cut.lifted[j, v] > 0:
                 value -= more(leaf, cut, j, v)
             for c in range(_COLUMNS):
-                out[c] = out[c] + value * charge[j, first + c, v]
+                out[c] = out[c] + value * left.on[j, first + c, v]
     return out
 
 
 @wp.kernel
 def residuals(
-    shapes: Shapes, places: Places, green: Response, cut: WarpCut, clusters: int,
-    charge: wp.array3d(dtype=wp.float32), on: wp.array3d(dtype=wp.float32),
-    near: wp.array3d(dtype=wp.float32), far: wp.array3d(dtype=wp.float32),
-    out: wp.array3d(dtype=wp.float32), energy: wp.array2d(dtype=wp.vec2),
-):  # fmt: skip
-    """Potentials that all charges leave in the function below each cluster, (n, 2 lead, v).
+    shapes: Shapes, places: Places, green: Response, cut: WarpCut, clusters: int, left: Left
+):
+    """Potentials that all charges leave in the function below each cluster, and its energy.
 
-    ``charge`` are those of functions, ``on`` those on clusters. ``energy`` is filled with the
-    functions' own energies [1/m], zero where a cluster is a panel or there is none.
+    Both are filled in ``left``; the energy [1/m] is zero where a cluster is a panel or there is
+    none.
     """
     i, chunk, v = wp.tid()
     k = cut.node[i, v]
@@ -243,16 +239,16 @@ def residuals(
     if k >= 0:
         u = shapes.first[places.choice[e, b]]
     if k < 0 or shapes.kids[wp.max(k, 0), 0] < 0:
-        energy[i, v] = wp.vec2()
+        left.energy[i, v] = wp.vec2()
         return
     x = shapes.function[k]
     scale = places.scale[e, b]
     leaf = placed(shapes, green, cut.pose[b, v], scale, u + shapes.kids[k, 0])
-    left = _met(green, cut, leaf, b, clusters, first, v, near, far, on)
+    out = _met(green, cut, leaf, b, clusters, first, v, left)
     whole = own(shapes, places, e, b, x, x)
     whole[0] += _BARRIER * leaf.beyond * leaf.beyond * leaf.beyond
     leaf = placed(shapes, green, cut.pose[b, v], scale, u + shapes.kids[k, 1])
-    left -= _met(green, cut, leaf, b, clusters, first, v, near, far, on)
+    out -= _met(green, cut, leaf, b, clusters, first, v, left)
     whole[0] += _BARRIER * leaf.beyond * leaf.beyond * leaf.beyond
     o = b * clusters
     other = wp.where(imaginary, first - green.lead, first + green.lead)
@@ -261,11 +257,11 @@ def residuals(
         if y >= 0:
             value = own(shapes, places, e, b, x, y)
             for c in range(_COLUMNS):
-                left[c] = left[c] - value[0] * charge[o + j, first + c, v]
+                out[c] = out[c] - value[0] * left.charge[o + j, first + c, v]
             if cut.lossy[v] != 0:
                 sign = wp.where(imaginary, 1.0, -1.0)
                 for c in range(_COLUMNS):
-                    left[c] = left[c] - sign * value[1] * charge[o + j, other + c, v]
+                    out[c] = out[c] - sign * value[1] * left.charge[o + j, other + c, v]
     for c in range(_COLUMNS):
-        out[i, first + c, v] = left[c]
-    energy[i, v] = whole
+        left.residual[i, first + c, v] = out[c]
+    left.energy[i, v] = whole

@@ -26,6 +26,7 @@ class Circuit:
     electrodes: wp.int32
     driven: wp.int32
     unit: wp.float32  # 4π eps0 [F/m]
+    omega: wp.float32  # angular frequency [rad/s]
     rest: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
     empty: wp.array2d(dtype=wp.float64)  # that of the driven ones, the others eliminated, (k, k)
     screened: wp.array2d(dtype=wp.float32)  # bound of what an entry changes by [F], (t, t)
@@ -219,7 +220,7 @@ def eliminate(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d)):
 
 @wp.kernel
 def report(
-    circuit: Circuit, omega: float, whole: wp.array3d(dtype=wp.vec2d),
+    circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d),
     capacitance: wp.array4d(dtype=wp.float32), delta: wp.array4d(dtype=wp.float32),
     conductance: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
     doubt: wp.array2d(dtype=wp.float32), error: wp.array2d(dtype=wp.float32),
@@ -232,7 +233,7 @@ def report(
         value = whole[i, j, v]
         capacitance[e, s, i, j] = wp.float32(value[0])
         delta[e, s, i, j] = wp.float32(value[0] - circuit.empty[i, j])
-        conductance[e, s, i, j] = -omega * wp.float32(value[1])
+        conductance[e, s, i, j] = -circuit.omega * wp.float32(value[1])
     total = wp.float64(0.0)
     for j in range(circuit.electrodes, circuit.driven):
         total += whole[i, j, v][0]
