@@ -13,7 +13,7 @@ import pytest
 from capsense.design.loader import parse_design
 from capsense.design.model import Design
 from capsense.errors import FieldError
-from capsense.field.background import BackgroundField, build_background
+from capsense.field.background import BackgroundField
 from capsense.field.boundary import Accuracy, BoundarySolution, build_model, terminals
 from capsense.field.green import (
     TABLES,
