@@ -261,7 +261,7 @@ def reduced(
 # ---- scores ----
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
-CROSSING = 5.0
+CROSSING, CROSSED, LARGE = 5.0, 0.3, (0.12, 0.16)
 LONG, SHORE = (0.03, 0.06), 5e-3
 
 
@@ -314,8 +314,11 @@ def scores(
                     score[part] += linear.get(part, 1.0) * DECAY * score[k]
         whole = CROSSING * score[0]
         for k in reversed(range(len(kids))):
-            part = looks[k].crossing * looks[k].size / looks[0].size if k in looks else 0.0
-            score[k] = max(score[k], part * whole, *(score[p] for p in kids[k] if p >= 0))
+            if k in looks:
+                large = _smooth((looks[k].size - LARGE[0]) / (LARGE[1] - LARGE[0]))
+                least = max(whole * looks[k].size / looks[0].size, CROSSED * large)
+                score[k] = max(score[k], looks[k].crossing * least)
+            score[k] = max([score[k], *(score[p] for p in kids[k] if p >= 0)])
         out.append(score)
     return out
 

@@ -32,6 +32,12 @@ _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 _CROSSING = 5.0
 """Least score of clusters that cross a wall, over their share of that of their body by length."""
+_CROSSED = 0.3
+"""The same of large clusters of bodies that hardly count: so much that functions are fully faded
+in. Their points lie among the sources that stand for the wall, 40 mm behind it, and would attract
+themselves so much that no definite matrix were left."""
+_WIDE = 0.12, 0.16
+"""Clusters come to be large between these extents [m]."""
 _PARTED = 0.1
 """Fade of a function from which on its two clusters are represented by their parts alone."""
 USED, FRONTIER, LEAF = 2, 1, 0
@@ -230,7 +236,9 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
                 scores[part] += share * _DECAY * scores[k]
     whole = _CROSSING * scores[0]
     for k in range(count - 1, -1, -1):
-        scores[k] = max(scores[k], crossing[k] * whole * extent[k] / extent[0])
+        wide = smooth((body.scale * extent[k] - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
+        least = max(_CROSSED * wide, whole * extent[k] / extent[0])
+        scores[k] = max(scores[k], crossing[k] * least)
         if kids[2 * k] >= 0:
             scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
 
