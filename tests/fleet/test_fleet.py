@@ -145,6 +145,16 @@ def test_environments_do_not_depend_on_each_other(fleet):
     np.testing.assert_array_equal(fleet.step(where).delta, turned)
 
 
+def test_a_check_is_against_a_finer_preset():
+    """Not against the same, of which it would be no check."""
+    where = poses(np.random.default_rng(6), 2, 3)
+    found = {
+        p: Fleet("six_patch", BODIES, 2, preset=p).check(where).worst
+        for p in ("standard", "learning")
+    }
+    assert 1e-3 < found["standard"] < found["learning"]
+
+
 def test_a_fleet_checks_itself(fleet):
     """Measured: at the learning preset some per cent of the largest entry."""
     found = fleet.check(poses(np.random.default_rng(6), COUNT, 3), samples=5)

@@ -500,6 +500,14 @@ def demodulating(**options):
     return Readout(bank, Schedule.sequential(1, 1e-3), law, **options), front
 
 
+@pytest.mark.parametrize("chip", ["fdc1004", "mpr121"])
+def test_no_age_is_negative(chip: str) -> None:
+    """A conversion that ends with the reading has the age 0, however sums of times are rounded."""
+    readout = Readout.preset(chip, NAMES)
+    ages = [readout.sample(0.01 * k, np.eye(3) * 1e-12).held().age for k in range(400)]
+    assert np.min(ages) == 0.0
+
+
 def test_loss_reaches_the_demodulated_magnitude():
     """|V_o| of a divider of Y = G + jωC over 1/R + Y + jωC_p, worked out here.
 

@@ -59,7 +59,8 @@ class Fleet:
         sensors: How many sensors of the design each has, s.
         device: ``"cpu"`` for the compiled core on all processors, or a device of Warp:
             ``"cuda:0"``, or ``"warp:cpu"``, which is for tests.
-        preset: Accuracy on the CPU, as of :class:`Simulator`.
+        preset: Accuracy on the CPU, as of :class:`Simulator`, whose own default is
+            ``"standard"``.
         budget: Clusters of each body on Warp: 32, 64 or 128.
         excitation_frequency: Excitation frequency [Hz].
 
@@ -99,6 +100,7 @@ class Fleet:
         self.device = device
         field = load_or_build(self.design, default_settings(self.design))
         chosen_preset = PRESETS[preset]
+        self._finer: Preset = "standard" if preset == "learning" else "fine"
         if device != "cpu":
             chosen_preset = replace(chosen_preset, panels=_PANELS * budget)
         self._solver = SurfaceSolver(
@@ -295,7 +297,9 @@ class Fleet:
         samples: int = 16,
         seed: int = 0,
     ) -> FleetCheck:
-        """Compare some environments with ``Simulator(preset="standard")``.
+        """Compare some environments with a ``Simulator`` of a finer preset.
+
+        That is ``"standard"``, or ``"fine"`` where the fleet's own is not ``"learning"``.
 
         Args:
             poses: As :meth:`step` takes them, on the host.
@@ -313,7 +317,9 @@ class Fleet:
         delta = self.solved(where, at).delta
         found = delta if self._warp is None else delta.numpy()
         drawn = np.random.default_rng(seed).permutation(e)[:samples]
-        simulator = Simulator(self.design, excitation_frequency=self._solver.excitation_frequency)
+        simulator = Simulator(
+            self.design, excitation_frequency=self._solver.excitation_frequency, preset=self._finer
+        )
         errors = np.empty((len(drawn), s, *self.baseline.shape))
         contact = []
         for row, k in enumerate(drawn.tolist()):

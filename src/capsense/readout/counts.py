@@ -112,7 +112,7 @@ class Counts:
         held = Held(np.zeros(k), np.zeros(k, dtype=np.int64), np.full(k, np.inf))
         held.capacitance[last.channel] = last.capacitance
         held.code[last.channel] = last.code
-        held.age[last.channel] = now - last.time
+        held.age[last.channel] = np.maximum(now - last.time, 0.0)  # sums of times are rounded
         return held
 
     def table(self, what: str = "capacitance") -> tuple[Array, NDArray]:
