@@ -302,6 +302,22 @@ def test_a_scene_in_millimetres_is_told(sim, height):
             sim.step(cs.Scene(bodies))
 
 
+@pytest.mark.parametrize(
+    ("place", "told"), [((0, 0, 60), True), ((40, 0, 30), True), ((0, 0, 20), False)]
+)
+def test_places_in_millimetres_are_told(sim, place, told):
+    """Of a ball whose radius is in metres; one that is near enough is none."""
+    ball, near = (cs.Body(cs.Sphere(0.03), cs.Pose(at)) for at in (place, (0, 0, 0.1)))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sim.step(cs.Scene([ball]))
+        assert [
+            f"at ({place[0]:g}, 0, {place[2]:g}) m" in str(w.message) for w in caught
+        ] == told * [True]
+        sim.step(cs.Scene([ball, near]))
+        assert len(caught) == told
+
+
 @pytest.mark.parametrize("name", LONG)
 def test_long_bodies_read_as_their_part_in_the_domain(sim, name):
     """Measured: as a body that ends just outside; it may be pushed along without a change."""

@@ -180,6 +180,8 @@ _SHOWN = 8
 """Bodies that are listed when a scene is printed."""
 _HUGE = 25
 """A body whose smallest side is so many domains was meant in millimetres."""
+_FAR = 50
+"""So was one that is so many domains away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,19 +265,32 @@ class Scene:
         return self.bodies[key]
 
     def warn_of_units(self, domain: float) -> None:
-        """Warn of a scene that was given in millimetres: all of it is far too large.
+        """Warn of a scene in millimetres: all of it is far too large, or far too far away.
 
         Args:
             domain: Width of what the sensor sees [m].
         """
-        sizes = (np.ptp(body.shape.bounds(), axis=0) for body in self.bodies)
-        if self.bodies and all(size.min() > _HUGE * domain for size in sizes):
-            first = self.bodies[0]
-            sides = " × ".join(f"{side:g}" for side in np.ptp(first.shape.bounds(), axis=0))
+        if not self.bodies:
+            return
+        first = self.bodies[0]
+        name = first.name or "bodies[0]"
+        fix = "nothing changes its readings; lengths are metres, so multiply millimetres by 1e-3"
+        sizes = [np.ptp(body.shape.bounds(), axis=0) for body in self.bodies]
+        if all(size.min() > _HUGE * domain for size in sizes):
+            sides = " × ".join(f"{side:g}" for side in sizes[0])
             warnings.warn(
-                f"{first.name or 'bodies[0]'} is {sides} m, far more than the {domain:g} m that "
-                "the sensor sees, as are all other bodies, and nothing changes its readings; "
-                "lengths are metres, so multiply millimetres by 1e-3",
+                f"{name} is {sides} m, far more than the {domain:g} m that the sensor sees, as are "
+                f"all other bodies, and {fix}",
+                stacklevel=3,
+            )
+        elif all(
+            np.linalg.norm(body.pose.position) > _FAR * domain + size.max()
+            for body, size in zip(self.bodies, sizes, strict=True)
+        ):
+            place = ", ".join(f"{x:g}" for x in first.pose.position)
+            warnings.warn(
+                f"{name} is at ({place}) m, far beyond the {domain:g} m that the sensor sees, as "
+                f"are all other bodies, and {fix}",
                 stacklevel=3,
             )
 
