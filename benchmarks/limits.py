@@ -5,6 +5,7 @@
   help there.
 - wide boxes in parallel with the sensor, against 2,800 panels, and what their readings tell of it.
 - boxes that come down in steps of 0.02 mm: by how much a large entry falls in a step, at most.
+- a person's arm whose hand leaves the domain, against the preset fine.
 - dielectrics in depth images of 128 × 128 pixels with front and back, against the shapes.
 - sheets of a dielectric as deforming surfaces of 800 triangles, against boxes as thick.
 - bodies that reach into the sensor: error estimates over the largest entry.
@@ -28,6 +29,7 @@ from layered_views import view
 from reference_scenes import MORE, diagonal_errors, reference_scenes
 
 import capsense as cs
+from capsense.humans import Build, arm
 from capsense.simulator import PresetName
 from capsense.surface.solver import Preset, SurfaceSolver
 
@@ -150,10 +152,32 @@ def inside(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         yield name, out
 
 
+def person(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Root of the mean square and largest error of the diagonal against the preset fine.
+
+    An arm of ten capsules with its forearm along x, in three places; the hand leaves the domain.
+    """
+    *sims, fine = (cs.Simulator(DESIGN, preset=p, background=sim.background) for p in PRESETS)
+    limb = arm(Build("male", percentile=50), "right")
+    turn = cs.Pose.from_euler((0, 0, 0), (0, 90, 0), degrees=True).quaternion
+    parts = limb.bodies(cs.Pose((0, 0, 0), turn), {})
+    low = min(b.pose.position[2] - b.shape.params[0] for b in parts if "forearm" in str(b.name))
+    for gap in (0.01, 0.03, 0.1):
+        off = []
+        for x in (0.35, 0.45, 0.55):
+            scene = cs.Scene(limb.bodies(cs.Pose((x, 0, gap - low), turn), {}))
+            truth = fine.step(scene).delta
+            off.append([diagonal_errors(s.step(scene).delta, truth) for s in sims])
+        rms = np.sqrt(np.mean(np.square(off), axis=(0, 2)))
+        worst = np.abs(off).max(axis=(0, 2))
+        yield f"gap {1e3 * gap:g} mm", np.stack([rms, worst], axis=1).ravel().tolist()
+
+
 PARTS = {
     "contact, presets learning, standard, fine, and 2,800 panels": contact,
     "wide boxes: median and largest error, and median estimate, of each preset": wide,
     "falls in a step: 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, of each preset": falls,
+    "a person's arm: rms and largest error, presets learning and standard": person,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
     "deforming sheets of dielectrics, gaps of 5, 10, 20, 50 mm": cloth,
     "in the sensor: error estimate with lowest points at 1, 0, -1, -5 mm": inside,
