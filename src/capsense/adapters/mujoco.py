@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack
@@ -36,6 +37,8 @@ __all__ = [
     "attach_skin",
 ]  # fmt: skip
 
+_AWAY = 5.0
+"""No sensor is so far [m] from the body that carries it."""
 _SCALAR_LAST = [1, 2, 3, 0]
 _TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
 """MuJoCo's cameras look along -z: half a turn about x."""
@@ -251,6 +254,12 @@ def add_sensor(
     carrier = spec.body(body) if isinstance(body, str) else None
     if carrier is None:
         raise refuse_missing("body", str(body), [b.name for b in spec.bodies if b.name])
+    away = math.hypot(*pose.position)
+    if away > _AWAY and body != "world":
+        raise SceneError(
+            f"pose places the sensor {away:g} m from body {body!r}; lengths are metres, so "
+            "multiply millimetres by 1e-3"
+        )
     taken = {"site": spec.sites, "camera": spec.cameras if camera is not None else []}
     for kind, things in taken.items():
         if name in [thing.name for thing in things]:
