@@ -137,3 +137,14 @@ def test_a_shape_travels_light() -> None:
     """The charge functions of a body that was in a scene are not sent along with it."""
     kept = results()
     assert len(pickle.dumps(kept["scene"])) < 20_000
+
+
+def test_a_simulator_takes_no_shapes_along() -> None:
+    """Its pickle is hardly larger after a step: charge functions are worked out anew."""
+    sim = cs.Simulator(tiny_design(), settings=SETTINGS)
+    scene = cs.Scene([cs.Body(cs.Box((0.01, 0.02, 0.01)), cs.Pose((0, 0, 0.03)), "glass")])
+    before = len(pickle.dumps(sim))
+    expected = sim.step(scene).delta
+    after = pickle.dumps(sim)
+    assert len(after) < before + 200_000
+    np.testing.assert_array_equal(pickle.loads(after).step(scene).delta, expected)

@@ -99,10 +99,6 @@ class _Laid:
     """What the parts are made of."""
     shapes: list[RigidShape | ChangingBody]
 
-    def holds(self, whole: Matter, places: list[int], found: list[Any]) -> bool:
-        """Whether records of these are the same."""
-        return self.whole is whole and self.places == places and self.found == found
-
 
 def _laid_out(
     whole: Matter, places: list[int], found: list[tuple[RigidShape | ChangingBody, float]]
@@ -142,11 +138,14 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain [m], as :func:`windowed` takes them."""
-        self._nothing: Array = np.zeros((self.green.terminals, self.green.terminals))
         self._room = self.green.room[0], self.green.room[1]
         self._last: tuple[View, Solution] | None = None
         self._laid: _Laid | None = None
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
+        return self.__dict__ | {"_laid": None}
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
         """Return what a scene changes.
@@ -160,7 +159,7 @@ class SurfaceSolver:
         bodies, solution = self.solution(view, jacobian=jacobian)
         slope = self.jacobian(view, bodies, solution) if jacobian else None
         if solution is None:
-            return self._change(view, self._nothing, 0.0, 0, slope)
+            return self._change(view, np.zeros((self.green.terminals,) * 2), 0.0, 0, slope)
         self._last = view, solution
         return self._change(view, *self.in_farads(solution), solution.size, slope)
 
@@ -192,10 +191,9 @@ class SurfaceSolver:
         if plain:
             counts = [0, *(len(bodies.records) for _, _, bodies in plain)]
             records = np.concatenate([bodies.records for _, _, bodies in plain])
-            preset = self.preset
             with first_use():
                 delta, doubt, size = solve_each(
-                    records, np.cumsum(counts), self.green, preset.threshold, preset.width
+                    records, np.cumsum(counts), self.green, self.preset.threshold, self.preset.width
                 )
             delta, doubt = UNIT * delta, UNIT * doubt
             sound = (size >= 0) & np.isfinite(delta).all(axis=(1, 2))
@@ -332,7 +330,7 @@ class SurfaceSolver:
                 found.append(self.functions_of(part, share))
                 places.append(place)
         laid = self._laid
-        if laid is None or not laid.holds(matter, places, found):
+        if laid is None or laid.whole is not matter or (laid.places, laid.found) != (places, found):
             laid = self._laid = _laid_out(matter, places, found)
         records, chosen = laid.records.copy(), view.met[places]
         records["rotation"] = rotation = packed.rotation[chosen]
