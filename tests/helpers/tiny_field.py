@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -71,4 +72,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    # what a shell starts in the background ignores it, and so does all that is started from there
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     main()
