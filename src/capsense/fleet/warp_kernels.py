@@ -26,7 +26,7 @@ _WIDE = wp.constant(WIDE)
 
 
 @wp.func
-def unit(p: wp.vec3, source: wp.vec3, floor: float, least: float):
+def _unit(p: wp.vec3, source: wp.vec3, floor: float, least: float):
     """Potential of a unit charge and its image in the floor."""
     dx = p[0] - source[0]
     dy = p[1] - source[1]
@@ -34,6 +34,15 @@ def unit(p: wp.vec3, source: wp.vec3, floor: float, least: float):
     ez = p[2] + source[2] - 2.0 * floor
     across = dx * dx + dy * dy
     return 1.0 / wp.sqrt(wp.max(across + dz * dz, least * least)) - 1.0 / wp.sqrt(across + ez * ez)
+
+
+@wp.func
+def four_units(
+    p0: wp.vec3, p1: wp.vec3, p2: wp.vec3, p3: wp.vec3, source: wp.vec3, floor: float, least: float
+):
+    """The sum of that over four points."""
+    return (_unit(p0, source, floor, least) + _unit(p1, source, floor, least)
+            + _unit(p2, source, floor, least) + _unit(p3, source, floor, least))  # fmt: skip
 
 
 @wp.kernel
@@ -53,19 +62,12 @@ def rows(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
         if near < 1.0 and inner > 0.0 and part < green.far_table.shape[1]:
             for s in range(green.far.shape[0]):
                 q = green.far[s]
-                value = (
-                    unit(p0, q, green.floor, _FAR_LEAST) + unit(p1, q, green.floor, _FAR_LEAST)
-                    + unit(p2, q, green.floor, _FAR_LEAST) + unit(p3, q, green.floor, _FAR_LEAST)
-                )  # fmt: skip
+                value = four_units(p0, p1, p2, p3, q, green.floor, _FAR_LEAST)
                 total += (1.0 - near) * inner * value * green.far_table[s, part]
         if near > 0.0 and inner > 0.0:
             for s in range(green.near.shape[0]):
                 q = green.near[s]
-                value = (
-                    unit(p0, q, green.floor, _NEAR_LEAST) + unit(p1, q, green.floor, _NEAR_LEAST)
-                    + unit(p2, q, green.floor, _NEAR_LEAST)
-                    + unit(p3, q, green.floor, _NEAR_LEAST)
-                )  # fmt: skip
+                value = four_units(p0, p1, p2, p3, q, green.floor, _NEAR_LEAST)
                 total += near * inner * value * green.near_table[s, part]
     for c in range(_WIDTH):
         out[i, part * _WIDTH + c, v] = total[c]
@@ -116,6 +118,12 @@ def mean(a: Leaf, cut: WarpCut, j: int, v: int, mirrored: float, floor: float):
         along = 3.0 * (ax * ax + ay * ay + az * az + aw * aw) * second
         return inverse * (1.0 + 0.5 * (along - whole) * second)
     fourth = _fourth(wp.max(a.soft, cut.soft[j, v]))
+    return _between(a, b0, b1, b2, b3, fourth)
+
+
+@wp.func
+def _between(a: Leaf, b0: wp.vec3, b1: wp.vec3, b2: wp.vec3, b3: wp.vec3, fourth: float):
+    """Mean of a bounded 1/r between a cluster and four points."""
     return 0.25 * (
         _four(a.p0, b0, b1, b2, b3, fourth) + _four(a.p1, b0, b1, b2, b3, fourth)
         + _four(a.p2, b0, b1, b2, b3, fourth) + _four(a.p3, b0, b1, b2, b3, fourth)
@@ -225,10 +233,7 @@ def _imaged(a: Leaf, floor: float):
     b2 = wp.cw_mul(flip, a.p2) + lift
     b3 = wp.cw_mul(flip, a.p3) + lift
     fourth = _fourth(0.0)
-    return 0.25 * (
-        _four(a.p0, b0, b1, b2, b3, fourth) + _four(a.p1, b0, b1, b2, b3, fourth)
-        + _four(a.p2, b0, b1, b2, b3, fourth) + _four(a.p3, b0, b1, b2, b3, fourth)
-    )  # fmt: skip
+    return _between(a, b0, b1, b2, b3, fourth)
 
 
 @wp.func

@@ -25,7 +25,7 @@ from capsense.fleet.warp_cut import (
     many,
     placed,
 )
-from capsense.fleet.warp_kernels import mean, more, own, unit
+from capsense.fleet.warp_kernels import four_units, mean, more, own
 from capsense.fleet.warp_solve import Left, over, times
 from capsense.surface.pair_kernels import BARRIER
 from capsense.surface.solve_kernels import COARSE
@@ -187,23 +187,21 @@ def _met(
     if leaf.near > 0.0 and inner > 0.0:
         for s in range(green.near.shape[0]):
             q = green.near[s]
-            value = inner * leaf.near * (
-                unit(leaf.p0, q, green.floor, _NEAR_LEAST)
-                + unit(leaf.p1, q, green.floor, _NEAR_LEAST)
-                + unit(leaf.p2, q, green.floor, _NEAR_LEAST)
-                + unit(leaf.p3, q, green.floor, _NEAR_LEAST)
-            )  # fmt: skip
+            value = (
+                inner
+                * leaf.near
+                * four_units(leaf.p0, leaf.p1, leaf.p2, leaf.p3, q, green.floor, _NEAR_LEAST)
+            )
             for c in range(_COLUMNS):
                 out[c] = out[c] + value * left.near[s, first + c, v]
     if leaf.near < 1.0 and inner > 0.0:
         for s in range(green.far.shape[0]):
             q = green.far[s]
-            value = inner * (1.0 - leaf.near) * (
-                unit(leaf.p0, q, green.floor, _FAR_LEAST)
-                + unit(leaf.p1, q, green.floor, _FAR_LEAST)
-                + unit(leaf.p2, q, green.floor, _FAR_LEAST)
-                + unit(leaf.p3, q, green.floor, _FAR_LEAST)
-            )  # fmt: skip
+            value = (
+                inner
+                * (1.0 - leaf.near)
+                * four_units(leaf.p0, leaf.p1, leaf.p2, leaf.p3, q, green.floor, _FAR_LEAST)
+            )
             for c in range(_COLUMNS):
                 out[c] = out[c] + value * left.far[s, first + c, v]
     for j in range(cut.node.shape[0]):
