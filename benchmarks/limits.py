@@ -24,12 +24,11 @@ from step_scenes import PIXELS, WIDE, low, sheet
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
-from field_cases import bar, delta_reference
+from field_cases import arm_scenes, bar, delta_reference
 from layered_views import view
 from reference_scenes import MORE, diagonal_errors, reference_scenes
 
 import capsense as cs
-from capsense.humans import Build, arm
 from capsense.simulator import PresetName
 from capsense.surface.solver import Preset, SurfaceSolver
 
@@ -158,14 +157,9 @@ def person(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     An arm of ten capsules with its forearm along x, in three places; the hand leaves the domain.
     """
     *sims, fine = (cs.Simulator(DESIGN, preset=p, background=sim.background) for p in PRESETS)
-    limb = arm(Build("male", percentile=50), "right")
-    turn = cs.Pose.from_euler((0, 0, 0), (0, 90, 0), degrees=True).quaternion
-    parts = limb.bodies(cs.Pose((0, 0, 0), turn), {})
-    low = min(b.pose.position[2] - b.shape.params[0] for b in parts if "forearm" in str(b.name))
     for gap in (0.01, 0.03, 0.1):
         off = []
-        for x in (0.35, 0.45, 0.55):
-            scene = cs.Scene(limb.bodies(cs.Pose((x, 0, gap - low), turn), {}))
+        for scene in arm_scenes(gap):
             truth = fine.step(scene).delta
             off.append([diagonal_errors(s.step(scene).delta, truth) for s in sims])
         rms = np.sqrt(np.mean(np.square(off), axis=(0, 2)))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from field_cases import (
     PICO,
+    arm_scenes,
     assert_physical,
     body_of,
     capsule,
@@ -26,7 +27,6 @@ from field_cases import (
 import capsense as cs
 from capsense.constants import EPS0
 from capsense.design.model import Domain
-from capsense.humans import Build, arm
 
 Array = np.ndarray
 
@@ -169,15 +169,10 @@ def test_a_persons_arm_that_leaves_the_box(simulators, preset, rms, worst):
     Fingers across the wall, taken as one cluster, made it 62 % wrong.
     """
     sims = [simulators("six_patch", preset=p) for p in (preset, "fine")]
-    limb = arm(Build("male", percentile=50), "right")
-    turn = cs.Pose.from_euler((0, 0, 0), (0, 90, 0), degrees=True).quaternion
-    parts = limb.bodies(cs.Pose((0, 0, 0), turn), {})
-    low = min(b.pose.position[2] - b.shape.params[0] for b in parts if "forearm" in str(b.name))
     errors = []
     for gap in (0.01, 0.03, 0.1):
-        for shift in (0.35, 0.45, 0.55):
-            bodies = limb.bodies(cs.Pose((shift, 0, gap - low), turn), {})
-            found, truth = (np.diag(s.step(cs.Scene(bodies)).delta) for s in sims)
+        for scene in arm_scenes(gap):
+            found, truth = (np.diag(s.step(scene).delta) for s in sims)
             errors.append(100 * (found - truth) / np.maximum(truth, 0.01 * truth.max()))
     assert np.sqrt(np.mean(np.square(errors))) < rms
     assert np.abs(errors).max() < worst

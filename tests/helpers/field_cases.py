@@ -21,6 +21,7 @@ import capsense as cs
 from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Design, Domain, Electrode
 from capsense.field.background import BuildSettings
+from capsense.humans import Build, arm
 
 Array = NDArray[np.float64]
 
@@ -62,6 +63,19 @@ def capsule_reference(gap_mm: int) -> Array:
 def bar(gap: float, x: float = 0.0, **options: Any) -> cs.Body:
     """The reference bar with its lower face ``gap`` [m] above the electrode plane."""
     return cs.Body(cs.Box(BAR), cs.Pose((x, 0.0, gap + BAR[2] / 2)), **options)
+
+
+def arm_scenes(gap: float) -> list[cs.Scene]:
+    """An arm whose forearm lies ``gap`` [m] above the plane, along x, in three places.
+
+    It has ten capsules, and its hand leaves the domain of ``six_patch``.
+    """
+    limb = arm(Build("male", percentile=50), "right")
+    turn = cs.Pose.from_euler((0, 0, 0), (0, 90, 0), degrees=True).quaternion
+    parts = limb.bodies(cs.Pose((0, 0, 0), turn), {})
+    low = min(b.pose.position[2] - b.shape.params[0] for b in parts if "forearm" in str(b.name))
+    places = (cs.Pose((x, 0, gap - low), turn) for x in (0.35, 0.45, 0.55))
+    return [cs.Scene(limb.bodies(place, {})) for place in places]
 
 
 def ball(z: float = 0.08, radius: float = 0.04, **options: Any) -> cs.Body:
