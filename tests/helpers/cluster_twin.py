@@ -76,7 +76,8 @@ def cut_of(
         np.array(c) for c in zip(*rows, strict=True)
     )
     kids = np.stack([first, second], axis=1)
-    return Cut(body, node, kids, share, leaf, whole, fade, above, np.array(leaves))
+    parts = (1.0 - whole)[:, None] * np.stack([share, 1.0 - share], axis=1)
+    return Cut(body, node, kids, share, parts, leaf, whole, fade, above, np.array(leaves))
 
 
 def _add_barrier(cut: Cut, functions: Functions, system: System, beyond: Array) -> None:

@@ -23,6 +23,8 @@ SOFT, ROUND = 0.15, 0.82
 """Points of different bodies see 1/r bounded: extent and least moment count so much for it."""
 GAIN = 1.3
 """What functions that are left out stand for, themselves and all below."""
+BARRIER = 1e6
+"""Energy of charge out of reach [1/m]."""
 COARSE_PANELS = 0.6
 """What panels are too coarse for, over the energy of the functions that end in them."""
 
@@ -69,11 +71,11 @@ class Clusters(NamedTuple):
     owner: Array
 
 
-def galerkin(pieces: tuple[Piece, ...], green: GreenFunction) -> Array:
-    """ΔC with an unknown for every panel, shape (terminals, terminals) [m]."""
-    singles = [np.eye(len(p.panels)) for p in pieces]
-    found = clusters(pieces, singles)
-    matrix = interaction(found, green)
+def galerkin(pieces: tuple[Piece, ...], green: GreenFunction, room: Array) -> Array:
+    """ΔC with an unknown for every panel in the room, shape (terminals, terminals) [m]."""
+    found = clusters(pieces, [np.eye(len(p.panels)) for p in pieces])
+    out = beyond(found.points, room)
+    matrix = interaction(found, green) + np.diag(BARRIER * out**3)
     matrix = matrix.astype(np.result_type(*(p.block for p in pieces), *(p.tie for p in pieces)))
     group = np.array([-1 - b if p.group is None else p.group for b, p in enumerate(pieces)])
     for b, piece in enumerate(pieces):
@@ -83,9 +85,18 @@ def galerkin(pieces: tuple[Piece, ...], green: GreenFunction) -> Array:
     phi = four_point_mean(found.points, green, "phi0")
     free = np.unique([g for g, p in zip(group, pieces, strict=True) if p.neutral])
     net = (group[found.owner][:, None] == free).astype(float)
+    kept = out < 1.0
+    matrix, phi, net = matrix[np.ix_(kept, kept)], phi[kept], net[kept]
     saddle = np.block([[matrix, net], [net.T, np.zeros((len(free),) * 2)]])
     x = np.linalg.solve(saddle, np.concatenate([phi, np.zeros((len(free), phi.shape[1]))]))
     return phi.T @ x[: len(phi)]
+
+
+def beyond(points: Array, room: Array) -> Array:
+    """How far clusters (k, 4, 3) are out of reach, 0 to 1, by their middles."""
+    middle = points.mean(axis=1)
+    off = np.maximum(np.maximum(room[0] - middle, middle - room[1]), 0.0)
+    return np.array([_smooth(d / SHORE) for d in np.linalg.norm(off, axis=1)])
 
 
 def interaction(found: Clusters, green: GreenFunction) -> Array:
@@ -187,23 +198,36 @@ class Chosen(NamedTuple):
     """The same of the cluster above."""
 
 
-def on_leaves(
-    tree: tuple[Array, Array, Array], share: Array, chosen: Chosen, cluster: int
-) -> Array:
-    """Charges on the leaves of a unit charge on a cluster."""
+def within_reach(
+    tree: tuple[Array, Array, Array], share: Array, chosen: Chosen, out: Array
+) -> dict[int, tuple[Array, Array]]:
+    """Unit charges on what is within reach of each cluster, on the panels and on the leaves.
+
+    ``out`` is how far each leaf is out of reach. A cluster that is wholly out has none.
+    """
     kids, _, charge = tree
-    whole = dict(zip(chosen.leaves.tolist(), chosen.whole.tolist(), strict=True))
     amount = [charge[share[:, k] > 0].sum() for k in range(len(kids))]
-    left, out = {cluster: 1.0}, dict.fromkeys(whole, 0.0)
-    for k in range(cluster, len(kids)):  # wholes stand before their parts
-        if k in left:
-            value = left.pop(k)
-            if k in whole:
-                out[k] = value * whole[k]
-            value *= 1.0 - whole.get(k, 0.0)
-            if value > 0.0:
-                left |= {part: value * amount[part] / amount[k] for part in kids[k].tolist()}
-    return np.array(list(out.values()))
+    leaves, split = chosen.leaves.tolist(), chosen.functions.tolist()
+    inside: dict[int, float] = {}
+    found: dict[int, tuple[Array, Array]] = {}
+    for k in sorted({*leaves, *split}, reverse=True):  # parts stand behind their wholes
+        terms, rest = [], 1.0
+        if k in leaves:
+            j = leaves.index(k)
+            terms.append((chosen.whole[j] * (1 - out[j]), share[:, k], np.eye(len(leaves))[j]))
+            rest -= chosen.whole[j]
+        if k in split:
+            for part in kids[k].tolist():
+                if part in found:
+                    weight = rest * amount[part] / amount[k] * inside[part]
+                    terms.append((weight, *found[part]))
+        inside[k] = sum(weight for weight, _, _ in terms)
+        if inside[k] > 0.0:
+            found[k] = (
+                sum(weight * panels for weight, panels, _ in terms) / inside[k],
+                sum(weight * on for weight, _, on in terms) / inside[k],
+            )
+    return found
 
 
 def reduced(
@@ -211,37 +235,40 @@ def reduced(
     trees: list[tuple[Array, Array, Array]],
     chosen: list[Chosen],
     green: GreenFunction,
+    room: Array,
 ) -> tuple[Array, Array, Array]:
     """ΔC and the part of it that is estimated, from chosen functions (kids, panel, charge), and
     what panels are too coarse for."""
     share = [shares(*tree) for tree in trees]
     found = clusters(pieces, [s[:, c.leaves] for s, c in zip(share, chosen, strict=True)])
+    out = beyond(found.points, room)
     columns, blocks, fade, above, ends = [], [], [], [], []
     for b, (piece, tree, all_of, cut) in enumerate(zip(pieces, trees, share, chosen, strict=True)):
-        kids = tree[0]
-        haars = all_of[:, kids[cut.functions, 0]] - all_of[:, kids[cut.functions, 1]]
-        start = [] if piece.neutral else [0]
-        functions = np.column_stack([*(all_of[:, [k]] for k in start), haars])
-        own = np.flatnonzero(found.owner == b)
+        kids, own = tree[0], found.owner == b
+        units = within_reach(tree, all_of, cut, out[own])
+        used = [] if piece.neutral or 0 not in units else [units[0]]
+        net = len(used)
+        parted = [x in units and y in units for x, y in kids[cut.functions]]
+        for x, y in kids[cut.functions[parted]]:
+            used.append((units[x][0] - units[y][0], units[x][1] - units[y][1]))
+        functions = np.column_stack([on_panels for on_panels, _ in used])
         spread = np.zeros((len(found.owner), functions.shape[1]))
-        spread[own] = np.column_stack(
-            [*(on_leaves(tree, all_of, cut, k) for k in start)]
-            + [
-                on_leaves(tree, all_of, cut, x) - on_leaves(tree, all_of, cut, y)
-                for x, y in kids[cut.functions]
-            ]
-        )
+        spread[own] = np.column_stack([on_leaves for _, on_leaves in used])
         columns.append(spread)
         block = functions.T @ piece.block @ functions
-        for k in start:
-            block[k, k] += piece.tie
+        block[:net, :net] += piece.tie
         blocks.append(block)
-        fade.append(np.concatenate([[1.0] * len(start), cut.fade]))
-        above.append(np.concatenate([[1.0] * len(start), cut.above]))
-        panels = (kids[kids[cut.functions]][..., 0] < 0).mean(axis=1)
-        ends.append(np.concatenate([[0.0] * len(start), panels]))
+        fade.append(np.concatenate([[1.0] * net, cut.fade[parted]]))
+        above.append(np.concatenate([[1.0] * net, cut.above[parted]]))
+        panels = (kids[kids[cut.functions[parted]]][..., 0] < 0).mean(axis=1)
+        members_out = [
+            any(out[own][on != 0.0].max(initial=0.0) > 0.0 for on in (units[x][1], units[y][1]))
+            for x, y in kids[cut.functions[parted]]
+        ]
+        ends.append(np.concatenate([[0.0] * net, np.where(members_out, 0.0, panels)]))
     to_leaves = np.concatenate(columns, axis=1)
-    matrix = to_leaves.T @ interaction(found, green) @ to_leaves
+    energy = interaction(found, green) + np.diag(BARRIER * out**3)
+    matrix = to_leaves.T @ energy @ to_leaves
     at = np.cumsum([0, *(len(b) for b in blocks)])
     for b, block in enumerate(blocks):
         matrix[at[b] : at[b + 1], at[b] : at[b + 1]] += block
@@ -261,7 +288,7 @@ def reduced(
 # ---- scores ----
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
-CROSSING, CROSSED, LARGE = 5.0, 0.3, (0.12, 0.16)
+CROSSED, LARGE = 0.3, (0.12, 0.16)
 LONG, SHORE = (0.03, 0.06), 5e-3
 
 
@@ -270,7 +297,7 @@ def scores(
 ) -> list[Array]:
     """Share of the electrodes' energies that each split takes up alone, raised from below.
 
-    Parts that cross a wall have at least five times the share of their body, by length.
+    Parts that cross a wall have at least their share of that of their body, by length.
     """
     seen, stiff = [], []
     energy = np.zeros(green.far_phi.shape[1])
@@ -312,11 +339,10 @@ def scores(
             for part in kids[k]:
                 if part >= 0 and kids[part, 0] >= 0:
                     score[part] += linear.get(part, 1.0) * DECAY * score[k]
-        whole = CROSSING * score[0]
         for k in reversed(range(len(kids))):
             if k in looks:
                 large = _smooth((looks[k].size - LARGE[0]) / (LARGE[1] - LARGE[0]))
-                least = max(whole * looks[k].size / looks[0].size, CROSSED * large)
+                least = max(score[0] * looks[k].size / looks[0].size, CROSSED * large)
                 score[k] = max(score[k], looks[k].crossing * least)
             score[k] = max([score[k], *(score[p] for p in kids[k] if p >= 0)])
         out.append(score)

@@ -30,11 +30,8 @@ _DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
-_CROSSING = 5.0
-"""Least score of clusters that cross a wall, over their share of that of their body by length."""
 _CROSSED = 0.3
-"""The same of large clusters of bodies that hardly count: so much that functions are fully faded
-in. Their points lie among the sources that stand for the wall, 40 mm behind it, and would attract
+"""Least score of large clusters that cross a wall: so much that functions are fully faded in. Their points lie among the sources that stand for the wall, 40 mm behind it, and would attract
 themselves so much that no definite matrix were left."""
 _WIDE = 0.12, 0.16
 """Clusters come to be large between these extents [m]."""
@@ -54,7 +51,9 @@ class Cut(NamedTuple):
     kids: NDArray[Any]
     """Its parts in this list, -1 for a leaf, shape (k, 2)."""
     share: NDArray[Any]
-    """Share of the first part in its charge, shape (k,)."""
+    """Share of the first part in its equilibrium charge, shape (k,)."""
+    parts: NDArray[Any]
+    """Shares of its two parts in the charge within reach, beside ``whole``, shape (k, 2)."""
     leaf: NDArray[Any]
     """Its number among the leaves, else -1, shape (k,)."""
     whole: NDArray[Any]
@@ -207,7 +206,7 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
 
     Charge beyond a wall costs so much energy that none is there. A part that crosses one can carry
     charge where it is inside only if it is split too, which its own score does not tell. So that
-    is at least _CROSSING times the score of the body, times the part's share of its length.
+    is at least the score of the body, times the part's share of its length.
     """
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     extent, count = doubles(body.extent), 2 * body.n - 1
@@ -234,7 +233,7 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
             if part >= 0 and kids[2 * part] >= 0:
                 share = linear[part] if met[part] else 1.0
                 scores[part] += share * _DECAY * scores[k]
-    whole = _CROSSING * scores[0]
+    whole = scores[0]
     for k in range(count - 1, -1, -1):
         wide = smooth((body.scale * extent[k] - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
         least = max(_CROSSED * wide, whole * extent[k] / extent[0])
@@ -288,8 +287,8 @@ def _whole(state, above):
 def _collect(bodies, first, state, place, fades, above, count, leaves):
     cut = Cut(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),
-        np.zeros(count), np.empty(count, np.int64), np.empty(count), np.empty(count),
-        np.empty(count), np.empty(leaves, np.int64),
+        np.zeros(count), np.zeros((count, 2)), np.empty(count, np.int64), np.empty(count),
+        np.empty(count), np.empty(count), np.empty(leaves, np.int64),
     )  # fmt: skip
     leaf = 0
     for b in range(bodies.shape[0]):
@@ -314,6 +313,8 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
                     place[o + kids[2 * k + 1]],
                 )
                 cut.share[a] = charge[kids[2 * k + 0]] / charge[k]
+                cut.parts[a, 0] = (1.0 - cut.whole[a]) * cut.share[a]
+                cut.parts[a, 1] = (1.0 - cut.whole[a]) - cut.parts[a, 0]
     return cut
 
 
@@ -330,7 +331,7 @@ def functions_of(bodies, cut, beyond):
         if cut.leaf[a] >= 0:
             reaches_out[a] = beyond[cut.leaf[a]] > 0.0
         if cut.kids[a, 0] >= 0:
-            count += 1
+            count += _there(cut, cut.kids[a, 0]) and _there(cut, cut.kids[a, 1])
             for c in range(2):
                 reaches_out[a] = reaches_out[a] or reaches_out[cut.kids[a, c]]
     cluster, number, body = (
@@ -343,10 +344,12 @@ def functions_of(bodies, cut, beyond):
     for rest in range(2):
         for a in range(cut.node.shape[0]):
             b = cut.body[a]
-            if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral:
+            if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral and _there(cut, a):
                 cluster[f], number[f], body[f] = -1 - a, 0, b
                 f += 1
-            if cut.kids[a, 0] >= 0 and (cut.fade[a] == 0.0) == (rest == 1):
+            x, y = cut.kids[a]
+            parted = x >= 0 and _there(cut, x) and _there(cut, y)
+            if parted and (cut.fade[a] == 0.0) == (rest == 1):
                 # functions are numbered breadth first, as clusters are
                 cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
                 ends[f] = 0.0 if reaches_out[a] else _panels(bodies[b], cut.node[a])
@@ -354,6 +357,12 @@ def functions_of(bodies, cut, beyond):
         if rest == 0:
             solved = f
     return Functions(cluster[:f], number[:f], body[:f], ends[:f], solved)
+
+
+@compiled
+def _there(cut, a):
+    """Whether anything of a cluster is within reach."""
+    return cut.whole[a] + cut.parts[a, 0] + cut.parts[a, 1] > 0.0
 
 
 @compiled

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from capsense._dense import WIDTH, cholesky, multiply_part, substitute
 from capsense._jit import compiled
-from capsense._simd import at, madd, put_span, singles, span
+from capsense._simd import at, madd, put_span, span
+from capsense.surface.reach_kernels import add_own
 
 SHEET = 6.0
 """Impedance of a thin sheet to charge that moves from one part of a cluster to the other, times its
@@ -74,12 +75,13 @@ def _differences(cut, functions, values, out):
 def _climb(cut, values):
     """Fill the means (k, m) of all clusters of a cut from those of its leaves."""
     for a in range(cut.node.shape[0] - 1, -1, -1):
-        if cut.kids[a, 0] >= 0:
+        row = values[a]
+        if cut.kids[a, 0] < 0 and cut.leaf[a] < 0:
+            row[:] = np.float32(0.0)
+        elif cut.kids[a, 0] >= 0:
             whole = np.float32(cut.whole[a])
-            p = (np.float32(1.0) - whole) * np.float32(cut.share[a])
-            q = np.float32(1.0) - whole - p
+            p, q = np.float32(cut.parts[a, 0]), np.float32(cut.parts[a, 1])
             x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
-            row = values[a]
             for i in range(values.shape[1]):
                 own = whole * row[i] if whole > 0.0 else np.float32(0.0)
                 row[i] = own + (p * x[i] + q * y[i])
@@ -104,26 +106,22 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
     response = _products(psi, solved)
     matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
     for f in range(total):
-        body = bodies[functions.body[f]]
-        energy, line = singles(body.energy), functions.number[f] * body.n
         if f >= solved:  # its two parts are leaves
             parts = cut.kids[functions.cluster[f]]
             x, y = cut.leaf[parts[0]], cut.leaf[parts[1]]
             own[f] += float(pairs[x, x]) + float(pairs[y, y]) - 2.0 * float(pairs[x, y])
-            if body.energy != 0:
-                own[f] += float(energy[line + functions.number[f]]) / body.scale
         for e in range(min(f + 1, solved)):
             value = float(outer[f, e]) - float(response[f, e])
-            if functions.body[e] == functions.body[f] and body.energy != 0:
-                value += float(energy[line + functions.number[e]]) / body.scale
             if f < solved:
                 matrix[f, e] = value
                 matrix[e, f] = value
             else:
                 rest[f - solved, e] = value
-        if f < solved:
-            own[f] = matrix[f, f]
-    _add_matter(bodies, functions, matrix, rest, own)
+    add_own(bodies, cut, functions, False, matrix, rest, own)
+    add_own(bodies, cut, functions, True, matrix, rest, own)
+    _add_matter(bodies, functions, matrix, own)
+    for f in range(solved):
+        own[f] = matrix[f, f]
     return System(phi, matrix, rest, own)
 
 
@@ -184,35 +182,20 @@ def _depth(rows):
 
 
 @compiled
-def _add_matter(bodies, functions, matrix, rest, own):
-    """Add what ties bodies to ground, and the inside of dielectrics."""
+def _add_matter(bodies, functions, matrix, own):
+    """Add what ties bodies to ground, and the sheets of dielectrics."""
     solved = functions.solved
     for f in range(functions.cluster.shape[0]):
         body = bodies[functions.body[f]]
         if functions.cluster[f] < 0:
-            own[f] += body.tie
             for e in range(solved):
                 if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
                     matrix[f, e] += body.tie
-        if functions.cluster[f] < 0:
-            continue
-        if body.sheet > 0.0:
+        elif body.sheet > 0.0:
             along = SHEET * body.softness / body.sheet
             own[f] += along
             if f < solved:
                 matrix[f, f] += along
-        if body.impedance == 0:
-            continue
-        inside = singles(body.impedance)
-        factor = body.softness / body.scale
-        for e in range(solved):
-            if functions.body[e] == functions.body[f] and functions.cluster[e] >= 0:
-                value = factor * float(inside[functions.number[f] * body.n + functions.number[e]])
-                if f < solved:
-                    matrix[f, e] += value
-                else:
-                    rest[f - solved, e] += value
-        own[f] += factor * float(inside[functions.number[f] * (body.n + 1)])
 
 
 @compiled
@@ -359,9 +342,7 @@ def leaf_charges(cut, functions, x, leaves):
             for i in range(m):
                 out[cut.leaf[a], i] = cut.whole[a] * charge[a, i]
         if cut.kids[a, 0] >= 0:
-            p = (1.0 - cut.whole[a]) * cut.share[a]
-            q = 1.0 - cut.whole[a] - p
             for i in range(m):
-                charge[cut.kids[a, 0], i] += p * charge[a, i]
-                charge[cut.kids[a, 1], i] += q * charge[a, i]
+                charge[cut.kids[a, 0], i] += cut.parts[a, 0] * charge[a, i]
+                charge[cut.kids[a, 1], i] += cut.parts[a, 1] * charge[a, i]
     return out

@@ -18,6 +18,7 @@ from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs
+from capsense.surface.reach_kernels import add_own, reached
 from capsense.surface.solve_kernels import (
     COARSE,
     GAIN,
@@ -69,7 +70,7 @@ def prepared(
         The cut, its leaves, its functions and their system.
     """
     cut = chosen(bodies, green, threshold, width)
-    leaves = placed(bodies, cut, green, INSIDE)
+    cut, leaves = reached(cut, placed(bodies, cut, green, INSIDE))
     rows = leaf_rows(leaves.points, leaves.beyond, green)
     pairs = leaf_pairs(leaves, green.floor)
     bound_images(leaves, rows, pairs, green)
@@ -193,20 +194,19 @@ def solve_lossy(
     n, m = functions.solved, green.terminals
     matrix = np.concatenate([real, below]).astype(complex)
     diagonal = own.astype(complex)
+    plain["impedance"] = [0 if z is None else z.ctypes.data for z in impedances]
+    plain["softness"] = 1.0
+    inside, beside, alone = np.zeros_like(real), np.zeros_like(below), np.zeros_like(own)
+    add_own(plain, cut, functions, True, inside, beside, alone)
+    factor = softness[functions.body]
+    matrix += factor[:, None] * np.concatenate([inside, beside])
+    diagonal += factor * alone
     net = functions.cluster < 0
     for b in range(len(records)):
-        mine = np.flatnonzero((functions.body == b) & ~net)
-        z = impedances[b]
-        if z is not None:
-            number = functions.number
-            inside = mine[mine < n]
-            factor = softness[b] / records["scale"][b]
-            matrix[np.ix_(mine, inside)] += factor * z[np.ix_(number[mine], number[inside])]
-            diagonal[mine] += factor * z[number[mine], number[mine]]
         root = np.flatnonzero((functions.body == b) & net)
         others = np.flatnonzero(net & (records["group"][functions.body] == records["group"][b]))
         matrix[np.ix_(root, others)] += ties[b] if np.isfinite(ties[b]) else records["tie"][b]
-        diagonal[root] = matrix[root, root]
+    diagonal[:n] = np.diag(matrix)
     clusters = np.where(net, 0, functions.cluster)
     fade = np.where(net, 1.0, cut.fade[clusters])
     root = np.sqrt(fade[:n])
