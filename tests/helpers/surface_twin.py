@@ -23,7 +23,7 @@ SOFT, ROUND = 0.15, 0.82
 """Points of different bodies see 1/r bounded: extent and least moment count so much for it."""
 GAIN = 1.3
 """What functions that are left out stand for, themselves and all below."""
-BARRIER = 1e6
+BARRIER = 1e5
 """Energy of charge out of reach [1/m]."""
 COARSE_PANELS = 0.6
 """What panels are too coarse for, over the energy of the functions that end in them."""
@@ -75,14 +75,14 @@ def galerkin(pieces: tuple[Piece, ...], green: GreenFunction, room: Array) -> Ar
     """ΔC with an unknown for every panel in the room, shape (terminals, terminals) [m]."""
     found = clusters(pieces, [np.eye(len(p.panels)) for p in pieces])
     out = beyond(found.points, room)
-    matrix = interaction(found, green) + np.diag(BARRIER * out**3)
+    matrix = interaction(found, green, out)
     matrix = matrix.astype(np.result_type(*(p.block for p in pieces), *(p.tie for p in pieces)))
     group = np.array([-1 - b if p.group is None else p.group for b, p in enumerate(pieces)])
     for b, piece in enumerate(pieces):
         own, joint = found.owner == b, group[found.owner] == group[b]
         matrix[np.ix_(own, own)] += piece.block
         matrix[np.ix_(own, joint)] += 0.0 if piece.neutral else piece.tie
-    phi = four_point_mean(found.points, green, "phi0")
+    phi = (1 - out)[:, None] * four_point_mean(found.points, green, "phi0")
     free = np.unique([g for g, p in zip(group, pieces, strict=True) if p.neutral])
     net = (group[found.owner][:, None] == free).astype(float)
     kept = out < 1.0
@@ -99,13 +99,17 @@ def beyond(points: Array, room: Array) -> Array:
     return np.array([_smooth(d / SHORE) for d in np.linalg.norm(off, axis=1)])
 
 
-def interaction(found: Clusters, green: GreenFunction) -> Array:
-    """Mean potentials of clusters on each other but for those of a body on itself [1/m]."""
-    psi = four_point_mean(found.points, green, "psi")
+def interaction(found: Clusters, green: GreenFunction, out: Array) -> Array:
+    """Mean potentials of clusters on each other but for those of a body on itself [1/m].
+
+    ``out`` is how far each is out of reach, shape (k,).
+    """
+    psi = (1 - out)[:, None] * four_point_mean(found.points, green, "psi")
     image = found.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
     other = found.owner[:, None] != found.owner
     between = np.where(other, inverse_distances(found.points, found.points, found.soft), 0.0)
-    return between - inverse_distances(found.points, image, found.soft) - psi @ psi.T
+    images = inverse_distances(found.points, image, found.soft) + psi @ psi.T
+    return between - images + np.diag(BARRIER * out**3)
 
 
 def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
@@ -251,9 +255,9 @@ def reduced(
         parted = [x in units and y in units for x, y in kids[cut.functions]]
         for x, y in kids[cut.functions[parted]]:
             used.append((units[x][0] - units[y][0], units[x][1] - units[y][1]))
-        functions = np.column_stack([on_panels for on_panels, _ in used])
-        spread = np.zeros((len(found.owner), functions.shape[1]))
-        spread[own] = np.column_stack([on_leaves for _, on_leaves in used])
+        functions = np.array([on for on, _ in used]).reshape(-1, len(piece.panels)).T
+        spread = np.zeros((len(found.owner), len(used)))
+        spread[own] = np.array([on for _, on in used]).reshape(-1, own.sum()).T
         columns.append(spread)
         block = functions.T @ piece.block @ functions
         block[:net, :net] += piece.tie
@@ -267,12 +271,12 @@ def reduced(
         ]
         ends.append(np.concatenate([[0.0] * net, np.where(members_out, 0.0, panels)]))
     to_leaves = np.concatenate(columns, axis=1)
-    energy = interaction(found, green) + np.diag(BARRIER * out**3)
-    matrix = to_leaves.T @ energy @ to_leaves
+    matrix = to_leaves.T @ interaction(found, green, out) @ to_leaves
     at = np.cumsum([0, *(len(b) for b in blocks)])
     for b, block in enumerate(blocks):
         matrix[at[b] : at[b + 1], at[b] : at[b + 1]] += block
-    phi = to_leaves.T @ four_point_mean(found.points, green, "phi0")
+    phi = four_point_mean(found.points, green, "phi0")
+    phi = to_leaves.T @ ((1 - out)[:, None] * phi)
     t, parent = np.concatenate(fade), np.concatenate(above)
     root = np.sqrt(t)
     faded = root[:, None] * matrix * root

@@ -31,8 +31,9 @@ _DECAY = 0.35
 _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 _CROSSED = 0.3
-"""Least score of large clusters that cross a wall: so much that functions are fully faded in. Their points lie among the sources that stand for the wall, 40 mm behind it, and would attract
-themselves so much that no definite matrix were left."""
+"""Least score of large clusters that cross a wall: so much that functions are fully faded in. Their
+points lie among the sources that stand for the wall, 40 mm behind it, and would attract themselves
+so much that no definite matrix were left."""
 _WIDE = 0.12, 0.16
 """Clusters come to be large between these extents [m]."""
 _PARTED = 0.1
@@ -204,9 +205,9 @@ def _mean_potentials(body, green, means, met, crossing, linear):
 def _raise_scores(body, mean, met, linear, crossing, weight, scores):
     """Score a body's clusters from the mean potentials of those that were met.
 
-    Charge beyond a wall costs so much energy that none is there. A part that crosses one can carry
-    charge where it is inside only if it is split too, which its own score does not tell. So that
-    is at least the score of the body, times the part's share of its length.
+    No charge is beyond a wall. A part that crosses one can carry charge where it is inside only if
+    it is split too, which its own score does not tell. So that is at least the score of the body,
+    times the part's share of its length.
     """
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     extent, count = doubles(body.extent), 2 * body.n - 1
@@ -322,8 +323,9 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
 def functions_of(bodies, cut, beyond):
     """List the charge functions of a cut, those to be solved for first.
 
-    ``beyond`` is how far each leaf is out of reach. Where one is, charge is held off by an energy
-    that tells nothing of how coarse panels are, so that none of its functions counts for that.
+    ``beyond`` is how far each leaf is out of reach. Where one is in part, charge is held off by an
+    energy that tells nothing of how coarse panels are, so that none of its functions counts for
+    that.
     """
     count = bodies.shape[0]
     reaches_out = np.zeros(cut.node.shape[0], np.bool_)

@@ -14,7 +14,7 @@ FAR = 0.75
 """Clusters farther apart than so many of their joint extents are met by their moments."""
 _CLOSE = 0.6
 """Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
-BARRIER = 1e6
+BARRIER = 1e5
 """Energy of charge that is out of reach [1/m]."""
 LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""

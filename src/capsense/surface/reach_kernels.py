@@ -92,13 +92,14 @@ def add_own(bodies, cut, functions, inside, matrix, rest, own):
         while last < cut.node.shape[0] and cut.body[last] == b:
             moved = moved or (cut.kids[last, 0] >= 0 and abs(_moved(cut, last)) > _SAME)
             last += 1
-        body, count = bodies[b], 0
-        for f in range(total):
-            if functions.body[f] == b:
-                of[count] = f
-                count += 1
+        body = bodies[b]
         address = body.impedance if inside else body.energy
         if address != 0:
+            count = 0
+            for f in range(total):
+                if functions.body[f] == b:
+                    of[count] = f
+                    count += 1
             factor = (body.softness if inside else 1.0) / body.scale
             table = singles(address)
             block = np.empty((0, 0))
