@@ -9,8 +9,7 @@ from test_fleet import BODIES, poses
 import capsense as cs
 from capsense.errors import ReadoutError
 from capsense.fleet import Fleet
-from capsense.readout.channels import self_patterns
-from capsense.readout.front_end import Wiring
+from capsense.readout.channels import Wiring, self_patterns
 from capsense.readout.noise import allan_deviation
 from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout

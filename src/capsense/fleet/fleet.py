@@ -14,8 +14,8 @@ from capsense._thread_pool import OneAtATime
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
+from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.cpu_core import CpuCore
 from capsense.fleet.reading import FleetCheck, FleetReading, on_device

@@ -17,7 +17,7 @@ from capsense.errors import ReadoutError
 from capsense.fleet import warp_chip_kernels as kernels
 from capsense.fleet.reading import on_device
 from capsense.fleet.warp_laws import law_of
-from capsense.readout.counts import Held
+from capsense.readout.conversions import Held
 from capsense.readout.noise import ClimateDrift, Context, Flicker, Mains, RandomWalk, White
 from capsense.readout.readout import Readout
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, require_whole
-from capsense.readout.counts import Held
+from capsense.readout.conversions import Held
 from capsense.readout.readout import Readout
 
 
