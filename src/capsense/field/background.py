@@ -45,11 +45,8 @@ class MeshSettings:
 
     def refined(self, factor: float) -> MeshSettings:
         """Return settings with ``factor`` times as many nodes along each axis."""
-        return MeshSettings(
-            self.edge / factor, self.growth / factor, self.far / factor, self.face / factor,
-            self.growth_z / factor, self.far_z / factor, self.tall / factor,
-            self.merge / max(1.0, factor),
-        )  # fmt: skip
+        finer = {name: value / factor for name, value in vars(self).items()}
+        return MeshSettings(**{**finer, "merge": self.merge / max(1.0, factor)})
 
 
 @dataclass(frozen=True)
