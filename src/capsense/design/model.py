@@ -6,7 +6,7 @@ And which designs are refused, since they could not be built or solved.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -196,18 +196,17 @@ def check_design(design: Design, *, source: str = "design") -> None:
     """
     if not design.electrodes:
         raise DesignError(f"{source}: design has no electrode; add an [[electrode]] table")
-    sheets: list[Electrode | Conductor] = [*design.electrodes, *design.conductors]
-    _unique_names([_label(s) for s in sheets], [s.name for s in sheets], source)
-    _unique_names([_label(k) for k in design.layers], [k.name for k in design.layers], source)
-    for sheet in sheets:
+    _unique_names(design.sheets, source)
+    _unique_names(design.layers, source)
+    for sheet in design.sheets:
         _inside_domain(sheet, design.domain, source)
     for layer in design.layers:
         _layer_inside_domain(layer, design.domain, source)
     for lower, upper in combinations(design.layers, 2):
         _apart(lower, upper, source)
-    for one, other in combinations(sheets, 2):
+    for one, other in combinations(design.sheets, 2):
         _no_short(one, other, source)
-    for sheet in sheets:
+    for sheet in design.sheets:
         for layer in design.layers:
             _not_crossing(sheet, layer, source)
 
@@ -216,15 +215,15 @@ def _label(item: Electrode | Conductor | Layer) -> str:
     return f'{type(item).__name__.lower()} "{item.name}"'
 
 
-def _unique_names(labels: list[str], names: list[str], source: str) -> None:
+def _unique_names(items: Sequence[Electrode | Conductor | Layer], source: str) -> None:
     seen: dict[str, str] = {}
-    for label, name in zip(labels, names, strict=True):
-        if name in seen:
+    for item in items:
+        if item.name in seen:
             raise DesignError(
-                f"{source}: {label}: the name {name!r} is already that of {seen[name]}; "
-                "give each its own name"
+                f"{source}: {_label(item)}: the name {item.name!r} is already that of "
+                f"{seen[item.name]}; give each its own name"
             )
-        seen[name] = label
+        seen[item.name] = _label(item)
 
 
 def _at(point: Array) -> str:
