@@ -128,12 +128,12 @@ def test_concatenation_keeps_panels_apart():
     """Invariant: edges, quadrature and areas stay with their panel."""
     parts = [cut(SHAPES[n], Grading(5e-4, largest=0.01))[1] for n in ("holes", "square", "L")]
     joined = concatenate(parts)
-    assert len(joined) == sum(len(p) for p in parts)
+    assert joined.size == sum(p.size for p in parts)
     np.testing.assert_allclose(joined.areas, np.concatenate([p.areas for p in parts]))
     offset = 0
     for part in parts:
-        for k in range(len(part)):
+        for k in range(part.size):
             mine = part.edges[part.first[k] : part.first[k + 1]]
             j = offset + k
             np.testing.assert_array_equal(joined.edges[joined.first[j] : joined.first[j + 1]], mine)
-        offset += len(part)
+        offset += part.size
