@@ -48,7 +48,7 @@ def main() -> None:
         solution = BoundarySolution(design)
         charges = solution.densities(np.eye(len(terminals(design))))
         sim = cs.Simulator(design)
-        print(f"{name}: {len(solution.model.panels)} panels", flush=True)
+        print(f"{name}: {solution.model.panels.size} panels", flush=True)
         for x, gap in CASES:
             start = time.perf_counter()
             centre = np.array([x, 0.0, 1e-3 * gap + SIZE[2] / 2])

@@ -86,7 +86,7 @@ def matrix(design: cs.Design, scale: float) -> tuple[np.ndarray, int]:
     """Maxwell matrix [F], and how many panels it took."""
     solution = BoundarySolution(design, Accuracy(scale))
     charges = solution.terminal_charges(solution.densities(np.eye(len(terminals(design)))))
-    return 0.5 * (charges + charges.T), len(solution.model.panels)
+    return 0.5 * (charges + charges.T), solution.model.panels.size
 
 
 def compare(name: str, data: dict[str, Any]) -> None:
@@ -143,7 +143,7 @@ def parts() -> None:
             solution = BoundarySolution(design)
             empty = solution, solution.densities(np.eye(len(terminals(design))))
             baseline = solution.terminal_charges(empty[1])[0, 0]
-            print(f"{name}: {len(solution.model.panels)} panels, C {baseline / FEMTO:.1f} fF")
+            print(f"{name}: {solution.model.panels.size} panels, C {baseline / FEMTO:.1f} fF")
             sim = cs.Simulator(design, background=build_background(design))
             boards.SIZE = (0.06, 0.06, 0.02)
             for gap in (0.003, 0.005, 0.02, 0.05):

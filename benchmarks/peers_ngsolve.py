@@ -9,7 +9,7 @@ from peers_iterative import TOLERANCE
 from peers_task import Array, bar_corners, design, within
 
 from capsense.constants import EPS0
-from capsense.masked.stiffness import unit_potentials
+from capsense.masked import MeshSensor
 from capsense.mesh import TetMesh
 
 _MM = 1e3
@@ -41,7 +41,7 @@ class NgSolve:
         self._ng, self._matrix = ng, self._form.mat
         x, y, z = (np.ascontiguousarray(c) for c in mesh.points.T)
         self._points = (x, y, z)
-        values, self._free = unit_potentials(mesh, design().electrode_names, ("ground",))
+        values, self._free = MeshSensor(mesh, design().electrode_names).unit_potentials()
         self._bits = ng.BitArray(self._free.tolist())
         self._zero, self._image = (self._matrix.CreateColVector() for _ in range(2))
         self._zero[:] = 0.0

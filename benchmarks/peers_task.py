@@ -18,7 +18,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.masked.stiffness import stiffness, unit_potentials
+from capsense.masked import MeshSensor
+from capsense.masked.solver import StiffnessMap
 from capsense.mesh import TetMesh, mesh_design
 
 Array = NDArray[np.float64]
@@ -108,8 +109,10 @@ def make_system(
 
 def p1_system(mesh: TetMesh) -> System:
     """The P1 system of a mesh."""
-    values, free = unit_potentials(mesh, design().electrode_names, ("ground",))
-    return make_system(stiffness(mesh), values, np.flatnonzero(free), mesh.points, mesh.n_tets, 1)
+    values, free = MeshSensor(mesh, design().electrode_names).unit_potentials()
+    stiffness = StiffnessMap(mesh)
+    matrix = stiffness.matrix(stiffness.assemble(np.ones(mesh.n_tets)))
+    return make_system(matrix, values, np.flatnonzero(free), mesh.points, mesh.n_tets, 1)
 
 
 def p2_system(mesh: TetMesh) -> System:

@@ -179,7 +179,7 @@ def change(case: dict[str, Any], scale: float) -> tuple[Array, Array, int]:
         own = np.diag(matrix)[:n] + matrix[:n, shields].sum(axis=1)
         return np.vstack([matrix[:n, :n], own])
 
-    return rows(delta), rows(apart), len(panels)
+    return rows(delta), rows(apart), panels.size
 
 
 def converged(case: dict[str, Any]) -> dict[str, Any]:

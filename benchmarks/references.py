@@ -34,8 +34,7 @@ from capsense.design.geometry import Facet, Surface, boundary_segments
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
 from capsense.field.boundary import terminals
-from capsense.field.facets import walls
-from capsense.field.panels import Grading, concatenate, cut_facet, make_panels
+from capsense.field.panels import Grading, concatenate, cut_facet, make_panels, walls
 
 Array = NDArray[np.float64]
 
@@ -222,7 +221,7 @@ class Solution:
         self._floor = float(design.domain.lower[2])
         n = len(self.owner)
         matrix = kernels.system_matrix(
-            np.zeros(n, dtype=bool), np.zeros(n), self._floor, self.panels.polygons
+            np.zeros(n, dtype=bool), np.zeros(n), self._floor, self.panels
         )
         unit = np.zeros((n, len(names)))
         driven = self.owner >= 0
@@ -234,7 +233,7 @@ class Solution:
         """Potentials [V] at points [m], shape (n, 3) -> (n, terminals)."""
         return np.concatenate(
             [
-                kernels.potential_matrix(part, self._floor, self.panels.polygons) @ self.scaled
+                kernels.potential_matrix(part, self._floor, self.panels) @ self.scaled
                 for part in np.array_split(points, 1 + len(points) // 2000)
             ]
         )

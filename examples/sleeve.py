@@ -14,7 +14,7 @@ import numpy as np
 
 import capsense as cs
 from capsense.humans import Build, arm
-from capsense.scene.mesh_shape import DeformableSurface
+from capsense.scene.scene import DeformableSurface
 
 STEPS = 80
 CLOTH = cs.Material("silvered cloth", 1.0, 1e5)

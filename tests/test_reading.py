@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import capsense as cs
-from capsense.field.change import Terminals
+from capsense.field.background import Terminals
 
 
 def test_mutual_capacitances_are_positive() -> None:

@@ -22,24 +22,19 @@ from capsense.plotting.runs import plot
 from capsense.reading import Reading, StepStats
 from capsense.readout.calibration import calibrate
 from capsense.readout.config import load_readout
-from capsense.readout.counts import Counts
+from capsense.readout.conversions import Counts
 from capsense.readout.presets import available_chips
 from capsense.readout.readout import Readout
 from capsense.recording.reader import open_recording, replay
 from capsense.recording.recorder import Recorder, record
 from capsense.scenario import Scenario, load_scenario
 from capsense.scene.camera import OrthographicCamera, PerspectiveCamera
-from capsense.scene.depth import (
-    DepthFrame,
-    decode_permittivity,
-    encode_permittivity,
-    point_surface,
-)
+from capsense.scene.depth import DepthFrame, decode_permittivity, encode_permittivity
 from capsense.scene.layers import Layers, render_depth
 from capsense.scene.materials import MATERIALS, Material
-from capsense.scene.mesh_shape import DeformableSurface, TriMesh
+from capsense.scene.mesh_shape import TriMesh, point_surface
 from capsense.scene.pose import Pose
-from capsense.scene.scene import Body, Scene
+from capsense.scene.scene import Body, DeformableSurface, Scene
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from capsense.server.client import Client
 from capsense.simulator import Simulator

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from capsense.readout.counts import Counts
+    from capsense.readout.conversions import Counts
 
 Array = NDArray[np.float64]
 

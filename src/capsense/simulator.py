@@ -17,10 +17,9 @@ from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError, SceneError
-from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.background import BackgroundField, BuildSettings, Change, Charges, Terminals
 from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.change import Change, Charges, Terminals
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
 from capsense.scene.depth import DepthFrame

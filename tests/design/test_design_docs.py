@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from capsense.design import parse_design
-from capsense.design.tables import LAYER_EPS_R
+from capsense.design.loader import LAYER_EPS_R
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "designs.md").read_text(encoding="utf-8")

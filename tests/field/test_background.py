@@ -9,9 +9,8 @@ import pytest
 from tiny_field import SETTINGS, arrays, digest, tiny_design
 
 from capsense.field import background
-from capsense.field.background import BuildSettings, build_background
+from capsense.field.background import BuildSettings, MeshSettings, build_background
 from capsense.field.boundary import Accuracy, BoundarySolution
-from capsense.mesh.lattice import MeshSettings
 
 
 def test_a_field_is_that_of_its_boundary_elements() -> None:

@@ -12,9 +12,9 @@ import pytest
 from tiny_field import arrays, digest
 
 from capsense.errors import FieldError
-from capsense.field import store
+from capsense.field import cache
 from capsense.field.background import BackgroundField
-from capsense.field.store import load_background, read_arrays, save_background, write_arrays
+from capsense.field.cache import load_background, read_arrays, save_background, write_arrays
 
 
 def test_a_field_comes_back_to_the_last_bit(built: BackgroundField, tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_files_of_others_are_refused(
         load_background(path, "another")
     with pytest.raises(FieldError, match="has kind 'field', expected 'charges'"):
         read_arrays(path, kind="charges", key="one key")
-    monkeypatch.setattr(store, "FORMAT", store.FORMAT + 1)
+    monkeypatch.setattr(cache, "FORMAT", cache.FORMAT + 1)
     with pytest.raises(FieldError, match="has format"):
         load_background(path, "one key")
     np.savez(path, x=np.zeros(3))

@@ -130,12 +130,12 @@ def test_quadrature_of_far_panels_matches_the_closed_form():
     polygon = shapely.box(0.0, 0.0, 0.004, 0.004)
     facet = Facet(polygon, np.zeros(3), np.eye(3))
     panels = make_panels(facet, cut_facet(facet, sheet(polygon).rims[:0], Grading(1e-3)))
-    assert len(panels) == 1
+    assert panels.size == 1
     reach = kernels._NEAR * panels.diameters[0]
     directions = np.random.default_rng(0).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     points = panels.centers[0] + 1.001 * reach * directions
-    got = kernels.potential_matrix(points, -1e3, panels.polygons)[:, 0]
+    got = kernels.potential_matrix(points, -1e3, panels)[:, 0]
     exact = [kernels.polygon_potential(panels.edges, UP, *p) for p in points]
     np.testing.assert_allclose(got, exact, rtol=3e-4)
 
@@ -146,7 +146,7 @@ def test_images_hold_the_floor_at_zero():
     facet = Facet(polygon, np.array([0.0, 0.0, 0.01]), np.eye(3))
     panels = make_panels(facet, cut_facet(facet, sheet(polygon).rims[:0], Grading(1e-3)))
     points = np.array([[0.0, 0.0, -0.02], [0.03, 0.01, -0.02], [0.0, 0.0, 0.02]])
-    got = kernels.potential_matrix(points, -0.02, panels.polygons).sum(axis=1)
+    got = kernels.potential_matrix(points, -0.02, panels).sum(axis=1)
     np.testing.assert_allclose(got[:2], 0.0, atol=1e-15)
     assert got[2] > 0.005
 
@@ -224,8 +224,8 @@ def slow_slope(p: Panels, i: int, j: int, image: bool) -> float:
 
 def test_rows_of_conductors_against_slow_means(panels):
     """Differential: averaged over close panels, and over those closer to the floor than wide."""
-    n = len(panels)
-    matrix = kernels.system_matrix(np.zeros(n, np.int64), np.zeros(n), FLOOR, panels.polygons)
+    n = panels.size
+    matrix = kernels.system_matrix(np.zeros(n, np.int64), np.zeros(n), FLOOR, panels)
     far = 0
     for i in range(n):
         for j in range(n):
@@ -242,10 +242,10 @@ def test_rows_of_conductors_against_slow_means(panels):
 
 def test_rows_of_interfaces_against_slow_means(panels):
     """Differential: fields of panels and images; 2π for a panel's own."""
-    n = len(panels)
+    n = panels.size
     contrast = np.linspace(-0.9, 0.9, n)
-    matrix = kernels.system_matrix(np.ones(n, np.int64), contrast, FLOOR, panels.polygons)
-    slopes = kernels.normal_gradient_matrix(np.arange(n), FLOOR, panels.polygons)
+    matrix = kernels.system_matrix(np.ones(n, np.int64), contrast, FLOOR, panels)
+    slopes = kernels.normal_gradient_matrix(np.arange(n), FLOOR, panels)
     for i in range(n):
         for j in range(n):
             expected = slow_slope(panels, i, j, True)
@@ -257,9 +257,9 @@ def test_rows_of_interfaces_against_slow_means(panels):
 
 def test_solid_angles_and_rows_of_parts(panels):
     """Differential: the normal part of the gradient; means over the panel that has the charge."""
-    n = len(panels)
+    n = panels.size
     contrast = np.linspace(-0.9, 0.9, n)
-    matrix = kernels.system_matrix(np.full(n, 2), contrast, FLOOR, panels.polygons)
+    matrix = kernels.system_matrix(np.full(n, 2), contrast, FLOOR, panels)
 
     def angle(i: int, r: np.ndarray) -> float:
         edges, normal = shape_of(panels, i)
@@ -283,8 +283,8 @@ def test_solid_angles_and_rows_of_parts(panels):
 def test_fluxes_of_point_charges(panels):
     """Differential: a point's field through a panel is the panel's at the point, turned round."""
     points = np.array([[0.0, 0.0, 0.01], [0.03, 0.01, 0.002], [0.2, -0.1, 0.3]])
-    rows = np.array([0, 7, len(panels) - 1])
-    found = kernels.flux_matrix(points, rows, FLOOR, panels.polygons)
+    rows = np.array([0, 7, panels.size - 1])
+    found = kernels.flux_matrix(points, rows, FLOOR, panels)
     for k, r in enumerate(points):
         for m, j in enumerate(rows):
             ways = slow_gradient(panels, j, r) - slow_gradient(panels, j, mirrored(r))

@@ -23,7 +23,7 @@ from tiny_field import SETTINGS, digest, tiny_data, tiny_design
 
 from capsense.design.loader import parse_design
 from capsense.field import background, cache
-from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.background import BackgroundField, BuildSettings, MeshSettings
 from capsense.field.boundary import BoundarySolution
 from capsense.field.cache import (
     cache_key,
@@ -31,9 +31,9 @@ from capsense.field.cache import (
     default_settings,
     exclusive,
     load_or_build,
+    read_arrays,
+    write_arrays,
 )
-from capsense.field.store import read_arrays, write_arrays
-from capsense.mesh.lattice import MeshSettings
 
 DENSE = "boundary elements: factorising"
 FIT = "response to charges: fit"

@@ -10,7 +10,7 @@ import pytest
 from field_cases import rectangle
 
 from capsense.design.geometry import Facet
-from capsense.field.facets import FAR_PLANE, plane_spacings, smallest_gaps
+from capsense.field.panels import FAR_PLANE, plane_spacings, smallest_gaps
 
 MM = 1e-3
 TURNS = {

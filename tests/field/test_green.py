@@ -15,6 +15,7 @@ from capsense.design.model import Design
 from capsense.errors import FieldError
 from capsense.field.background import BackgroundField
 from capsense.field.boundary import Accuracy, BoundarySolution, build_model, terminals
+from capsense.field.cache import load_background, save_background
 from capsense.field.green import (
     TABLES,
     GreenFunction,
@@ -30,7 +31,6 @@ from capsense.field.green_points import (
     spread,
     training_points,
 )
-from capsense.field.store import load_background, save_background
 
 Array = np.ndarray
 

@@ -38,12 +38,12 @@ def test_pieces_tile_the_facet(name):
     """Invariant: no gap, no overlap, every panel in the facet's plane."""
     polygon = shapely.geometry.polygon.orient(SHAPES[name])
     pieces, panels = cut(polygon, Grading(1e-4, largest=0.004))
-    assert len(pieces) == len(panels)
+    assert len(pieces) == panels.size
     assert sum(p.area for p in pieces) == pytest.approx(polygon.area, rel=1e-6)
     assert shapely.union_all(pieces).symmetric_difference(polygon).area < 1e-6 * polygon.area
     np.testing.assert_allclose(panels.areas, [p.area for p in pieces], rtol=1e-9)
     assert (panels.areas > 0).all()
-    np.testing.assert_allclose(panels.normals, np.tile(TILTED[2], (len(panels), 1)))
+    np.testing.assert_allclose(panels.normals, np.tile(TILTED[2], (panels.size, 1)))
     for points in (panels.centers, panels.edges.reshape(-1, 3), panels.quad[panels.weights > 0]):
         np.testing.assert_allclose((points - [0.1, -0.2, 0.05]) @ TILTED[2], 0.0, atol=1e-15)
 
@@ -128,12 +128,12 @@ def test_concatenation_keeps_panels_apart():
     """Invariant: edges, quadrature and areas stay with their panel."""
     parts = [cut(SHAPES[n], Grading(5e-4, largest=0.01))[1] for n in ("holes", "square", "L")]
     joined = concatenate(parts)
-    assert len(joined) == sum(len(p) for p in parts)
+    assert joined.size == sum(p.size for p in parts)
     np.testing.assert_allclose(joined.areas, np.concatenate([p.areas for p in parts]))
     offset = 0
     for part in parts:
-        for k in range(len(part)):
+        for k in range(part.size):
             mine = part.edges[part.first[k] : part.first[k + 1]]
             j = offset + k
             np.testing.assert_array_equal(joined.edges[joined.first[j] : joined.first[j + 1]], mine)
-        offset += len(part)
+        offset += part.size

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tiny_field import SETTINGS, digest, tiny_design
 
 from capsense.design import Design
-from capsense.field import cache, ship
+from capsense.field import cache
 from capsense.field.background import build_background
 from capsense.field.boundary import BoundarySolution
 from capsense.field.cache import cache_key, load_or_build
 
 
+@pytest.fixture(scope="module")
+def ship() -> Iterator[Any]:
+    """The script that builds them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+        yield import_module("ship_fields")
+
+
 @pytest.fixture
-def only_tiny(monkeypatch: pytest.MonkeyPatch) -> Design:
+def only_tiny(ship: Any, monkeypatch: pytest.MonkeyPatch) -> Design:
     """A package with one design, the tiny one."""
     design = tiny_design()
     monkeypatch.setattr(ship, "available_designs", lambda: ("tiny",))
@@ -26,7 +37,7 @@ def only_tiny(monkeypatch: pytest.MonkeyPatch) -> Design:
     return design
 
 
-def test_shipped_fields_are_current() -> None:
+def test_shipped_fields_are_current(ship: Any) -> None:
     if not any(ship.FOLDER.glob("*.npz")):
         pytest.skip(f"no fields are shipped; build them with: {ship.COMMAND}")
     wrong = "\n".join(ship.stale())
@@ -34,7 +45,7 @@ def test_shipped_fields_are_current() -> None:
 
 
 def test_shipping(
-    only_tiny: Design, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    ship: Any, only_tiny: Design, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     folder, work = tmp_path / "shipped", tmp_path / "work"
@@ -62,7 +73,7 @@ def test_shipping(
 
 
 def test_what_is_stale_is_named(
-    only_tiny: Design, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ship: Any, only_tiny: Design, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert ship.stale(tmp_path, SETTINGS) == ["tiny: not shipped"]
     (made,) = ship.ship(["tiny"], tmp_path, settings=SETTINGS, cache_dir=tmp_path / "work")
@@ -99,7 +110,7 @@ def test_a_damaged_shipped_field_is_reported_and_passed_over(
     assert cache.load_shipped("key", tmp_path / "none") is None
 
 
-def test_the_fingerprint_sees_the_numerics(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fingerprint_sees_the_numerics(ship: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def shifted(name: str, part: float) -> object:
         return lambda *args: part * original(*args)
 

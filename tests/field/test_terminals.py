@@ -7,7 +7,7 @@ import pytest
 from field_cases import patches, rectangle, sheet
 
 from capsense.design.model import Conductor, Design, Role
-from capsense.field.change import Terminals
+from capsense.field.background import Terminals
 
 Array = np.ndarray
 FLOATING, DRIVEN, ELECTRODES, ALL = 2, 4, 3, 6

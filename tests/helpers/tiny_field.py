@@ -18,10 +18,9 @@ import numpy as np
 
 from capsense.design import Design
 from capsense.design.loader import parse_design
-from capsense.field.background import BackgroundField, BuildSettings
+from capsense.field.background import BackgroundField, BuildSettings, MeshSettings
 from capsense.field.cache import load_or_build
 from capsense.field.green import to_arrays
-from capsense.mesh.lattice import MeshSettings
 
 SETTINGS = BuildSettings(panel_scale=8.0, mesh=MeshSettings().refined(0.5))
 

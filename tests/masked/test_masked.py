@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from p1_twin import capacitance_p1
 
 from capsense.errors import FieldError, SolveError
 from capsense.masked import MeshSensor
 from capsense.masked.solver import GROUNDED, MaskedSolver, MaskedStats
-from capsense.masked.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, kuhn_tets
 
 STRIPES = ("E1", "E2", "E3")

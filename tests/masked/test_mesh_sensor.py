@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from p1_twin import capacitance_p1
 from scipy.spatial import Delaunay
 
 import capsense as cs
 from capsense.constants import EPS0
 from capsense.errors import FieldError, MeshError, RecordingError
 from capsense.masked import MeshSensor
-from capsense.masked.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, kuhn_tets, load_mesh
 
 PUBLISHED = Path(__file__).parents[1] / "data/published_meshes/mesh_data_3stripe_electrodes.mat"

@@ -12,12 +12,12 @@ import pytest
 import shapely
 import trimesh
 from mesh_test_designs import rectangle, roof, sheet, two_patches
+from p1_twin import boundary_faces, capacitance_p1
 
 import capsense.mesh.gmsh_mesher as mesher
 from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
 from capsense.errors import MeshError, MissingDependencyError
-from capsense.masked.stiffness import capacitance_p1
 from capsense.mesh import TetMesh, mesh_design
 
 gmsh = pytest.importorskip("gmsh", exc_type=(ImportError, OSError))
@@ -66,7 +66,7 @@ def test_every_node_on_a_sheet_is_in_its_group(patches):
 
 
 def test_ground_is_the_whole_box_and_nothing_else(patches):
-    np.testing.assert_array_equal(patches.node_groups["ground"], np.unique(patches.boundary_faces))
+    np.testing.assert_array_equal(patches.node_groups["ground"], np.unique(boundary_faces(patches)))
 
 
 def test_layers_are_unions_of_elements(patches):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from p1_twin import boundary_faces, link_weights, stiffness
 
 from capsense.constants import EPS0
 from capsense.errors import MeshError
-from capsense.masked.stiffness import link_weights, stiffness
 from capsense.mesh import kuhn_tets
 
 X = np.array([-1.0, -0.4, 0.1, 1.3])
@@ -31,12 +31,12 @@ def test_tetrahedra_fill_the_box_and_conform():
     mesh = kuhn_tets(X, Y, Z)
     assert mesh.volumes.sum() == pytest.approx(2.3 * 0.9 * 1.0, rel=1e-12)
     # Conforming: the boundary is that of the box, two triangles for each outer lattice face.
-    assert len(mesh.boundary_faces) == 2 * 2 * (3 * 2 + 2 * 4 + 3 * 4)
+    assert len(boundary_faces(mesh)) == 2 * 2 * (3 * 2 + 2 * 4 + 3 * 4)
 
 
 def test_ground_is_the_outer_surface():
     mesh = kuhn_tets(X, Y, Z)
-    outer = np.unique(mesh.boundary_faces)
+    outer = np.unique(boundary_faces(mesh))
     np.testing.assert_array_equal(mesh.node_groups["ground"], outer)
 
 

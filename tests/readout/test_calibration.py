@@ -21,10 +21,10 @@ from capsense.readout.calibration import (
     unit_range,
 )
 from capsense.readout.channels import ChannelBank, self_patterns
-from capsense.readout.converter import LinearLaw
+from capsense.readout.conversions import Schedule
+from capsense.readout.laws import LinearLaw
 from capsense.readout.noise import Flicker, White
 from capsense.readout.readout import Readout
-from capsense.readout.schedule import Schedule
 
 GAIN, OFFSET, DRIFT = (
     np.array([1.02, 0.95]),

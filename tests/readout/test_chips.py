@@ -9,9 +9,8 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadoutError
-from capsense.readout.channels import Pattern, mutual_patterns
+from capsense.readout.channels import Pattern, Wiring, mutual_patterns
 from capsense.readout.converter import Range
-from capsense.readout.front_end import Wiring
 from capsense.readout.noise import allan_deviation
 from capsense.readout.presets import CHIPS, ReadoutOptions, Status, schedule_of
 from capsense.readout.presets import build as build_chip

@@ -13,9 +13,8 @@ from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor, calibrate
 from capsense.readout.checks import phasors, require
 from capsense.readout.config import choose_readout, load_readout, parse_readout
-from capsense.readout.converter import ResonanceLaw, ShuntLaw
-from capsense.readout.detector import ExponentialTracker, SteppingTracker
-from capsense.readout.front_end import ShuntFrontEnd
+from capsense.readout.converter import ExponentialTracker, SteppingTracker
+from capsense.readout.laws import ResonanceLaw, ShuntFrontEnd, ShuntLaw
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
 from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout

@@ -9,17 +9,8 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadoutError
-from capsense.readout.converter import (
-    CapDac,
-    Conversion,
-    LinearLaw,
-    Range,
-    ReciprocalLaw,
-    ResonanceLaw,
-    ShuntLaw,
-    quantise,
-)
-from capsense.readout.front_end import ShuntFrontEnd
+from capsense.readout.converter import CapDac, Conversion, Range, quantise
+from capsense.readout.laws import LinearLaw, ReciprocalLaw, ResonanceLaw, ShuntFrontEnd, ShuntLaw
 
 LINEAR = LinearLaw(1e-15, -8000, 7999)
 RECIPROCAL = ReciprocalLaw(16e-6, 0.5e-6, 3.3)

@@ -9,7 +9,7 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadoutError
-from capsense.readout.detector import Detector, ExponentialTracker, Filter, SteppingTracker
+from capsense.readout.converter import Detector, ExponentialTracker, Filter, SteppingTracker
 
 
 def watch(detector, codes, rising=True):

@@ -9,7 +9,8 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadoutError
-from capsense.readout.front_end import ShuntFrontEnd, Wiring, demodulate, demodulated
+from capsense.readout.channels import Wiring
+from capsense.readout.laws import ShuntFrontEnd, demodulate, demodulated
 
 PAPER = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0)
 

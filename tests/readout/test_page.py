@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from capsense.readout.config import parse_readout
-from capsense.readout.front_end import ShuntFrontEnd
+from capsense.readout.laws import ShuntFrontEnd
 
 PAGE = (Path(__file__).parents[2] / "docs" / "readout.md").read_text(encoding="utf-8")
 

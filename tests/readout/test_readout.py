@@ -13,15 +13,13 @@ from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
-from capsense.readout.channels import ChannelBank, Pattern, self_patterns
-from capsense.readout.converter import CapDac, LinearLaw, ShuntLaw
-from capsense.readout.counts import Counts, join
-from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker
-from capsense.readout.front_end import ShuntFrontEnd, Wiring
+from capsense.readout.channels import ChannelBank, Pattern, Wiring, self_patterns
+from capsense.readout.conversions import Counts, Schedule, join
+from capsense.readout.converter import CapDac, Detector, ExponentialTracker, SteppingTracker
+from capsense.readout.laws import LinearLaw, ShuntFrontEnd, ShuntLaw
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.presets import CHIPS
 from capsense.readout.readout import Readout
-from capsense.readout.schedule import Schedule
 
 NAMES = ("A", "B", "C")
 FINE = LinearLaw(1e-21, -(10**12), 10**12)

@@ -7,7 +7,7 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadoutError
-from capsense.readout.schedule import Schedule, idle_of, rounds
+from capsense.readout.conversions import Schedule, idle_of, rounds
 
 
 def written_out(plan, cycles):

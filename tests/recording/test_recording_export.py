@@ -12,7 +12,7 @@ import recorded_scenes
 import capsense as cs
 from capsense.cli.main import main
 from capsense.errors import MissingDependencyError, RecordingError
-from capsense.readout.counts import join
+from capsense.readout.conversions import join
 from capsense.recording.export import export
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,7 @@ from tiny_field import SETTINGS, tiny_design
 import capsense as cs
 from capsense.cli.main import main
 from capsense.errors import RecordingError
-from capsense.mesh.lattice import MeshSettings
+from capsense.field.background import MeshSettings
 from capsense.recording.session import Session, read_session
 from capsense.viewer.source import RecordingSource
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.scene.contact import TOUCH, Sheets, distances, points_on
+from capsense.scene.scene import TOUCH, Sheets, distances, points_on
 
 CORNERS = np.array([[[0, 0, 0], [0.03, 0, 0], [0.03, 0.03, 0]]], float)
 PADS = [CORNERS - np.array([0.035, 0, 0]), CORNERS + np.array([0.005, -0.01, 0.002])]

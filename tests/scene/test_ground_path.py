@@ -6,7 +6,7 @@ import pytest
 from relative import near
 
 from capsense.errors import SceneError
-from capsense.scene.scene import GROUND_PATHS, GroundPath
+from capsense.scene.materials import GROUND_PATHS, GroundPath
 
 
 @pytest.mark.parametrize("frequency", [50.0, 250e3, 1e7])

@@ -40,7 +40,7 @@ from capsense.readout.config import make_readout
 from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
-from capsense.scene.scene import Grounding
+from capsense.scene.materials import Grounding
 from capsense.simulator import Simulator
 
 __all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from capsense.design.model import Design
 from capsense.errors import CapSenseError
 from capsense.scene import Body, Layers, Scene, TriMesh
-from capsense.scene.contact import TOUCH, distances, points_on
+from capsense.scene.scene import TOUCH, distances, points_on
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS
 

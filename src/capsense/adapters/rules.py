@@ -13,7 +13,7 @@ from capsense._validate import suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Body, Material, Pose, Shape, material
-from capsense.scene.scene import Grounding, checked_grounding
+from capsense.scene.materials import Grounding, checked_grounding
 
 Names = tuple[str, ...]
 """The names that one solid answers to, such as those of its geom and of its body."""

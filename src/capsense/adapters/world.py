@@ -18,7 +18,7 @@ from capsense.scene import Body, Box, Material, Pose, Scene, Shape
 from capsense.scene.mesh_shape import SHEET_THICKNESS
 
 if TYPE_CHECKING:
-    from capsense.scene.mesh_shape import DeformableSurface
+    from capsense.scene.scene import DeformableSurface
 
 Array = NDArray[np.float64]
 
@@ -204,7 +204,7 @@ class World:
 
     def _soft_bodies(self, frames: Frames) -> list[Body]:
         """The deformables that reach into the domain, as they are now."""
-        from capsense.scene.mesh_shape import DeformableSurface
+        from capsense.scene.scene import DeformableSurface
 
         rotation = Pose((0, 0, 0), frames.sensor_quaternion).rotation
         out = []

@@ -27,7 +27,7 @@ from capsense.errors import ReadoutError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from capsense.readout.counts import Counts
+    from capsense.readout.conversions import Counts
     from capsense.readout.presets import Chip
     from capsense.readout.readout import Readout
     from capsense.readout.recording import CapacitanceRecord

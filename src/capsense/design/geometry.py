@@ -1,14 +1,21 @@
-"""Planar facets and sheets made of them; where sheets meet each other and boxes."""
+"""Planar facets and sheets made of them: where design files place them, and where they meet."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import shapely
+import shapely.affinity
 from numpy.typing import NDArray
 from shapely.geometry import Polygon, box
+from shapely.geometry.polygon import orient
+
+from capsense import _validate
+from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
 
@@ -170,13 +177,19 @@ def coplanar_overlap(a: Surface, b: Surface) -> float:
     return total
 
 
+def to_plane(other: Facet, facet: Facet) -> Polygon:
+    """The outline of ``other`` in the (u, v) of ``facet`` [m], projected onto its plane."""
+
+    def convert(uv: Array) -> Array:
+        return ((other.to_sensor(uv) - facet.origin) @ facet.axes.T)[:, :2]
+
+    return shapely.transform(other.polygon, convert)
+
+
 def in_plane_of(facet: Facet, other: Facet) -> Polygon | None:
     """The outline of ``other`` in the (u, v) of ``facet`` [m], or None if not in its plane."""
-    rings = [r - facet.origin for r in ring_vertices(other)]
-    if np.abs(rings[0] @ facet.axes[2]).max() > TOUCH:
-        return None
-    flat = [r @ facet.axes[:2].T for r in rings]
-    return Polygon(flat[0], flat[1:])
+    height = (ring_vertices(other)[0] - facet.origin) @ facet.axes[2]
+    return None if np.abs(height).max() > TOUCH else to_plane(other, facet)
 
 
 def enters_box(surface: Surface, lower: Array, upper: Array) -> bool:
@@ -205,3 +218,106 @@ def _facet_in_box(facet: Facet, low: Array, high: Array) -> bool:
                 return False
     part = Polygon((np.array(points) - facet.origin) @ facet.axes[:2].T)
     return bool(part.buffer(0).intersects(facet.polygon))
+
+
+class DesignTable(_validate.Table):
+    """One table of a design file; whatever is wrong raises :class:`DesignError`."""
+
+    error_type = DesignError
+
+
+PLACEMENT_KEYS = ("center", "z", "rotation", "tilt", "quaternion")
+"""Keys of an item that say where its shape sits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A rigid motion: sensor point = ``rotation @ local point + origin``."""
+
+    origin: Array
+    """Position [m] of the local origin in the sensor frame, shape (3,)."""
+    rotation: Array
+    """Rotation matrix from local to sensor axes, shape (3, 3)."""
+
+    def apply(self, points: Array) -> Array:
+        """Map local points [m], shape (..., 3), to the sensor frame."""
+        return np.asarray(points, dtype=float) @ self.rotation.T + self.origin
+
+
+def _cos_sin(degrees: float) -> tuple[float, float]:
+    """Cosine and sine, exact at multiples of 90°."""
+    quarter, rest = divmod(degrees, 90.0)
+    if rest == 0.0:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarter) % 4]
+    return math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+
+
+def axis_rotation(axis: int, degrees: float) -> Array:
+    """Rotation matrix about coordinate axis 0, 1 or 2, shape (3, 3)."""
+    c, s = _cos_sin(degrees)
+    out = np.eye(3)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    out[i, i] = out[j, j] = c
+    out[i, j], out[j, i] = -s, s
+    return out
+
+
+def read_placement(table: DesignTable) -> Placement:
+    """Read ``center``, ``z``, ``rotation``, ``tilt`` and ``quaternion`` of an item.
+
+    ``rotation`` turns about the shape's own z axis; ``tilt`` = [rx, ry, rz] then turns about the
+    sensor's x, y and z axes, in that order; both in degrees. ``quaternion`` (x, y, z, w) replaces
+    both.
+
+    Raises:
+        DesignError: If a number is missing or wrong, or if keys contradict each other.
+    """
+    center = table.coordinates("center", (2, 3), default=(0.0, 0.0))
+    if len(center) == 3 and "z" in table:
+        raise table.error(
+            f"z = {table.data['z']!r} and a third number in center = {list(center)} both set the "
+            "height; keep one of them"
+        )
+    z = center[2] if len(center) == 3 else table.coordinate("z", 0.0)
+    rotation = axis_rotation(2, table.number("rotation", -360, 360, 0.0, "degrees"))
+    if "quaternion" in table:
+        for key in ("rotation", "tilt"):
+            if key in table:
+                raise table.error(
+                    f"{key} = {table.data[key]!r} and quaternion both turn the shape; "
+                    "keep one of them"
+                )
+        from scipy.spatial.transform import Rotation
+
+        quaternion, *more = table.unit_quaternions("quaternion")
+        if more:
+            raise table.error(f"quaternion holds {1 + len(more)} orientations; give one")
+        rotation = Rotation.from_quat(quaternion).as_matrix()
+    elif "tilt" in table:
+        angles = table.numbers("tilt", (3,), "[rx, ry, rz] in degrees")
+        for angle in angles:
+            if abs(angle) > 360:
+                raise table.error(f"tilt = {list(angles)} must be within ±360 degrees")
+        for axis, angle in enumerate(angles):
+            rotation = axis_rotation(axis, angle) @ rotation
+    return Placement(np.array([center[0], center[1], z]), rotation)
+
+
+def place_polygons(polygons: Sequence[Polygon], placement: Placement) -> Surface:
+    """A sheet of planar facets from polygons [m] in the local plane z = 0.
+
+    A horizontal sheet gets the axes of the sensor frame and the origin (0, 0, z), so that its
+    polygons hold sensor coordinates (x, y); any other keeps its local polygons.
+    """
+    rotation, origin = placement.rotation, placement.origin
+    facets = []
+    horizontal = bool(np.all(np.abs(rotation[:2, 2]) < 1e-12))
+    for polygon in polygons:
+        if horizontal:
+            (a, b), (d, e) = rotation[0, :2], rotation[1, :2]
+            moved = shapely.affinity.affine_transform(polygon, [a, b, d, e, origin[0], origin[1]])
+            facets.append(Facet(orient(moved), np.array([0.0, 0.0, origin[2]]), np.eye(3)))
+        else:
+            facets.append(Facet(orient(polygon), origin.copy(), rotation.T.copy()))
+    rims = np.concatenate([boundary_segments(f) for f in facets])
+    return Surface(tuple(facets), rims)

@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
+from shapely.geometry import Polygon
+from shapely.geometry.polygon import orient
 
 from capsense._validate import nearest, read_toml, suggest
-from capsense.design.checks import check_design, cut_clearance, snap_to_layers
-from capsense.design.geometry import Facet, Surface
-from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role
+from capsense.design.geometry import (
+    PLACEMENT_KEYS,
+    TOUCH,
+    DesignTable,
+    Facet,
+    Placement,
+    Surface,
+    boundary_segments,
+    in_plane_of,
+    read_placement,
+)
+from capsense.design.model import (
+    Conductor,
+    Design,
+    Domain,
+    Electrode,
+    Layer,
+    Role,
+    check_design,
+)
 from capsense.design.shapes import (
     SHAPES,
     bend_sheet,
@@ -22,10 +42,19 @@ from capsense.design.shapes import (
     planar_surface,
     read_bend,
 )
-from capsense.design.tables import LAYER_EPS_R, PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
+LAYER_EPS_R: dict[str, float] = read_toml(
+    Path(__file__).with_name("materials.toml"), "material", DesignError
+)
+"""Relative permittivity by material name (lower case)."""
+
 LAYER_KEYS = ("name", "material", "eps_r")
+SOLIDS: dict[str, tuple[tuple[str, ...], Callable[[DesignTable, Placement], Surface]]] = {
+    "box": (("size",), box_surface),
+    "cylinder": (("radius", "length"), cylinder_surface),
+}
+"""Closed surfaces by name: the keys that they read, and what makes them."""
 STL_KEYS = ("file", "unit", "scale", "part", "closed")
 TOP_KEYS = (
     "name",
@@ -169,22 +198,23 @@ def _read_surface(
     table: DesignTable, folder: Path, domain: Domain, extra: tuple[str, ...]
 ) -> Surface:
     """Read ``shape``, where it sits, and its own keys; ``extra`` are keys of the item itself."""
-    names = [*SHAPES, "box", "cylinder", "stl"]
-    shape = table.choice("shape", names)
+    shape = table.choice("shape", [*SHAPES, *SOLIDS, "stl"])
     common = ("name", "shape", *extra, *PLACEMENT_KEYS)
     if shape == "stl":
         from capsense.design.stl_shape import read_stl_surface
 
         table.only((*common, *STL_KEYS))
         return read_stl_surface(table, folder, domain)
-    if shape == "box":
-        table.only((*common, "size"))
-        return box_surface(table, read_placement(table))
-    if shape == "cylinder":
-        table.only((*common, "radius", "length"))
-        return cylinder_surface(table, read_placement(table))
+    if shape in SOLIDS:
+        return _read_solid(table, shape, common)
     table.only((*common, *SHAPES[shape].keys, "leads"))
     return planar_surface(table, shape, read_placement(table))
+
+
+def _read_solid(table: DesignTable, shape: str, common: tuple[str, ...]) -> Surface:
+    keys, make = SOLIDS[shape]
+    table.only((*common, *keys))
+    return make(table, read_placement(table))
 
 
 def _bent(sheet: Electrode | Conductor, radius: float, source: str) -> Surface:
@@ -225,17 +255,13 @@ def _read_layer(table: DesignTable, folder: Path) -> Layer:
 def _read_part(table: DesignTable, folder: Path) -> tuple[Facet, ...]:
     """The faces of a dielectric part with a ``shape``, normals outwards."""
     common = (*LAYER_KEYS, "shape", *PLACEMENT_KEYS)
-    shape = table.choice("shape", ("box", "cylinder", "stl"))
+    shape = table.choice("shape", (*SOLIDS, "stl"))
     if shape == "stl":
         from capsense.design.stl_shape import read_stl_solid
 
         table.only((*common, "file", "unit", "scale"))
         return read_stl_solid(table, folder)
-    if shape == "box":
-        table.only((*common, "size"))
-        return box_surface(table, read_placement(table)).facets
-    table.only((*common, "radius", "length"))
-    return cylinder_surface(table, read_placement(table)).facets
+    return _read_solid(table, shape, common).facets
 
 
 def _read_material(table: DesignTable) -> tuple[str, float]:
@@ -255,3 +281,72 @@ def _read_material(table: DesignTable) -> tuple[str, float]:
     if "eps_r" in table:
         return "custom", table.number("eps_r", 1.0, 1000.0)
     raise table.error('missing key: give material = "…" or eps_r = a number')
+
+
+def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
+    """Move a horizontal sheet that lies within a micrometre of a layer's face exactly onto it."""
+    levels = [float(z) for layer in layers for z in (layer.lower[2], layer.upper[2])]
+    if np.ptp(surface.bounds[:, 2]) > TOUCH:
+        return surface
+    facets, moved = [], 0.0
+    for facet in surface.facets:
+        z = float(facet.origin[2])
+        near = [level for level in levels if 0.0 < abs(level - z) <= TOUCH]
+        if near and bool(np.all(facet.axes[:2, 2] == 0.0)):
+            moved = near[0] - z
+            facet = Facet(facet.polygon, facet.origin + np.array([0.0, 0.0, moved]), facet.axes)
+        facets.append(facet)
+    if moved == 0.0:
+        return surface
+    return Surface(tuple(facets), surface.rims + np.array([0.0, 0.0, moved]))
+
+
+SLIVER = 1e-5
+"""Remainders narrower than this [m] are dropped: no board house would etch them."""
+GRID = 1e-9
+"""Coordinates of cut outlines are snapped to this grid [m]."""
+
+
+def cut_clearance(table: DesignTable, surface: Surface, electrodes: Sequence[Electrode]) -> Surface:
+    """Cut ``clearance`` [m] around every electrode that lies in a facet's plane.
+
+    The gap's outline is the electrode's, offset with mitred corners. What remains may be several
+    pieces with holes; they stay one conductor, as a pour stitched by vias is. A pour in another
+    plane than the electrodes' keeps its outline.
+
+    Raises:
+        DesignError: If ``clearance`` is no positive length, if the conductor is not flat, or if
+            nothing of it remains.
+    """
+    clearance = table.length("clearance")
+    facets: list[Facet] = []
+    cut = False
+    for facet in surface.facets:
+        gaps = []
+        for electrode in electrodes:
+            for other in electrode.surface.facets:
+                outline = in_plane_of(facet, other)
+                if outline is not None:
+                    gaps.append(outline.buffer(clearance, join_style="mitre", mitre_limit=2.0))
+        if not gaps:
+            facets.append(facet)
+            continue
+        cut = True
+        rest = shapely.difference(
+            facet.polygon, shapely.union_all(gaps, grid_size=GRID), grid_size=GRID
+        )
+        for piece in shapely.get_parts(rest):
+            if isinstance(piece, Polygon) and not piece.buffer(-SLIVER / 2).is_empty:
+                facets.append(Facet(orient(piece), facet.origin, facet.axes))
+    if not cut:
+        return surface
+    if any(in_plane_of(surface.facets[0], f) is None for f in surface.facets):
+        raise table.error(
+            f"clearance = {clearance:g} needs a flat conductor; give the pour as a planar shape of "
+            "its own"
+        )
+    if not facets:
+        raise table.error(
+            f"clearance = {clearance:g} leaves nothing of it; make it larger or reduce clearance"
+        )
+    return Surface(tuple(facets), np.concatenate([boundary_segments(f) for f in facets]))

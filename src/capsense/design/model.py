@@ -1,17 +1,31 @@
-"""What a sensor is: electrodes, dielectric layers and other conductors in a grounded box."""
+"""What a sensor is: electrodes, dielectric layers and other conductors in a grounded box.
+
+And which designs are refused, since they could not be built or solved.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.geometry import Facet, Surface, box_facets, ring_vertices
+from capsense.design.geometry import (
+    TOUCH,
+    Facet,
+    Surface,
+    box_facets,
+    coplanar_overlap,
+    enters_box,
+    find_contact,
+    ring_vertices,
+)
+from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
 
@@ -122,7 +136,25 @@ class Design:
         Names, description, file formatting and ``build`` do not enter; the order of electrodes
         does, since it is the order of matrix rows. Coordinates count to a nanometre.
         """
-        return design_hash(self)
+        lines = ["capsense design 1"]
+        lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")
+        lines += ["open"] * self.domain.open
+        for electrode in self.electrodes:
+            lines += ["electrode", *_surface_lines(electrode.surface)]
+        others = [
+            "\n".join([f"conductor {c.role.value}", *_surface_lines(c.surface)])
+            for c in self.conductors
+        ]
+        others += [
+            "\n".join(
+                [
+                    f"layer {float(k.eps_r)!r} {_nanometres(np.concatenate([k.lower, k.upper]))}",
+                    *(_surface_lines(k.surface) if k.facets else ()),
+                ]
+            )
+            for k in self.layers
+        ]
+        return hashlib.sha256("\n".join(lines + sorted(others)).encode()).hexdigest()
 
     @property
     def sheets(self) -> tuple[Electrode | Conductor, ...]:
@@ -133,29 +165,6 @@ class Design:
     def electrode_names(self) -> tuple[str, ...]:
         """Electrode names in matrix order."""
         return tuple(e.name for e in self.electrodes)
-
-
-def design_hash(design: Design) -> str:
-    """SHA-256 (hex) over everything of a design that its fields depend on."""
-    lines = ["capsense design 1"]
-    lines.append(f"domain {_nanometres(np.array([*design.domain.size, design.domain.backplane]))}")
-    lines += ["open"] * design.domain.open
-    for electrode in design.electrodes:
-        lines += ["electrode", *_surface_lines(electrode.surface)]
-    others = [
-        "\n".join([f"conductor {c.role.value}", *_surface_lines(c.surface)])
-        for c in design.conductors
-    ]
-    others += [
-        "\n".join(
-            [
-                f"layer {float(k.eps_r)!r} {_nanometres(np.concatenate([k.lower, k.upper]))}",
-                *(_surface_lines(k.surface) if k.facets else ()),
-            ]
-        )
-        for k in design.layers
-    ]
-    return hashlib.sha256("\n".join(lines + sorted(others)).encode()).hexdigest()
 
 
 def _nanometres(values: Array) -> list[int]:
@@ -174,3 +183,151 @@ def _surface_lines(surface: Surface) -> list[str]:
             rings.append(min(forward, forward[:1] + forward[:0:-1]))
         lines.append(f"facet {rings[0]} {sorted(rings[1:])}")
     return sorted(lines)
+
+
+def check_design(design: Design, *, source: str = "design") -> None:
+    """Refuse a design that could not be built, or that the field solver could not treat.
+
+    Raises:
+        DesignError: If there is no electrode; if a name is used twice; if an electrode touches
+            another, or a conductor; if anything leaves the domain; if layers overlap; if a sheet
+            crosses a layer's surface. The message names ``source``, the item, the value and the
+            fix.
+    """
+    if not design.electrodes:
+        raise DesignError(f"{source}: design has no electrode; add an [[electrode]] table")
+    _unique_names(design.sheets, source)
+    _unique_names(design.layers, source)
+    for sheet in design.sheets:
+        _inside_domain(sheet, design.domain, source)
+    for layer in design.layers:
+        _layer_inside_domain(layer, design.domain, source)
+    for lower, upper in combinations(design.layers, 2):
+        _apart(lower, upper, source)
+    for one, other in combinations(design.sheets, 2):
+        _no_short(one, other, source)
+    for sheet in design.sheets:
+        for layer in design.layers:
+            _not_crossing(sheet, layer, source)
+
+
+def _label(item: Electrode | Conductor | Layer) -> str:
+    return f'{type(item).__name__.lower()} "{item.name}"'
+
+
+def _unique_names(items: Sequence[Electrode | Conductor | Layer], source: str) -> None:
+    seen: dict[str, str] = {}
+    for item in items:
+        if item.name in seen:
+            raise DesignError(
+                f"{source}: {_label(item)}: the name {item.name!r} is already that of "
+                f"{seen[item.name]}; give each its own name"
+            )
+        seen[item.name] = _label(item)
+
+
+def _at(point: Array) -> str:
+    return "(" + ", ".join(f"{x:.6g}" for x in np.round(point, 9) + 0.0) + ") m"
+
+
+def _beyond(bounds: Array, domain: Domain, margin: float) -> Iterator[tuple[str, str]]:
+    """What bounds, shape (2, 3), do that are not ``margin`` inside, and where, in words."""
+    walls = np.array([domain.lower, domain.upper])
+    room = (bounds - walls) * [[1.0], [-1.0]]
+    for axis, side in zip(*np.nonzero(margin > room.T), strict=True):
+        name, value, wall = "xyz"[axis], bounds[side, axis], walls[side, axis]
+        verb = "touches" if abs(value - wall) < TOUCH else "leaves"
+        yield verb, f"it reaches {name} = {value:.6g} m and the wall is at {name} = {wall:.6g} m"
+
+
+def _inside_domain(sheet: Electrode | Conductor, domain: Domain, source: str) -> None:
+    for verb, where in _beyond(sheet.surface.bounds, domain, TOUCH):
+        raise DesignError(
+            f"{source}: {_label(sheet)}: {verb} the grounded box: {where}; move it inside (center, "
+            "z, size) or enlarge domain size or backplane; lengths are metres"
+        )
+
+
+def _layer_inside_domain(layer: Layer, domain: Domain, source: str) -> None:
+    for _, where in _beyond(np.array([layer.lower, layer.upper]), domain, -TOUCH):
+        raise DesignError(
+            f"{source}: {_label(layer)}: leaves the domain: {where}; reduce its size or z, or "
+            "enlarge domain size or backplane; lengths are metres"
+        )
+
+
+def _apart(one: Layer, other: Layer, source: str) -> None:
+    low, high = np.maximum(one.lower, other.lower), np.minimum(one.upper, other.upper)
+    if not np.all(high - low > TOUCH):
+        return
+    if one.facets or other.facets:
+        from capsense.design.solid import overlap
+
+        point = overlap(one.surface, other.surface)
+        if point is not None:
+            raise DesignError(
+                f"{source}: {_label(other)}: overlaps {_label(one)} at {_at(point)}; move one of "
+                "them or cut it back in CAD, so that they share no more than flat faces"
+            )
+    else:
+        raise DesignError(
+            f"{source}: {_label(other)}: overlaps {_label(one)} over {_at(high - low)} at "
+            f"{_at((low + high) / 2)}; change z, size or center so that they only share a face"
+        )
+
+
+def _no_short(one: Electrode | Conductor, other: Electrode | Conductor, source: str) -> None:
+    alike = (
+        isinstance(one, Conductor)
+        and isinstance(other, Conductor)
+        and one.role == other.role
+        and one.role is not Role.FLOATING
+    )
+    point = find_contact(one.surface, other.surface)
+    if point is None:
+        return
+    if alike:
+        area = coplanar_overlap(one.surface, other.surface)
+        if area > TOUCH**2:
+            raise DesignError(
+                f"{source}: {_label(other)}: lies on {_label(one)} over {area * 1e6:.6g} mm² "
+                f"at {_at(point)}; cut one of them back, they may only share edges"
+            )
+        return
+    fix = "move them apart (center, z) or reduce their size"
+    if isinstance(one, Electrode) and isinstance(other, Conductor):
+        fix = f"set clearance = 0.0005 on {_label(other)} or move it to another z"
+    raise DesignError(
+        f"{source}: {_label(one)}: touches or overlaps {_label(other)} at {_at(point)}, a short "
+        f"circuit; {fix}"
+    )
+
+
+def _not_crossing(sheet: Electrode | Conductor, layer: Layer, source: str) -> None:
+    low, high = sheet.surface.bounds
+    if layer.facets:
+        _not_through(sheet, layer, source)
+        return
+    within = np.all(low >= layer.lower - TOUCH) and np.all(high <= layer.upper + TOUCH)
+    if within or not enters_box(sheet.surface, layer.lower, layer.upper):
+        return
+    raise DesignError(
+        f"{source}: {_label(sheet)}: crosses the surface of {_label(layer)}: it spans {_at(low)} "
+        f"to {_at(high)}, the layer {_at(layer.lower)} to {_at(layer.upper)}; put it on a face of "
+        f"the layer (such as z = {layer.upper[2]:g}), or wholly inside or outside"
+    )
+
+
+def _not_through(sheet: Electrode | Conductor, part: Layer, source: str) -> None:
+    from capsense.design.solid import crossing
+
+    low, high = sheet.surface.bounds
+    if np.any(low > part.upper) or np.any(high < part.lower):
+        return
+    point = crossing(sheet.surface.triangles, part.surface.triangles)
+    if point is not None:
+        raise DesignError(
+            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at {_at(point)}, and "
+            "partly outside; put it wholly inside or outside, or flat on a flat face; where both "
+            "are curved leave a gap of 0.2 mm, for they are made of flat pieces"
+        )

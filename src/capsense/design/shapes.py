@@ -22,8 +22,15 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon, box
 from shapely.geometry.polygon import orient
 
-from capsense.design.geometry import TOUCH, Facet, Surface, boundary_segments
-from capsense.design.tables import DesignTable, Placement, place_polygons
+from capsense.design.geometry import (
+    TOUCH,
+    DesignTable,
+    Facet,
+    Placement,
+    Surface,
+    boundary_segments,
+    place_polygons,
+)
 from capsense.errors import DesignError
 
 Array = NDArray[np.float64]

@@ -9,10 +9,16 @@ from numpy.typing import NDArray
 from shapely.affinity import translate
 
 from capsense._validate import UNITS
-from capsense.design.geometry import Facet, Surface, boundary_segments
+from capsense.design.geometry import (
+    PLACEMENT_KEYS,
+    DesignTable,
+    Facet,
+    Surface,
+    boundary_segments,
+    read_placement,
+)
 from capsense.design.model import Domain, Electrode
 from capsense.design.stl import SheetMesh, read_stl, sheet_surface, weld
-from capsense.design.tables import PLACEMENT_KEYS, DesignTable, read_placement
 from capsense.errors import DesignError
 
 Array = NDArray[np.float64]

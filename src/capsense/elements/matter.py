@@ -14,8 +14,8 @@ from capsense.constants import EPS0
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import RigidShape
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
-from capsense.scene.materials import Material
-from capsense.scene.scene import Grounding, PackedScene
+from capsense.scene.materials import Grounding, Material
+from capsense.scene.scene import PackedScene
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

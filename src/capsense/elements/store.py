@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from capsense.elements.panels import panels_of, polygon_panels
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.errors import FieldError
-from capsense.field.cache import default_cache_dir
-from capsense.field.store import read_arrays, write_arrays
+from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
 from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
 from capsense.scene.shapes import ShapeKind
 

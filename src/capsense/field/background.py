@@ -1,18 +1,18 @@
-"""The empty-domain field of a design, ready for the online solver."""
+"""The field of a design in its empty domain, and what solvers tell of the scenes in it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.model import Design
+from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
 from capsense.field.green import GreenFunction, build_green
-from capsense.mesh.lattice import MeshSettings
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -20,6 +20,33 @@ Progress = Callable[[str, float], None]
 NUMERICS = 10
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """Spacings of the planes whose cells are split into tetrahedra; all lengths in metres."""
+
+    edge: float = 0.0036
+    """Largest spacing beside an electrode's edge, in the plane."""
+    growth: float = 0.53
+    """Growth of the in-plane spacing per unit distance from the nearest edge."""
+    far: float = 0.06
+    """Largest in-plane spacing."""
+    face: float = 0.0024
+    """Spacing beside an electrode's face, across the plane."""
+    growth_z: float = 0.207
+    """Growth of the spacing across the plane per unit distance from the nearest face."""
+    far_z: float = 0.013
+    """Largest spacing across the plane …"""
+    tall: float = 0.074
+    """… or, where that is more, this fraction of the distance from the nearest face."""
+    merge: float = 0.0008
+    """Edges closer to each other than this share one plane."""
+
+    def refined(self, factor: float) -> MeshSettings:
+        """Return settings with ``factor`` times as many nodes along each axis."""
+        finer = {name: value / factor for name, value in vars(self).items()}
+        return MeshSettings(**{**finer, "merge": self.merge / max(1.0, factor)})
 
 
 @dataclass(frozen=True)
@@ -87,3 +114,99 @@ def build_background(
     green = build_green(solution, densities, begin)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What a scene changes in the Maxwell matrix of all terminals."""
+
+    matrix: Array
+    """Change of the matrix [F], shape (terminals, terminals)."""
+    error: float
+    """Estimated error of its largest entry [F]; infinite where an electrode lies inside a body."""
+    iterations: int = 0
+    """Iterations of the linear solver; 0 for a direct one."""
+    unknowns: int = 0
+    """Unknowns that were solved for, for each terminal."""
+    loss: Array | None = None
+    """Part of the change in quadrature [F], the same shape, where matter has losses: the complex
+    capacitance is ``matrix - 1j * loss``."""
+    jacobian: Array | None = None
+    """How the matrix changes with the poses of the scene's bodies, where it was asked for, shape
+    (bodies, terminals, terminals, 6)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Charges:
+    """Charges that the terminals draw onto the bodies."""
+
+    points: Array
+    """Where they sit [m], shape (n, 3)."""
+    density: Array
+    """Size of the surface density for each terminal at 1 V [C/m²], shape (n, terminals)."""
+    pitch: float
+    """Usual distance of neighbours [m]."""
+
+
+class Terminals:
+    """The terminals of a design: t in all, of which k are driven: n electrodes, then shields.
+
+    Matrices are given for all terminals, floating conductors of the design last.
+
+    Args:
+        design: The design.
+        rest: Maxwell matrix of all terminals in the empty domain [F], shape (t, t).
+    """
+
+    def __init__(self, design: Design, rest: Array) -> None:
+        self.electrodes = len(design.electrodes)
+        self.driven = len(rest) - sum(c.role == Role.FLOATING for c in design.conductors)
+        """How many electrodes there are, n, and how many terminals are driven, k."""
+        self.rest = rest
+        self.empty: Array = self._without_floating(rest)
+        """Maxwell matrix of the driven terminals in the empty domain [F], shape (k, k)."""
+        self.bound: Array = np.maximum(-rest, 0.0)  # coarse meshes may have them the other way
+        """Most that each entry changes by [F], shape (t, t): terminals that are screened from each
+        other do not couple."""
+        np.fill_diagonal(self.bound, np.inf)
+
+    def screened(self, change: Array) -> Array:
+        """Bound a change, shape (..., t, t)."""
+        return np.minimum(change, self.bound)
+
+    def change(self, change: NDArray[Any]) -> NDArray[Any]:
+        """Change of the driven terminals' matrix by that of all, (..., t, t) -> (..., k, k)."""
+        if self.driven == len(self.rest):
+            return change
+        return self._without_floating(self.rest + change) - self.empty
+
+    def slope(self, change: NDArray[Any], slope: Array) -> Array:
+        """Derivative of the electrodes' matrix by that of all terminals.
+
+        Args:
+            change: As :meth:`change` takes it, shape (..., t, t).
+            slope: Shape (..., b, t, t, 6).
+
+        Returns:
+            Shape (..., b, n, n, 6).
+        """
+        n = self.electrodes
+        if self.driven == len(self.rest):
+            return slope[..., :n, :n, :]
+        own, cross = self._floating(self.rest + change)
+        follow = np.zeros((*change.shape[:-2], len(self.rest), n), change.dtype)
+        follow[..., :n, :] = np.eye(n)
+        follow[..., self.driven :, :] = -np.linalg.solve(own, cross[..., :n])
+        return np.einsum("...ai,...bacm,...cj->...bijm", follow, slope, follow)
+
+    def _floating(self, matrix: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Blocks of floating conductors: with themselves, and with the driven terminals."""
+        k = self.driven
+        return matrix[..., k:, k:], matrix[..., k:, :k]
+
+    def _without_floating(self, matrix: NDArray[Any]) -> NDArray[Any]:
+        k = self.driven
+        if k == len(self.rest):
+            return matrix
+        own, cross = self._floating(matrix)
+        return matrix[..., :k, :k] - cross.swapaxes(-1, -2) @ np.linalg.solve(own, cross)

@@ -26,23 +26,33 @@ _NEAR = 2.0
 """Panels nearer than this many of their own diameters are integrated in closed form."""
 
 
-class Polygons(NamedTuple):
-    """Panels as the kernels take them."""
+class Panels(NamedTuple):
+    """Planar polygonal panels as flat arrays, as the kernels take them."""
 
     edges: Array
     """Ends of all edges [m], shape (k, 2, 3)."""
     first: NDArray[np.int64]
-    """Where each panel's edges begin, shape (n + 1,)."""
+    """Edges of panel p are ``first[p]:first[p + 1]``, shape (n + 1,)."""
     normals: Array
-    """Shape (n, 3)."""
+    """Unit normals, shape (n, 3)."""
     centers: Array
-    """[m], shape (n, 3)."""
+    """Centroids [m], shape (n, 3)."""
     diameters: Array
-    """[m], shape (n,)."""
+    """Largest distance from the centroid to a vertex, doubled [m], shape (n,)."""
     quad: Array
     """Points of a quadrature [m], shape (n, q, 3)."""
     weights: Array
     """Their weights [m²], zero for those not used, shape (n, q)."""
+
+    @property
+    def size(self) -> int:
+        """Number of panels n."""
+        return len(self.centers)
+
+    @property
+    def areas(self) -> Array:
+        """Panel areas [m²], shape (n,)."""
+        return self.weights.sum(axis=1)
 
 
 @kernel
@@ -238,7 +248,7 @@ def _mean_normal_gradient(p, i, j, floor, grad):
     return total
 
 
-def potential_matrix(points: Array, floor: float, panels: Polygons) -> Array:
+def potential_matrix(points: Array, floor: float, panels: Panels) -> Array:
     """Return G [m], shape (points, panels): potential times 4π eps0 of unit charge densities.
 
     The grounded plane z = ``floor`` is met by image charges.
@@ -254,9 +264,7 @@ def _fill_potentials(start, stop, points, floor, p, out):
             out[i, j] = _imaged_potential(p, j, floor, points[i, 0], points[i, 1], points[i, 2])
 
 
-def system_matrix(
-    kind: NDArray[np.int64], contrast: Array, floor: float, panels: Polygons
-) -> Array:
+def system_matrix(kind: NDArray[np.int64], contrast: Array, floor: float, panels: Panels) -> Array:
     """Return the boundary-element matrix, shape (n, n), rows scaled by 4π eps0.
 
     ``kind``: 0 conductors, 1 interfaces, 2 interfaces of parts that are no upright boxes.
@@ -304,7 +312,7 @@ def _mean_potential(p, i, j, floor):
     return value
 
 
-def normal_gradient_matrix(rows: NDArray[np.int64], floor: float, panels: Polygons) -> Array:
+def normal_gradient_matrix(rows: NDArray[np.int64], floor: float, panels: Panels) -> Array:
     """Return n · ∇ of each panel's unit potential, averaged over the panels ``rows``."""
     out = np.empty((len(rows), len(panels.centers)))
     return filled(_fill_normal_gradients, out, rows, floor, panels)
@@ -318,7 +326,7 @@ def _fill_normal_gradients(start, stop, rows, floor, p, out):
             out[k, j] = _mean_normal_gradient(p, rows[k], j, floor, grad)
 
 
-def flux_matrix(points: Array, rows: NDArray[np.int64], floor: float, panels: Polygons) -> Array:
+def flux_matrix(points: Array, rows: NDArray[np.int64], floor: float, panels: Panels) -> Array:
     """Return n · ∇ of 1 / |x − point| integrated over x on panels ``rows``, shape (points, rows).
 
     The grounded plane z = ``floor`` is met by an image of each point.

@@ -20,16 +20,20 @@ from capsense.design.geometry import Facet
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field import bem_kernels as kernels
-from capsense.field.facets import (
+from capsense.field.bem_kernels import Panels
+from capsense.field.panels import (
     FAR_PLANE,
     PLANE_TOL,
+    Grading,
+    concatenate,
+    cut_facet,
     interfaces,
+    make_panels,
     plane_spacings,
     smallest_gaps,
     thickness_of,
     walls,
 )
-from capsense.field.panels import Grading, Panels, concatenate, cut_facet, make_panels
 
 Array = NDArray[np.float64]
 
@@ -107,9 +111,9 @@ def build_model(design: Design, accuracy: Accuracy | None = None) -> BoundaryMod
         fitted = _fitted(design)
         scale *= fitted if scale <= 1.0 else max(fitted, 1.0)
     model = _cut(design, scale)
-    if len(model.panels) > _MAX_PANELS:
+    if model.panels.size > _MAX_PANELS:
         raise FieldError(
-            f"design {design.name!r} needs {len(model.panels)} boundary panels, more than the "
+            f"design {design.name!r} needs {model.panels.size} boundary panels, more than the "
             f"{_MAX_PANELS} that fit in memory; lower [build] resolution, simplify its outlines or "
             "coarsen its STL files"
         )
@@ -121,10 +125,10 @@ def _fitted(design: Design) -> float:
 
     Sizes are halved from the coarsest on, so that no cut has many more panels than are allowed.
     """
-    scale, count = _COARSEST, len(_cut(design, _COARSEST).panels)
+    scale, count = _COARSEST, _cut(design, _COARSEST).panels.size
     while scale > 1.0 and count * 2**_POWER < 1.5 * _MANY:
         scale /= 2
-        count = len(_cut(design, scale).panels)
+        count = _cut(design, scale).panels.size
     if scale > 1.0 or count > _MANY:
         return scale * (count / _MANY) ** (1 / _POWER)
     return float(np.clip((count / _FEW) ** (1 / _POWER), _FINEST, 1.0))
@@ -160,7 +164,7 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
             return
         panels = make_panels(facet, pieces)
         parts.append(panels)
-        owners.append(np.full(len(panels), owner, dtype=np.int64))
+        owners.append(np.full(panels.size, owner, dtype=np.int64))
 
     reach = 2.5 * thin if math.isfinite(thin) else 0.0
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
@@ -208,12 +212,12 @@ class BoundarySolution:
         self.design = design
         self.model = build_model(design, accuracy)
         panels, owner = self.model.panels, self.model.owner
-        progress(f"boundary elements: {len(panels)} panels")
+        progress(f"boundary elements: {panels.size} panels")
         self._contrast = (self.model.eps_front - self.model.eps_back) / (
             self.model.eps_front + self.model.eps_back
         )
         kind = np.where(owner == INTERFACE, 1 + any(k.facets != () for k in design.layers), 0)
-        matrix = kernels.system_matrix(kind, self._contrast, self.model.floor, panels.polygons)
+        matrix = kernels.system_matrix(kind, self._contrast, self.model.floor, panels)
         progress("boundary elements: factorising")
         self._lu = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=True)
 
@@ -224,7 +228,7 @@ class BoundarySolution:
         [m], shape (k, 3), one a column, where a point charge of 4π eps0 · 1 V·m sits.
         """
         panels, owner = self.model.panels, self.model.owner
-        rhs = np.zeros((len(panels), potentials.shape[1]))
+        rhs = np.zeros((panels.size, potentials.shape[1]))
         driven = owner >= 0
         rhs[driven] = potentials[owner[driven]]
         if sources is not None:
@@ -235,11 +239,11 @@ class BoundarySolution:
         """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
         panels, floor = self.model.panels, self.model.floor
         points = np.ascontiguousarray(sources)
-        rhs = -kernels.potential_matrix(points, floor, panels.polygons).T
+        rhs = -kernels.potential_matrix(points, floor, panels).T
         rows = np.flatnonzero(self.model.owner == INTERFACE)
         if len(rows):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
-            flux = kernels.flux_matrix(points, rows, floor, panels.polygons)
+            flux = kernels.flux_matrix(points, rows, floor, panels)
             rhs[rows] = self._contrast[rows, None] * flux.T
         return rhs / panels.areas[:, None]
 
@@ -251,7 +255,7 @@ class BoundarySolution:
         free = mean[:, None] * densities
         rows = np.flatnonzero((model.owner >= 0) & (np.abs(jump) > 1e-12))
         if len(rows):
-            grad = kernels.normal_gradient_matrix(rows, model.floor, panels.polygons)
+            grad = kernels.normal_gradient_matrix(rows, model.floor, panels)
             # eps0 E_n = -grad . n sigma / (4 pi)
             free[rows] -= jump[rows, None] * (grad @ densities) / (4 * math.pi)
         charge = free * panels.areas[:, None]
@@ -266,6 +270,6 @@ class BoundarySolution:
         scaled = densities / (4 * math.pi * EPS0)
         for start in range(0, len(points), chunk):
             block = np.ascontiguousarray(points[start : start + chunk])
-            matrix = kernels.potential_matrix(block, self.model.floor, self.model.panels.polygons)
+            matrix = kernels.potential_matrix(block, self.model.floor, self.model.panels)
             out[start : start + chunk] = matrix @ scaled
         return out

@@ -14,7 +14,7 @@ housings, and outside of the walls. Farther from the sensor fewer charges and fe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -197,10 +197,7 @@ def build_green(
     far_fit = _Fit(basis(away, far, floor) * far_weight, settings.regularisation)
     far_modes = far_fit.solve(there @ modes[:, :n_far])
     far_phi = _fit_phi(away, distances, far, floor, basis(away, near, floor) @ near_phi)
-    tables = (
-        near, _rounded(modes), near_phi,
-        far, _rounded(far_modes), far_phi,
-    )  # fmt: skip
+    tables = (near, _rounded(modes), near_phi, far, _rounded(far_modes), far_phi)
     if not all(np.isfinite(t).all() for t in tables):
         raise FieldError(f"the Green's function of design {design.name!r} is not finite")
     numbers = {
@@ -222,16 +219,13 @@ def from_arrays(arrays: Mapping[str, Any]) -> GreenFunction:
         KeyError: A field is missing.
     """
 
-    def table(name: str) -> Table:
-        return np.ascontiguousarray(arrays[name], dtype=np.float32)
+    def value(name: str) -> Any:
+        if name in TABLES:
+            return np.ascontiguousarray(arrays[name], dtype=np.float32)
+        given = np.array(arrays[name], dtype=float)
+        return given if given.ndim else float(given)
 
-    return GreenFunction(
-        float(arrays["floor"]),
-        table("near_sources"), table("near_modes"), table("near_phi"),
-        table("far_sources"), table("far_modes"), table("far_phi"),
-        np.array(arrays["box"], dtype=float), np.array(arrays["blend"], dtype=float),
-        float(arrays["clearance"]), float(arrays["misfit"]),
-    )  # fmt: skip
+    return GreenFunction(**{f.name: value(f.name) for f in fields(GreenFunction)})
 
 
 def _weight(distances: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Cut conducting sheets and dielectric interfaces into panels, graded towards charged rims.
+"""Conducting sheets, bare faces of dielectrics and walls of a design, cut into panels.
 
 Charge piles up at the rims of a sheet like 1/√distance. Every facet is therefore split into bands
 of geometrically growing distance from its rims, and each band into cells whose size follows the
@@ -7,15 +7,19 @@ band's distance. Panels are the intersections: planar polygons that fill the fac
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
+from shapely.geometry.polygon import orient
 
-from capsense.design.geometry import Facet
-from capsense.field.bem_kernels import Polygons
+from capsense.design.geometry import Facet, box_facets, ring_vertices, to_plane
+from capsense.design.model import Design, Layer
+from capsense.field.bem_kernels import Panels
 
 Array = NDArray[np.float64]
 
@@ -39,57 +43,24 @@ class Grading:
     """No cell is larger than this [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Panels:
-    """A set of planar polygonal panels as flat arrays."""
-
-    edges: Array
-    """Edges of all panels, shape (k, 2, 3)."""
-    first: NDArray[np.int64]
-    """Edges of panel p are ``first[p]:first[p + 1]``, shape (n + 1,)."""
-    normals: Array
-    """Unit normals, shape (n, 3)."""
-    centers: Array
-    """Centroids [m], shape (n, 3)."""
-    diameters: Array
-    """Largest distance from the centroid to a vertex, doubled [m], shape (n,)."""
-    quad: Array
-    """Quadrature points [m], shape (n, q, 3)."""
-    weights: Array
-    """Quadrature weights [m²], zero where unused, shape (n, q)."""
-
-    def __len__(self) -> int:
-        return len(self.centers)
-
-    @property
-    def areas(self) -> Array:
-        """Panel areas [m²], shape (n,)."""
-        return self.weights.sum(axis=1)
-
-    @property
-    def polygons(self) -> Polygons:
-        """The arrays as the compiled kernels take them."""
-        return Polygons(*(getattr(self, name) for name in Polygons._fields))
-
-
 def concatenate(parts: list[Panels]) -> Panels:
     """Join panel sets, in order."""
-    q = max(p.quad.shape[1] for p in parts)
-
-    def pad(a: Array) -> Array:
-        widths = [(0, 0), (0, q - a.shape[1])] + [(0, 0)] * (a.ndim - 2)
-        return np.pad(a, widths)
-
     counts = np.concatenate([np.diff(p.first) for p in parts])
-    return Panels(
-        edges=np.concatenate([p.edges for p in parts]),
-        first=np.concatenate([[0], np.cumsum(counts)]),
-        normals=np.concatenate([p.normals for p in parts]),
-        centers=np.concatenate([p.centers for p in parts]),
-        diameters=np.concatenate([p.diameters for p in parts]),
-        quad=np.concatenate([pad(p.quad) for p in parts]),
-        weights=np.concatenate([pad(p.weights) for p in parts]),
-    )
+    columns = dict(zip(Panels._fields, zip(*parts, strict=True), strict=True))
+    joined = {name: _joined(arrays) for name, arrays in columns.items()}
+    return Panels(**{**joined, "first": np.concatenate([[0], np.cumsum(counts)])})
+
+
+def _joined(arrays: Sequence[Array]) -> Array:
+    """Arrays one after another; the second axis is filled up with zeros where others are longer."""
+    if arrays[0].ndim == 1:
+        return np.concatenate(arrays)
+    width = max(a.shape[1] for a in arrays)
+    out = np.zeros((sum(map(len, arrays)), width, *arrays[0].shape[2:]))
+    ends = np.cumsum([len(a) for a in arrays])
+    for array, end in zip(arrays, ends, strict=True):
+        out[end - len(array) : end, : array.shape[1]] = array
+    return out
 
 
 def cut_facet(facet: Facet, rims: Array, grading: Grading, reach: float = 0.0) -> list[Polygon]:
@@ -149,12 +120,9 @@ def make_panels(facet: Facet, polygons: list[Polygon]) -> Panels:
     counts: list[int] = []
     centers, diameters, quads, weights = [], [], [], []
     for polygon in polygons:
-        polygon = shapely.geometry.polygon.orient(polygon)
-        rings = [np.asarray(polygon.exterior.coords)] + [
-            np.asarray(ring.coords) for ring in polygon.interiors
-        ]
-        loops = [np.stack([r[:-1], r[1:]], axis=1) for r in rings]
-        flat = np.concatenate(loops)
+        polygon = orient(polygon)
+        rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
+        flat = np.concatenate([np.stack([r[:-1], r[1:]], axis=1) for r in rings])
         edges.append(facet.to_sensor(flat))
         counts.append(len(flat))
         points, w = _quadrature(polygon, rings)
@@ -163,19 +131,14 @@ def make_panels(facet: Facet, polygons: list[Polygon]) -> Panels:
         diameters.append(2 * np.sqrt(((flat[:, 0] - center) ** 2).sum(axis=1)).max())
         quads.append(facet.to_sensor(points))
         weights.append(w)
-    n, q = len(polygons), max(len(w) for w in weights)
-    quad, weight = np.zeros((n, q, 3)), np.zeros((n, q))
-    for p in range(n):
-        quad[p, : len(quads[p])] = quads[p]
-        weight[p, : len(weights[p])] = weights[p]
     return Panels(
         edges=np.concatenate(edges),
         first=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        normals=np.tile(facet.axes[2], (n, 1)),
+        normals=np.tile(facet.axes[2], (len(polygons), 1)),
         centers=np.array(centers),
         diameters=np.array(diameters),
-        quad=quad,
-        weights=weight,
+        quad=_joined([points[None] for points in quads]),
+        weights=_joined([w[None] for w in weights]),
     )
 
 
@@ -193,3 +156,99 @@ def _quadrature(polygon: Polygon, rings: list[Array]) -> tuple[Array, Array]:
     area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     points = np.einsum("qk,tkd->tqd", _TRIANGLE_RULE, triangles).reshape(-1, 2)
     return points, np.repeat(area / 3, 3)
+
+
+PLANE_TOL = 1e-6
+"""What is nearer to a plane than this [m] lies in it."""
+FAR_PLANE = 0.01
+"""Parallel sheets farther apart than this [m] need no panels of their distance."""
+
+
+def smallest_gaps(sheets: list[tuple[Facet, int]]) -> list[float]:
+    """Distance of each facet to the nearest other facet [m], from their outlines."""
+    outlines = [np.concatenate(ring_vertices(facet)) for facet, _ in sheets]
+    gaps = []
+    for k, (facet, owner) in enumerate(sheets):
+        gap = math.inf
+        for other, (mate, mate_owner) in enumerate(sheets):
+            if other == k or (mate_owner == owner and owner >= 0):
+                continue
+            local = (outlines[other] - facet.origin) @ facet.axes.T
+            if np.abs(local[:, 2]).max() < PLANE_TOL:
+                gap = min(gap, float(facet.polygon.boundary.distance(to_plane(mate, facet))))
+        gaps.append(max(gap, 1e-5))
+    return gaps
+
+
+def plane_spacings(sheets: list[tuple[Facet, int]]) -> list[float]:
+    """Distance of each facet to the nearest parallel facet that faces it [m], at most 10 mm."""
+    out = []
+    for k, (facet, _) in enumerate(sheets):
+        spacing = FAR_PLANE
+        for other, (mate, _) in enumerate(sheets):
+            height = abs((mate.origin - facet.origin) @ facet.axes[2])
+            parallel = abs(mate.axes[2] @ facet.axes[2]) > 1 - 1e-6
+            nearer = other != k and parallel and PLANE_TOL < height < spacing
+            if nearer and facet.polygon.intersects(to_plane(mate, facet)):
+                spacing = height
+        out.append(spacing)
+    return out
+
+
+def interfaces(design: Design, sheets: list[Facet]) -> list[tuple[Facet, float]]:
+    """Faces of dielectrics that no sheet covers, each once, with the thickness of the part [m]."""
+    out: list[tuple[Facet, float]] = []
+    covers = list(sheets)
+    for number, layer in enumerate(design.layers):
+        later = [f for other in design.layers[number + 1 :] for f in other.facets]
+        thickness = float((layer.upper - layer.lower).min())
+        if layer.facets:
+            thickness = thickness_of(layer)
+        for face in layer.surface.facets:
+            if _on_wall(face, design):
+                continue
+            region = face.polygon
+            for cover in _coplanar(face, covers):
+                region = region.difference(cover)
+            pieces = [region]
+            for mate in _coplanar(face, later):
+                pieces = [p for r in pieces for p in (r.intersection(mate), r.difference(mate))]
+            for piece in shapely.get_parts(pieces):
+                if piece.area > 1e-12 and piece.geom_type == "Polygon":
+                    out.append((Facet(piece, face.origin, face.axes), thickness))
+        covers += layer.surface.facets
+    return out
+
+
+def thickness_of(layer: Layer) -> float:
+    """Thickness of a part [m]; that of a box is its height."""
+    if layer.facets:
+        from capsense.design.solid import thickness
+
+        return thickness(layer.facets)
+    return float((layer.upper - layer.lower)[2])
+
+
+def _coplanar(face: Facet, others: list[Facet]) -> Iterator[shapely.Polygon]:
+    """Outlines of the facets that lie in a facet's plane, in that plane."""
+    if not others:
+        return
+    normals, origins = np.array([(f.axes[2], f.origin) for f in others]).swapaxes(0, 1)
+    parallel = np.abs(normals @ face.axes[2]) > 1 - 1e-9
+    apart = np.abs(((face.origin - origins) * normals).sum(axis=1))
+    for k in np.flatnonzero(parallel & (apart < PLANE_TOL)):
+        yield to_plane(others[k], face)
+
+
+def _on_wall(face: Facet, design: Design) -> bool:
+    if design.domain.open or np.abs(face.axes[2]).max() < 1 - 1e-9:
+        return False
+    corners = np.array([design.domain.lower, design.domain.upper])
+    return bool(np.abs((face.origin - corners) @ face.axes[2]).min() < PLANE_TOL)
+
+
+def walls(design: Design) -> list[Facet]:
+    """Ceiling and side walls of the box; the floor is met by images. An open domain has none."""
+    if design.domain.open:
+        return []
+    return [f for f in box_facets(design.domain.lower, design.domain.upper) if f.axes[2, 2] > -0.5]

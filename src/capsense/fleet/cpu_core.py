@@ -12,7 +12,7 @@ from capsense._thread_pool import in_parts
 from capsense.elements.matter import UNIT
 from capsense.elements.rigid import BODY
 from capsense.errors import SolveError
-from capsense.field.change import Terminals
+from capsense.field.background import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.reading import FleetReading
 from capsense.fleet.step_kernels import Found, Poses, Sensor, seen, step_rows

@@ -14,13 +14,13 @@ from capsense._thread_pool import OneAtATime
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
+from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.field.change import Terminals
 from capsense.fleet.bodies import BodyTable
 from capsense.fleet.cpu_core import CpuCore
 from capsense.fleet.reading import FleetCheck, FleetReading, on_device
+from capsense.readout.conversions import SideBySide
 from capsense.readout.readout import Readout
-from capsense.readout.side_by_side import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS, SurfaceSolver

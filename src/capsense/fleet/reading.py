@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.readout.counts import Held
+from capsense.readout.conversions import Held
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Chips of one kind on Warp as kernels: a thread is one channel of one chip.
 
-The twin is :class:`~capsense.readout.side_by_side.SideBySide`.
+The twin is :class:`~capsense.readout.conversions.SideBySide`.
 """
 
 from __future__ import annotations

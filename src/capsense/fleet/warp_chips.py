@@ -1,6 +1,6 @@
 """Chips of one kind on Warp, one for each sensor of a fleet, with noise and drift of their own.
 
-The twin is :class:`~capsense.readout.side_by_side.SideBySide`: the same channels, schedule, stages
+The twin is :class:`~capsense.readout.conversions.SideBySide`: the same channels, schedule, stages
 and converters in double precision, but other random numbers.
 """
 
@@ -17,7 +17,7 @@ from capsense.errors import ReadoutError
 from capsense.fleet import warp_chip_kernels as kernels
 from capsense.fleet.reading import on_device
 from capsense.fleet.warp_laws import law_of
-from capsense.readout.counts import Held
+from capsense.readout.conversions import Held
 from capsense.readout.noise import ClimateDrift, Context, Flicker, Mains, RandomWalk, White
 from capsense.readout.readout import Readout
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capsense.elements.matter import UNIT
 from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
-from capsense.field.change import Terminals
+from capsense.field.background import Terminals
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_kernels as kernels
 from capsense.fleet import warp_left as left

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from capsense.errors import ReadoutError
-from capsense.readout.converter import LinearLaw, ReciprocalLaw, ResonanceLaw, ShuntLaw
+from capsense.readout.laws import LinearLaw, ReciprocalLaw, ResonanceLaw, ShuntLaw
 
 wp.set_module_options({"enable_backward": False})
 

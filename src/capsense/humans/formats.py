@@ -20,7 +20,7 @@ from capsense._validate import suggest
 from capsense.errors import MissingDependencyError, SceneError
 from capsense.humans.limb import Limb, LimbPart, Segment
 from capsense.scene import Material, Pose, TriMesh, material
-from capsense.scene.scene import Grounding, checked_grounding
+from capsense.scene.materials import Grounding, checked_grounding
 
 Array = NDArray[np.float64]
 

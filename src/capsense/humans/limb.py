@@ -36,8 +36,8 @@ import numpy as np
 from capsense._validate import suggest
 from capsense.errors import SceneError
 from capsense.scene import Body, Capsule, Material, Pose
+from capsense.scene.materials import Grounding, checked_grounding
 from capsense.scene.pose import Vec3
-from capsense.scene.scene import Grounding, checked_grounding
 
 Sex = Literal["female", "male"]
 Side = Literal["left", "right"]

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.scene import Body, Capsule, Material, Pose, Scene
-from capsense.scene.scene import Grounding
+from capsense.scene.materials import Grounding
 from capsense.simulator import Simulator
 
 Array = NDArray[np.float64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from capsense.reading import Reading
-from capsense.readout.counts import Held
+from capsense.readout.conversions import Held
 from capsense.readout.readout import Readout
 
 

@@ -21,14 +21,13 @@ from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Design, Domain, Electrode
 from capsense.design.stl import sheet_surface, weld
 from capsense.errors import CapSenseError, DesignError, MeshError, SceneError
+from capsense.field.background import Change, MeshSettings
 from capsense.field.boundary import terminals
-from capsense.field.change import Change
 from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh, kuhn_tets
-from capsense.mesh.lattice import MeshSettings
 from capsense.mesh.tetmesh import GROUND
 from capsense.scene import Scene
-from capsense.scene.contact import met
+from capsense.scene.scene import met
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
@@ -51,7 +50,8 @@ def plan_axes(design: Design, s: MeshSettings) -> tuple[Array, Array, Array]:
         else:
             size, growth, far = np.full(len(edges), s.face), s.growth_z, s.far_z
         tall = s.tall if axis == 2 else 0.0
-        out.append(_graded(lower[axis], upper[axis], planes, edges, size, growth, far, tall))
+        stops = np.concatenate([[lower[axis]], planes, [upper[axis]]])
+        out.append(_graded(stops, edges, size, growth, far, tall))
     return out[0], out[1], out[2]
 
 
@@ -61,11 +61,9 @@ def _sheet_planes(sheet: Surface, axis: int) -> Array:
     flat = np.abs(rims[:, 0, axis] - rims[:, 1, axis]) < 1e-9
     length = np.linalg.norm(rims[:, 1] - rims[:, 0], axis=1)
     # short segments are the facets of an arc, not edges worth a plane of their own
-    total: dict[float, float] = {}
-    for c, ell in zip(np.round(rims[flat, 0, axis], 9), length[flat], strict=True):
-        total[c] = total.get(c, 0.0) + ell
-    keep = [c for c, ell in total.items() if ell > 0.002]
-    return np.concatenate([keep, sheet.bounds[:, axis]])
+    at, which = np.unique(np.round(rims[flat, 0, axis], 9), return_inverse=True)
+    long = np.bincount(which, length[flat], len(at)) > 0.002
+    return np.concatenate([at[long], sheet.bounds[:, axis]])
 
 
 def _merge(values: Array, distance: float, lower: float, upper: float) -> Array:
@@ -82,21 +80,13 @@ def _merge(values: Array, distance: float, lower: float, upper: float) -> Array:
 
 
 def _graded(
-    lower: float,
-    upper: float,
-    planes: Array,
-    edges: Array,
-    size: Array,
-    growth: float,
-    far: float,
-    tall: float,
+    stops: Array, edges: Array, size: Array, growth: float, far: float, tall: float
 ) -> Array:
-    """Lay planes through ``planes``, spaced by ``size`` at ``edges`` and growing from there.
+    """Lay planes through ``stops``, spaced by ``size`` at ``edges`` and growing from there.
 
     The spacing is at most ``far``, or the fraction ``tall`` of the distance from the edges.
     """
-    stops = np.concatenate([[lower], planes, [upper]])
-    out = [lower]
+    out = [stops[0]]
     for a, b in pairwise(stops):
         t = np.linspace(a, b, 801)
         mid = 0.5 * (t[1:] + t[:-1])
@@ -129,12 +119,7 @@ def hold_nodes(design: Design, axes: Axes) -> Owner:
     for body in design.sheets:
         who = names.index(body.name) if body.name in names else WALL
         for facet in body.surface.facets:
-            k = int(np.argmin(np.abs(axes[2] - facet.origin[2])))
-            horizontal = abs(facet.axes[2, 2]) > 1 - 1e-12
-            if horizontal and abs(axes[2][k] - facet.origin[2]) < _ON_PLANE:
-                _claim_plane(axes, owner, facet, k, who)
-            else:
-                _claim_crossed(axes, owner, facet, who)
+            _claim(axes, owner, facet, who)
     for axis in range(3):
         face: list[slice | int] = [slice(None)] * 3
         for end in (0, -1):
@@ -143,19 +128,8 @@ def hold_nodes(design: Design, axes: Axes) -> Owner:
     return owner
 
 
-def _claim_plane(axes: Axes, owner: Owner, facet: Facet, k: int, who: int) -> None:
-    """Mark the nodes of plane k of the z axis that lie on a horizontal facet."""
-    x, y, _ = axes
-    xy = facet.to_sensor(shapely.get_coordinates(facet.polygon))[:, :2]
-    polygon = shapely.set_coordinates(shapely.Polygon(facet.polygon), xy)
-    closed = polygon.buffer(1e-8, join_style="mitre")
-    gx, gy = np.meshgrid(x, y, indexing="ij")
-    inside = shapely.contains_xy(closed, gx.ravel(), gy.ravel()).reshape(gx.shape)
-    owner[:, :, k][inside] = who
-
-
-def _claim_crossed(axes: Axes, owner: Owner, facet: Facet, who: int) -> None:
-    """Mark the nodes that a facet in general position goes through."""
+def _claim(axes: Axes, owner: Owner, facet: Facet, who: int) -> None:
+    """Mark the nodes that a facet goes through."""
     for axis in range(3):
         if abs(facet.axes[2, axis]) < 1e-6:
             continue
@@ -223,8 +197,7 @@ class MeshSensor:
         """
         points = self.mesh.points
         lower, upper = points.min(axis=0), points.max(axis=0)
-        size = upper - lower
-        middle = 0.5 * (lower + upper)
+        size, middle = upper - lower, 0.5 * (lower + upper)
         if np.abs(middle[:2]).max() > 1e-6 * size.max():
             top = points[self.mesh.group_nodes(self.names), 2].max()
             shift = ", ".join(f"{-v:.6g}" for v in (*middle[:2], top))
@@ -236,6 +209,38 @@ class MeshSensor:
         electrodes = tuple(Electrode(name, self._surface(name)) for name in self.names)
         width, depth, height = size.tolist()
         return Design("mesh", Domain((width, depth, height), -float(lower[2])), electrodes)
+
+    def unit_potentials(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Dirichlet values of the M unit problems, and which nodes are free.
+
+        Returns:
+            values: 1 V, or the profile given, on electrode j in column j and 0 V elsewhere [V],
+                shape (n, M).
+            free: Nodes on no electrode and not on ground, shape (n,).
+
+        Raises:
+            MeshError: If a group is unknown or empty, an electrode shares nodes with another or
+                ground, or a profile is of no electrode, of another shape, negative or not finite.
+        """
+        mesh, names = self.mesh, list(self.names)
+        if not names:
+            raise MeshError("at least one electrode group is needed")
+        if strange := sorted(set(self.profiles) - set(names)):
+            raise MeshError(f"profile {strange[0]!r} is of no electrode; there are {names}")
+        owner = np.full(mesh.n_points, -1)
+        values = np.zeros((mesh.n_points, len(names)))
+        owner[mesh.group_nodes(self.ground)] = len(names)
+        for column, name in enumerate(names):
+            members = mesh.group_nodes([name])
+            if len(members) == 0:
+                raise MeshError(f"electrode group {name!r} is empty")
+            if shared := int((owner[members] >= 0).sum()):
+                raise MeshError(
+                    f"electrode group {name!r} shares {shared} nodes with another group"
+                )
+            owner[members] = column
+            values[members, column] = _profile(name, self.profiles.get(name, 1.0), len(members))
+        return values, owner < 0
 
     def _surface(self, name: str) -> Surface:
         """Faces whose corners are all nodes of a group, without those in its inside.
@@ -252,6 +257,21 @@ class MeshSensor:
             if len(faces):
                 return sheet_surface(weld(self.mesh.points[np.unique(np.sort(faces), axis=0)]))
         return Surface((), np.empty((0, 2, 3)))
+
+
+def _profile(name: str, given: ArrayLike, count: int) -> Array:
+    potential = np.asarray(given, dtype=np.float64)
+    if potential.shape not in ((), (count,)):
+        raise MeshError(
+            f"profile {name!r} has shape {potential.shape}; give one potential for each of the "
+            f"group's {count} nodes"
+        )
+    if not (np.isfinite(potential) & (potential >= 0)).all() or not potential.any():
+        raise MeshError(
+            f"profile {name!r} must be finite, from 0 V on and not zero everywhere; drive the "
+            "electrode with a negative voltage instead, or split its group in two"
+        )
+    return potential
 
 
 def mesh_sensor(mesh: TetMesh | MeshSensor) -> MeshSensor:
@@ -277,8 +297,7 @@ def lattice_sensor(design: Design, terminals: Sequence[str], settings: MeshSetti
     mesh = kuhn_tets(*axes)
     owner = hold_nodes(design, axes).ravel()
     groups = {name: np.flatnonzero(owner == k) for k, name in enumerate(terminals)}
-    missing = [name for name, nodes in groups.items() if not len(nodes)]
-    if missing:
+    if missing := [name for name, nodes in groups.items() if not len(nodes)]:
         raise SceneError(
             f"method 'fem_masked' needs mesh nodes on every electrode; {missing[0]!r} has none: "
             "raise [build] resolution, or use method 'surface'"
@@ -317,7 +336,6 @@ class MaskedScenes:
         held = sensor.names if electrodes is None else electrodes
         self._points = sensor.mesh.points[sensor.mesh.group_nodes(held)]
         self._mesh = sensor.mesh
-        self._centroids = sensor.mesh.centroids
         self._solver = MaskedSolver(sensor, warm_start=warm_start)
         self.empty: Array = self._solver.step(np.full(self._mesh.n_tets, -1), [])
         """Maxwell matrix of the empty mesh [F], shape (terminals, terminals)."""
@@ -353,6 +371,7 @@ class MaskedScenes:
         assert not jacobian
         inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)
         eps, contact = np.ones(len(scene)), False
+        conducts = np.array([b.material.is_conductor(self._excitation_frequency) for b in scene])
         for i, body in enumerate(scene):
             if not isinstance(body.grounding, str):
                 raise SceneError(
@@ -364,24 +383,18 @@ class MaskedScenes:
                     f"body {body.name or i} is an open surface, and method 'fem_masked' needs an "
                     "inside: close it, give a DepthFrame, or use method 'surface'"
                 )
-            local = body.pose.inverse().apply(self._centroids)
-            within = body.shape.signed_distance(local) < 0
-            conducts = body.material.is_conductor(self._excitation_frequency)
-            off = body.shape.signed_distance(body.pose.inverse().apply(self._points))
-            contact |= body.shape.kind != ShapeKind.LAYERS and met(off, conducts)
-            if conducts:
+            to_body = body.pose.inverse()
+            within = body.shape.signed_distance(to_body.apply(self._mesh.centroids)) < 0
+            off = body.shape.signed_distance(to_body.apply(self._points))
+            contact |= body.shape.kind != ShapeKind.LAYERS and met(off, bool(conducts[i]))
+            if conducts[i]:
                 eps[i] = GROUNDED if body.grounding == "grounded" else self.FLOATING_EPS_R
                 inside[within] = i
             else:
                 eps[i] = body.material.at(self._excitation_frequency).eps_r
-                taken = inside >= 0
-                conductor = np.array(
-                    [b.material.is_conductor(self._excitation_frequency) for b in scene]
-                )
-                inside[within & ~(taken & conductor[inside])] = i
+                inside[within & ~((inside >= 0) & conducts[inside])] = i
         matrix = self._solver.step(inside, eps.tolist())
         stats = self._solver.stats
-        goal = self._solver.tolerance * float(np.abs(matrix).max())
-        error = math.inf if contact else goal
+        error = math.inf if contact else self._solver.tolerance * float(np.abs(matrix).max())
         free = self._mesh.n_points - stats.grounded_nodes
         return Change(matrix - self.empty, error, int(stats.iterations), free)

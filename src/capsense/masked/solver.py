@@ -8,6 +8,9 @@ An object is either a dielectric, which gives its tetrahedra their permittivity,
 at 0 V, which fixes every node of its tetrahedra at 0 V; `GROUNDED` (infinite eps_r) marks the
 latter. A conductor can also be imitated by a large finite eps_r, as far as it touches nothing:
 it is then floating, and CG needs more iterations the larger the contrast.
+
+With ∇λ_a the constant gradient of node a's hat function on an element e of volume V_e, the P1
+stiffness matrix is K_ab = Σ_e ε0 ε_e V_e ∇λ_a·∇λ_b [F].
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,13 +26,15 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import ArrayLike, NDArray
 
-from capsense.errors import SolveError
-from capsense.masked.stiffness import StiffnessMap, check_eps_r, unit_potentials
+from capsense.constants import EPS0
+from capsense.errors import FieldError, SolveError
+from capsense.mesh.tetmesh import TetMesh
 
 if TYPE_CHECKING:
     from capsense.masked.mesh_sensor import MeshSensor
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.integer]
 
 GROUNDED = math.inf
 """The eps_r that marks a conductor held at 0 V."""
@@ -37,6 +43,106 @@ _REFRESH = 1000
 """Residual updates after which the matrix is assembled afresh, so that rounding cannot pile up."""
 _UPDATE_SHARE = 0.25
 """Share of changed elements above which assembling afresh is cheaper than updating."""
+
+
+def gradients(points: Array, tets: IntArray) -> tuple[Array, Array]:
+    """Gradients of the hat functions, and the volumes, of linear tetrahedra.
+
+    Args:
+        points: Node positions [m], shape (n, 3).
+        tets: Corner nodes, shape (k, 4).
+
+    Returns:
+        grads: Gradient [1/m] of each corner's hat function, shape (k, 4, 3); they sum to zero.
+        volumes: Volume of each tetrahedron [m³], shape (k,), negative if it is inverted.
+    """
+    corners = points[tets]
+    sides = corners[:, 1:] - corners[:, :1]
+    volumes = np.linalg.det(sides) / 6.0
+    grads = np.empty((len(tets), 4, 3))
+    grads[:, 1:] = np.linalg.inv(sides).transpose(0, 2, 1)
+    grads[:, 0] = -grads[:, 1:].sum(axis=1)
+    return grads, volumes
+
+
+def check_eps_r(mesh: TetMesh, eps_r: ArrayLike) -> Array:
+    """Relative permittivity per element, shape (k,), from one number or k of them.
+
+    Raises:
+        FieldError: If the shape does not fit or a value is not positive and finite.
+    """
+    values = np.asarray(eps_r, dtype=np.float64)
+    if values.shape not in ((), (mesh.n_tets,)):
+        raise FieldError(f"eps_r must be a number or have shape ({mesh.n_tets},): {values.shape}")
+    if not (np.isfinite(values) & (values > 0)).all():
+        raise FieldError("every eps_r must be positive and finite")
+    return np.broadcast_to(values, (mesh.n_tets,)).copy()
+
+
+@dataclass(frozen=True, eq=False)
+class StiffnessMap:
+    """The linear map from element permittivities to CSR values, ``data = csr_map @ eps_r``.
+
+    The sparsity pattern of K is fixed: `indptr` and `indices` are those of every matrix made
+    here.
+    """
+
+    mesh: TetMesh
+
+    @cached_property
+    def pattern(self) -> sp.csr_matrix:
+        """K's sparsity pattern, shape (n, n), with the values 0, 1, 2… in order of storage."""
+        n, (a, b) = self.mesh.n_points, self.mesh.edges.T
+        nodes = np.arange(n)
+        rows, columns = np.concatenate([a, b, nodes]), np.concatenate([b, a, nodes])
+        pattern = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+        pattern.sort_indices()
+        pattern.data = np.arange(pattern.nnz, dtype=np.float64)
+        return pattern
+
+    @cached_property
+    def element_entries(self) -> tuple[NDArray[np.int64], Array]:
+        """Where an element's 4×4 matrix goes in the CSR values, and the matrix at eps_r = 1.
+
+        Both have shape (k, 16); the positions index `data`, the matrices are in farads.
+        """
+        mesh = self.mesh
+        grads, volumes = gradients(mesh.points, mesh.tets)
+        local = EPS0 * volumes[:, None, None] * np.einsum("kad,kbd->kab", grads, grads)
+        rows = np.repeat(mesh.tets, 4, axis=1).astype(np.int64)
+        columns = np.tile(mesh.tets, (1, 4)).astype(np.int64)
+        pattern = self.pattern
+        stored_rows = np.repeat(np.arange(mesh.n_points), np.diff(pattern.indptr))
+        keys = stored_rows * mesh.n_points + pattern.indices
+        return np.searchsorted(keys, rows * mesh.n_points + columns), local.reshape(-1, 16)
+
+    @cached_property
+    def csr_map(self) -> sp.csc_matrix:
+        """Maps eps_r, shape (k,), to the CSR values of K [F], shape (nnz, k)."""
+        where, local = self.element_entries
+        columns = np.repeat(np.arange(self.mesh.n_tets), 16)
+        shape = (self.pattern.nnz, self.mesh.n_tets)
+        return sp.csc_matrix((local.ravel(), (where.ravel(), columns)), shape=shape)
+
+    def matrix(self, data: Array) -> sp.csr_matrix:
+        """K with these CSR values [F], shape (nnz,); the values are shared, not copied."""
+        pattern = self.pattern
+        return sp.csr_matrix((data, pattern.indices, pattern.indptr), shape=pattern.shape)
+
+    def assemble(self, eps_r: Array) -> Array:
+        """CSR values [F], shape (nnz,), for permittivities of shape (k,)."""
+        return self.csr_map @ eps_r
+
+    def update(self, data: Array, cells: IntArray, change: Array) -> None:
+        """Add to the CSR values, in place, what a change of eps_r in some cells makes of them.
+
+        Args:
+            data: CSR values [F], shape (nnz,).
+            cells: Distinct elements whose permittivity changed, shape (c,).
+            change: Change of their eps_r, shape (c,).
+        """
+        where, local = self.element_entries
+        np.add.at(data, where[cells].ravel(), (local[cells] * change[:, None]).ravel())
 
 
 @dataclass(frozen=True)
@@ -101,9 +207,7 @@ class MaskedSolver:
         self.tolerance = tolerance
         self.max_iterations = max_iterations
         self.warm_start = warm_start
-        self._dirichlet, self._free = unit_potentials(
-            mesh, sensor.names, sensor.ground, sensor.profiles
-        )
+        self._dirichlet, self._free = sensor.unit_potentials()
         self._background = check_eps_r(mesh, sensor.eps_r)
         self._map = StiffnessMap(mesh)
         self._stats = MaskedStats(0, 0, 0, 0.0)

@@ -5,5 +5,4 @@ Gmsh and meshio are imported where they are used.
 
 from capsense.mesh.gmsh_mesher import mesh_design
 from capsense.mesh.io import load_mesh, save_mesh
-from capsense.mesh.lattice import kuhn_tets
-from capsense.mesh.tetmesh import MeshQuality, TetMesh
+from capsense.mesh.tetmesh import MeshQuality, TetMesh, kuhn_tets

@@ -218,16 +218,6 @@ def _load_msh(path: Path, scale: float) -> TetMesh:
     return _compact(data.points * scale, data.tets, data.nodes, data.cells)
 
 
-def _tetrahedra(data: Any) -> NDArray[np.integer]:
-    counts = Counter({block.type: len(block.data) for block in data.cells})
-    if others := {kind: n for kind, n in counts.items() if kind in _OTHER_SOLIDS}:
-        raise MeshError(f"it holds solids that are not tetrahedra: {others}")
-    blocks = [block.data[:, :4] for block in data.cells if block.type in _TETRAHEDRA]
-    if not blocks:
-        raise MeshError(f"it holds no tetrahedra (it holds: {', '.join(counts) or 'nothing'})")
-    return np.concatenate(blocks)
-
-
 def _load_vtu(path: Path, scale: float) -> TetMesh:
     require_package("meshio", "meshio, which .vtu files need,", "mesh")
     import meshio
@@ -235,11 +225,15 @@ def _load_vtu(path: Path, scale: float) -> TetMesh:
     if b"vtkLZMADataCompressor" in path.read_bytes():
         raise MeshError("it is compressed by LZMA, to a size that nothing tells; save it by zlib")
     data = meshio.read(path)
-    tets = _tetrahedra(data)
+    counts = Counter({block.type: len(block.data) for block in data.cells})
+    if others := {kind: n for kind, n in counts.items() if kind in _OTHER_SOLIDS}:
+        raise MeshError(f"it holds solids that are not tetrahedra: {others}")
     kept = [i for i, block in enumerate(data.cells) if block.type in _TETRAHEDRA]
+    if not kept:
+        raise MeshError(f"it holds no tetrahedra (it holds: {', '.join(counts) or 'nothing'})")
     return _compact(
         np.asarray(data.points, dtype=float) * scale,
-        tets,
+        np.concatenate([data.cells[i].data[:, :4] for i in kept]),
         {
             name.removeprefix(_NODE_PREFIX): np.flatnonzero(values)
             for name, values in data.point_data.items()

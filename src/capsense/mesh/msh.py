@@ -285,10 +285,9 @@ class _Block:
     entity: int
     physical: int
     """Number of the physical group; 0 for none."""
-    nodes: NDArray[np.int64]
+    name: str
+    nodes: NDArray[np.integer]
     """Corners of each element, counted from 1, shape (e, 1), (e, 3) or (e, 4)."""
-    bounds: NDArray[np.float64]
-    """Lower and upper corner [m], shape (2, 3)."""
 
 
 def write_msh(mesh: TetMesh, path: Path, version: MshVersion = "4.1") -> None:
@@ -300,17 +299,10 @@ def write_msh(mesh: TetMesh, path: Path, version: MshVersion = "4.1") -> None:
     if version not in ("4.1", "2.2"):
         raise MeshError(f"unknown .msh version {version!r}; known: 4.1, 2.2")
     blocks = list(_blocks(mesh))
-    names: dict[tuple[int, int], str] = {}
-    cell_names = list(mesh.cell_groups)
-    node_names = list(mesh.node_groups)
-    for block in blocks:
-        if block.physical:
-            names[block.dim, block.physical] = (cell_names if block.dim == 3 else node_names)[
-                block.physical - 1
-            ]
+    names = sorted({(b.dim, b.physical, b.name) for b in blocks if b.physical})
     out = StringIO()
     out.write(f"$MeshFormat\n{version} 0 8\n$EndMeshFormat\n$PhysicalNames\n{len(names)}\n")
-    for (dim, tag), name in sorted(names.items()):
+    for dim, tag, name in names:
         out.write(f'{dim} {tag} "{name}"\n')
     out.write("$EndPhysicalNames\n")
     (_write_41 if version == "4.1" else _write_22)(out, mesh, blocks)
@@ -324,38 +316,31 @@ def _blocks(mesh: TetMesh) -> Iterator[_Block]:
     )
     faces = np.unique(np.sort(faces, axis=1), axis=0)
     points = 0
-    for tag, members in enumerate(mesh.node_groups.values(), start=1):
+    for tag, (name, members) in enumerate(mesh.node_groups.items(), start=1):
         inside = np.zeros(mesh.n_points, dtype=bool)
         inside[members] = True
         triangles = faces[inside[faces].all(axis=1)]
         if len(triangles):
-            yield _block(mesh, 2, tag, tag, triangles)
+            yield _Block(2, tag, tag, name, triangles + 1)
         for node in np.setdiff1d(members, triangles):
             points += 1
-            yield _block(mesh, 0, points, tag, np.array([[node]]))
+            yield _Block(0, points, tag, name, np.array([[node + 1]]))
     free = np.ones(mesh.n_tets, dtype=bool)
-    for tag, members in enumerate(mesh.cell_groups.values(), start=1):
+    for tag, (name, members) in enumerate(mesh.cell_groups.items(), start=1):
         free[members] = False
         if len(members):
-            yield _block(mesh, 3, tag, tag, mesh.tets[members])
+            yield _Block(3, tag, tag, name, mesh.tets[members] + 1)
     if free.any():
-        yield _block(mesh, 3, len(mesh.cell_groups) + 1, 0, mesh.tets[free])
-
-
-def _block(
-    mesh: TetMesh, dim: int, entity: int, physical: int, nodes: NDArray[np.integer]
-) -> _Block:
-    corners = mesh.points[nodes.ravel()]
-    bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
-    return _Block(dim, entity, physical, nodes.astype(np.int64) + 1, bounds)
+        yield _Block(3, len(mesh.cell_groups) + 1, 0, "", mesh.tets[free] + 1)
 
 
 def _write_41(out: StringIO, mesh: TetMesh, blocks: list[_Block]) -> None:
     out.write("$Entities\n")
     out.write(" ".join(str(sum(b.dim == dim for b in blocks)) for dim in range(4)) + "\n")
     for block in sorted(blocks, key=lambda b: (b.dim, b.entity)):
-        corners = block.bounds[:1] if block.dim == 0 else block.bounds
-        position = " ".join(f"{value:.16g}" for value in corners.ravel())
+        corners = mesh.points[block.nodes.ravel() - 1]
+        bounds = [corners.min(axis=0), corners.max(axis=0)][: 1 if block.dim == 0 else 2]
+        position = " ".join(f"{value:.16g}" for value in np.ravel(bounds))
         physical = f"1 {block.physical}" if block.physical else "0"
         out.write(f"{block.entity} {position} {physical}{'' if block.dim == 0 else ' 0'}\n")
     out.write("$EndEntities\n")

@@ -1,10 +1,11 @@
-"""The tetrahedral mesh {P, E, T} that fields are solved on, with its named groups."""
+"""The tetrahedral mesh {P, E, T} that fields are solved on, its quality, and Kuhn lattices."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import permutations
 from types import MappingProxyType
 from typing import Any
 
@@ -134,13 +135,6 @@ class TetMesh:
         """Centroid of each tetrahedron [m], shape (k, 3)."""
         return self.points[self.tets].mean(axis=1)
 
-    @cached_property
-    def boundary_faces(self) -> IntArray:
-        """Triangles that belong to one tetrahedron only, shape (b, 3), unordered."""
-        faces = np.sort(self.tets[:, [(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)]].reshape(-1, 3))
-        unique, counts = np.unique(faces, axis=0, return_counts=True)
-        return unique[counts == 1]
-
     def group_nodes(self, names: Iterable[str]) -> IntArray:
         """The sorted union of node groups, shape (g,).
 
@@ -188,8 +182,6 @@ class TetMesh:
 
     def quality(self) -> MeshQuality:
         """Figures of merit of the mesh; printable."""
-        from capsense.mesh.tetmesh import mesh_quality
-
         return mesh_quality(self)
 
 
@@ -214,6 +206,58 @@ def _group(values: ArrayLike, count: int, what: str, of: str) -> IntArray:
     members = np.unique(_indices(values, count, what, of))
     members.flags.writeable = False
     return members
+
+
+def kuhn_tets(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> TetMesh:
+    """Split every cell of a rectilinear lattice into six Kuhn tetrahedra.
+
+    Each tetrahedron walks from a cell's lower corner to its upper one along the three axes, in
+    one of the six orders, so neighbours conform. Its P1 stiffness couples a node only to its six
+    axis neighbours, with positive weights: the diagonal links carry none. On a uniform lattice
+    this is the 7-point difference stencil; on a graded one the weight of an axis link averages
+    the cross-sections of the four cells around it as (2, 1, 1, 2)/6.
+
+    Args:
+        x: Strictly increasing coordinates [m] of the lattice planes, at least two, shape (nx,).
+        y: The same, shape (ny,).
+        z: The same, shape (nz,).
+
+    Returns:
+        Node (i, j, k) has number ``(i * ny + j) * nz + k``; cell (i, j, k) owns the tetrahedra
+        ``6 * ((i * (ny - 1) + j) * (nz - 1) + k) + (0…5)``. Node group "ground" holds the six
+        outer faces.
+
+    Raises:
+        MeshError: If coordinates are not finite, one-dimensional and strictly increasing.
+    """
+    axes = [_coordinates(values, name) for values, name in ((x, "x"), (y, "y"), (z, "z"))]
+    shape = tuple(len(axis) for axis in axes)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.arange(len(points)).reshape(shape)
+
+    corner = number[:-1, :-1, :-1].ravel()
+    stride = (shape[1] * shape[2], shape[2], 1)
+    tets = np.empty((len(corner), 6, 4), dtype=np.int64)
+    for path, order in enumerate(permutations(range(3))):
+        steps = np.cumsum([0] + [stride[axis] for axis in order])
+        tets[:, path] = corner[:, None] + steps
+
+    inner = np.zeros(shape, dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    return TetMesh(
+        points=points,
+        tets=tets.reshape(-1, 4).astype(np.int32),
+        node_groups={GROUND: number[~inner].astype(np.int32)},
+    )
+
+
+def _coordinates(values: ArrayLike, name: str) -> Array:
+    axis = np.asarray(values, dtype=np.float64)
+    if axis.ndim != 1 or len(axis) < 2:
+        raise MeshError(f"{name} must be a vector of two coordinates at least, not {axis.shape}")
+    if not np.isfinite(axis).all() or not (np.diff(axis) > 0).all():
+        raise MeshError(f"{name} must be finite and strictly increasing")
+    return axis
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Readout: farads in, counts out. It knows no field code.
 
-Channels (:mod:`.channels`), schedule (:mod:`.schedule`), wiring (:mod:`.front_end`), analogue
-stages (:mod:`.noise`), converter (:mod:`.converter`) and detector (:mod:`.detector`) make a
-:class:`~capsense.readout.readout.Readout`; known chips are in :mod:`.presets`. Beside it stand the
-front end with its IQ demodulation (:mod:`.front_end`), calibration (:mod:`.calibration`), and
-sensitivity maps with image reconstruction (:mod:`.imaging`).
+Channels and wiring (:mod:`.channels`), schedule (:mod:`.conversions`), analogue stages
+(:mod:`.noise`), the law of the converter (:mod:`.laws`), converter and detector
+(:mod:`.converter`) make a :class:`~capsense.readout.readout.Readout`; known chips are in
+:mod:`.presets`. Beside it stand IQ demodulation (:mod:`.laws`), calibration (:mod:`.calibration`),
+and sensitivity maps with image reconstruction (:mod:`.imaging`).
 """

@@ -27,6 +27,12 @@ def require(
         raise ReadoutError(f"{owner}: {name} is {value!r}; give {wanted}")
 
 
+def require_positive(owner: str, item: object, **units: str) -> None:
+    """Refuse attributes of an item, by name with their units, that are no finite number above 0."""
+    for name, unit in units.items():
+        require(owner, name, getattr(item, name), 0.0, unit, open_=True)
+
+
 def require_whole(owner: str, name: str, value: object, low: int, high: float = math.inf) -> None:
     """Refuse what is no whole number from ``low`` to ``high``."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -11,10 +12,9 @@ from capsense import _validate
 from capsense._validate import read_toml, suggest
 from capsense.errors import ReadoutError
 from capsense.readout.calibration import LinearSensor
-from capsense.readout.channels import RESTS, Pattern, Rest, mutual_patterns, self_patterns
-from capsense.readout.converter import Law, ResonanceLaw, ShuntLaw
-from capsense.readout.detector import Detector, ExponentialTracker, SteppingTracker, Tracker
-from capsense.readout.front_end import Wiring
+from capsense.readout.channels import RESTS, Pattern, Rest, Wiring, mutual_patterns, self_patterns
+from capsense.readout.converter import Detector, ExponentialTracker, SteppingTracker, Tracker
+from capsense.readout.laws import Law, ResonanceLaw, ShuntLaw
 from capsense.readout.presets import CHIPS, Chip, ReadoutOptions, build, chip_of, expected_of
 from capsense.readout.readout import ReadingLike, Readout
 
@@ -33,6 +33,14 @@ class ReadoutTable(_validate.Table):
     """One table of a readout file; whatever is wrong raises :class:`ReadoutError`."""
 
     error_type = ReadoutError
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Errors that are raised inside name the file and the item."""
+        try:
+            yield
+        except ReadoutError as error:
+            raise self.error(str(error)) from None
 
 
 def load_readout(path: str | Path, electrodes: Sequence[str]) -> Readout:
@@ -141,10 +149,8 @@ def parse_readout(
         if key in top:
             table = ReadoutTable(top.data[key], source, key)
             options.update(read(table))
-    try:
+    with top.named():
         return build(chip, electrodes, ReadoutOptions.of(options))
-    except ReadoutError as error:
-        raise top.error(str(error)) from None
 
 
 def _given(table: ReadoutTable, limits: Limits) -> dict[str, float]:
@@ -185,10 +191,8 @@ def _law(top: ReadoutTable, chip: Chip) -> Law:
     given = _given(table, limits)
     if "frequency" in given:
         given["excitation_frequency"] = given.pop("frequency")
-    try:
+    with table.named():
         return ShuntLaw(replace(law.front_end, **given), full_scale, bits)
-    except ReadoutError as error:
-        raise table.error(str(error)) from None
 
 
 def _patterns(top: ReadoutTable, mode: str, electrodes: Sequence[str]) -> tuple[Pattern, ...]:
@@ -208,11 +212,9 @@ def _patterns(top: ReadoutTable, mode: str, electrodes: Sequence[str]) -> tuple[
             raise top.error('pairs is for mode = "mutual"; remove one')
         return self_patterns(electrodes, rest=rest)
     what = 'a list of [transmitter, receiver] names, like [["E1", "E2"]]'
-    try:
-        pairs = top.pairs("pairs", what, electrodes, "the sensor")
+    pairs = top.pairs("pairs", what, electrodes, "the sensor")
+    with top.named():
         return mutual_patterns(electrodes, pairs, rest=rest)
-    except ReadoutError as error:
-        raise top.error(str(error)) from None
 
 
 def _pattern(table: ReadoutTable, electrodes: Sequence[str]) -> Pattern:
@@ -231,10 +233,9 @@ def _pattern(table: ReadoutTable, electrodes: Sequence[str]) -> Pattern:
         _require_electrode(table, "floating", name, electrodes)
     rest = cast("Rest", table.choice("rest", RESTS, "grounded"))
     shield = table.number("shield", -1e3, 1e3, 0.0 if drive else 1.0)
-    try:
-        return Pattern(sense, drive, tuple(floating), rest, shield, table.text("name"))
-    except ReadoutError as error:
-        raise table.error(str(error)) from None
+    name = table.text("name")
+    with table.named():
+        return Pattern(sense, drive, tuple(floating), rest, shield, name)
 
 
 def _require_electrode(table: ReadoutTable, key: str, name: str, electrodes: Sequence[str]) -> None:
@@ -300,12 +301,8 @@ def _calibration(table: ReadoutTable) -> dict[str, Any]:
     """What ``Calibration.toml`` writes: one number for all channels, or one per channel."""
     limits = {"gain": (-1e6, 1e6, ""), "offset": (-1e-6, 1e-6, "F"), "drift": (-1e-6, 1e-6, "F/s")}
     table.only((*limits, "epoch"))
-    figures: dict[str, Any] = {"gain": 1.0, "offset": 0.0, "drift": 0.0}
-    for key, (low, high, unit) in limits.items():
-        if key in table:
-            figures[key] = table.series(key, low, high, unit)
+    given = {key: table.series(key, *limit) for key, limit in limits.items() if key in table}
+    figures: dict[str, Any] = {"gain": 1.0, "offset": 0.0, "drift": 0.0, **given}
     epoch = table.number("epoch", -1e12, 1e12, 0.0)
-    try:
+    with table.named():
         return {"stages": (LinearSensor(**figures, epoch=epoch),)}
-    except ReadoutError as error:
-        raise table.error(str(error)) from None

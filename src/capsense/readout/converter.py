@@ -1,10 +1,15 @@
-"""Converters: from a capacitance to an integer code, and what a user makes of the code."""
+"""Converters and the logic behind them: codes, their saturation, baselines, touch decisions.
+
+All logic works on codes, as the chips do. The *signal* of a channel is its code minus its baseline,
+counted positive in the direction in which codes go when the capacitance grows.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntFlag
+from functools import partial
 from typing import Literal, Protocol
 
 import numpy as np
@@ -12,15 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_number
 from capsense.errors import ReadoutError
-from capsense.readout.checks import Array, Ints, require, require_whole
-from capsense.readout.front_end import ShuntFrontEnd
-from capsense.readout.schedule import rounds
+from capsense.readout.checks import Array, Bools, Ints, require, require_whole
+from capsense.readout.conversions import rounds
+from capsense.readout.laws import Law
 
 Flags = NDArray[np.uint8]
-
-
-_MOST_CURVED = 0.1
-"""Larger deviations from a straight line are refused; beyond 0.25 codes would fall again."""
 
 
 class Range(IntFlag):
@@ -31,231 +32,6 @@ class Range(IntFlag):
     """The capacitance was below what the converter can tell; its code is the last it has."""
     ABOVE = 2
     """The capacitance was above what the converter can tell."""
-
-
-class Law(Protocol):
-    """How code and capacitance belong together."""
-
-    @property
-    def low(self) -> int:
-        """Smallest code."""
-
-    @property
-    def high(self) -> int:
-        """Largest code."""
-
-    @property
-    def rising(self) -> bool:
-        """Whether the code grows with the capacitance."""
-
-    def level(self, capacitance: Array) -> Array:
-        """Code before rounding, of capacitances [F] of any shape."""
-
-    def capacitance(self, code: Ints) -> Array:
-        """Capacitance [F] that a code stands for."""
-
-
-@dataclass(frozen=True)
-class LinearLaw:
-    """``code = C/lsb + zero``: sigma-delta converters with a reference capacitor, and counters."""
-
-    lsb: float
-    """Capacitance of one code [F]."""
-    low: int
-    high: int
-    zero: int = 0
-    """Code at 0 F."""
-    nonlinearity: float = 0.0
-    """Largest deviation of the codes from the straight line through the ends of their range, over
-    the range: a parabola, up where it is positive. Its user does not know of it."""
-    rising = True
-
-    def __post_init__(self) -> None:
-        require("linear law", "lsb", self.lsb, 0.0, "F", open_=True)
-        _require_codes(self.low, self.high)
-        if not abs(as_number(self.nonlinearity)) <= _MOST_CURVED:
-            raise ReadoutError(
-                f"linear law: nonlinearity is {self.nonlinearity!r}; give a share of the range, up "
-                f"to {_MOST_CURVED} of it"
-            )
-
-    def level(self, capacitance: Array) -> Array:
-        """Code before rounding."""
-        code = capacitance / self.lsb + self.zero
-        if not self.nonlinearity:
-            return code
-        share = np.clip((code - self.low) / (self.high - self.low), 0.0, 1.0)
-        return code + 4.0 * self.nonlinearity * (self.high - self.low) * share * (1.0 - share)
-
-    def capacitance(self, code: Ints) -> Array:
-        """Capacitance of a code [F]."""
-        return self.lsb * (np.asarray(code) - self.zero).astype(float)
-
-
-@dataclass(frozen=True)
-class ReciprocalLaw:
-    """``code = 2^bits · I T/(C V_dd)``: charge with a current I for a time T, read the voltage.
-
-    The charger needs a headroom to either rail; codes beyond it are out of range.
-    """
-
-    current: float
-    """I [A]."""
-    time: float
-    """T [s]."""
-    supply: float
-    """V_dd [V]."""
-    bits: int = 10
-    headroom: float = 0.7
-    """[V]"""
-    rising = False
-
-    def __post_init__(self) -> None:
-        for name, unit in (("current", "A"), ("time", "s"), ("supply", "V")):
-            require("reciprocal law", name, getattr(self, name), 0.0, unit, open_=True)
-        require("reciprocal law", "headroom", self.headroom, 0.0, "V")
-        _require_codes(self.low, self.high)
-
-    @property
-    def low(self) -> int:
-        """Smallest code in range: at the largest capacitance."""
-        return math.ceil(self.headroom / self.supply * 2**self.bits)
-
-    @property
-    def high(self) -> int:
-        """Largest code in range."""
-        full = 2**self.bits
-        return min(math.floor((self.supply - self.headroom) / self.supply * full), full - 1)
-
-    @property
-    def _product(self) -> float:
-        return 2**self.bits * self.current * self.time / self.supply
-
-    def level(self, capacitance: Array) -> Array:
-        """Code before rounding; beyond all codes for a capacitance of zero or less."""
-        with np.errstate(divide="ignore"):
-            return np.where(capacitance > 0, self._product / np.maximum(capacitance, 0.0), np.inf)
-
-    def capacitance(self, code: Ints) -> Array:
-        """Capacitance of a code [F]; infinite at code 0."""
-        with np.errstate(divide="ignore"):
-            return self._product / np.asarray(code, dtype=float)
-
-    def set_for(self, capacitance: float) -> ReciprocalLaw:
-        """The same with an MPR121's current and time that bring a capacitance [F] near 90 %.
-
-        Raises:
-            ReadoutError: No setting brings it into the range.
-        """
-        settings = [(k * 1e-6, 0.5e-6 * 2**power) for power in range(7) for k in range(1, 64)]
-        laws = [replace(self, current=current, time=time) for current, time in settings]
-        wanted = np.array(capacitance)
-        fitting = [law for law in laws if law.low <= float(law.level(wanted)) <= law.high]
-        if not fitting:
-            raise ReadoutError(
-                f"expected = {capacitance:g} F is outside of what an MPR121 can charge; give "
-                "0.2e-12 to 2800e-12 F"
-            )
-        goal = self.low + 0.9 * (self.high - self.low)
-        return min(fitting, key=lambda law: abs(float(law.level(wanted)) - goal))
-
-
-@dataclass(frozen=True)
-class ResonanceLaw:
-    """``code = 2^bits f/f_ref`` with ``f = 1/(2π √(L (C_fixed + C)))``: an LC tank's frequency."""
-
-    inductance: float
-    """L [H]."""
-    fixed: float
-    """C_fixed, the tank's own capacitor [F]."""
-    reference: float
-    """f_ref [Hz]."""
-    bits: int = 28
-    slowest: float = 10e3
-    """Least frequency that is counted [Hz]."""
-    rising = False
-
-    def __post_init__(self) -> None:
-        for name, unit in (
-            ("inductance", "H"), ("fixed", "F"), ("reference", "Hz"), ("slowest", "Hz"),
-        ):  # fmt: skip
-            require("resonance law", name, getattr(self, name), 0.0, unit, open_=True)
-        _require_codes(self.low, self.high)
-
-    @property
-    def low(self) -> int:
-        """Smallest code: that of the least frequency."""
-        return math.ceil(self.slowest / self.reference * 2**self.bits)
-
-    @property
-    def high(self) -> int:
-        """Largest code: a quarter of the reference frequency, beyond which it is not counted."""
-        return 2**self.bits // 4
-
-    def level(self, capacitance: Array) -> Array:
-        """Code before rounding; beyond all codes where the tank has no capacitance left."""
-        total = np.maximum(self.fixed + capacitance, 0.0)
-        with np.errstate(divide="ignore"):
-            frequency = 1 / (2 * math.pi * np.sqrt(self.inductance * total))
-        return frequency / self.reference * 2**self.bits
-
-    def capacitance(self, code: Ints) -> Array:
-        """Capacitance of a code [F]."""
-        frequency = np.asarray(code, dtype=float) * (self.reference / 2**self.bits)
-        return 1 / (self.inductance * (2 * math.pi * frequency) ** 2) - self.fixed
-
-
-@dataclass(frozen=True)
-class ShuntLaw:
-    """``code = 2^(bits−1) |V_o|/full_scale``: a front end's IQ magnitude, sampled by a radio.
-
-    The phase tells the sign, so that noise about zero stays noise about zero. The capacitance is
-    what the recovery formula makes of the magnitude, as in Schöffmann et al. 2022; see
-    :mod:`capsense.readout.front_end` for its error. A complex capacitance C − jG/ω, of matter that
-    conducts, has a phasor V_o of another phase and magnitude.
-    """
-
-    front_end: ShuntFrontEnd
-    full_scale: float
-    """Largest amplitude [V]."""
-    bits: int = 16
-    rising = True
-
-    def __post_init__(self) -> None:
-        require("shunt law", "full_scale", self.full_scale, 0.0, "V", open_=True)
-        require_whole("shunt law", "bits", self.bits, 2)
-        _require_codes(self.low, self.high)
-
-    @property
-    def low(self) -> int:
-        """Smallest code; the one below it has no counterpart."""
-        return -self.high
-
-    @property
-    def high(self) -> int:
-        """Largest code: the radio's, or the last below what the amplifier gives for any C."""
-        most = self.front_end.gain * self.front_end.amplitude / self.full_scale
-        return min(2 ** (self.bits - 1) - 1, math.ceil(most * 2 ** (self.bits - 1)) - 1)
-
-    def level(self, capacitance: Array) -> Array:
-        """Code before rounding."""
-        sign = np.where(capacitance.real < 0.0, -1.0, 1.0)
-        size = np.abs(self.front_end.output(sign * capacitance))
-        scale = 2 ** (self.bits - 1) / self.full_scale
-        return np.asarray(sign * size * scale, dtype=float)
-
-    def capacitance(self, code: Ints) -> Array:
-        """Capacitance of a code [F]."""
-        volts = np.abs(code) * (self.full_scale / 2 ** (self.bits - 1))
-        return np.asarray(np.sign(code) * self.front_end.recover(volts), dtype=float)
-
-
-def _require_codes(low: int, high: int) -> None:
-    if not low < high:
-        raise ReadoutError(
-            f"the codes run from {low} to {high}; widen the range (at a reciprocal law, raise the "
-            "supply or lower the headroom; at a shunt law, lower the full scale)"
-        )
 
 
 @dataclass(frozen=True)
@@ -386,3 +162,170 @@ def quantise(law: Law, capacitance: ArrayLike) -> tuple[Ints, Flags]:
         above = (level > clipped) == law.rising
         flags[wrong] = np.where(above[wrong], Range.ABOVE, Range.BELOW)
     return clipped.astype(np.int64), flags
+
+
+class TrackerProcess(Protocol):
+    """A baseline tracker at work."""
+
+    def __call__(self, channel: Ints, signal: Array, touched: Bools) -> Array:
+        """Return the change of the baseline along the signal [codes], shape (n,).
+
+        Args:
+            channel: Channel numbers, all different, shape (n,).
+            signal: Signal against the present baseline [codes], shape (n,).
+            touched: Whether the channel is held to be touched, shape (n,).
+        """
+
+
+class Tracker(Protocol):
+    """How a baseline follows slow changes."""
+
+    def start(self, channels: int) -> TrackerProcess:
+        """Return the tracker's process."""
+
+
+@dataclass(frozen=True)
+class ExponentialTracker:
+    """First-order low-pass of the code; stands still while the channel is touched."""
+
+    samples: float
+    """Time constant, in samples of a channel."""
+    hold: bool = True
+    """Whether the baseline stands still during a touch."""
+
+    def __post_init__(self) -> None:
+        require("baseline tracker", "samples", self.samples, 0.0, "", open_=True)
+
+    def start(self, channels: int) -> TrackerProcess:
+        """Return the process."""
+        return partial(self._follow, -math.expm1(-1.0 / self.samples))
+
+    def _follow(self, share: float, channel: Ints, signal: Array, touched: Bools) -> Array:
+        step = share * signal
+        return np.where(touched, 0.0, step) if self.hold else step
+
+
+@dataclass(frozen=True)
+class Filter:
+    """One of the settings of :class:`SteppingTracker`."""
+
+    max_half_delta: int = 1
+    """A signal of up to twice this many codes is taken over at once (MHD)."""
+    noise_half_delta: int = 1
+    """Step of the baseline when a larger signal lasts (NHD) [codes]."""
+    noise_count: int = 0
+    """Number of such samples in a row that are taken for noise (NCL)."""
+    delay: int = 0
+    """The filter runs at every ``delay + 1``-th sample (FDL)."""
+
+    def __post_init__(self) -> None:
+        for name in ("max_half_delta", "noise_half_delta", "noise_count", "delay"):
+            require_whole("baseline filter", name, getattr(self, name), 0, 255)
+
+
+@dataclass(frozen=True)
+class SteppingTracker:
+    """Baseline tracking after the MPR121: three settings, for when the signal rises, falls, rests.
+
+    The data sheet describes the registers' meaning and not the circuit; this is that meaning in
+    its plainest form.
+    """
+
+    away: Filter = Filter(1, 1, 255, 2)
+    """Against a growing capacitance: a hand that comes must not be taken into the baseline."""
+    back: Filter = Filter(1, 1, 0, 0)
+    """Against a falling capacitance: quick, so that a wrong baseline fixes itself."""
+    touched: Filter = Filter(0, 0, 255, 255)
+
+    def start(self, channels: int) -> TrackerProcess:
+        """Return the process."""
+        table = np.array(
+            [
+                (2 * f.max_half_delta, f.noise_half_delta, f.noise_count, f.delay)
+                for f in (self.away, self.back, self.touched)
+            ]
+        )
+        lasted = np.zeros(channels, dtype=np.int64)
+        waited = np.zeros(channels, dtype=np.int64)
+        return partial(_step, table, lasted, waited)
+
+
+def _step(
+    table: Ints, lasted: Ints, waited: Ints, channel: Ints, signal: Array, touched: Bools
+) -> Array:
+    """Baselines' changes; ``lasted`` and ``waited`` count samples of each channel, shape (K,)."""
+    setting = np.where(touched, 2, np.where(signal > 0, 0, 1))
+    small, step, count, delay = table[setting].T
+    due = waited[channel] >= delay
+    waited[channel] = np.where(due, 0, waited[channel] + 1)
+    within = np.abs(signal) <= small
+    run = np.where(within, 0, lasted[channel] + due)
+    moved = due & (run > count)
+    lasted[channel] = np.where(moved, 0, run)
+    limited = np.sign(signal) * np.minimum(step, np.abs(signal))
+    return np.where(due & within, signal, np.where(moved, limited, 0.0))
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Touch or proximity decision with hysteresis and debouncing, over a tracked baseline.
+
+    Raises:
+        ReadoutError: Thresholds are not ``0 < release <= touch``, or debounce is below 1.
+    """
+
+    touch: float
+    """Signal from which a channel counts as touched [codes]."""
+    release: float
+    """Signal below which it is released [codes]."""
+    tracker: Tracker
+    debounce: int = 1
+    """Samples in a row that a change of state takes."""
+
+    def __post_init__(self) -> None:
+        if not 0 < as_number(self.release) <= as_number(self.touch) < math.inf:
+            raise ReadoutError(
+                f"detector: touch = {self.touch!r} and release = {self.release!r}; give "
+                "0 < release <= touch, in codes"
+            )
+        require_whole("detector", "debounce", self.debounce, 1)
+
+    def start(self, channels: int, rising: bool) -> Detection:
+        """Return the detector's process; ``rising`` as of the converter's law."""
+        return Detection(self, channels, 1.0 if rising else -1.0)
+
+
+class Detection:
+    """A detector at work. Baselines start at each channel's first code."""
+
+    def __init__(self, detector: Detector, channels: int, sign: float) -> None:
+        self._spec, self._sign = detector, sign
+        self._track = detector.tracker.start(channels)
+        self._baseline = np.zeros(channels)
+        self._seen = np.zeros(channels, dtype=bool)
+        self._touched = np.zeros(channels, dtype=bool)
+        self._run = np.zeros(channels, dtype=np.int64)
+
+    def __call__(self, channel: Ints, code: Ints) -> tuple[Array, Bools]:
+        """Return baselines [codes] and states after each code of a batch, each of shape (n,)."""
+        baseline, touched = np.empty(len(code)), np.empty(len(code), dtype=bool)
+        for part in rounds(len(code), len(self._run)):
+            baseline[part], touched[part] = self._in_turn(channel[part], code[part])
+        return baseline, touched
+
+    def _in_turn(self, channel: Ints, code: Ints) -> tuple[Array, Bools]:
+        """One code a channel at most."""
+        fresh = ~self._seen[channel]
+        if fresh.any():
+            self._baseline[channel] = np.where(fresh, code, self._baseline[channel])
+            self._seen[channel] = True
+        signal = self._sign * (code - self._baseline[channel])
+        touched = self._touched[channel]
+        other = np.where(touched, signal < self._spec.release, signal >= self._spec.touch)
+        run = np.where(other, self._run[channel] + 1, 0)
+        flip = run >= self._spec.debounce
+        touched = touched ^ flip
+        self._touched[channel] = touched
+        self._run[channel] = np.where(flip, 0, run)
+        self._baseline[channel] += self._sign * self._track(channel, signal, touched)
+        return self._baseline[channel], touched

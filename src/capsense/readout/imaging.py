@@ -129,11 +129,11 @@ def _axis(name: str, nodes: ArrayLike) -> Array:
 
 def _four_edges(product: Array, axis: int) -> Array:
     """Sum over a cell's four edges along ``axis``."""
-    first, second = (a for a in range(3) if a != axis)
-    ahead = np.take(product, range(1, product.shape[first]), axis=first)
-    both = ahead + np.take(product, range(product.shape[first] - 1), axis=first)
-    ahead = np.take(both, range(1, both.shape[second]), axis=second)
-    return ahead + np.take(both, range(both.shape[second] - 1), axis=second)
+    for across in range(3):
+        if across != axis:
+            nodes = np.moveaxis(product, across, 0)
+            product = np.moveaxis(nodes[1:] + nodes[:-1], 0, across)
+    return product
 
 
 def back_projection(matrix: ArrayLike) -> Array:

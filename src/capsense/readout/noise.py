@@ -4,7 +4,7 @@ A stage is a small frozen description. When a readout starts it makes a *process
 holds what changes: random numbers, filters' memories. Stages are applied in their order; each takes
 the capacitances of a batch of samples and returns new ones. A batch is a run of successive samples
 of the schedule, of any length; a process with a memory for each channel goes through it in
-:func:`~capsense.readout.schedule.rounds`. It gives the same numbers, to the last bit, however
+:func:`~capsense.readout.conversions.rounds`. It gives the same numbers, to the last bit, however
 samples are dealt into batches.
 
 Levels are stated the way data sheets and Allan plots state them. With conversions back to back and

@@ -15,21 +15,20 @@ from typing import Any, Literal
 
 from capsense._validate import as_number, read_toml, suggest
 from capsense.errors import ReadoutError
-from capsense.readout.channels import ChannelBank, Pattern, mutual_patterns, self_patterns
+from capsense.readout.channels import ChannelBank, Pattern, Wiring, mutual_patterns, self_patterns
 from capsense.readout.checks import Array, require
-from capsense.readout.converter import (
-    CapDac,
+from capsense.readout.conversions import Schedule, idle_of
+from capsense.readout.converter import CapDac, Detector, SteppingTracker
+from capsense.readout.laws import (
     Law,
     LinearLaw,
     ReciprocalLaw,
     ResonanceLaw,
+    ShuntFrontEnd,
     ShuntLaw,
 )
-from capsense.readout.detector import Detector, SteppingTracker
-from capsense.readout.front_end import ShuntFrontEnd, Wiring
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, Stage, White
 from capsense.readout.readout import Readout
-from capsense.readout.schedule import Schedule, idle_of
 
 Mode = Literal["self", "mutual"]
 

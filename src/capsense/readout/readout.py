@@ -12,14 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_number
 from capsense.errors import ReadoutError
-from capsense.readout.channels import ChannelBank
+from capsense.readout.channels import ChannelBank, Wiring
 from capsense.readout.checks import Array, phasors, real, require, require_whole
-from capsense.readout.converter import CapDac, Conversion, Law, ShuntLaw
-from capsense.readout.counts import Counts
-from capsense.readout.detector import Detector
-from capsense.readout.front_end import Wiring
+from capsense.readout.conversions import Counts, Schedule
+from capsense.readout.converter import CapDac, Conversion, Detector
+from capsense.readout.laws import Law, ShuntLaw
 from capsense.readout.noise import Context, Process, Stage
-from capsense.readout.schedule import Schedule
 
 _BATCH = 4096
 """Samples processed at a time."""

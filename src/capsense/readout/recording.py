@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from capsense.errors import ReadoutError
 from capsense.readout.channels import ChannelBank, Pattern
@@ -45,7 +47,7 @@ class CapacitanceRecord:
         Raises:
             ReadoutError: The recording does not hold what a channel needs.
         """
-        return self._values({k: v[:, None] for k, v in self.columns.items()}, bank)
+        return self._values(self.columns, bank)
 
     def empty_channels(self, bank: ChannelBank) -> Array:
         """Channel values with an empty scene [F], shape (K,); the first sample's if unknown.
@@ -55,35 +57,30 @@ class CapacitanceRecord:
         """
         if not self.empty:
             return self.channels(bank)[0]
-        return self._values({k: np.array([[v]]) for k, v in self.empty.items()}, bank)[0]
+        return self._values(self.empty, bank)
 
-    def _values(self, columns: dict[str, Array], bank: ChannelBank) -> Array:
-        matrix = self._matrix(columns)
-        if matrix is not None:
-            alone = [columns.get(f"C_{name}") for name in self.electrodes]
-            coupling = None
-            if all(a is not None for a in alone):
-                own = np.concatenate([a for a in alone if a is not None], axis=1)
-                coupling = own - np.diagonal(matrix, axis1=1, axis2=2)
-            elif self.shields and any(p.shield for p in bank.patterns):
-                raise ReadoutError(
-                    f"{self.path} does not hold what the sensor's shields do when they are driven; "
-                    "read its readings.npz, or set shield = 0 for each channel"
-                )
-            return bank.values(matrix, coupling)
-        return np.concatenate([self._simple(columns, p) for p in bank.patterns], axis=1)
-
-    def _matrix(self, columns: dict[str, Array]) -> Array | None:
+    def _values(self, columns: Mapping[str, ArrayLike], bank: ChannelBank) -> Array:
         names = self.electrodes
         entries = [
-            [columns.get(f"C_{a}_{b}", columns.get(f"C_{b}_{a}")) for b in names] for a in names
+            columns.get(f"C_{a}_{b}", columns.get(f"C_{b}_{a}")) for a in names for b in names
         ]
-        if any(entry is None for row in entries for entry in row):
-            return None
-        rows = [np.concatenate([e for e in row if e is not None], axis=1) for row in entries]
-        return np.stack(rows, axis=1)
+        if any(entry is None for entry in entries):
+            return np.stack([self._simple(columns, p) for p in bank.patterns], axis=-1)
+        whole = np.stack([np.asarray(e) for e in entries], axis=-1)
+        matrix = whole.reshape(*whole.shape[:-1], len(names), len(names))
+        alone = [columns.get(f"C_{name}") for name in names]
+        coupling = None
+        if all(a is not None for a in alone):
+            own = np.stack([np.asarray(a) for a in alone], axis=-1)
+            coupling = own - np.diagonal(matrix, axis1=-2, axis2=-1)
+        elif self.shields and any(p.shield for p in bank.patterns):
+            raise ReadoutError(
+                f"{self.path} does not hold what the sensor's shields do when they are driven; "
+                "read its readings.npz, or set shield = 0 for each channel"
+            )
+        return bank.values(matrix, coupling)
 
-    def _simple(self, columns: dict[str, Array], pattern: Pattern) -> Array:
+    def _simple(self, columns: Mapping[str, ArrayLike], pattern: Pattern) -> Array:
         plain = not pattern.floating and pattern.rest == "grounded"
         if plain and len(pattern.drive) == 1:
             ((driven, weight),) = pattern.drive.items()
@@ -92,7 +89,7 @@ class CapacitanceRecord:
                 names = [f"Cm_{driven}_{pattern.sense}", f"Cm_{pattern.sense}_{driven}"]
             for name in names:
                 if name in columns:
-                    return weight * columns[name]
+                    return weight * np.asarray(columns[name])
         raise ReadoutError(
             f"{self.path} does not hold what channel {pattern.name!r} needs; it has "
             f'{", ".join(list(columns)[:8])}…; record with excitation = "matrix" to have all'

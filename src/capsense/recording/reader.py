@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from capsense.codec import CHANGING, design_from_json, read_body, read_rest, read_shape
 from capsense.errors import RecordingError, SceneError
 from capsense.reading import Reading, StepStats
-from capsense.readout.counts import Counts
+from capsense.readout.conversions import Counts
 from capsense.recording.ros import PACKAGE, Messages, require
 from capsense.recording.session import (
     DESIGN,

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from capsense.design.model import Design
 from capsense.errors import RecordingError
-from capsense.field.background import NUMERICS, BuildSettings
-from capsense.mesh.lattice import MeshSettings
+from capsense.field.background import NUMERICS, BuildSettings, MeshSettings
 from capsense.reading import Reading, StepStats
 from capsense.readout.config import parse_readout
 from capsense.readout.readout import Readout

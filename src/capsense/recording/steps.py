@@ -15,7 +15,7 @@ from capsense._style import signal_colours
 from capsense.codec import CHANGING, body_fields, shape_fields
 from capsense.errors import require_package
 from capsense.reading import Reading
-from capsense.readout.counts import Counts
+from capsense.readout.conversions import Counts
 from capsense.recording.ros import PACKAGE, WORLD, Composer, Messages, lasting
 from capsense.recording.session import Session, shield_coupling
 from capsense.scene import Body, DepthFrame, Pose, RestSurface, Scene, Shape, SurfaceMesh

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from capsense.design.model import Design
 from capsense.errors import ScenarioError
 from capsense.reading import Reading
-from capsense.readout.counts import Counts
+from capsense.readout.conversions import Counts
 from capsense.recording.session import versions
 from capsense.scenario import Sample, Scenario
 from capsense.scenario.model import Channel

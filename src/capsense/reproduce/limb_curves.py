@@ -28,7 +28,7 @@ from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
 from capsense.design.loader import parse_design
 from capsense.field.background import BuildSettings
 from capsense.reproduce.harness import Store
-from capsense.scene.scene import Grounding
+from capsense.scene.materials import Grounding
 
 if TYPE_CHECKING:
     from capsense.design.model import Design

@@ -24,7 +24,7 @@ from capsense.adapters.attached import AttachedSensor
 from capsense.humans import Build, Limb, arm, leg
 from capsense.humans.formats import mjcf_body
 from capsense.scene import Pose
-from capsense.scene.scene import Grounding
+from capsense.scene.materials import Grounding
 
 Array = NDArray[np.float64]
 Which = Literal["arm", "leg"]

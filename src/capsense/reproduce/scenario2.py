@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
-from capsense.field.background import BuildSettings
-from capsense.mesh.lattice import MeshSettings
+from capsense.field.background import BuildSettings, MeshSettings
 from capsense.readout.calibration import cross_correlation
 from capsense.reproduce.harness import (
     Cell,
@@ -44,7 +43,7 @@ from capsense.reproduce.limb_worlds import (
     read_poses,
     rides,
 )
-from capsense.scene.scene import Grounding
+from capsense.scene.materials import Grounding
 from capsense.simulator import Method
 
 if TYPE_CHECKING:

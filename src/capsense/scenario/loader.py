@@ -28,7 +28,7 @@ from capsense.scene import (
     Shape,
     TriMesh,
 )
-from capsense.scene.scene import Grounding
+from capsense.scene.materials import Grounding
 from capsense.scene.surface import read_triangles
 
 if TYPE_CHECKING:

@@ -10,20 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
-from capsense.scene.pose import Pose
+from capsense.scene.pose import Pose, as_float
 
 Array = NDArray[np.float64]
 
 _HALF_TURN = Pose(quaternion=(1.0, 0.0, 0.0, 0.0))
 """From the camera frame used here to that of OpenGL: y and z change sign."""
-
-
-def _number(value: object) -> float:
-    """A value as a float, NaN if it is none."""
-    try:
-        return float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
 
 
 @dataclass(frozen=True)
@@ -56,7 +48,7 @@ class OrthographicCamera:
     def __post_init__(self) -> None:
         for name in ("width", "height", "near", "far"):
             value = getattr(self, name)
-            number = _number(value)
+            number = as_float(value)
             if not math.isfinite(number) or number < 0 or (number == 0 and name != "near"):
                 raise SceneError(
                     f"OrthographicCamera: {name} is {value!r}; give a length in metres"
@@ -178,7 +170,7 @@ class PerspectiveCamera:
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "near", "far"):
             value = getattr(self, name)
-            number, above = _number(value), name in ("fx", "fy", "far")
+            number, above = as_float(value), name in ("fx", "fy", "far")
             if not math.isfinite(number) or (above and number <= 0):
                 raise SceneError(
                     f"PerspectiveCamera: {name} is {value!r}; give a finite number"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
 from capsense.scene.shapes import Shape, ShapeKind, as_points
-from capsense.scene.surface import checked_mesh
+from capsense.scene.surface import checked_mesh, checked_thickness
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,9 +68,7 @@ class Layers(Shape):
             raise SceneError(
                 f"Layers: the image has {f.shape} pixels; give at most {_MAX_PIXELS:,}"
             )
-        wide = tuple(float(s) for s in size)
-        if len(wide) != 2 or not all(np.isfinite(s) and s > 0 for s in wide):
-            raise SceneError(f"Layers: size is {size!r}; give (width, height) in metres")
+        wide = _checked_size("Layers", size)
         if f.ndim == 2:
             f, b = f[None], b[None]
         low, high = np.empty((2, *f.shape), np.float32)
@@ -210,11 +208,9 @@ def render_depth(
     from capsense.scene.image_kernels import pair, scan
 
     v, f = checked_mesh(vertices, faces)
-    wide = tuple(float(s) for s in size)
-    if len(wide) != 2 or not all(np.isfinite(s) and s > 0 for s in wide):
-        raise SceneError(f"render_depth: size is {size!r}; give (width, height) in metres")
+    wide = _checked_size("render_depth", size)
     rows, columns = _checked_resolution(resolution)
-    sheet = _checked_thickness(thickness)
+    sheet = 0.0 if thickness is None else checked_thickness(thickness)
     dx, dy = wide[0] / columns, wide[1] / rows
     p = v * (1.0 / dx, 1.0 / dy, 1.0) + (0.5 * columns - 0.5, 0.5 * rows - 0.5, 0.0)
     room = _ROOM
@@ -228,27 +224,15 @@ def render_depth(
     layers = max(1, most if sheet > 0.0 else (most + 1) // 2)
     front, back = np.empty((layers, rows, columns)), np.empty((layers, rows, columns))
     pair(met, count, sheet > 0.0, front, back)
-    return Raster(front, back, (wide[0], wide[1]))
+    return Raster(front, back, wide)
 
 
-def _checked_thickness(thickness: float | None) -> float:
-    """Check the thickness of a sheet [m]; 0 for None.
-
-    Raises:
-        SceneError: Not a positive finite number.
-    """
-    if thickness is None:
-        return 0.0
-    try:
-        number = float(thickness)
-    except (TypeError, ValueError, OverflowError):
-        number = np.nan
-    if not (np.isfinite(number) and number > 0):
-        raise SceneError(
-            f"thickness is {thickness!r}; give a positive length in metres, or None for a closed "
-            "surface"
-        )
-    return number
+def _checked_size(owner: str, size: tuple[float, float]) -> tuple[float, float]:
+    """Check width and height [m]."""
+    wide = tuple(float(s) for s in size)
+    if len(wide) != 2 or not all(np.isfinite(s) and s > 0 for s in wide):
+        raise SceneError(f"{owner}: size is {size!r}; give (width, height) in metres")
+    return wide[0], wide[1]
 
 
 def _checked_resolution(resolution: object) -> tuple[int, int]:
@@ -262,7 +246,7 @@ def _checked_resolution(resolution: object) -> tuple[int, int]:
         whole = (rows, columns) == tuple(resolution)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         whole, rows, columns = False, 0, 0
-    if not (whole and rows > 0 and columns > 0 and rows * columns <= 4_000_000):
+    if not (whole and rows > 0 and columns > 0 and rows * columns <= _MAX_PIXELS):
         raise SceneError(
             f"render_depth: resolution is {resolution!r}; give (rows, columns), at most 4,000,000 "
             "pixels"

@@ -1,4 +1,4 @@
-"""Materials: relative permittivity and conductivity, by name.
+"""Materials: relative permittivity and conductivity, by name; and paths to ground.
 
 The values are typical ones at room temperature; a sensor cares about the class of a material
 (conductor, tissue, plastic) more than about its second digit. Where a number matters, measure
@@ -8,18 +8,18 @@ at 250 kHz, and :meth:`Material.at` gives those at another frequency.
 
 from __future__ import annotations
 
-import difflib
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal, cast, get_args
 
-from capsense._validate import as_number
+from capsense._validate import as_number, suggest
 from capsense.constants import EPS0
 from capsense.errors import SceneError
+from capsense.scene.pose import as_float
 
 
 @dataclass(frozen=True)
@@ -108,10 +108,7 @@ class Material:
             raise SceneError(f"material name is {self.name!r}; give a non-empty string")
         for key, low in (("eps_r", 1.0), ("sigma", 0.0)):
             value = getattr(self, key)
-            try:
-                number = float(value)
-            except (TypeError, ValueError, OverflowError):
-                number = math.nan
+            number = as_float(value)
             if not math.isfinite(number) or number < low:
                 raise SceneError(
                     f"material {self.name!r}: {key} is {value!r}; give a finite number, at "
@@ -205,21 +202,100 @@ def material(name: str) -> Material:
     """Look a material up by name; upper and lower case, ``_`` and spaces are the same.
 
     Raises:
-        SceneError: No such material; the message lists the known ones, the nearest first.
+        SceneError: No such material; the message names the nearest one and lists all.
     """
     if not isinstance(name, str):
         raise SceneError(f"material is {name!r}; give a name or a Material(name, eps_r, sigma)")
     key = name.strip().lower().replace("_", " ")
     if key in _ALIASES:
         return MATERIALS[_ALIASES[key]]
-    matcher = difflib.SequenceMatcher(b=key)
-
-    def likeness(known: str) -> float:
-        matcher.set_seq1(known.lower())
-        return -matcher.ratio()
-
-    names = ", ".join(sorted(MATERIALS, key=likeness))
     raise SceneError(
-        f"unknown material {name!r}; known, nearest first: {names}; or pass "
+        f"unknown material {name!r}; {suggest(name, MATERIALS)}; or pass "
         f"Material(name, eps_r, sigma)"
     )
+
+
+@dataclass(frozen=True)
+class GroundPath:
+    """A capacitance to ground, with a resistance in series and one in parallel to both.
+
+    Raises:
+        SceneError: A number is out of range.
+    """
+
+    capacitance: float
+    """[F]"""
+    series: float = 0.0
+    """Resistance of the body itself, in series [Ω]."""
+    leakage: float = math.inf
+    """Resistance of shoes and floor, in parallel [Ω]."""
+    source: str = ""
+    """Where the numbers come from."""
+
+    def __post_init__(self) -> None:
+        if not 0 < as_number(self.capacitance) < math.inf:
+            raise SceneError(
+                f"ground path: capacitance is {self.capacitance!r} F; give a positive number, "
+                "like 100e-12"
+            )
+        if not 0 <= as_number(self.series) < math.inf:
+            raise SceneError(f"ground path: series is {self.series!r} Ω; give zero or more")
+        if not as_number(self.leakage) > 0:
+            raise SceneError(f"ground path: leakage is {self.leakage!r} Ω; give a positive number")
+
+    def impedance(self, frequency: float) -> complex:
+        """Impedance from the body to ground at ``frequency`` [Hz], in ohms.
+
+        Raises:
+            SceneError: The frequency is not a positive finite number.
+        """
+        if not 0 < as_number(frequency) < math.inf:
+            raise SceneError(f"frequency is {frequency!r} Hz; give a positive finite number")
+        branch = self.series + 1 / (2j * math.pi * frequency * self.capacitance)
+        return 1 / (1 / branch + 1 / self.leakage)
+
+    def equivalent_capacitance(self, frequency: float) -> float:
+        """Capacitance with the same magnitude of impedance at ``frequency`` [Hz], in farads.
+
+        What ``Body(grounding=...)`` takes. The phase is left out: 13 degrees off a pure
+        capacitance for the human-body model at 250 kHz.
+
+        Raises:
+            SceneError: The frequency is not a positive finite number.
+        """
+        return 1 / (2 * math.pi * frequency * abs(self.impedance(frequency)))
+
+
+GROUND_PATHS: Mapping[str, GroundPath] = MappingProxyType(
+    {name: GroundPath(**figures) for name, figures in DATA["ground_paths"].items()}
+)
+"""Models of a person's path to ground, by name."""
+
+
+_LARGEST = 1e-3
+"""Capacitances to ground beyond this [F] are slips of the pen."""
+
+_Tie = Literal["grounded", "floating"]
+Grounding = _Tie | float
+
+
+def checked_grounding(grounding: object) -> Grounding:
+    """Check a grounding.
+
+    Raises:
+        SceneError: Neither one of the two words nor a positive capacitance up to 1 mF.
+    """
+    fix = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
+    if isinstance(grounding, str) and grounding in get_args(_Tie):
+        return cast("_Tie", grounding)
+    farads = math.nan if isinstance(grounding, str | bool) else as_float(grounding)
+    if math.isnan(farads):
+        raise SceneError(f"grounding is {grounding!r}; {fix}")
+    if not 0 < farads < math.inf:
+        raise SceneError(f"grounding is {farads} F, not a positive finite capacitance; {fix}")
+    if farads > _LARGEST:
+        raise SceneError(
+            f"grounding is {farads:g} farads, more than anything has; 100 pF are 100e-12, and a "
+            'body of a large capacitance to ground is "grounded"'
+        )
+    return farads

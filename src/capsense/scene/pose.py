@@ -21,6 +21,14 @@ _MIN_NORM = 1e-9
 _ORTHONORMAL_TOLERANCE = 1e-6
 
 
+def as_float(value: object) -> float:
+    """A value as a float, NaN if it is no number."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
 def checked_floats(values: object, count: int, what: str, fix: str) -> tuple[float, ...]:
     """Turn ``values`` into ``count`` finite floats, or raise :class:`SceneError`."""
     try:

@@ -1,86 +1,23 @@
-"""Scenes: the bodies around a sensor at one instant."""
+"""Scenes: the bodies around a sensor at one instant, and whether they touch its electrodes."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from capsense._validate import as_number
 from capsense.errors import SceneError
-from capsense.scene.materials import DATA, Material
+from capsense.scene.materials import Grounding, Material, checked_grounding
 from capsense.scene.materials import material as find_material
+from capsense.scene.mesh_shape import SHEET_THICKNESS, RestSurface, SurfaceMesh, TriangleShape
 from capsense.scene.pose import Pose
-from capsense.scene.shapes import Shape
+from capsense.scene.shapes import Shape, ShapeKind
 
-
-@dataclass(frozen=True)
-class GroundPath:
-    """A capacitance to ground, with a resistance in series and one in parallel to both.
-
-    Raises:
-        SceneError: A number is out of range.
-    """
-
-    capacitance: float
-    """[F]"""
-    series: float = 0.0
-    """Resistance of the body itself, in series [Ω]."""
-    leakage: float = math.inf
-    """Resistance of shoes and floor, in parallel [Ω]."""
-    source: str = ""
-    """Where the numbers come from."""
-
-    def __post_init__(self) -> None:
-        if not 0 < as_number(self.capacitance) < math.inf:
-            raise SceneError(
-                f"ground path: capacitance is {self.capacitance!r} F; give a positive number, "
-                "like 100e-12"
-            )
-        if not 0 <= as_number(self.series) < math.inf:
-            raise SceneError(f"ground path: series is {self.series!r} Ω; give zero or more")
-        if not as_number(self.leakage) > 0:
-            raise SceneError(f"ground path: leakage is {self.leakage!r} Ω; give a positive number")
-
-    def impedance(self, frequency: float) -> complex:
-        """Impedance from the body to ground at ``frequency`` [Hz], in ohms.
-
-        Raises:
-            SceneError: The frequency is not a positive finite number.
-        """
-        if not 0 < as_number(frequency) < math.inf:
-            raise SceneError(f"frequency is {frequency!r} Hz; give a positive finite number")
-        branch = self.series + 1 / (2j * math.pi * frequency * self.capacitance)
-        return 1 / (1 / branch + 1 / self.leakage)
-
-    def equivalent_capacitance(self, frequency: float) -> float:
-        """Capacitance with the same magnitude of impedance at ``frequency`` [Hz], in farads.
-
-        What ``Body(grounding=...)`` takes. The phase is left out: 13 degrees off a pure
-        capacitance for the human-body model at 250 kHz.
-
-        Raises:
-            SceneError: The frequency is not a positive finite number.
-        """
-        return 1 / (2 * math.pi * frequency * abs(self.impedance(frequency)))
-
-
-GROUND_PATHS: Mapping[str, GroundPath] = MappingProxyType(
-    {name: GroundPath(**figures) for name, figures in DATA["ground_paths"].items()}
-)
-"""Models of a person's path to ground, by name."""
-
-
-_LARGEST = 1e-3
-"""Capacitances to ground beyond this [F] are slips of the pen."""
-
-Grounding = Literal["grounded", "floating"] | float
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -144,36 +81,62 @@ def _checked_pose(pose: object) -> Pose:
     return pose
 
 
-def checked_grounding(grounding: object) -> Grounding:
-    """Check a grounding.
+class DeformableSurface:
+    """A triangle mesh whose vertices may be replaced at every step.
+
+    Its triangles carry the charge, so it may be open, which makes it a thin sheet. The first
+    vertices tell which triangles belong together; give a form without creases.
+
+    Args:
+        vertices: Points [m] in the sensor frame, shape (n, 3).
+        faces: Vertex indices, shape (m, 3). Those of a closed surface should wind alike.
+        thickness: That of an open surface of a dielectric, such as cloth [m]; conductors and
+            closed surfaces need none.
+        material: As for :class:`~capsense.scene.scene.Body`.
+        grounding: As for :class:`~capsense.scene.scene.Body`.
+        name: As for :class:`~capsense.scene.scene.Body`.
 
     Raises:
-        SceneError: Neither one of the two words nor a positive capacitance up to 1 mF.
+        SceneError: Wrong shapes or values.
     """
-    fix = 'give "grounded", "floating", or a capacitance to ground in farads, like 100e-12'
-    if isinstance(grounding, str):
-        if grounding == "grounded":
-            return "grounded"
-        if grounding == "floating":
-            return "floating"
-        raise SceneError(f"grounding is {grounding!r}; {fix}")
-    if isinstance(grounding, bool):
-        raise SceneError(f"grounding is {grounding!r}; {fix}")
-    try:
-        farads = float(grounding)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        raise SceneError(f"grounding is {grounding!r}; {fix}") from None
-    if not (math.isfinite(farads) and farads > 0):
-        raise SceneError(f"grounding is {farads} F, not a positive finite capacitance; {fix}")
-    if farads > _LARGEST:
-        raise SceneError(
-            f"grounding is {farads:g} farads, more than anything has; 100 pF are 100e-12, and a "
-            'body of a large capacitance to ground is "grounded"'
-        )
-    return farads
 
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        *,
+        thickness: float = SHEET_THICKNESS,
+        material: Material | str = "human",
+        grounding: Grounding = "grounded",
+        name: str | None = None,
+    ) -> None:
+        self._rest = RestSurface(vertices, faces, thickness)
+        self._shape = SurfaceMesh(self._rest.vertices, self._rest)
+        self.material = material if isinstance(material, Material) else find_material(material)
+        self.grounding = checked_grounding(grounding)
+        self.name = name
 
-Array = NDArray[np.float64]
+    @property
+    def faces(self) -> NDArray[np.int64]:
+        """Vertex indices, shape (m, 3)."""
+        return self._rest.faces
+
+    @property
+    def vertices(self) -> Array:
+        """The vertices [m] in the sensor frame, shape (n, 3); set them to deform the surface.
+
+        Raises:
+            SceneError: Set to another shape, or to numbers that are not finite.
+        """
+        return self._shape.vertices
+
+    @vertices.setter
+    def vertices(self, vertices: ArrayLike) -> None:
+        self._shape = SurfaceMesh(vertices, self._rest)
+
+    def body(self) -> Body:
+        """The surface as it is now, as a body of a scene in the sensor frame."""
+        return Body(self._shape, Pose(), self.material, self.grounding, self.name)
 
 
 _SHOWN = 8
@@ -309,3 +272,109 @@ class Scene:
         place_bodies(table, rotation, bounds)
         kinds = table[:, 0].astype(np.int64)
         return PackedScene(kinds, table[:, 1:4], rotation, table[:, 11:], bounds, shapes)
+
+
+TOUCH = 2e-4
+"""What is nearer to an electrode than this [m] touches it."""
+_FEW = 10
+"""About so many points of each electrode are looked at first."""
+
+
+class Sheets:
+    """The electrodes of a sensor, as points.
+
+    Args:
+        sheets: Triangles of each electrode [m], shapes (t, 3, 3).
+    """
+
+    def __init__(self, sheets: Sequence[Array]) -> None:
+        few = np.concatenate([points_on(corners, _FEW) for corners in sheets])
+        self._few = np.unique(few, axis=0)
+        self._many = np.concatenate([points_on(corners) for corners in sheets])
+        apart = np.linalg.norm(self._many[:, None] - self._few, axis=2)
+        self._nearest = apart.argmin(axis=1)
+        self._reach = apart.min(axis=1) + TOUCH
+        self._middle = self._few.mean(axis=0, keepdims=True)
+        arms = np.concatenate([self._few, self._many]) - self._middle
+        self._radius = float(np.linalg.norm(arms, axis=1).max()) + TOUCH
+        self.bounds = np.array([self._few.min(axis=0) - TOUCH, self._few.max(axis=0) + TOUCH])
+        """Corners of a box around all of them [m], shape (2, 3)."""
+
+    def meet(self, body: Body, conducting: bool) -> bool:
+        """Whether one of them lies inside a body, or touches one that conducts.
+
+        A depth image has no inside.
+        """
+        if body.shape.kind == ShapeKind.LAYERS:
+            return False
+        if distances(body, self._middle, each=False)[0] > self._radius:
+            return False
+        off = distances(body, self._few, each=False)
+        close = off[self._nearest] <= self._reach  # others are no nearer than the few around them
+        if close.any():
+            off = np.concatenate([off, distances(body, self._many[close], each=False)])
+        return met(off, conducting)
+
+
+def met(off: Array, conducting: bool) -> bool:
+    """Whether points at such distances from a body [m] mean that it holds an electrode.
+
+    One lies inside it, or touches it where it conducts.
+    """
+    return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
+
+
+def distances(body: Body, points: Array, *, each: bool = True) -> Array:
+    """Distances of points to a body [m], negative inside; of an open mesh, by its winding.
+
+    Of the points that rays find inside an open mesh, ``each`` is made sure, or the deepest only.
+    """
+    local, shape = body.pose.inverse().apply(points), body.shape
+    if not isinstance(shape, TriangleShape) or shape.closed or not len(points):
+        return shape.signed_distance(local)
+    off = np.minimum(shape.ray_distance(local), shape.ray_distance(local, down=True))
+    inside = off < 0
+    if not each:
+        deepest = int(off.argmin())
+        if off[deepest] < -TOUCH and not _wound(shape, local[[deepest]], -off[[deepest]])[0]:
+            inside[:] = False
+    else:
+        inside[inside] = _wound(shape, local[inside], -off[inside])
+    return np.where(inside, off, np.abs(off))
+
+
+def _wound(shape: TriangleShape, points: Array, off: Array) -> NDArray[np.bool_]:
+    """Points that an open surface winds round by more than a half.
+
+    Points nearer to one another than one of them is to the surface, ``off`` [m], are alike.
+
+    A. Jacobson, L. Kavan, O. Sorkine-Hornung, *Robust inside-outside segmentation using
+    generalized winding numbers* (2013); solid angles after A. van Oosterom and J. Strackee (1983).
+    """
+    out = np.zeros(len(points), dtype=bool)
+    left = np.ones(len(points), dtype=bool)
+    for k in np.argsort(-off).tolist():
+        if not left[k]:
+            continue
+        arms = shape.vertices[shape.faces] - points[k]
+        a, b, c = arms[:, 0], arms[:, 1], arms[:, 2]
+        u, v, w = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        below = u * v * w + (a * b).sum(1) * w + (b * c).sum(1) * u + (c * a).sum(1) * v
+        angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below)
+        alike = np.linalg.norm(points - points[k], axis=1) <= off[k]
+        out[alike & left] = abs(angle.sum()) > 2 * math.pi
+        left[alike] = False
+    return out
+
+
+def points_on(corners: Array, count: int = 100) -> Array:
+    """Corners of triangles (t, 3, 3), and some ``count`` points spread evenly [m], shape (n, 3)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    steps = np.arange(count) + 0.5
+    triangle = np.searchsorted(np.cumsum(area) / area.sum(), steps / count)
+    u, v = np.sqrt(steps * 0.7548776662 % 1.0), steps * 0.5698402910 % 1.0  # Roberts' R2 sequence
+    shares = np.stack([1 - u, u * (1 - v), u * v], axis=1)
+    spread = (shares[:, :, None] * corners[np.minimum(triangle, len(area) - 1)]).sum(axis=1)
+    few = corners.reshape(-1, 3)[:: max(1, 3 * len(corners) // count)]
+    return np.concatenate([few, spread])

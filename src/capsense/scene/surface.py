@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.errors import SceneError
+from capsense.scene.pose import as_float
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -160,6 +161,21 @@ def checked_vertices(vertices: ArrayLike) -> Array:
         bad = int(np.flatnonzero(~np.isfinite(v).all(axis=1))[0])
         raise SceneError(f"vertex {bad} is {v[bad].tolist()}, not finite")
     return v
+
+
+def checked_thickness(thickness: object) -> float:
+    """Check the thickness of a sheet [m].
+
+    Raises:
+        SceneError: Not a positive finite number.
+    """
+    number = as_float(thickness)
+    if not 0 < number < np.inf:
+        raise SceneError(
+            f"thickness is {thickness!r}; give a positive length in metres, or None for a closed "
+            "surface"
+        )
+    return number
 
 
 def _merged(v: Array, f: Faces) -> tuple[Array, Faces]:

@@ -28,7 +28,7 @@ from capsense.scenario.loader import (
 )
 from capsense.scene import Body, Material, Pose
 from capsense.scene.camera import OrthographicCamera
-from capsense.scene.scene import Grounding
+from capsense.scene.materials import Grounding
 from capsense.server.frames import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL
 
 MAX_TEXT = 65536

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from capsense.errors import ProtocolError, ReadoutError
 from capsense.reading import Reading
-from capsense.readout.counts import Counts
+from capsense.readout.conversions import Counts
 from capsense.readout.readout import Readout
 from capsense.scene import Body, Scene
 from capsense.scene.depth import DepthFrame

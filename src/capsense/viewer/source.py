@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from capsense.codec import design_from_json
 from capsense.design import Design
 from capsense.errors import ProtocolError, RecordingError, ServerError
-from capsense.field.change import Charges
+from capsense.field.background import Charges
 from capsense.reading import Reading, StepStats
 from capsense.recording.session import GONE, reading_of
 from capsense.scenario import Channel, Scenario

@@ -1,4 +1,4 @@
-"""Build the fields that come with the package: ``python -m capsense.field.ship``.
+"""Build the fields that come with the package: ``python benchmarks/ship_fields.py``.
 
 Run it whenever a packaged design, a default setting or the numerics have changed; the test suite
 says when. An interrupted run goes on at the field where it stopped, if the code is the same.
@@ -18,15 +18,23 @@ from pathlib import Path
 
 import numpy as np
 
+from capsense import field
 from capsense.design.loader import available_designs, load_design, parse_design
 from capsense.errors import FieldError
 from capsense.field.background import BuildSettings, build_background
-from capsense.field.cache import cache_key, default_cache_dir, default_settings, load_or_build
+from capsense.field.cache import (
+    cache_key,
+    default_cache_dir,
+    default_settings,
+    load_or_build,
+    read_arrays,
+    save_background,
+)
 from capsense.field.green_points import GreenSettings
-from capsense.field.store import read_arrays, save_background
 
-COMMAND = "python -m capsense.field.ship"
-FOLDER = Path(__file__).parent / "shipped"
+COMMAND = "python benchmarks/ship_fields.py"
+SOURCES = Path(field.__file__ or "").parent
+FOLDER = SOURCES / "shipped"
 SIZE_LIMIT = 20_000_000
 """All shipped fields together stay below this [bytes]."""
 _SAME, _SAME_FIT = 1e-5, 1e-3
@@ -73,11 +81,11 @@ def ship(
             if progress is not None:
                 progress(f"{name}: {stage}", fraction)
 
-        field = load_or_build(design, chosen, cache_dir=work, shipped=False, progress=tell)
+        found = load_or_build(design, chosen, cache_dir=work, shipped=False, progress=tell)
         for old in folder.glob(f"{name}-{'?' * 32}.npz"):
             old.unlink()
         path = folder / f"{name}-{key}.npz"
-        save_background(field, path, key, compact=True, note=note)
+        save_background(found, path, key, compact=True, note=note)
         out.append(Shipped(path, path.stat().st_size))
         _log.info("%s: %.2f MB", path.name, out[-1].size / 1e6)
     for file in folder.glob("*.npz"):
@@ -131,11 +139,11 @@ def fingerprint() -> list[float]:
             "layer": [{"name": "plate", "eps_r": 3.0, "size": [0.06, 0.04], "z": [-0.002, 0.0]}],
         }
     )
-    field = build_background(design, BuildSettings(panel_scale=8.0))
+    found = build_background(design, BuildSettings(panel_scale=8.0))
     points = np.array([[-0.015, 0.0, 0.01], [0.015, 0.0, 0.01], [0.0, 0.0, 0.02]])
-    potentials = field.green.phi0(points)
-    answers = np.diag(field.green.g(points, points))
-    rough = (field.n_panels, *field.capacitance.ravel())
+    potentials = found.green.phi0(points)
+    answers = np.diag(found.green.g(points, points))
+    rough = (found.n_panels, *found.capacitance.ravel())
     sizes = chain.from_iterable(np.atleast_1d(v) for v in astuple(GreenSettings()))
     fitted = (*potentials.ravel(), *answers)
     assert len(fitted) == _FITTED
@@ -145,7 +153,7 @@ def fingerprint() -> list[float]:
 def _source_hash() -> str:
     """Hash of the code that builds fields; unlike the cache key it sees every edit."""
     digest = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.glob("*.py")):
+    for file in sorted(SOURCES.glob("*.py")):
         digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
 
