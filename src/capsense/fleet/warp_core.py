@@ -52,22 +52,15 @@ class WarpCore:
         cut = warp_cut.WarpCut()
         cut.pose = room(places, views, dtype=wp.transform)
         cut.moved = room(places, views, dtype=wp.vec3)
-        for name in ("node", "split", "number", "lifted"):
-            setattr(cut, name, room(n, views, dtype=wp.int32))
-        for name in (
-            "score",
-            "part",
-            "mix",
-            "weight",
-            "ends",
-            "out",
-            "extent",
-            "soft",
-            "beyond",
-            "near",
+        for names, rows, kind in (
+            (("split", "number"), n, wp.int32),
+            (("score", "part", "mix", "weight", "ends", "out"), n, wp.float32),
+            (("node", "lifted"), 3 * n, wp.int32),
+            (("extent", "soft", "beyond", "near"), 3 * n, wp.float32),
         ):
-            setattr(cut, name, room(n, views))
-        cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
+            for name in names:
+                setattr(cut, name, room(rows, views, dtype=kind))
+        cut.points, cut.unlifted = (room(3 * n, 4, views, dtype=wp.vec3) for _ in range(2))
         cut.leader = room(places, views, dtype=wp.int32)
         cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
         cut.width, cut.walled = (room(views, dtype=wp.int32) for _ in range(2))
@@ -142,7 +135,7 @@ class WarpCore:
         count, k, places = self.counts[2], self.clusters, self.counts[1]
         bodies = as_transforms(bodies, self.poses)
         sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
-        n, views = self.cut.node.shape
+        n, views = self.cut.number.shape
         t = self.green.terminals
         green, cut, circuit = self.green, self.cut, self.circuit
         at = (self.shapes, self.places)
@@ -150,13 +143,13 @@ class WarpCore:
         width = rows.shape[1]
         self.launch(warp_cut.choose, (places, views), *at, green, bodies, sensors, k, cut)
         self.launch(warp_cut.connect, views, self.places, count, k, cut)
-        self.launch(warp_cut.place, (n, views), *at, green, count, k, cut)
+        self.launch(warp_cut.place, (3 * n, views), *at, green, count, k, cut)
         self.launch(warp_cut.weigh, views, *at, green, k, cut)
         self.launch(kernels.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
         turned = matrix.transpose((1, 0, 2))
         self.launch(kernels.energies, (n, n, views), *at, cut, k, matrix)
         for values in (matrix, turned):
-            self.launch(kernels.from_functions, (n, views), cut, k, values)
+            self.launch(kernels.from_functions, (n, views), cut, k, 1, values)
         self.launch(kernels.pairs, (n, n, views), green, cut, k, matrix)
         self.launch(kernels.bound_images, (n, views), green, cut, rows, matrix)
         self.launch(kernels.to_functions, (width, views), cut, k, 1, rows)
@@ -186,11 +179,10 @@ class WarpCore:
         launch(left.charges, (t, views), cut, lead, *solved, rest.charge)
         launch(left.coarse, (t, views), cut, self.matrix, self.loss, rest.charge, rest.doubt)
         parts = columns // left.COLUMNS
-        launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, rest.sums)
+        launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, 0, rest.sums)
         for table, to in ((green.near_columns, rest.near), (green.far_columns, rest.far)):
-            launch(
-                left.strengths, (table.shape[1], columns, views), cut, lead, table, rest.sums, to
-            )
+            size = table.shape[1], columns, views
+            launch(left.strengths, size, cut, lead, 1, table, rest.sums, to)
         launch(left.to_clusters, (columns, views), cut, k, lead, rest.charge, rest.on)
         launch(
             left.residuals, (n, parts, views), self.shapes, self.places, green, cut, k, rest,
@@ -199,21 +191,39 @@ class WarpCore:
     def differentiate(self) -> Any:
         """Derivatives of the last matrices [F/m], [F/rad], shape (e, s, b, n, n, 6)."""
         environments, places, sensors = self.counts
-        n, views = self.cut.node.shape
+        n, views = self.cut.number.shape
         circuit, green, cut, k, rest = self.circuit, self.green, self.cut, self.clusters, self.left
-        m, t = circuit.electrodes, green.terminals
+        m, t, lead, room = circuit.electrodes, green.terminals, green.lead, self.room
+        sources, modes = (len(green.near), len(green.far)), rest.sums.shape[0]
         if self._slopes is None:
             self._slopes = [
-                *(self.room(rows, m, views) for rows in (t, n, len(green.near), len(green.far))),
-                self.room(n, m, views, dtype=wp.spatial_vector),
-                self.room(views, places, m, m, dtype=wp.spatial_vector),
-            ]
-        turn, charge, near, far, pull, out = self._slopes
-        launch = self.launch
+                *(room(rows, lead, views) for rows in (3 * n, n, *sources, modes)),
+                *(room(rows, lead, views) for rows in (3 * n, *sources)),
+                room(t, m, views), room(3 * n, lead, views, dtype=wp.spatial_vector),
+                room(views, places, m, m, dtype=wp.spatial_vector),
+            ]  # fmt: skip
+        more, back, near, far, sums, charge, all_near, all_far, turn, pull, out = self._slopes
+        launch, parts = self.launch, lead // left.COLUMNS
+        launch(slope.estimated, (n, lead, views), cut, rest, more)
+        launch(slope.felt, (sources[0], parts, views), green, cut, 0, more, near)
+        launch(slope.felt, (sources[1], parts, views), green, cut, 1, more, far)
+        launch(slope.answered, (modes, lead, views), green, cut, near, far, sums)
+        at = self.shapes, self.places
+        launch(slope.energies_below, (n, parts, views), *at, cut, k, more, back)
+        launch(kernels.from_functions, (lead, views), cut, k, 0, back)
+        launch(slope.pairs_below, (n, parts, views), green, cut, k, more, back)
+        launch(kernels.to_functions, (lead, views), cut, k, 0, back)
+        launch(slope.withdrawn, (lead, views), cut, lead, self.matrix, self.rows, sums, back)
+        launch(left.modes, (modes, parts, views), cut, lead, self.rows, back, 1, sums)
+        launch(left.to_clusters, (lead, views), cut, k, lead, back, more)
+        for table, to in ((green.near_columns, near), (green.far_columns, far)):
+            launch(left.strengths, (table.shape[1], lead, views), cut, lead, 0, table, sums, to)
         launch(slope.follow, (m, views), circuit, self.whole, turn)
-        for values, to in ((rest.on, charge), (rest.near, near), (rest.far, far)):
-            launch(slope.followed, to.shape, circuit, turn, values, to)
-        launch(slope.forces, (n, m, views), green, cut, k, charge, near, far, pull)
+        for first, other, to in (
+            (rest.on, more, charge), (rest.near, near, all_near), (rest.far, far, all_far)
+        ):  # fmt: skip
+            launch(slope.followed, to.shape, circuit, turn, first, other, to)
+        launch(slope.forces, (3 * n, parts, views), green, cut, k, charge, all_near, all_far, pull)
         launch(slope.slopes, (places, m, views), circuit, cut, k, charge, pull, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),

@@ -94,11 +94,14 @@ class Response:
 
 @wp.struct
 class WarpCut:
-    """Clusters and functions of every view, K for each place; n = b K."""
+    """Clusters and functions of every view, K for each place; n = b K.
+
+    Leaves are the clusters and, behind all of them, the two parts of each, l = 3 n.
+    """
 
     pose: wp.array2d(dtype=wp.transform)  # of the bodies in the sensor frame, (b, v)
     moved: wp.array2d(dtype=wp.vec3)  # from a body's origin to that of what is left of it, (b, v)
-    node: wp.array2d(dtype=wp.int32)  # cluster in each place, -1 for none, (n, v)
+    node: wp.array2d(dtype=wp.int32)  # cluster of the shape that a leaf is, -1 for none, (l, v)
     score: wp.array2d(dtype=wp.float32)
     split: wp.array2d(dtype=wp.int32)  # place of the cluster that was split for this one, (n, v)
     part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
@@ -108,13 +111,13 @@ class WarpCut:
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
     ends: wp.array2d(dtype=wp.float32)  # which part of its two parts are panels, (n, v)
     out: wp.array2d(dtype=wp.float32)  # how far a cluster's leaves are out of reach, (n, v)
-    points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
+    points: wp.array3d(dtype=wp.vec3)  # of the leaves, (l, 4, v)
     unlifted: wp.array3d(dtype=wp.vec3)  # the same before they were lifted off the design
-    lifted: wp.array2d(dtype=wp.int32)  # whether they were, (n, v)
+    lifted: wp.array2d(dtype=wp.int32)  # whether they were, (l, v)
     extent: wp.array2d(dtype=wp.float32)
     soft: wp.array2d(dtype=wp.float32)  # distance below which 1/r is bounded [m]
     beyond: wp.array2d(dtype=wp.float32)
-    near: wp.array2d(dtype=wp.float32)  # share of the near sources, (n, v)
+    near: wp.array2d(dtype=wp.float32)  # share of the near sources, (l, v)
     leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
     tie: wp.array2d(dtype=wp.vec2)  # energy of the net charge of the leader and all others, (b, v)
     lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
@@ -350,12 +353,23 @@ def placed(shapes: Shapes, green: Response, at: wp.transform, scale: float, k: i
 def place(
     shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
 ):
-    """Place all clusters in the sensor frame."""
+    """Place all leaves in the sensor frame."""
     i, v = wp.tid()
-    k = cut.node[i, v]
+    n = cut.number.shape[0]
+    b = i // clusters
+    k = int(-1)
+    if i < n:
+        k = cut.node[i, v]
+    else:
+        b = (i - n) // (2 * clusters)
+        whole = cut.node[(i - n) // 2, v]
+        if whole >= 0:
+            k = shapes.kids[whole, (i - n) % 2]
+            if k >= 0:
+                k += shapes.first[places.choice[v // sensors, b]]
+        cut.node[i, v] = k
     if k < 0:
         return
-    b = i // clusters
     leaf = placed(shapes, green, cut.pose[b, v], places.scale[v // sensors, b], k)
     cut.points[i, 0, v] = leaf.p0
     cut.points[i, 1, v] = leaf.p1
@@ -384,7 +398,7 @@ def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: W
     v = wp.tid()
     passes = green.far_table.shape[1]
     walled = int(0)
-    for i in range(cut.node.shape[0]):
+    for i in range(cut.number.shape[0]):
         k = cut.node[i, v]
         if k >= 0:
             if cut.near[i, v] > 0.0:

@@ -88,6 +88,8 @@ def leaf_of(cut: WarpCut, i: int, v: int):
     out.lifted = cut.lifted[i, v]
     out.extent = cut.extent[i, v]
     out.soft = cut.soft[i, v]
+    out.beyond = cut.beyond[i, v]
+    out.near = cut.near[i, v]
     return out
 
 
@@ -304,10 +306,15 @@ def energies(
 
 
 @wp.kernel
-def from_functions(cut: WarpCut, clusters: int, values: wp.array3d(dtype=wp.float32)):
-    """What clusters have of what the shapes' functions have in the first index, in place."""
+def from_functions(
+    cut: WarpCut, clusters: int, walled: int, values: wp.array3d(dtype=wp.float32)
+):  # fmt: skip
+    """What clusters have of what the shapes' functions have in the first index, in place.
+
+    ``walled`` asks for it only in views whose functions are others, see ``weigh``.
+    """
     c, v = wp.tid()
-    if cut.walled[v] == 0:
+    if cut.walled[v] < walled:
         return
     for b in range(cut.leader.shape[0]):
         o = b * clusters

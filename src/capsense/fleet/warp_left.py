@@ -23,9 +23,8 @@ from capsense.fleet.warp_cut import (
     Shapes,
     WarpCut,
     many,
-    placed,
 )
-from capsense.fleet.warp_kernels import four_units, mean, more, own
+from capsense.fleet.warp_kernels import four_units, leaf_of, mean, more, own
 from capsense.fleet.warp_solve import Left, over, times
 from capsense.surface.pair_kernels import BARRIER
 from capsense.surface.solve_kernels import COARSE
@@ -98,14 +97,17 @@ def coarse(
 @wp.kernel
 def modes(
     cut: WarpCut, lead: int, rows: wp.array3d(dtype=wp.float32),
-    charge: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
+    charge: wp.array3d(dtype=wp.float32), added: int, out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Sums of ψ over all charges, (modes, 2 lead, v)."""
+    """Sums of ψ over all charges, (modes, 2 lead, v); ``added`` to what there is."""
     k, chunk, v = wp.tid()
     first = _COLUMNS * chunk
     if lead + k >= cut.width[v] or (first >= lead and cut.lossy[v] == 0):
         return
     total = some()
+    if added != 0:
+        for c in range(_COLUMNS):
+            total[c] = out[k, first + c, v]
     for f in range(rows.shape[0]):
         value = rows[f, lead + k, v]
         for c in range(_COLUMNS):
@@ -116,11 +118,12 @@ def modes(
 
 @wp.kernel
 def strengths(
-    cut: WarpCut, lead: int, table: wp.array2d(dtype=many), sums: wp.array3d(dtype=wp.float32),
-    out: wp.array3d(dtype=wp.float32),
+    cut: WarpCut, lead: int, applied: int, table: wp.array2d(dtype=many),
+    sums: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Strength of the design's sources, a terminal at 1 V and charges in place, (s, 2 lead, v).
+    """Strength of the design's sources, a terminal at ``applied`` V and charges in place.
 
+    Shape (s, 2 lead, v).
     Those of sources that a view does not need are not worked out.
     """
     batch, c, v = wp.tid()
@@ -128,7 +131,7 @@ def strengths(
     if width > cut.width[v] or (c >= lead and cut.lossy[v] == 0):
         return
     total = many()
-    if c < lead:
+    if c < lead and applied != 0:
         total = table[c, batch]
     for k in range(lead, width):
         total += sums[k - lead, c, v] * table[k, batch]
@@ -204,7 +207,7 @@ def _met(
             )
             for c in range(_COLUMNS):
                 out[c] = out[c] + value * left.far[s, first + c, v]
-    for j in range(cut.node.shape[0]):
+    for j in range(cut.number.shape[0]):
         if cut.node[j, v] >= 0:
             value = mean(leaf, cut, j, v, 1.0, green.floor)
             if j // clusters != body:
@@ -233,19 +236,16 @@ def residuals(
         return
     b = i // clusters
     e = v // places.hidden.shape[0]
-    u = int(0)
-    if k >= 0:
-        u = shapes.first[places.choice[e, b]]
-    if k < 0 or shapes.kids[wp.max(k, 0), 0] < 0:
+    part = cut.number.shape[0] + 2 * i
+    if cut.node[part, v] < 0:
         left.energy[i, v] = wp.vec2()
         return
     x = shapes.function[k]
-    scale = places.scale[e, b]
-    leaf = placed(shapes, green, cut.pose[b, v], scale, u + shapes.kids[k, 0])
+    leaf = leaf_of(cut, part, v)
     out = _met(green, cut, leaf, b, clusters, first, v, left)
     whole = own(shapes, places, e, b, x, x)
     whole[0] += _BARRIER * leaf.beyond * leaf.beyond * leaf.beyond
-    leaf = placed(shapes, green, cut.pose[b, v], scale, u + shapes.kids[k, 1])
+    leaf = leaf_of(cut, part + 1, v)
     out -= _met(green, cut, leaf, b, clusters, first, v, left)
     whole[0] += _BARRIER * leaf.beyond * leaf.beyond * leaf.beyond
     o = b * clusters

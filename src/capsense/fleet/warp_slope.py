@@ -1,11 +1,11 @@
 """How the matrices of many environments change as bodies move, by the closed adjoint, on Warp.
 
-The twin of these kernels is :mod:`capsense.surface.gradient_kernels`. Charges x = A⁻¹ Φ are held
-while they move in the field of the other charges, of all images and of the design; what changes
-with the share of near sources or with the lift off the design is left out, as there. What functions
-that are not solved for add is left out too, which the CPU follows. Floating
-conductors of the design follow: columns are of electrodes, what floats mixed in. Lengths in
-metres, 4π eps0 = 1.
+The twin of these kernels is :mod:`capsense.surface.gradient_kernels`. Charges are held while they
+move in the field of the other charges, of all images and of the design; what changes with the share
+of near sources or with the lift off the design is left out, as there. The charges are those solved
+for, x = A⁻¹ Φ, those of the estimate on the parts of clusters, y = D (φ - B x), and what these take
+from the first, -A⁻¹ Bᵀ y: see ``solve_kernels._add_adjoint``. Floating conductors of the design
+follow: columns are of electrodes, what floats mixed in. Lengths in metres, 4π eps0 = 1.
 """
 
 from __future__ import annotations
@@ -13,14 +13,18 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
-from capsense.fleet.warp_cut import Response, WarpCut
-from capsense.fleet.warp_kernels import bound
-from capsense.fleet.warp_solve import Circuit
+from capsense.fleet.warp_cut import SOURCES, Places, Response, Shapes, WarpCut, many
+from capsense.fleet.warp_kernels import bound, four_units, leaf_of, mean, more, own
+from capsense.fleet.warp_left import COLUMNS, some
+from capsense.fleet.warp_solve import Circuit, Left
 from capsense.surface.pair_kernels import FAR
+from capsense.surface.solve_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-_FAR = wp.constant(FAR)
+lines = wp.types.matrix(shape=(COLUMNS, 3), dtype=wp.float32)
+_SOURCES, _COLUMNS = wp.constant(SOURCES), wp.constant(COLUMNS)
+_FAR, _GAIN = wp.constant(FAR), wp.constant(GAIN)
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
 
 
@@ -46,15 +50,179 @@ def follow(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d), out: wp.array3d(
 
 @wp.kernel
 def followed(
-    circuit: Circuit, turn: wp.array3d(dtype=wp.float32), values: wp.array3d(dtype=wp.float32),
+    circuit: Circuit, turn: wp.array3d(dtype=wp.float32), first: wp.array3d(dtype=wp.float32),
+    other: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Columns of electrodes from the sum of those of terminals, (x, lead, v).
+
+    What floats is mixed in. The first sum may have fewer rows.
+    """
+    x, j, v = wp.tid()
+    total = float(0.0)
+    if j < circuit.electrodes:
+        for a in range(turn.shape[0]):
+            if a == j or a >= circuit.driven:
+                value = other[x, a, v]
+                if x < first.shape[0]:
+                    value += first[x, a, v]
+                total += value * turn[a, j, v]
+    out[x, j, v] = total
+
+
+@wp.func
+def _body(cut: WarpCut, clusters: int, leaf: int):
+    """Whose leaf it is."""
+    n = cut.number.shape[0]
+    return wp.where(leaf < n, leaf // clusters, (leaf - n) // (2 * clusters))
+
+
+@wp.func
+def _columns(values: wp.array3d(dtype=wp.float32), row: int, first: int, v: int):
+    out = some()
+    for c in range(_COLUMNS):
+        out[c] = values[row, first + c, v]
+    return out
+
+
+@wp.kernel
+def estimated(cut: WarpCut, left: Left, out: wp.array3d(dtype=wp.float32)):
+    """Charges on the parts of clusters that belong to the estimate, in the rows behind those of
+    the clusters, (l, lead, v)."""
+    i, c, v = wp.tid()
+    n = cut.number.shape[0]
+    charge = float(0.0)
+    own = left.energy[i, v][0]
+    if own > 0.0:
+        charge = _GAIN * left.residual[i, c, v] / own
+    out[n + 2 * i, c, v] = charge
+    out[n + 2 * i + 1, c, v] = -charge
+
+
+@wp.kernel
+def felt(
+    green: Response, cut: WarpCut, far: int, charge: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Columns of electrodes (x, n, v) from those of terminals, what floats mixed in."""
-    x, j, v = wp.tid()
-    total = values[x, j, v]
-    for a in range(circuit.driven, turn.shape[0]):
-        total += values[x, a, v] * turn[a, j, v]
-    out[x, j, v] = total
+    """Potentials at the near or the far sources by charges on parts of clusters, (s, lead, v)."""
+    s, chunk, v = wp.tid()
+    first = _COLUMNS * chunk
+    total = some()
+    for i in range(cut.number.shape[0], cut.node.shape[0]):
+        share = wp.where(far == 0, cut.near[i, v], 1.0 - cut.near[i, v])
+        share *= 0.25 * (1.0 - cut.beyond[i, v])
+        if cut.node[i, v] >= 0 and share > 0.0:
+            p0 = cut.points[i, 0, v]
+            p1 = cut.points[i, 1, v]
+            p2 = cut.points[i, 2, v]
+            p3 = cut.points[i, 3, v]
+            if far == 0:
+                share *= four_units(p0, p1, p2, p3, green.near[s], green.floor, _NEAR_LEAST)
+            else:
+                share *= four_units(p0, p1, p2, p3, green.far[s], green.floor, _FAR_LEAST)
+            total += share * _columns(charge, i, first, v)
+    for c in range(_COLUMNS):
+        out[s, first + c, v] = total[c]
+
+
+@wp.func
+def _answer(
+    table: wp.array2d(dtype=many), column: int, values: wp.array3d(dtype=wp.float32), c: int, v: int
+):  # fmt: skip
+    total = float(0.0)
+    if column < table.shape[0]:
+        for batch in range(table.shape[1]):
+            few = table[column, batch]
+            for s in range(wp.min(_SOURCES, values.shape[0] - _SOURCES * batch)):
+                total += few[s] * values[_SOURCES * batch + s, c, v]
+    return total
+
+
+@wp.kernel
+def answered(
+    green: Response, cut: WarpCut, near: wp.array3d(dtype=wp.float32),
+    far: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Sums of ψ over charges from their potentials at the sources, (modes, lead, v)."""
+    k, c, v = wp.tid()
+    total = float(0.0)
+    if green.lead + k < cut.width[v]:
+        total = _answer(green.near_columns, green.lead + k, near, c, v)
+        total += _answer(green.far_columns, green.lead + k, far, c, v)
+    out[k, c, v] = total
+
+
+@wp.kernel
+def energies_below(
+    shapes: Shapes, places: Places, cut: WarpCut, clusters: int,
+    charge: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Energies of the shapes' functions with charges on parts of clusters, (n, lead, v)."""
+    j, chunk, v = wp.tid()
+    first = _COLUMNS * chunk
+    n = cut.number.shape[0]
+    b = j // clusters
+    total = some()
+    y = wp.where(j == b * clusters, 0, cut.number[j, v])
+    if cut.node[b * clusters, v] >= 0 and y >= 0:
+        for k in range(b * clusters, (b + 1) * clusters):
+            if cut.node[n + 2 * k, v] >= 0:
+                x = shapes.function[cut.node[k, v]]
+                value = own(shapes, places, v // places.hidden.shape[0], b, x, y)
+                total += value[0] * _columns(charge, n + 2 * k, first, v)
+    for c in range(_COLUMNS):
+        out[j, first + c, v] = total[c]
+
+
+@wp.kernel
+def pairs_below(
+    green: Response, cut: WarpCut, clusters: int, charge: wp.array3d(dtype=wp.float32),
+    out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Add potentials on clusters of charges on parts of clusters, (n, lead, v)."""
+    i, chunk, v = wp.tid()
+    first = _COLUMNS * chunk
+    if cut.node[i, v] < 0:
+        return
+    total = some()
+    leaf = leaf_of(cut, i, v)
+    for j in range(cut.number.shape[0], cut.node.shape[0]):
+        if cut.node[j, v] >= 0:
+            value = -mean(leaf, cut, j, v, 1.0, green.floor)
+            if _body(cut, clusters, j) != i // clusters:
+                value += mean(leaf, cut, j, v, 0.0, green.floor)
+            elif leaf.lifted + cut.lifted[j, v] > 0:
+                value += more(leaf, cut, j, v)
+            total += value * _columns(charge, j, first, v)
+    for c in range(_COLUMNS):
+        out[i, first + c, v] = out[i, first + c, v] + total[c]
+
+
+@wp.kernel
+def withdrawn(
+    cut: WarpCut, lead: int, matrix: wp.array3d(dtype=wp.float32),
+    rows: wp.array3d(dtype=wp.float32), sums: wp.array3d(dtype=wp.float32),
+    out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Charges of the functions, -A⁻¹ times the potentials in place less those of the modes."""
+    c, v = wp.tid()
+    n = matrix.shape[0]
+    for i in range(n):
+        total = float(0.0)
+        if cut.number[i, v] >= 0 and matrix[i, i, v] > 0.0:
+            total = -out[i, c, v]
+            for k in range(lead, cut.width[v]):
+                total += rows[i, k, v] * sums[k - lead, c, v]
+            for k in range(i):
+                total -= matrix[i, k, v] * out[k, c, v]
+            total = total / matrix[i, i, v]
+        out[i, c, v] = total
+    for step in range(n):
+        i = n - 1 - step
+        if matrix[i, i, v] > 0.0:
+            total = out[i, c, v]
+            for k in range(i + 1, n):
+                total -= matrix[k, i, v] * out[k, c, v]
+            out[i, c, v] = total / matrix[i, i, v]
 
 
 @wp.func
@@ -128,36 +296,44 @@ def forces(
     near: wp.array3d(dtype=wp.float32), far: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.spatial_vector),
 ):  # fmt: skip
-    """Gradient of electrode j's potential at each cluster, and its torque about its body's origin.
+    """Gradient of electrodes' potentials at each leaf, and its torque about its body's origin.
 
-    Shape (n, n electrodes, v).
+    Shape (l, lead, v).
     """
-    i, j, v = wp.tid()
-    total = wp.spatial_vector()
+    i, chunk, v = wp.tid()
+    first = _COLUMNS * chunk
+    force = lines()
+    torque = lines()
     if cut.node[i, v] >= 0:
-        origin = wp.transform_get_translation(cut.pose[i // clusters, v])
-        share = 0.25 * (1.0 - cut.beyond[i, v])
+        body = _body(cut, clusters, i)
+        origin = wp.transform_get_translation(cut.pose[body, v])
+        inner = 0.25 * (1.0 - cut.beyond[i, v])
+        share = cut.near[i, v]
         for p in range(4):
             at = cut.points[i, p, v]
-            pull = wp.vec3()
-            if cut.near[i, v] > 0.0:
+            pull = lines()
+            if share > 0.0 and inner > 0.0:
                 for s in range(green.near.shape[0]):
-                    pull += (cut.near[i, v] * near[s, j, v]) * _source(
-                        at, green.near[s], green.floor, _NEAR_LEAST
-                    )
-            if cut.near[i, v] < 1.0:
+                    one = (inner * share) * _source(at, green.near[s], green.floor, _NEAR_LEAST)
+                    pull += wp.outer(_columns(near, s, first, v), one)
+            if share < 1.0 and inner > 0.0:
                 for s in range(green.far.shape[0]):
-                    pull += ((1.0 - cut.near[i, v]) * far[s, j, v]) * _source(
+                    one = (inner - inner * share) * _source(
                         at, green.far[s], green.floor, _FAR_LEAST
                     )
-            total += share * wp.spatial_vector(pull, wp.cross(at - origin, pull))
-        for k in range(cut.node.shape[0]):
-            if cut.node[k, v] >= 0:
-                q = charge[k, j, v]
-                total += q * _pair(cut, i, k, v, 1.0, green.floor, origin)
-                if k // clusters != i // clusters:
-                    total -= q * _pair(cut, i, k, v, 0.0, green.floor, origin)
-    out[i, j, v] = total
+                    pull += wp.outer(_columns(far, s, first, v), one)
+            force += pull
+            torque -= pull * wp.skew(at - origin)
+        for j in range(cut.node.shape[0]):
+            if cut.node[j, v] >= 0:
+                push = _pair(cut, i, j, v, 1.0, green.floor, origin)
+                if _body(cut, clusters, j) != body:
+                    push -= _pair(cut, i, j, v, 0.0, green.floor, origin)
+                q = _columns(charge, j, first, v)
+                force += wp.outer(q, wp.spatial_top(push))
+                torque += wp.outer(q, wp.spatial_bottom(push))
+    for c in range(_COLUMNS):
+        out[i, first + c, v] = wp.spatial_vector(force[c], torque[c])
 
 
 @wp.kernel
@@ -170,9 +346,8 @@ def slopes(
     b, i, v = wp.tid()
     for j in range(circuit.electrodes):
         total = wp.spatial_vector()
-        for k in range(clusters):
-            f = b * clusters + k
-            if cut.node[f, v] >= 0:
+        for f in range(cut.node.shape[0]):
+            if _body(cut, clusters, f) == b and cut.node[f, v] >= 0:
                 total += charge[f, i, v] * pull[f, j, v] + charge[f, j, v] * pull[f, i, v]
         force = wp.spatial_top(total)
         torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
