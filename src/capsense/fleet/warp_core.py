@@ -207,7 +207,7 @@ class WarpCore:
         launch(slope.estimated, (n, lead, views), cut, rest, more)
         launch(slope.felt, (sources[0], parts, views), green, cut, 0, more, near)
         launch(slope.felt, (sources[1], parts, views), green, cut, 1, more, far)
-        launch(slope.answered, (modes, lead, views), green, cut, near, far, sums)
+        launch(slope.answered, (modes, parts, views), green, cut, near, far, sums)
         at = self.shapes, self.places
         launch(slope.energies_below, (n, parts, views), *at, cut, k, more, back)
         launch(kernels.from_functions, (lead, views), cut, k, 0, back)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
-from capsense.fleet.warp_cut import SOURCES, Places, Response, Shapes, WarpCut, many
+from capsense.fleet.warp_cut import SOURCES, Leaf, Places, Response, Shapes, WarpCut, many
 from capsense.fleet.warp_kernels import bound, four_units, leaf_of, mean, more, own
 from capsense.fleet.warp_left import COLUMNS, some
 from capsense.fleet.warp_solve import Circuit, Left
@@ -22,7 +22,7 @@ from capsense.surface.solve_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-lines = wp.types.matrix(shape=(COLUMNS, 3), dtype=wp.float32)
+pulls = wp.types.matrix(shape=(COLUMNS, 6), dtype=wp.float32)
 _SOURCES, _COLUMNS = wp.constant(SOURCES), wp.constant(COLUMNS)
 _FAR, _GAIN = wp.constant(FAR), wp.constant(GAIN)
 _NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
@@ -126,14 +126,15 @@ def felt(
 
 @wp.func
 def _answer(
-    table: wp.array2d(dtype=many), column: int, values: wp.array3d(dtype=wp.float32), c: int, v: int
+    table: wp.array2d(dtype=many), column: int, values: wp.array3d(dtype=wp.float32), first: int,
+    v: int,
 ):  # fmt: skip
-    total = float(0.0)
+    total = some()
     if column < table.shape[0]:
         for batch in range(table.shape[1]):
             few = table[column, batch]
             for s in range(wp.min(_SOURCES, values.shape[0] - _SOURCES * batch)):
-                total += few[s] * values[_SOURCES * batch + s, c, v]
+                total += few[s] * _columns(values, _SOURCES * batch + s, first, v)
     return total
 
 
@@ -143,12 +144,14 @@ def answered(
     far: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Sums of ψ over charges from their potentials at the sources, (modes, lead, v)."""
-    k, c, v = wp.tid()
-    total = float(0.0)
+    k, chunk, v = wp.tid()
+    first = _COLUMNS * chunk
+    total = some()
     if green.lead + k < cut.width[v]:
-        total = _answer(green.near_columns, green.lead + k, near, c, v)
-        total += _answer(green.far_columns, green.lead + k, far, c, v)
-    out[k, c, v] = total
+        total = _answer(green.near_columns, green.lead + k, near, first, v)
+        total += _answer(green.far_columns, green.lead + k, far, first, v)
+    for c in range(_COLUMNS):
+        out[k, first + c, v] = total[c]
 
 
 @wp.kernel
@@ -231,10 +234,29 @@ def _source(p: wp.vec3, source: wp.vec3, floor: float, least: float):
     d = p - source
     e = wp.vec3(d[0], d[1], p[2] + source[2] - 2.0 * floor)
     square = wp.dot(d, d)
-    image = wp.dot(e, e)
-    out = e / (image * wp.sqrt(image))
-    if square > least * least:
-        out -= d / (square * wp.sqrt(square))
+    away = 1.0 / wp.sqrt(wp.dot(e, e))
+    near = 1.0 / wp.sqrt(wp.max(square, least * least))
+    near = wp.where(square > least * least, near * near * near, 0.0)
+    return (away * away * away) * e - near * d
+
+
+@wp.func
+def _sources(
+    leaf: Leaf, sources: wp.array(dtype=wp.vec3), strength: wp.array3d(dtype=wp.float32),
+    floor: float, least: float, origin: wp.vec3, first: int, v: int,
+):  # fmt: skip
+    """Forces on a leaf, and torques about an origin, by sources: columns from ``first`` on."""
+    out = pulls()
+    for s in range(sources.shape[0]):
+        source = sources[s]
+        f0 = _source(leaf.p0, source, floor, least)
+        f1 = _source(leaf.p1, source, floor, least)
+        f2 = _source(leaf.p2, source, floor, least)
+        f3 = _source(leaf.p3, source, floor, least)
+        torque = wp.cross(leaf.p0 - origin, f0) + wp.cross(leaf.p1 - origin, f1)
+        torque += wp.cross(leaf.p2 - origin, f2) + wp.cross(leaf.p3 - origin, f3)
+        pull = wp.spatial_vector(f0 + f1 + f2 + f3, torque)
+        out += wp.outer(_columns(strength, s, first, v), pull)
     return out
 
 
@@ -302,38 +324,31 @@ def forces(
     """
     i, chunk, v = wp.tid()
     first = _COLUMNS * chunk
-    force = lines()
-    torque = lines()
+    total = pulls()
     if cut.node[i, v] >= 0:
         body = _body(cut, clusters, i)
         origin = wp.transform_get_translation(cut.pose[body, v])
-        inner = 0.25 * (1.0 - cut.beyond[i, v])
-        share = cut.near[i, v]
-        for p in range(4):
-            at = cut.points[i, p, v]
-            pull = lines()
-            if share > 0.0 and inner > 0.0:
-                for s in range(green.near.shape[0]):
-                    one = (inner * share) * _source(at, green.near[s], green.floor, _NEAR_LEAST)
-                    pull += wp.outer(_columns(near, s, first, v), one)
-            if share < 1.0 and inner > 0.0:
-                for s in range(green.far.shape[0]):
-                    one = (inner - inner * share) * _source(
-                        at, green.far[s], green.floor, _FAR_LEAST
-                    )
-                    pull += wp.outer(_columns(far, s, first, v), one)
-            force += pull
-            torque -= pull * wp.skew(at - origin)
+        leaf = leaf_of(cut, i, v)
+        inner = 0.25 * (1.0 - leaf.beyond)
+        floor = green.floor
+        if leaf.near > 0.0 and inner > 0.0:
+            total += (inner * leaf.near) * _sources(
+                leaf, green.near, near, floor, _NEAR_LEAST, origin, first, v
+            )
+        if leaf.near < 1.0 and inner > 0.0:
+            total += (inner - inner * leaf.near) * _sources(
+                leaf, green.far, far, floor, _FAR_LEAST, origin, first, v
+            )
         for j in range(cut.node.shape[0]):
             if cut.node[j, v] >= 0:
-                push = _pair(cut, i, j, v, 1.0, green.floor, origin)
+                pull = _pair(cut, i, j, v, 1.0, floor, origin)
                 if _body(cut, clusters, j) != body:
-                    push -= _pair(cut, i, j, v, 0.0, green.floor, origin)
-                q = _columns(charge, j, first, v)
-                force += wp.outer(q, wp.spatial_top(push))
-                torque += wp.outer(q, wp.spatial_bottom(push))
+                    pull -= _pair(cut, i, j, v, 0.0, floor, origin)
+                total += wp.outer(_columns(charge, j, first, v), pull)
     for c in range(_COLUMNS):
-        out[i, first + c, v] = wp.spatial_vector(force[c], torque[c])
+        out[i, first + c, v] = wp.spatial_vector(
+            total[c, 0], total[c, 1], total[c, 2], total[c, 3], total[c, 4], total[c, 5]
+        )
 
 
 @wp.kernel
