@@ -10,8 +10,7 @@ For derivatives, as in :mod:`capsense.surface.gradient_kernels`, charges are hel
 the field of the other charges, of all images and of the design; what changes with the share of near
 sources or with the lift off the design is left out, as there. The charges are those solved for,
 x = A⁻¹ Φ, those of the estimate on the parts of clusters, y = D (φ - B x), and what these take from
-the first, -A⁻¹ Bᵀ y: see ``solve_kernels._add_adjoint``. Floating conductors of the design follow:
-columns are of electrodes, what floats mixed in.
+the first, -A⁻¹ Bᵀ y: see ``solve_kernels._add_adjoint``. Floating conductors of the design follow.
 
 What has a column for each terminal has ``2 lead`` columns: real parts, then imaginary ones, which
 mean something in views with losses only; for derivatives, real parts alone. Lengths in metres,
@@ -91,12 +90,12 @@ def modes(
 
 @wp.kernel
 def strengths(
-    green: Response, cut: WarpCut, applied: int, sums: wp.array3d(dtype=wp.float32),
+    green: Response, cut: WarpCut, sums: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Strength of the design's sources, a terminal at ``applied`` V and charges in place.
+    """Strength of the design's sources, a terminal at 1 V and charges in place, (s, 2 lead, v).
 
-    Shape (s, 2 lead, v). Those of near sources are not worked out where a view needs none.
+    Those of near sources are not worked out where a view needs none.
     """
     batch, c, v = wp.tid()
     lead = green.lead
@@ -105,7 +104,7 @@ def strengths(
     if (near and width < green.columns.shape[0]) or (c >= lead and cut.lossy[v] == 0):
         return
     total = many()
-    if c < lead and applied != 0:
+    if c < lead:
         total = green.columns[c, batch]
     for k in range(lead, width):
         total += sums[k - lead, c, v] * green.columns[k, batch]
@@ -333,6 +332,13 @@ def modes_below(
 
 
 @wp.kernel
+def add(values: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):
+    """Add values to others."""
+    i, c, v = wp.tid()
+    out[i, c, v] = out[i, c, v] + values[i, c, v]
+
+
+@wp.kernel
 def follow(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d), out: wp.array3d(dtype=wp.float32)):
     """Potential of each terminal while an electrode is at 1 V, (t, n, v); floating ones follow.
 
@@ -353,38 +359,23 @@ def follow(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d), out: wp.array3d(
 
 
 @wp.kernel
-def followed(
-    circuit: Circuit, turn: wp.array3d(dtype=wp.float32), first: wp.array3d(dtype=wp.float32),
-    other: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
-    """Columns of electrodes from the sum of those of terminals, (x, lead, v).
-
-    What floats is mixed in. The first sum may have fewer rows.
-    """
-    x, j, v = wp.tid()
-    total = float(0.0)
-    if j < circuit.electrodes:
-        for a in range(turn.shape[0]):
-            if a == j or a >= circuit.driven:
-                value = other[x, a, v]
-                if x < first.shape[0]:
-                    value += first[x, a, v]
-                total += value * turn[a, j, v]
-    out[x, j, v] = total
-
-
-@wp.kernel
 def slopes(
-    circuit: Circuit, cut: WarpCut, charge: wp.array3d(dtype=wp.float32),
-    pull: wp.array3d(dtype=wp.spatial_vector), out: wp.array4d(dtype=wp.spatial_vector),
+    circuit: Circuit, cut: WarpCut, turn: wp.array3d(dtype=wp.float32),
+    charge: wp.array3d(dtype=wp.float32), pull: wp.array3d(dtype=wp.spatial_vector),
+    out: wp.array4d(dtype=wp.spatial_vector),
 ):  # fmt: skip
     """Derivative of the matrices by the pose of each body [F/m], [F/rad], (v, b, n, n)."""
     b, i, v = wp.tid()
     for j in range(circuit.electrodes):
         total = wp.spatial_vector()
-        for f in range(cut.node.shape[0]):
-            if body_of(cut, f) == b and cut.node[f, v] >= 0:
-                total += charge[f, i, v] * pull[f, j, v] + charge[f, j, v] * pull[f, i, v]
+        for k in range(turn.shape[0]):
+            for c in range(turn.shape[0]):
+                share = turn[k, i, v] * turn[c, j, v]
+                if share != 0.0:
+                    for f in range(cut.node.shape[0]):
+                        if body_of(cut, f) == b and cut.node[f, v] >= 0:
+                            one = charge[f, k, v] * pull[f, c, v]
+                            total += share * (one + charge[f, c, v] * pull[f, k, v])
         force = wp.spatial_top(total)
         torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
         out[v, b, i, j] = circuit.unit * wp.spatial_vector(force, torque)

@@ -46,26 +46,26 @@ class WarpCore:
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         environments, places, sensors = counts
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
-        room = self.room
-        cut = warp_cut.WarpCut()
-        cut.clusters = clusters
-        cut.pose = room(places, views, dtype=wp.transform)
-        cut.moved = room(places, views, dtype=wp.vec3)
-        for names, rows, kind in (
-            (("split", "number"), n, wp.int32),
-            (("score", "part", "mix", "weight", "ends", "out"), n, wp.float32),
-            (("node", "lifted"), 3 * n, wp.int32),
-            (("extent", "soft", "beyond", "near"), 3 * n, wp.float32),
-        ):
-            for name in names:
-                setattr(cut, name, room(rows, views, dtype=kind))
-        cut.points, cut.unlifted = (room(3 * n, views, dtype=warp_cut.four) for _ in range(2))
-        cut.leader = room(places, views, dtype=wp.int32)
-        cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
-        cut.width, cut.walled = (room(views, dtype=wp.int32) for _ in range(2))
-        self.cut = cut
-        passes, t = self.green.table.shape[1], self.green.terminals
-        self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
+        passes, t, lead = self.green.table.shape[1], self.green.terminals, self.green.lead
+        width, room, struct = passes * warp_cut.WIDTH, self.room, self._struct
+        self.cut = struct(warp_cut.WarpCut, {
+            "split number score part mix weight ends out": (n, views),
+            "node lifted extent soft beyond near points unlifted": (3 * n, views),
+            "pose moved leader tie": (places, views),
+            "lossy width walled": (views,),
+        })  # fmt: skip
+        self.cut.clusters = clusters
+        self.left = struct(solution.Left, {
+            "charge on residual": (n, 2 * lead, views),
+            "sums": (width - lead, 2 * lead, views),
+            "strength": (len(self.green.sources), 2 * lead, views),
+            "energy": (n, views), "doubt": (t, views), "dropped": (views,),
+        })  # fmt: skip
+        self.places = struct(warp_cut.Places, {
+            "choice neutral softness tie scale slack": (environments, places),
+            "hidden": (sensors, places), "group": (places,),
+        })  # fmt: skip
+        self.rows, self.matrix = room(n, width, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, t, views)
         self.whole = room(t, t, views, dtype=wp.vec2d)
         self.capacitance, self.delta, self.conductance = (
@@ -73,35 +73,22 @@ class WarpCore:
         )
         self.shields = room(environments, sensors, m, dtype=wp.float64)
         self.error = room(environments, sensors)
-        self.left = self._left(n, t, views)
         self.poses = room(environments, places, dtype=wp.transform)
         self.frames = room(environments, sensors, dtype=wp.transform)
         self.worlds = wp.clone(self.frames)
         """Frames of sensors that are those of the worlds."""
         self.worlds.fill_(wp.transform_identity())
-        self.places = warp_cut.Places()
-        for name in ("choice", "neutral"):
-            setattr(self.places, name, room(environments, places, dtype=wp.int32))
-        for name in ("softness", "tie"):
-            setattr(self.places, name, room(environments, places, dtype=wp.vec2))
-        self.places.scale = room(environments, places)
-        self.places.slack = room(environments, places, dtype=wp.vec3)
-        self.places.hidden = room(sensors, places, dtype=wp.int32)
-        self.places.group = room(places, dtype=wp.int32)
 
     def room(self, *shape: int, dtype: Any = wp.float32) -> Any:
         """An array of zeros on the device."""
         return wp.zeros(shape, dtype=dtype, device=self.device)
 
-    def _left(self, n: int, t: int, views: int) -> Any:
-        """Room for charges and what they leave."""
-        out, green, room = solution.Left(), self.green, self.room
-        columns = 2 * green.lead
-        out.charge, out.on, out.residual = (room(n, columns, views) for _ in range(3))
-        out.sums = room(self.rows.shape[1] - green.lead, columns, views)
-        out.strength = room(len(green.sources), columns, views)
-        out.energy, out.doubt = room(n, views, dtype=wp.vec2), room(t, views)
-        out.dropped = room(views, dtype=wp.int32)
+    def _struct(self, kind: Any, shapes: dict[str, tuple[int, ...]]) -> Any:
+        """A structure whose arrays, here by name, are zeros on the device."""
+        out = kind()
+        for names, shape in shapes.items():
+            for name in names.split():
+                setattr(out, name, self.room(*shape, dtype=kind.vars[name].type.dtype))
         return out
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
@@ -176,7 +163,7 @@ class WarpCore:
         size = rest.sums.shape[0], parts, views
         launch(charges.modes, size, cut, lead, rows, rest.charge, 0, rest.sums)
         size = batches, columns, views
-        launch(charges.strengths, size, green, cut, 1, rest.sums, rest.strength)
+        launch(charges.strengths, size, green, cut, rest.sums, rest.strength)
         launch(charges.to_clusters, (columns, views), cut, lead, rest.charge, rest.on)
         at = self.shapes, self.places
         launch(charges.residuals, (n, parts, views), *at, green, cut, rest)
@@ -190,32 +177,31 @@ class WarpCore:
         sources, modes = len(green.sources), rest.sums.shape[0]
         if self._slopes is None:
             self._slopes = [
-                *(room(rows, lead, views) for rows in (3 * n, n, sources, modes, 3 * n, sources)),
+                *(room(rows, lead, views) for rows in (3 * n, n, sources, modes)),
                 room(t, m, views), room(3 * n, lead, views, dtype=wp.spatial_vector),
                 room(views, places, m, m, dtype=wp.spatial_vector),
             ]  # fmt: skip
-        more, back, felt, sums, charge, strength, turn, pull, out = self._slopes
+        charge, back, strength, sums, turn, pull, out = self._slopes
         launch, parts, at = self.launch, lead // pairs.COLUMNS, (self.shapes, self.places)
-        launch(charges.estimated, (n, lead, views), cut, rest, more)
-        launch(charges.felt, (sources, parts, views), green, cut, more, felt)
-        launch(charges.answered, (modes, parts, views), green, cut, felt, sums)
-        launch(charges.energies_below, (n, parts, views), *at, cut, more, back)
+        launch(charges.estimated, (n, lead, views), cut, rest, charge)
+        launch(charges.felt, (sources, parts, views), green, cut, charge, strength)
+        launch(charges.answered, (modes, parts, views), green, cut, strength, sums)
+        launch(charges.energies_below, (n, parts, views), *at, cut, charge, back)
         launch(solution.from_functions, (lead, views), cut, 0, back)
-        launch(charges.pairs_below, (n, parts, views), green, cut, more, back)
+        launch(charges.pairs_below, (n, parts, views), green, cut, charge, back)
         launch(solution.to_functions, (lead, views), cut, 0, back)
         launch(charges.modes_below, (n, parts, views), cut, lead, self.rows, sums, back)
         solved = self.matrix, self.loss, back, self.quadrature
         launch(solution.forward, (t, views), cut, *solved)
+        launch(charges.add, (n, t, views), self.rows, back)
         launch(solution.charges, (t, views), cut, lead, *solved, rest.charge)
         launch(charges.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, 1, sums)
-        launch(charges.to_clusters, (lead, views), cut, lead, rest.charge, more)
-        batches = green.columns.shape[1]
-        launch(charges.strengths, (batches, lead, views), green, cut, 0, sums, felt)
-        launch(charges.follow, (m, views), circuit, self.whole, turn)
-        for first, other, to in ((rest.on, more, charge), (rest.strength, felt, strength)):
-            launch(charges.followed, to.shape, circuit, turn, first, other, to)
+        launch(charges.to_clusters, (lead, views), cut, lead, rest.charge, charge)
+        size = green.columns.shape[1], lead, views
+        launch(charges.strengths, size, green, cut, sums, strength)
         launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, pull)
-        launch(charges.slopes, (places, m, views), circuit, cut, charge, pull, out)
+        launch(charges.follow, (m, views), circuit, self.whole, turn)
+        launch(charges.slopes, (places, m, views), circuit, cut, turn, charge, pull, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,

@@ -345,7 +345,7 @@ def forces(
     green: Response, cut: WarpCut, charge: wp.array3d(dtype=wp.float32),
     strength: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.spatial_vector),
 ):  # fmt: skip
-    """Gradient of electrodes' potentials at each leaf, and its torque about its body's origin.
+    """Gradient of terminals' potentials at each leaf, and its torque about its body's origin.
 
     Shape (l, lead, v).
     """
