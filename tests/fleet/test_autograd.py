@@ -13,17 +13,14 @@ torch = pytest.importorskip("torch")
 
 @pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
 def test_gradients(device):
-    """Differential: a random sum of all entries, by every pose, to 2 % or 1 % of the largest.
-
-    On Warp gradients leave out what functions that are not solved for add: it is little of 128.
-    """
+    """Differential: a random sum of all entries, by every pose; to 0.5 and 0.1 % of the largest."""
     from capsense.fleet.autograd import change
 
     if device != "cpu":
         pytest.importorskip("warp")
     fleet = Fleet(
         "six_patch", [BODIES[0], BODIES[2]], 2, sensors=2, preset="standard",
-        device=device, budget=128,
+        device=device, budget=64,
     )  # fmt: skip
 
     def delta(poses):
@@ -54,7 +51,8 @@ def test_gradients(device):
             moved[e, b, 3:] /= np.linalg.norm(moved[e, b, 3:])
             ends.append((delta(moved) * weights).sum())
         difference = (ends[0] - ends[1]) / (2 * step)
-        assert gradient[e, b, k] == pytest.approx(difference, rel=0.02, abs=0.01 * scale)
+        bound = 5e-3 if device == "cpu" else 1e-3
+        assert gradient[e, b, k] == pytest.approx(difference, rel=0, abs=bound * scale)
 
 
 def test_refused():

@@ -274,9 +274,7 @@ def test_functions_that_add_nothing_are_left_out(lossy):
     assert found == pytest.approx(truth, rel=1e-5)
 
 
-MODULES = [
-    "warp_cut", "warp_kernels", "warp_solve", "warp_left", "warp_slope", "warp_chip_kernels",
-]  # fmt: skip
+MODULES = ["warp_cut", "warp_pairs", "warp_solve", "warp_charges", "warp_chip_kernels"]
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cluster_twin import same_functions, twin_of
+from reference_scenes import fleet_of, reference_scenes
+from scipy.spatial.transform import Rotation
 from test_fleet import BODIES, frames, poses, scene
 
+import capsense as cs
 from capsense.design import Role, load_design
 from capsense.design.model import Conductor
 from capsense.errors import SceneError
@@ -17,6 +20,7 @@ from capsense.fleet import Fleet
 
 pytest.importorskip("warp")
 COUNT = 3
+PRIMITIVES = cs.Box, cs.Sphere, cs.Capsule, cs.Cylinder, cs.Ellipsoid
 
 
 def against_twin(fleet, where, sensors):
@@ -59,6 +63,37 @@ def test_jacobian_with_floating_conductors_of_the_design(monkeypatch):
     assert against_twin(fleet, *some_poses(2)) < 1e-4
 
 
+@pytest.mark.parametrize(
+    ("budget", "bound", "middle"), [(32, 0.015, 5e-4), (64, 3e-3, 3e-4), (128, 3e-3, 3e-4)]
+)
+def test_jacobians_are_those_of_the_readings(budget, bound, middle):
+    """Differential: central differences over the reference map, every body moving and turning at
+    random. The bound is of scenes from 8 mm whose bodies are cut alike at both ends; the median of
+    all scenes."""
+    every = reference_scenes()
+    scenes = [s for s in every if all(isinstance(b.shape, PRIMITIVES) for b in s.scene)]
+    fleet, where = fleet_of(scenes, device="warp:cpu", budget=budget)
+    rng = np.random.default_rng(5)
+    way = rng.normal(size=(*where.shape[:2], 6)) * ([1e-4] * 3 + [5e-4] * 3)
+    slope = fleet.step(where, jacobian=True).jacobian.numpy()[:, 0].astype(float)
+    slope = np.einsum("ebijr,ebr->eij", slope, way)
+    ends, nodes = [], []
+    for sign in (1, -1):
+        moved = where.copy()
+        moved[..., :3] += sign * way[..., :3]
+        turn = Rotation.from_rotvec(sign * way[..., 3:].reshape(-1, 3))
+        turned = turn * Rotation.from_quat(where[..., 3:].reshape(-1, 4))
+        moved[..., 3:] = turned.as_quat().reshape(*where.shape[:2], 4)
+        ends.append(fleet.step(moved).delta.numpy()[:, 0].astype(float))
+        nodes.append(np.sort(fleet._warp.cut.number.numpy().reshape(-1, budget, len(scenes)), 1))
+    truth = 0.5 * (ends[0] - ends[1])
+    miss = np.abs(slope - truth).max(axis=(1, 2)) / np.abs(truth).max(axis=(1, 2))
+    alike = (nodes[0] == nodes[1]).all(axis=(0, 1)) & (np.array([s.gap for s in scenes]) > 0.0079)
+    assert alike.sum() > 45
+    assert miss[alike].max() < bound
+    assert np.median(miss) < middle
+
+
 def test_jacobian_of_joined_conductors():
     """Measured: central differences, of two conductors that are one."""
     bodies = [BODIES[0], BODIES[2]]
@@ -74,7 +109,7 @@ def test_jacobian_of_joined_conductors():
             moved[0, b, k] += sign * 2e-4
             ends.append(fleet.step(moved).delta.numpy()[0, 0].astype(float))
         difference = (ends[0] - ends[1]) / 4e-4
-        np.testing.assert_allclose(found[b, ..., k], difference, rtol=0, atol=0.02 * scale)
+        np.testing.assert_allclose(found[b, ..., k], difference, rtol=0, atol=4e-3 * scale)
 
 
 def test_refused():

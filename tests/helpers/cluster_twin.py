@@ -129,8 +129,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
         cut, leaves, functions, system = prepared(bodies, green)
-        delta, left, coarse, x, shift = reduced(cut, functions, system, False)
-        x[functions.solved :] = 0.0  # Jacobians leave out what these add
+        delta, left, coarse, x, shift = reduced(cut, functions, system, True)
         charge = leaf_charges(cut, functions, x, len(leaves.points))
         m = green.terminals
         return step.Solution(

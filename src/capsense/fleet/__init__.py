@@ -1,6 +1,6 @@
 """Many environments at once: arrays of poses in, arrays of matrices out."""
 
+from capsense.fleet.bodies import FleetCheck, FleetReading
 from capsense.fleet.fleet import Fleet
-from capsense.fleet.reading import FleetCheck, FleetReading
 
 __all__ = ["Fleet", "FleetCheck", "FleetReading"]

@@ -1,8 +1,10 @@
-"""What stands in the places of a fleet's environments."""
+"""What stands in the places of a fleet's environments, and what their sensors read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,11 +13,86 @@ from capsense.elements.matter import matter_of
 from capsense.elements.pieces import windowed
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.errors import SceneError
-from capsense.fleet.step_kernels import Bodies
+from capsense.readout.conversions import Held
 from capsense.scene import Body
 from capsense.surface.solver import SurfaceSolver
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FleetReading:
+    """What the sensors of all environments see; e environments, s sensors, n electrodes.
+
+    Arrays of NumPy on the CPU, else of Warp, in single precision, which PyTorch and JAX take by
+    DLPack; those are written anew by the next step.
+    """
+
+    capacitance: Any
+    """Maxwell capacitance matrices [F], shape (e, s, n, n)."""
+    delta: Any
+    """Their change by the bodies [F], shape (e, s, n, n)."""
+    error: Any = None
+    """Estimated error of the largest entry [F], shape (e, s)."""
+    shield_coupling: Any = None
+    """Charge on each electrode per volt on all shields together [F], shape (e, s, n), in double
+    precision."""
+    conductance: Any = None
+    """Conductance that matter with losses adds [S], shape (e, s, n, n); None on the CPU where
+    there is none."""
+    held: Held | None = None
+    """What the chips' registers hold, where there is a readout, each of shape (e, s, channels)."""
+    jacobian: Any = None
+    """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
+    about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
+
+
+@dataclass(frozen=True)
+class FleetCheck:
+    """Errors of some environments against :class:`Simulator`, over each one's largest entry."""
+
+    environments: tuple[int, ...]
+    """Which environments."""
+    rms: float
+    """Root of the mean square over all entries."""
+    worst: float
+    """The largest."""
+    where: tuple[int, int]
+    """Environment and sensor that have it."""
+    contact: tuple[tuple[int, int], ...] = ()
+    """Environments and sensors whose readings mean nothing: an electrode lies inside a body, or
+    within 0.2 mm of a conductor."""
+
+
+def on_device(values: Any) -> bool:
+    """Whether values are an array of Warp, PyTorch or JAX, which is taken by DLPack."""
+    return hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
+
+
+class Bodies(NamedTuple):
+    """What stands in every environment; e environments, b places for bodies."""
+
+    shapes: NDArray[Any]
+    """Shapes, of size 1, as records of ``elements.rigid.BODY``, shape (u,)."""
+    radius: NDArray[Any]
+    """Radius of a ball about each shape's origin that holds it [m], shape (u,)."""
+    choice: NDArray[Any]
+    """Shape in each place, -1 where nothing is, shape (e, b)."""
+    scale: NDArray[Any]
+    """How many times as large it is, shape (e, b)."""
+    softness: NDArray[Any]
+    """1 / (eps - 1), complex, 0 for conductors, shape (e, b)."""
+    tie: NDArray[Any]
+    """Energy that ties it to ground [1/m], complex, shape (e, b)."""
+    neutral: NDArray[Any]
+    """Whether it has no net charge, shape (e, b)."""
+    slack: NDArray[Any]
+    """Half of what is cut off of a long body along each axis [m], shape (e, b, 3); what is left is
+    nearest to the middle of the domain, see ``elements.pieces.windowed``."""
+    hidden: NDArray[Any]
+    """Whether a sensor does not see a place, shape (s, b)."""
+    group: NDArray[Any]
+    """Places that are joined to one conductor have the same number, shape (b,)."""
 
 
 class BodyTable:

@@ -16,9 +16,8 @@ from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.fleet.bodies import BodyTable
-from capsense.fleet.cpu_core import CpuCore
-from capsense.fleet.reading import FleetCheck, FleetReading, on_device
+from capsense.fleet.bodies import BodyTable, FleetCheck, FleetReading, on_device
+from capsense.fleet.cpu import CpuCore
 from capsense.readout.conversions import SideBySide
 from capsense.readout.readout import Readout
 from capsense.scene import Body, Pose, Scene

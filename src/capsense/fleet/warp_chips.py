@@ -15,8 +15,7 @@ import warp as wp
 
 from capsense.errors import ReadoutError
 from capsense.fleet import warp_chip_kernels as kernels
-from capsense.fleet.reading import on_device
-from capsense.fleet.warp_laws import law_of
+from capsense.fleet.bodies import on_device
 from capsense.readout.conversions import Held
 from capsense.readout.noise import ClimateDrift, Context, Flicker, Mains, RandomWalk, White
 from capsense.readout.readout import Readout
@@ -84,7 +83,7 @@ class WarpChips:
         instant[plan.order] = plan.offsets
         out.instant, out.period = array(instant), plan.period
         out.lag, out.slack = plan.lag, plan.slack
-        out.law = law_of(readout.law)
+        out.law = kernels.law_of(readout.law)
         if dac is not None:
             out.actual, out.step, out.follow = array(dac.actual()), dac.step, int(dac.follow)
             out.stride = dac.stride(readout.law)

@@ -13,13 +13,11 @@ from capsense.elements.matter import UNIT
 from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
+from capsense.fleet import warp_charges as charges
 from capsense.fleet import warp_cut
-from capsense.fleet import warp_kernels as kernels
-from capsense.fleet import warp_left as left
-from capsense.fleet import warp_slope as slope
+from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
-from capsense.fleet.reading import on_device
-from capsense.fleet.step_kernels import Bodies
+from capsense.fleet.bodies import Bodies, on_device
 from capsense.fleet.warp_chips import WarpChips
 from capsense.readout.readout import Readout
 from capsense.surface.solver import SurfaceSolver
@@ -42,38 +40,32 @@ class WarpCore:
         self, solver: SurfaceSolver, terminals: Terminals, counts: tuple[int, int, int],
         clusters: int, device: Any,
     ) -> None:  # fmt: skip
-        self.device, self.counts, self.clusters, self._taken = device, counts, clusters, 0
+        self.device, self.counts, self._taken = device, counts, 0
         self._slopes: list[Any] | None = None
         self.green, self.circuit = _response(solver, device), _circuit(terminals, device)
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         environments, places, sensors = counts
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
-        room = self.room
-        cut = warp_cut.WarpCut()
-        cut.pose = room(places, views, dtype=wp.transform)
-        cut.moved = room(places, views, dtype=wp.vec3)
-        for name in ("node", "split", "number", "lifted"):
-            setattr(cut, name, room(n, views, dtype=wp.int32))
-        for name in (
-            "score",
-            "part",
-            "mix",
-            "weight",
-            "ends",
-            "out",
-            "extent",
-            "soft",
-            "beyond",
-            "near",
-        ):
-            setattr(cut, name, room(n, views))
-        cut.points, cut.unlifted = (room(n, 4, views, dtype=wp.vec3) for _ in range(2))
-        cut.leader = room(places, views, dtype=wp.int32)
-        cut.tie, cut.lossy = room(places, views, dtype=wp.vec2), room(views, dtype=wp.int32)
-        cut.width, cut.walled = (room(views, dtype=wp.int32) for _ in range(2))
-        self.cut = cut
-        passes, t = self.green.near_table.shape[1], self.green.terminals
-        self.rows, self.matrix = room(n, passes * warp_cut.WIDTH, views), room(n, n, views)
+        passes, t, lead = self.green.table.shape[1], self.green.terminals, self.green.lead
+        width, room, struct = passes * warp_cut.WIDTH, self.room, self._struct
+        self.cut = struct(warp_cut.WarpCut, {
+            "split number score part mix weight ends out": (n, views),
+            "node lifted extent soft beyond near points unlifted": (3 * n, views),
+            "pose moved leader tie": (places, views),
+            "lossy width walled": (views,),
+        })  # fmt: skip
+        self.cut.clusters = clusters
+        self.left = struct(solution.Left, {
+            "charge on residual": (n, 2 * lead, views),
+            "sums": (width - lead, 2 * lead, views),
+            "strength": (len(self.green.sources), 2 * lead, views),
+            "energy": (n, views), "doubt": (t, views), "dropped": (views,),
+        })  # fmt: skip
+        self.places = struct(warp_cut.Places, {
+            "choice neutral softness tie scale slack": (environments, places),
+            "hidden": (sensors, places), "group": (places,),
+        })  # fmt: skip
+        self.rows, self.matrix = room(n, width, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, t, views)
         self.whole = room(t, t, views, dtype=wp.vec2d)
         self.capacitance, self.delta, self.conductance = (
@@ -81,37 +73,22 @@ class WarpCore:
         )
         self.shields = room(environments, sensors, m, dtype=wp.float64)
         self.error = room(environments, sensors)
-        self.left = self._left(n, t, views)
         self.poses = room(environments, places, dtype=wp.transform)
         self.frames = room(environments, sensors, dtype=wp.transform)
         self.worlds = wp.clone(self.frames)
         """Frames of sensors that are those of the worlds."""
         self.worlds.fill_(wp.transform_identity())
-        self.places = warp_cut.Places()
-        for name in ("choice", "neutral"):
-            setattr(self.places, name, room(environments, places, dtype=wp.int32))
-        for name in ("softness", "tie"):
-            setattr(self.places, name, room(environments, places, dtype=wp.vec2))
-        self.places.scale = room(environments, places)
-        self.places.slack = room(environments, places, dtype=wp.vec3)
-        self.places.hidden = room(sensors, places, dtype=wp.int32)
-        self.places.group = room(places, dtype=wp.int32)
 
     def room(self, *shape: int, dtype: Any = wp.float32) -> Any:
         """An array of zeros on the device."""
         return wp.zeros(shape, dtype=dtype, device=self.device)
 
-    def _left(self, n: int, t: int, views: int) -> Any:
-        """Room for charges and what they leave."""
-        out, green, room = solution.Left(), self.green, self.room
-        columns = 2 * green.lead
-        out.charge, out.on, out.residual = (room(n, columns, views) for _ in range(3))
-        out.sums = room(self.rows.shape[1] - green.lead, columns, views)
-        out.near, out.far = (
-            room(len(sources), columns, views) for sources in (green.near, green.far)
-        )
-        out.energy, out.doubt = room(n, views, dtype=wp.vec2), room(t, views)
-        out.dropped = room(views, dtype=wp.int32)
+    def _struct(self, kind: Any, shapes: dict[str, tuple[int, ...]]) -> Any:
+        """A structure whose arrays, here by name, are zeros on the device."""
+        out = kind()
+        for names, shape in shapes.items():
+            for name in names.split():
+                setattr(out, name, self.room(*shape, dtype=kind.vars[name].type.dtype))
         return out
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
@@ -139,37 +116,34 @@ class WarpCore:
         Raises:
             SceneError: They are of another shape or precision, or on another device.
         """
-        count, k, places = self.counts[2], self.clusters, self.counts[1]
         bodies = as_transforms(bodies, self.poses)
         sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
-        n, views = self.cut.node.shape
+        n, views = self.cut.number.shape
         t = self.green.terminals
         green, cut, circuit = self.green, self.cut, self.circuit
         at = (self.shapes, self.places)
         rows, matrix, whole = self.rows, self.matrix, self.whole
         width = rows.shape[1]
-        self.launch(warp_cut.choose, (places, views), *at, green, bodies, sensors, k, cut)
-        self.launch(warp_cut.connect, views, self.places, count, k, cut)
-        self.launch(warp_cut.place, (n, views), *at, green, count, k, cut)
-        self.launch(warp_cut.weigh, views, *at, green, k, cut)
-        self.launch(kernels.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
+        self.launch(warp_cut.choose, (self.counts[1], views), *at, green, bodies, sensors, cut)
+        self.launch(warp_cut.connect, views, self.places, cut)
+        self.launch(warp_cut.place, (3 * n, views), *at, green, cut)
+        self.launch(warp_cut.weigh, views, *at, green, cut)
+        self.launch(pairs.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
         turned = matrix.transpose((1, 0, 2))
-        self.launch(kernels.energies, (n, n, views), *at, cut, k, matrix)
+        self.launch(solution.energies, (n, n, views), *at, cut, matrix)
         for values in (matrix, turned):
-            self.launch(kernels.from_functions, (n, views), cut, k, values)
-        self.launch(kernels.pairs, (n, n, views), green, cut, k, matrix)
-        self.launch(kernels.bound_images, (n, views), green, cut, rows, matrix)
-        self.launch(kernels.to_functions, (width, views), cut, k, 1, rows)
+            self.launch(solution.from_functions, (n, views), cut, 1, values)
+        self.launch(pairs.pairs, (n, n, views), green, cut, matrix)
+        self.launch(pairs.bound_images, (n, views), green, cut, rows, matrix)
+        self.launch(solution.to_functions, (width, views), cut, 1, rows)
         for values in (matrix, turned):
-            self.launch(kernels.to_functions, (n, views), cut, k, 0, values)
-        self.launch(
-            kernels.assemble, (n, n, views), *at, cut, k, green.lead, rows, matrix, self.loss
-        )
+            self.launch(solution.to_functions, (n, views), cut, 0, values)
+        self.launch(solution.assemble, (n, n, views), *at, cut, green.lead, rows, matrix, self.loss)
         rest, loss, quadrature = self.left, self.loss, self.quadrature
         self.launch(solution.factorise, views, cut, matrix, rest.dropped)
         self.launch(solution.factorise_lossy, views, cut, matrix, loss, rest.dropped)
         self.launch(solution.forward, (t, views), cut, matrix, loss, rows, quadrature)
-        self._look_below(count)
+        self._look_below()
         self.launch(solution.change, (t, t, views), circuit, cut, rows, quadrature, rest, whole)
         self.launch(solution.eliminate, views, circuit, whole)
         self.launch(
@@ -177,44 +151,57 @@ class WarpCore:
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
         )  # fmt: skip
 
-    def _look_below(self, sensors: int) -> None:
+    def _look_below(self) -> None:
         """Charges, and the potentials that they leave in functions that are not solved for."""
-        cut, green, rest, k = self.cut, self.green, self.left, self.clusters
+        cut, green, rest, rows = self.cut, self.green, self.left, self.rows
         (n, columns, views), lead, t = rest.charge.shape, green.lead, green.terminals
-        launch, modes = self.launch, rest.sums.shape[0]
-        solved = self.matrix, self.loss, self.rows, self.quadrature
-        launch(left.charges, (t, views), cut, lead, *solved, rest.charge)
-        launch(left.coarse, (t, views), cut, self.matrix, self.loss, rest.charge, rest.doubt)
-        parts = columns // left.COLUMNS
-        launch(left.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, rest.sums)
-        for table, to in ((green.near_columns, rest.near), (green.far_columns, rest.far)):
-            launch(
-                left.strengths, (table.shape[1], columns, views), cut, lead, table, rest.sums, to
-            )
-        launch(left.to_clusters, (columns, views), cut, k, lead, rest.charge, rest.on)
-        launch(
-            left.residuals, (n, parts, views), self.shapes, self.places, green, cut, k, rest,
-        )  # fmt: skip
+        launch, matrix, loss = self.launch, self.matrix, self.loss
+        parts, batches = columns // pairs.COLUMNS, green.columns.shape[1]
+        solved = matrix, loss, rows, self.quadrature
+        launch(solution.charges, (t, views), cut, lead, *solved, rest.charge)
+        launch(charges.coarse, (t, views), cut, matrix, loss, rest.charge, rest.doubt)
+        size = rest.sums.shape[0], parts, views
+        launch(charges.modes, size, cut, lead, rows, rest.charge, 0, rest.sums)
+        size = batches, columns, views
+        launch(charges.strengths, size, green, cut, rest.sums, rest.strength)
+        launch(charges.to_clusters, (columns, views), cut, lead, rest.charge, rest.on)
+        at = self.shapes, self.places
+        launch(charges.residuals, (n, parts, views), *at, green, cut, rest)
 
     def differentiate(self) -> Any:
         """Derivatives of the last matrices [F/m], [F/rad], shape (e, s, b, n, n, 6)."""
         environments, places, sensors = self.counts
-        n, views = self.cut.node.shape
-        circuit, green, cut, k, rest = self.circuit, self.green, self.cut, self.clusters, self.left
-        m, t = circuit.electrodes, green.terminals
+        n, views = self.cut.number.shape
+        circuit, green, cut, rest = self.circuit, self.green, self.cut, self.left
+        m, t, lead, room = circuit.electrodes, green.terminals, green.lead, self.room
+        sources, modes = len(green.sources), rest.sums.shape[0]
         if self._slopes is None:
             self._slopes = [
-                *(self.room(rows, m, views) for rows in (t, n, len(green.near), len(green.far))),
-                self.room(n, m, views, dtype=wp.spatial_vector),
-                self.room(views, places, m, m, dtype=wp.spatial_vector),
-            ]
-        turn, charge, near, far, pull, out = self._slopes
-        launch = self.launch
-        launch(slope.follow, (m, views), circuit, self.whole, turn)
-        for values, to in ((rest.on, charge), (rest.near, near), (rest.far, far)):
-            launch(slope.followed, to.shape, circuit, turn, values, to)
-        launch(slope.forces, (n, m, views), green, cut, k, charge, near, far, pull)
-        launch(slope.slopes, (places, m, views), circuit, cut, k, charge, pull, out)
+                *(room(rows, lead, views) for rows in (3 * n, n, sources, modes)),
+                room(t, m, views), room(3 * n, lead, views, dtype=wp.spatial_vector),
+                room(views, places, m, m, dtype=wp.spatial_vector),
+            ]  # fmt: skip
+        charge, back, strength, sums, turn, pull, out = self._slopes
+        launch, parts, at = self.launch, lead // pairs.COLUMNS, (self.shapes, self.places)
+        launch(charges.estimated, (n, lead, views), cut, rest, charge)
+        launch(charges.felt, (sources, parts, views), green, cut, charge, strength)
+        launch(charges.answered, (modes, parts, views), green, cut, strength, sums)
+        launch(charges.energies_below, (n, parts, views), *at, cut, charge, back)
+        launch(solution.from_functions, (lead, views), cut, 0, back)
+        launch(charges.pairs_below, (n, parts, views), green, cut, charge, back)
+        launch(solution.to_functions, (lead, views), cut, 0, back)
+        launch(charges.modes_below, (n, parts, views), cut, lead, self.rows, sums, back)
+        solved = self.matrix, self.loss, back, self.quadrature
+        launch(solution.forward, (t, views), cut, *solved)
+        launch(charges.add, (n, t, views), self.rows, back)
+        launch(solution.charges, (t, views), cut, lead, *solved, rest.charge)
+        launch(charges.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, 1, sums)
+        launch(charges.to_clusters, (lead, views), cut, lead, rest.charge, charge)
+        size = green.columns.shape[1], lead, views
+        launch(charges.strengths, size, green, cut, sums, strength)
+        launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, pull)
+        launch(charges.follow, (m, views), circuit, self.whole, turn)
+        launch(charges.slopes, (places, m, views), circuit, cut, turn, charge, pull, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
@@ -274,17 +261,16 @@ def as_transforms(poses: Any, room: Any) -> Any:
 
 def _response(solver: SurfaceSolver, device: Any) -> Any:
     out, green = warp_cut.Response(), solver.green
-    for name in ("near", "far"):
-        sources = np.ascontiguousarray(getattr(green, name).T, np.float32)
-        table = getattr(green, f"{name}_table")
-        parts = np.ascontiguousarray(table.reshape(len(table), -1, warp_cut.WIDTH))
-        setattr(out, name, wp.array(sources, dtype=wp.vec3, device=device))
-        setattr(out, f"{name}_table", wp.array(parts, dtype=warp_cut.row, device=device))
-        batches = -(-len(table) // warp_cut.SOURCES)
-        turned = np.zeros((table.shape[1], batches * warp_cut.SOURCES), np.float32)
-        turned[:, : len(table)] = table.T
-        turned = turned.reshape(table.shape[1], batches, warp_cut.SOURCES)
-        setattr(out, f"{name}_columns", wp.array(turned, dtype=warp_cut.many, device=device))
+    sources = np.concatenate([green.far.T, green.near.T]).astype(np.float32)
+    (count, width), size = green.far_table.shape, warp_cut.SOURCES
+    table = np.zeros((size * -(-len(sources) // size), green.near_table.shape[1]), np.float32)
+    table[:count, :width], table[count : len(sources)] = green.far_table, green.near_table
+    columns = np.ascontiguousarray(table.T).reshape(len(table.T), -1, size)
+    parts = table[: len(sources)].reshape(len(sources), -1, warp_cut.WIDTH)
+    out.sources = wp.array(sources, dtype=wp.vec3, device=device)
+    out.table = wp.array(parts, dtype=warp_cut.row, device=device)
+    out.columns = wp.array(columns, dtype=warp_cut.many, device=device)
+    out.far, out.passes = count, width // warp_cut.WIDTH
     out.lead, out.terminals, out.middle = green.lead, green.terminals, wp.vec3(*solver.middle)
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blend.tolist()

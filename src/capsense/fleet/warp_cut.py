@@ -25,6 +25,8 @@ row = wp.types.vector(length=WIDTH, dtype=wp.float32)
 SOURCES = 16
 """Sources that a thread works out at a time."""
 many = wp.types.vector(length=SOURCES, dtype=wp.float32)
+four = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
+"""Four points of a cluster."""
 
 _WIDTH = wp.constant(WIDTH)
 _NEAREST = wp.constant(1e-3)
@@ -73,12 +75,11 @@ class Places:
 class Response:
     """Green's function of the design."""
 
-    near: wp.array(dtype=wp.vec3)
-    near_table: wp.array2d(dtype=row)  # (sources, passes)
-    far: wp.array(dtype=wp.vec3)
-    far_table: wp.array2d(dtype=row)
-    near_columns: wp.array2d(dtype=many)  # the same tables, (columns, batches of sources)
-    far_columns: wp.array2d(dtype=many)
+    sources: wp.array(dtype=wp.vec3)  # far ones, then near ones
+    table: wp.array2d(dtype=row)  # (sources, passes)
+    columns: wp.array2d(dtype=many)  # the same table, (columns, batches of sources)
+    far: wp.int32  # how many are far ones
+    passes: wp.int32  # that these have
     lead: wp.int32
     terminals: wp.int32
     floor: wp.float32
@@ -94,11 +95,15 @@ class Response:
 
 @wp.struct
 class WarpCut:
-    """Clusters and functions of every view, K for each place; n = b K."""
+    """Clusters and functions of every view, K for each place; n = b K.
 
+    Leaves are the clusters and, behind all of them, the two parts of each, l = 3 n.
+    """
+
+    clusters: wp.int32  # K
     pose: wp.array2d(dtype=wp.transform)  # of the bodies in the sensor frame, (b, v)
     moved: wp.array2d(dtype=wp.vec3)  # from a body's origin to that of what is left of it, (b, v)
-    node: wp.array2d(dtype=wp.int32)  # cluster in each place, -1 for none, (n, v)
+    node: wp.array2d(dtype=wp.int32)  # cluster of the shape that a leaf is, -1 for none, (l, v)
     score: wp.array2d(dtype=wp.float32)
     split: wp.array2d(dtype=wp.int32)  # place of the cluster that was split for this one, (n, v)
     part: wp.array2d(dtype=wp.float32)  # share of the first part, (n, v)
@@ -108,36 +113,17 @@ class WarpCut:
     number: wp.array2d(dtype=wp.int32)  # function of the shape, -1 for none, (n, v)
     ends: wp.array2d(dtype=wp.float32)  # which part of its two parts are panels, (n, v)
     out: wp.array2d(dtype=wp.float32)  # how far a cluster's leaves are out of reach, (n, v)
-    points: wp.array3d(dtype=wp.vec3)  # (n, 4, v)
-    unlifted: wp.array3d(dtype=wp.vec3)  # the same before they were lifted off the design
-    lifted: wp.array2d(dtype=wp.int32)  # whether they were, (n, v)
+    points: wp.array2d(dtype=four)  # of the leaves, (l, v)
+    unlifted: wp.array2d(dtype=four)  # the same before they were lifted off the design
+    lifted: wp.array2d(dtype=wp.int32)  # whether they were, (l, v)
     extent: wp.array2d(dtype=wp.float32)
     soft: wp.array2d(dtype=wp.float32)  # distance below which 1/r is bounded [m]
     beyond: wp.array2d(dtype=wp.float32)
-    near: wp.array2d(dtype=wp.float32)  # share of the near sources, (n, v)
+    near: wp.array2d(dtype=wp.float32)  # share of the near sources, (l, v)
     leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
     tie: wp.array2d(dtype=wp.vec2)  # energy of the net charge of the leader and all others, (b, v)
     lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
     width: wp.array(dtype=wp.int32)  # columns of φ⁰ and ψ that are not zero, (v,)
-
-
-@wp.struct
-class Leaf:
-    """One cluster in the sensor frame."""
-
-    p0: wp.vec3
-    p1: wp.vec3
-    p2: wp.vec3
-    p3: wp.vec3
-    u0: wp.vec3  # the same before they were lifted off the design
-    u1: wp.vec3
-    u2: wp.vec3
-    u3: wp.vec3
-    lifted: wp.int32
-    extent: wp.float32
-    soft: wp.float32
-    beyond: wp.float32
-    near: wp.float32
 
 
 @wp.func
@@ -181,15 +167,15 @@ def _need(
 @wp.kernel
 def choose(
     shapes: Shapes, places: Places, green: Response, bodies: wp.array2d(dtype=wp.transform),
-    sensors: wp.array2d(dtype=wp.transform), clusters: int, cut: WarpCut,
+    sensors: wp.array2d(dtype=wp.transform), cut: WarpCut,
 ):  # fmt: skip
     """Cut every body that a sensor sees into clusters."""
     b, v = wp.tid()
     e = v // sensors.shape[1]
     s = v % sensors.shape[1]
     u = places.choice[e, b]
-    o = b * clusters
-    for j in range(clusters):
+    o = b * cut.clusters
+    for j in range(cut.clusters):
         cut.node[o + j, v] = -1
         cut.number[o + j, v] = -1
     cut.ends[o, v] = 0.0
@@ -209,7 +195,7 @@ def choose(
     first = shapes.first[u]
     cut.node[o, v] = first
     cut.score[o, v] = _need(shapes, green, at, scale, first, first)
-    for j in range(1, clusters):
+    for j in range(1, cut.clusters):
         best = int(0)
         most = float(0.0)
         for i in range(j):
@@ -235,7 +221,7 @@ def choose(
 
 
 @wp.kernel
-def connect(places: Places, sensors: int, clusters: int, cut: WarpCut):
+def connect(places: Places, cut: WarpCut):
     """What ties the bodies of a view to ground; places that are joined are one conductor.
 
     Those that are out of sight count for the tie. The leader of those in sight has the function of
@@ -243,10 +229,10 @@ def connect(places: Places, sensors: int, clusters: int, cut: WarpCut):
     which is neutral.
     """
     v = wp.tid()
-    e = v // sensors
+    e = v // places.hidden.shape[0]
     lossy = int(0)
     for b in range(places.group.shape[0]):
-        o = b * clusters
+        o = b * cut.clusters
         leader = int(b)
         tie = places.tie[e, b]
         neutral = places.neutral[e, b]
@@ -256,7 +242,7 @@ def connect(places: Places, sensors: int, clusters: int, cut: WarpCut):
             ground = float(0.0)
             for c in range(places.group.shape[0]):
                 if places.group[c] == places.group[b] and places.choice[e, c] >= 0:
-                    if cut.node[c * clusters, v] >= 0:
+                    if cut.node[c * cut.clusters, v] >= 0:
                         leader = wp.min(leader, c)
                         others = wp.where(c == b, others, 1)
                     if places.neutral[e, c] == 0:  # those out of sight count too
@@ -308,22 +294,36 @@ def _lift(p: wp.vec3, gap: float, green: Response):
     return q
 
 
-@wp.func
-def placed(shapes: Shapes, green: Response, at: wp.transform, scale: float, k: int):
-    """A cluster of a shape in the sensor frame, and where it stands to design and walls."""
-    out = Leaf()
+@wp.kernel
+def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
+    """Place all leaves in the sensor frame, and find where they stand to design and walls."""
+    i, v = wp.tid()
+    n = cut.number.shape[0]
+    e = v // places.hidden.shape[0]
+    b = i // cut.clusters
+    k = int(-1)
+    if i < n:
+        k = cut.node[i, v]
+    else:
+        b = (i - n) // (2 * cut.clusters)
+        whole = cut.node[(i - n) // 2, v]
+        if whole >= 0:
+            k = shapes.kids[whole, (i - n) % 2]
+            if k >= 0:
+                k += shapes.first[places.choice[e, b]]
+        cut.node[i, v] = k
+    if k < 0:
+        return
+    scale = places.scale[e, b]
     size = scale * shapes.extent[k]
-    out.u0 = wp.transform_point(at, scale * shapes.points[k, 0])
-    out.u1 = wp.transform_point(at, scale * shapes.points[k, 1])
-    out.u2 = wp.transform_point(at, scale * shapes.points[k, 2])
-    out.u3 = wp.transform_point(at, scale * shapes.points[k, 3])
-    c = 0.5 * (out.u0 + out.u3)
+    points = four()
+    for q in range(4):
+        points[q] = wp.transform_point(cut.pose[b, v], scale * shapes.points[k, q])
+    cut.unlifted[i, v] = points
+    c = 0.5 * (points[0] + points[3])
     off = wp.length(_off(c, green.room0, green.room1))
+    lifted = int(0)
     deep = float(0.0)
-    out.p0 = out.u0
-    out.p1 = out.u1
-    out.p2 = out.u2
-    out.p3 = out.u3
     if green.cover < 1.0:
         depth = wp.min(1.0, green.box1[2] - c[2])
         for d in range(2):
@@ -331,49 +331,22 @@ def placed(shapes: Shapes, green: Response, at: wp.transform, scale: float, k: i
             depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
         deep = depth - _DEEP
         gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
-        out.p0 = _lift(out.u0, gap, green)
-        out.p1 = _lift(out.u1, gap, green)
-        out.p2 = _lift(out.u2, gap, green)
-        out.p3 = _lift(out.u3, gap, green)
-        way = wp.max(wp.length(out.p0 - out.u0), wp.length(out.p1 - out.u1))
-        way = wp.max(way, wp.max(wp.length(out.p2 - out.u2), wp.length(out.p3 - out.u3)))
-        out.lifted = wp.where(way > _LIFTED, 1, 0)
-    out.beyond = smooth(wp.max(off, deep) / _SHORE)
-    out.extent = size
-    out.soft = scale * shapes.soft[k]
-    away = wp.length(_off(0.5 * (out.p0 + out.p3), green.box0, green.box1))
-    out.near = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
-    return out
+        for q in range(4):
+            before = points[q]
+            points[q] = _lift(before, gap, green)
+            if wp.length(points[q] - before) > _LIFTED:
+                lifted = 1
+    cut.points[i, v] = points
+    cut.lifted[i, v] = lifted
+    cut.extent[i, v] = size
+    cut.soft[i, v] = scale * shapes.soft[k]
+    cut.beyond[i, v] = smooth(wp.max(off, deep) / _SHORE)
+    away = wp.length(_off(0.5 * (points[0] + points[3]), green.box0, green.box1))
+    cut.near[i, v] = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
 
 
 @wp.kernel
-def place(
-    shapes: Shapes, places: Places, green: Response, sensors: int, clusters: int, cut: WarpCut
-):
-    """Place all clusters in the sensor frame."""
-    i, v = wp.tid()
-    k = cut.node[i, v]
-    if k < 0:
-        return
-    b = i // clusters
-    leaf = placed(shapes, green, cut.pose[b, v], places.scale[v // sensors, b], k)
-    cut.points[i, 0, v] = leaf.p0
-    cut.points[i, 1, v] = leaf.p1
-    cut.points[i, 2, v] = leaf.p2
-    cut.points[i, 3, v] = leaf.p3
-    cut.unlifted[i, 0, v] = leaf.u0
-    cut.unlifted[i, 1, v] = leaf.u1
-    cut.unlifted[i, 2, v] = leaf.u2
-    cut.unlifted[i, 3, v] = leaf.u3
-    cut.lifted[i, v] = leaf.lifted
-    cut.extent[i, v] = leaf.extent
-    cut.soft[i, v] = leaf.soft
-    cut.beyond[i, v] = leaf.beyond
-    cut.near[i, v] = leaf.near
-
-
-@wp.kernel
-def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: WarpCut):
+def weigh(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
     """How many columns a view needs, and how its functions share charge among their parts.
 
     Fewer columns do where no cluster is near the design. Where clusters are out of reach, functions
@@ -382,13 +355,13 @@ def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: W
     they stand for the same charges. With losses they stay as they are.
     """
     v = wp.tid()
-    passes = green.far_table.shape[1]
+    passes = green.passes
     walled = int(0)
-    for i in range(cut.node.shape[0]):
+    for i in range(cut.number.shape[0]):
         k = cut.node[i, v]
         if k >= 0:
             if cut.near[i, v] > 0.0:
-                passes = green.near_table.shape[1]
+                passes = green.table.shape[1]
             x = cut.beyond[i, v]
             cut.out[i, v] = x
             walled = wp.where(x > 0.0 and cut.lossy[v] == 0, 1, walled)
@@ -397,9 +370,9 @@ def weigh(shapes: Shapes, places: Places, green: Response, clusters: int, cut: W
     cut.width[v] = _WIDTH * passes
     cut.walled[v] = walled
     for b in range(places.group.shape[0]):
-        o = b * clusters
-        for step in range(clusters - 1):
-            j = o + clusters - 1 - step
+        o = b * cut.clusters
+        for step in range(cut.clusters - 1):
+            j = o + cut.clusters - 1 - step
             if cut.number[j, v] >= 0:
                 i = o + cut.split[j, v]
                 cut.mix[j, v] = cut.part[j, v]

@@ -1,4 +1,6 @@
-"""The step of many environments as Warp kernels: the solution, and what electrodes see of it.
+"""The step of many environments as Warp kernels: the matrix, its solution, what electrodes see.
+
+The twin of these kernels is :mod:`capsense.surface.solve_kernels` with the same cut.
 
 What has losses is complex: a factor has its real part in the lower half of ``matrix`` and its
 imaginary part in the upper one, but for the diagonal's, which is in ``loss``. Functions that are
@@ -9,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.fleet.warp_cut import WarpCut
+from capsense.fleet.warp_cut import Places, Shapes, WarpCut
 from capsense.surface.solve_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -17,6 +19,128 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 _GAIN = wp.constant(GAIN)
 _DROPPED = wp.constant(1e-5)
 """Functions whose pivot is so small against their own energy are left out."""
+
+
+@wp.kernel
+def to_functions(cut: WarpCut, limited: int, values: wp.array3d(dtype=wp.float32)):
+    """Integrate what clusters have in the first index with the charge functions, in place.
+
+    ``limited`` says that the second index is of columns, of which a view has its width.
+    """
+    c, v = wp.tid()
+    if limited != 0 and c >= cut.width[v]:
+        return
+    for b in range(cut.leader.shape[0]):
+        o = b * cut.clusters
+        for k in range(cut.clusters - 1):
+            j = cut.clusters - 1 - k
+            if cut.number[o + j, v] >= 0:
+                i = o + cut.split[o + j, v]
+                x = values[i, c, v]
+                y = values[o + j, c, v]
+                p = cut.mix[o + j, v]
+                values[i, c, v] = p * x + (1.0 - p) * y
+                values[o + j, c, v] = x - y
+        leader = cut.leader[b, v]
+        if leader != b:
+            values[o, c, v] -= values[leader * cut.clusters, c, v]
+
+
+@wp.func
+def own(shapes: Shapes, places: Places, e: int, b: int, x: int, y: int):
+    """Energy of two functions of a body, complex."""
+    u = places.choice[e, b]
+    place = shapes.block[u] + wp.int64(x * shapes.functions[u] + y)
+    out = wp.vec2(shapes.energy[place], 0.0)
+    inside = places.softness[e, b]
+    if inside[0] != 0.0 or inside[1] != 0.0:
+        out += inside * shapes.impedance[place]
+    return out / places.scale[e, b]
+
+
+@wp.kernel
+def energies(shapes: Shapes, places: Places, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
+    """Energies of the shapes' functions, (n, n, v), where views have others, see ``weigh``."""
+    i, j, v = wp.tid()
+    if cut.walled[v] == 0:
+        return
+    b = i // cut.clusters
+    value = float(0.0)
+    if b == j // cut.clusters and cut.node[b * cut.clusters, v] >= 0:
+        x = wp.where(i % cut.clusters == 0, 0, cut.number[i, v])
+        y = wp.where(j % cut.clusters == 0, 0, cut.number[j, v])
+        if x >= 0 and y >= 0:
+            value = own(shapes, places, v // places.hidden.shape[0], b, x, y)[0]
+    out[i, j, v] = value
+
+
+@wp.kernel
+def from_functions(
+    cut: WarpCut, walled: int, values: wp.array3d(dtype=wp.float32)
+):  # fmt: skip
+    """What clusters have of what the shapes' functions have in the first index, in place.
+
+    ``walled`` asks for it only in views whose functions are others, see ``weigh``.
+    """
+    c, v = wp.tid()
+    if cut.walled[v] < walled:
+        return
+    for b in range(cut.leader.shape[0]):
+        o = b * cut.clusters
+        for k in range(1, cut.clusters):
+            if cut.number[o + k, v] >= 0:
+                i = o + cut.split[o + k, v]
+                whole = values[i, c, v]
+                apart = values[o + k, c, v]
+                p = cut.part[o + k, v]
+                values[i, c, v] = whole + (1.0 - p) * apart
+                values[o + k, c, v] = whole - p * apart
+
+
+@wp.kernel
+def assemble(
+    shapes: Shapes, places: Places, cut: WarpCut, lead: int,
+    potentials: wp.array3d(dtype=wp.float32), matrix: wp.array3d(dtype=wp.float32),
+    loss: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
+    """The matrix of all functions from their pairs, in place: its real part in the lower half.
+
+    The imaginary part is in the upper half, and that of the diagonal in ``loss``.
+    """
+    f, g, v = wp.tid()
+    if g > f:
+        return
+    e = v // places.hidden.shape[0]
+    x = cut.number[f, v]
+    y = cut.number[g, v]
+    value = wp.vec2(wp.where(f == g, 1.0, 0.0), 0.0)
+    if x >= 0 and y >= 0:
+        value = wp.vec2(matrix[f, g, v], 0.0)
+        for k in range(lead, cut.width[v]):
+            value[0] -= potentials[f, k, v] * potentials[g, k, v]
+        b = f // cut.clusters
+        c = g // cut.clusters
+        apart = cut.walled[v] == 0  # else the pairs have the shapes' energies
+        first = cut.leader[b, v]
+        other = cut.leader[c, v]
+        joined = f == b * cut.clusters and first != b
+        another = g == c * cut.clusters and other != c
+        if b == c:
+            if apart:
+                value += own(shapes, places, e, b, x, y)
+            if x == 0 and y == 0 and not joined:
+                value += cut.tie[b, v]
+        if apart and joined and first == c:
+            value -= own(shapes, places, e, c, 0, y)
+        if apart and another and other == b:
+            value -= own(shapes, places, e, b, x, 0)
+        if apart and joined and another and first == other:
+            value += own(shapes, places, e, first, 0, 0)
+    matrix[f, g, v] = value[0]
+    if f == g:
+        loss[f, v] = value[1]
+    else:
+        matrix[g, f, v] = value[1]
 
 
 @wp.struct
@@ -149,6 +273,36 @@ def forward(
         quadrature[i, t, v] = right[1]
 
 
+@wp.kernel
+def charges(
+    cut: WarpCut, lead: int, matrix: wp.array3d(dtype=wp.float32),
+    loss: wp.array2d(dtype=wp.float32), potentials: wp.array3d(dtype=wp.float32),
+    quadrature: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Charges L⁻ᵀ L⁻¹ φ⁰ of the functions from L⁻¹ φ⁰, (n, 2 lead, v)."""
+    t, v = wp.tid()
+    n = matrix.shape[0]
+    lossy = cut.lossy[v] != 0
+    for step in range(n):
+        i = n - 1 - step
+        total = wp.vec2(potentials[i, t, v], quadrature[i, t, v])
+        pivot = wp.vec2(matrix[i, i, v], 0.0)
+        if pivot[0] <= 0.0 or cut.number[i, v] < 0:
+            total = wp.vec2()
+        elif lossy:
+            for k in range(i + 1, n):
+                below = wp.vec2(matrix[k, i, v], matrix[i, k, v])
+                total -= times(below, wp.vec2(out[k, t, v], out[k, lead + t, v]))
+            pivot[1] = loss[i, v]
+            total = over(total, pivot)
+        else:
+            for k in range(i + 1, n):
+                total[0] -= matrix[k, i, v] * out[k, t, v]
+            total[0] = total[0] / pivot[0]
+        out[i, t, v] = total[0]
+        out[i, lead + t, v] = total[1]
+
+
 @wp.struct
 class Left:
     """Charges, and what functions that are not solved for leave; see :mod:`warp_left`."""
@@ -156,8 +310,7 @@ class Left:
     charge: wp.array3d(dtype=wp.float32)  # of functions, (n, 2 lead, v)
     on: wp.array3d(dtype=wp.float32)  # on clusters, (n, 2 lead, v)
     sums: wp.array3d(dtype=wp.float32)  # of ψ over all charges, (modes, 2 lead, v)
-    near: wp.array3d(dtype=wp.float32)  # strengths of near sources, (s, 2 lead, v)
-    far: wp.array3d(dtype=wp.float32)
+    strength: wp.array3d(dtype=wp.float32)  # of the design's sources, (s, 2 lead, v)
     residual: wp.array3d(dtype=wp.float32)  # potential in the function below a cluster, as charge
     energy: wp.array2d(dtype=wp.vec2)  # of that function, (n, v)
     dropped: wp.array(dtype=wp.int32)  # functions solved for that were left out, (v,)

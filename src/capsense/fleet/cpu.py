@@ -1,4 +1,7 @@
-"""The step of many environments, compiled: each solved as :mod:`capsense.surface.step` does it."""
+"""A fleet's step on the CPU: environments on all processors, those with losses one by one.
+
+What is compiled solves each as :mod:`capsense.surface.step` does it.
+"""
 
 from __future__ import annotations
 
@@ -7,37 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
-from capsense.elements.matter import SHUT
+from capsense._jit import compiled, first_use
+from capsense._thread_pool import in_parts
+from capsense.elements.matter import SHUT, UNIT
+from capsense.elements.rigid import BODY
+from capsense.errors import SolveError
+from capsense.field.background import Terminals
 from capsense.field.green_kernels import Green
+from capsense.fleet.bodies import Bodies, BodyTable, FleetReading
 from capsense.surface.gradient_kernels import jacobian
-from capsense.surface.step import estimate, solve
+from capsense.surface.solver import SurfaceSolver
+from capsense.surface.step import estimate, solve, solve_lossy
 
-
-class Bodies(NamedTuple):
-    """What stands in every environment; e environments, b places for bodies."""
-
-    shapes: NDArray[Any]
-    """Shapes, of size 1, as records of ``elements.rigid.BODY``, shape (u,)."""
-    radius: NDArray[Any]
-    """Radius of a ball about each shape's origin that holds it [m], shape (u,)."""
-    choice: NDArray[Any]
-    """Shape in each place, -1 where nothing is, shape (e, b)."""
-    scale: NDArray[Any]
-    """How many times as large it is, shape (e, b)."""
-    softness: NDArray[Any]
-    """1 / (eps - 1), complex, 0 for conductors, shape (e, b)."""
-    tie: NDArray[Any]
-    """Energy that ties it to ground [1/m], complex, shape (e, b)."""
-    neutral: NDArray[Any]
-    """Whether it has no net charge, shape (e, b)."""
-    slack: NDArray[Any]
-    """Half of what is cut off of a long body along each axis [m], shape (e, b, 3); what is left is
-    nearest to the middle of the domain, see ``elements.pieces.windowed``."""
-    hidden: NDArray[Any]
-    """Whether a sensor does not see a place, shape (s, b)."""
-    group: NDArray[Any]
-    """Places that are joined to one conductor have the same number, shape (b,)."""
+Array = NDArray[np.float64]
 
 
 class Sensor(NamedTuple):
@@ -77,7 +62,9 @@ class Found(NamedTuple):
 
 
 @compiled
-def step_rows(start, stop, bodies, poses, sensor, found):
+def _step_rows(
+    start: int, stop: int, bodies: Bodies, poses: Poses, sensor: Sensor, found: Found
+) -> None:
     """Solve environments ``start`` to ``stop``, but for those with losses."""
     sensors, places = poses.sensors.shape[1], bodies.choice.shape[1]
     green, slopes = sensor.green, found.slope.shape[0] > 0
@@ -86,7 +73,7 @@ def step_rows(start, stop, bodies, poses, sensor, found):
     turn = np.empty((3, 3))
     for e in range(start, stop):
         for s in range(sensors):
-            count = seen(bodies, poses, e, s, green.room, room, place)
+            count = _seen(bodies, poses, e, s, green.room, room, place)
             for c in range(count):
                 b = place[c]
                 if bodies.softness[e, b].imag != 0.0 or bodies.tie[e, b].imag != 0.0:
@@ -108,7 +95,9 @@ def step_rows(start, stop, bodies, poses, sensor, found):
 
 
 @compiled
-def seen(bodies, poses, e, s, room, records, place):
+def _seen(
+    bodies: Bodies, poses: Poses, e: int, s: int, room: Array, records: Any, place: Any
+) -> int:
     """Fill the records and places of what a sensor sees, (b,) each.
 
     Returns:
@@ -129,7 +118,7 @@ def seen(bodies, poses, e, s, room, records, place):
 
 
 @compiled
-def _connect(bodies, e, records, place, c):
+def _connect(bodies: Bodies, e: int, records: Any, place: Any, c: int) -> None:
     """Make a body one conductor with those that it is joined with, as ``Matter.write`` does.
 
     Those that are out of sight count for what ties it to ground.
@@ -156,7 +145,7 @@ def _connect(bodies, e, records, place, c):
 
 
 @compiled
-def _matrix(pose, out):
+def _matrix(pose: Array, out: Array) -> None:
     """Rotation matrix of a pose."""
     x, y, z, w = pose[3], pose[4], pose[5], pose[6]
     out[0, 0], out[1, 1] = 1.0 - 2.0 * (y * y + z * z), 1.0 - 2.0 * (x * x + z * z)
@@ -167,7 +156,7 @@ def _matrix(pose, out):
 
 
 @compiled
-def _position(poses, e, b, s, turn, body):
+def _position(poses: Poses, e: int, b: int, s: int, turn: Array, body: Any) -> None:
     """Set the position of a record to that of a body in a sensor's frame."""
     for i in range(3):
         at = 0.0
@@ -177,7 +166,10 @@ def _position(poses, e, b, s, turn, body):
 
 
 @compiled
-def _placed(bodies, e, b, poses, s, turns, room, record):
+def _placed(
+    bodies: Bodies, e: int, b: int, poses: Poses, s: int, turns: tuple[Array, Array], room: Array,
+    record: Any,
+) -> bool:  # fmt: skip
     """Fill the record of a body in a sensor's frame; False where it is out of its sight.
 
     ``turns`` are the sensor's rotation matrix, and room for that of the body.
@@ -209,3 +201,77 @@ def _placed(bodies, e, b, poses, s, turns, room, record):
     if bodies.softness[e, b] == 0.0:
         body.impedance = 0
     return True
+
+
+class CpuCore:
+    """Solves all sensors of all environments.
+
+    Args:
+        solver: Knows the design and how finely scenes are resolved.
+        terminals: Of the design.
+        table: What stands where.
+    """
+
+    def __init__(self, solver: SurfaceSolver, terminals: Terminals, table: BodyTable) -> None:
+        self._solver, self._terminals, self._table = solver, terminals, table
+
+    def step(self, bodies: Array, sensors: Array, jacobian: bool) -> FleetReading:
+        """The reading of poses, shapes (e, b, 7) and (e, s, 7).
+
+        Raises:
+            SolveError: Some environments have no solution.
+        """
+        (e, b, _), s = bodies.shape, sensors.shape[1]
+        solver, terminals = self._solver, self._terminals
+        where = Poses(bodies, sensors, solver.middle)
+        green = solver.green
+        m = green.terminals
+        slope = np.zeros((e if jacobian else 0, s, b, m, m, 6))
+        found = Found(
+            np.zeros((e, s, m, m)), np.zeros((e, s)), slope, np.zeros((e, s), np.bool_)
+        )  # fmt: skip
+        sensor = Sensor(green, solver.preset.threshold, solver.preset.width)
+        with first_use():
+            in_parts(_step_rows, e, self._table.bodies, where, sensor, found)
+            loss = self._lossy(where, found)
+        failed = np.flatnonzero(~np.isfinite(found.delta).all(axis=(1, 2, 3)))
+        if len(failed):
+            raise SolveError(
+                f"{len(failed)} of {e} environments have no solution, the first is {failed[0]}: "
+                "look for bodies that coincide"
+            )
+        n, change = terminals.electrodes, terminals.screened(UNIT * found.delta)
+        slopes = terminals.slope(change, UNIT * slope) if jacobian else None
+        change = terminals.change(change if loss is None else change - 1j * UNIT * loss)
+        shields = (terminals.empty + change.real)[..., :n, n:].sum(axis=-1)
+        change = change[..., :n, :n]
+        omega = 2 * np.pi * solver.excitation_frequency
+        return FleetReading(
+            terminals.empty[:n, :n] + change.real, change.real, UNIT * found.error, shields,
+            conductance=None if loss is None else -omega * change.imag, jacobian=slopes,
+        )  # fmt: skip
+
+    def _lossy(self, where: Poses, found: Found) -> NDArray[Any] | None:
+        """Solve what has losses; the part in quadrature (e, s, m, m), None where nothing has."""
+        if not found.lossy.any():
+            return None
+        solver, table = self._solver, self._table
+        bodies, preset = table.bodies, solver.preset
+        loss = np.zeros_like(found.delta)
+        records, place = np.empty(table.places, BODY), np.empty(table.places, np.int64)
+        for e, s in np.argwhere(found.lossy).tolist():
+            count = _seen(bodies, where, e, s, solver.green.room, records, place)
+            at = place[:count]
+            soft, lone = bodies.softness[e, at], records["neutral"][:count] != 0
+            ties = np.where(bodies.tie[e, at].imag != 0, bodies.tie[e, at], records["tie"][:count])
+            out = solve_lossy(
+                records[:count], np.where(lone, np.inf, ties), soft,
+                [
+                    table.shapes[u].impedance if x != 0 else None
+                    for u, x in zip(bodies.choice[e, at], soft, strict=True)
+                ],
+                solver.green, preset.threshold, preset.width,
+            )  # fmt: skip
+            found.delta[e, s], loss[e, s] = out.delta.real, -out.delta.imag
+            found.error[e, s] = (np.abs(np.diag(out.left)) + out.coarse).max()
+        return loss
