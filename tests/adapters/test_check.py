@@ -48,6 +48,92 @@ def test_a_wrong_place_is_told(place: Any, message: str, shapes_in: SensorIn) ->
     assert any(fix in found for fix in ("exclude=[", "quaternion (1, 0, 0, 0)", "exclude, groups"))
 
 
+@pytest.mark.parametrize("kind", ["site", "link"])
+def test_a_pose_in_the_wrong_unit_or_frame_is_named_as_that(
+    kind: str, tiny_simulator: cs.Simulator
+) -> None:
+    """60 mm written as 60: not for lack of things to see."""
+    message = r"nothing is in view, .*stands 60 m from the origin of the link .*millimetres × 1e-3"
+    if kind == "site":
+        mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+        text = (
+            '<mujoco><worldbody><body><geom size=".01"/><site name="pad" pos="0 0 60"/></body>'
+            '<body pos="0 0 .1"><geom size=".02"/></body></worldbody></mujoco>'
+        )
+        model = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        with pytest.warns(UserWarning, match=message):
+            sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
+        data.site_xpos[0] = (0.0, 0.0, 0.05)
+        assert not any("60 m" in text for text in sensor.check())
+    else:
+        p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+        client = p.connect(p.DIRECT)
+        ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.02, physicsClientId=client)
+        bodies = [
+            p.createMultiBody(0, ball, basePosition=(x, 0, 0), physicsClientId=client)
+            for x in (0, 0.1)
+        ]
+        with pytest.warns(UserWarning, match=message):
+            cs.pybullet.attach(client, bodies[0], -1, cs.Pose((0, 0, 60)), tiny_simulator)
+        p.disconnect(physicsClientId=client)
+
+
+@pytest.mark.parametrize(
+    ("groups", "place", "finding"),
+    [
+        (
+            [2],
+            "0 0 .09",
+            r"groups=\[2\] leaves out 'person/torso', in the sensor's range.*=\[1, 2\]",
+        ),
+        ([2], "9 0 0", r"groups=\[2\] leaves out 'person/torso', on bodies that move.*=\[1, 2\]"),
+        ([1, 2], "0 0 .09", None),
+        (
+            [3],
+            "0 0 .09",
+            r"groups=\[3\] leaves out 'lamp/bulb', 'person/torso', in .*=\[1, 2, 3\]",
+        ),
+        ([2, 3], "9 0 0", r"groups=\[2, 3\] leaves out 'person/torso', on bodies that move"),
+    ],
+)
+def test_groups_that_leave_a_person_out_are_told(
+    groups: list[int], place: str, finding: str | None, tiny_simulator: cs.Simulator
+) -> None:
+    """Not of what collides where the same is drawn, and not of the robot's own links far off."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
+      <body name="arm"><joint/><geom name="seen" size=".01" pos="0 0 -.05" group="2"/>
+        <geom name="hit" size=".012" pos="0 0 -.05" group="3"/><site name="pad"/>
+        <body name="tip" pos="0 0 -.9"><joint/><geom size=".01" group="5"/></body></body>
+      <body name="cup" pos=".02 0 .04"><freejoint/><geom name="drawn" size=".01" group="2"/>
+        <geom name="hull" size=".012" group="3"/></body>
+      <body name="lamp" pos="0 .02 .05"><geom name="bulb" size=".01" group="2"/></body>
+      <body name="person" pos="{place}" mocap="true">
+        <geom name="torso" size=".02" group="1"/></body>
+      <body name="shed" pos="5 5 5"><geom size=".1" group="1"/></body>
+      </worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator, groups=groups)
+    told = [text for text in sensor.check() if "leaves out" in text]
+    if finding is None:
+        assert told == []
+        return
+    assert len(told) == 1
+    assert re.match(finding, told[0]), told[0]
+    with pytest.warns(UserWarning, match="leaves out"):
+        cs.mujoco.attach(model, data, "pad", tiny_simulator, groups=groups)
+    with pytest.warns(UserWarning, match=r"sensor 'pad': groups="):
+        cs.mujoco.attach_skin(model, data, ["pad"], tiny_simulator, groups=groups)
+    named = "lamp/*" if "lamp" in told[0] else "person/*"
+    quiet = cs.mujoco.attach(
+        model, data, "pad", tiny_simulator, groups=groups, exclude=[named, "person/*"]
+    )
+    assert not any("leaves out" in text for text in quiet.check())
+
+
 @pytest.mark.parametrize(("height", "told"), [(0.05, False), (0.041, False), (0.02, True)])
 def test_electrodes_within_their_own_link(
     height: float, told: bool, tiny_simulator: cs.Simulator
@@ -181,7 +267,7 @@ def test_a_skin_warns_where_all_are_blind(tiny_simulator: cs.Simulator) -> None:
     assert [len(found) for found in skin.check().values()] == [0, 1]
     with pytest.warns(UserWarning, match="^sensor 'near': electrodes 'A', 'B' lie inside"):
         attach(0.0)
-    with pytest.warns(UserWarning, match="sensor 'far': nothing is in view"):
+    with pytest.warns(UserWarning, match="sensor 'near' and 1 more: nothing is in view"):
         attach(5.0)
 
 

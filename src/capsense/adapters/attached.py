@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.placement import (
+    FAR,
     blind,
     buried,
+    far_off,
     nothing_seen,
     placement,
     sees,
@@ -296,7 +299,11 @@ class GeometrySensor(AttachedSensor):
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
         own = self.world.names(self.source.robot(self._carrier))
         others = [str(b.name) for b in behind if b.name not in own]
-        return ([turned_round(others)] if others else found) + hidden
+        if others:
+            return [turned_round(others), *hidden]
+        own = self._own_frame()
+        away = 0.0 if own is None else math.dist(frames.position[own], frames.sensor_position)
+        return ([far_off(away)] if away > FAR else found) + hidden
 
     def _link(self, frames: Frames) -> Scene:
         """The bodies of the link that carries the sensor, where these are not seen."""

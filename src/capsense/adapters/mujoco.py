@@ -200,6 +200,11 @@ class MujocoSensor(GeometrySensor):
     def _time(self) -> float:
         return float(self.data.time)
 
+    def check(self) -> list[str]:
+        domain = self._design.domain
+        walls = np.array([domain.lower, domain.upper])
+        return super().check() + self.source.left_out(self._carrier, self.pose, walls)
+
     def _own_frame(self) -> int | None:
         return self._carrier if self.source.rules.exclude_own and self._carrier else None
 
@@ -257,8 +262,8 @@ def add_sensor(
     away = math.hypot(*pose.position)
     if away > _AWAY and body != "world":
         raise SceneError(
-            f"pose places the sensor {away:g} m from body {body!r}; lengths are metres, so "
-            "multiply millimetres by 1e-3"
+            f"pose places the sensor {away:g} m from body {body!r}; give it in metres "
+            "(millimetres × 1e-3) and in the frame of the body, not in that of the world"
         )
     taken = {"site": spec.sites, "camera": spec.cameras if camera is not None else []}
     for kind, things in taken.items():

@@ -16,6 +16,7 @@ from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, 
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
 from capsense.scene import Material, Pose, Shape, TriMesh
+from capsense.scene.contact import listed
 
 if TYPE_CHECKING:
     import mujoco
@@ -28,6 +29,8 @@ GROUNDING_KEY = "capsense.grounding:"
 
 _WIDE = 0.4
 """Terrains of larger half extents [m] are given out in tiles."""
+_PLANE = 0
+"""Type of planes, mjGEOM_PLANE."""
 _HEIGHT_FIELD = 1
 """Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
@@ -67,6 +70,14 @@ class ModelReader:
         self._meshes: dict[tuple[int, bool], TriMesh] = {}
         self._read_texts()
         rules.check([*self._names, *self._flex_names])
+
+    def excludes(self, geom: int) -> bool:
+        """Whether the rules leave a geom out."""
+        return self.rules.excludes(self._names[geom])
+
+    def name(self, geom: int) -> str:
+        """What a geom is called in scenes and messages."""
+        return self._names[geom][-1]
 
     def solid(self, geom: int) -> Solid | None:
         """A geom as a solid, or None where the rules leave it out.
@@ -297,6 +308,65 @@ class ModelSource(WorldSource):
                 stacklevel=2,
             )
         self._chosen = True
+
+    def left_out(self, own: int, sensor: Pose, walls: Array) -> list[str]:
+        """The finding for geoms that ``groups`` leaves out, though they matter.
+
+        These are in range, or on bodies that move, that are not seen otherwise and not of the
+        sensor's robot. A geom in the place of another one of the same body is not missed: robots
+        have geoms that collide and geoms that are drawn.
+
+        Args:
+            own: The body that carries the sensor.
+            sensor: Its frame in the world.
+            walls: Lower and upper corner of its domain [m], shape (2, 3).
+        """
+        m = self.model
+        taken = np.zeros(m.ngeom, dtype=bool)
+        taken[self._geoms] = True
+        missed = [
+            g
+            for g in np.flatnonzero(~taken & (m.geom_bodyid != own)).tolist()
+            if not self._reader.excludes(g) and not self._has_twin(g, taken)
+        ]
+        seen = set(m.geom_bodyid[taken].tolist())
+        root, free = m.body_rootid, (m.body_weldid > 0) | (m.body_mocapid[m.body_rootid] >= 0)
+        near = [g for g in missed if self._reaches(g, sensor, walls)]
+        moving = [
+            g
+            for g in missed
+            if free[b := int(m.geom_bodyid[g])] and b not in seen and root[b] != root[own]
+        ]
+        found = list(dict.fromkeys(near + moving))
+        if not found:
+            return []
+        groups = sorted(set(m.geom_group[self._geoms].tolist()))
+        more = sorted({*groups, *m.geom_group[found].tolist()})
+        names = listed([self._reader.name(g) for g in found], 4)
+        what = "in the sensor's range" if near else "on bodies that move"
+        return [
+            f"groups={groups} leaves out {names}, {what}, so that readings do not tell of "
+            f"{'it' if len(found) == 1 else 'them'}; give groups={more}, or exclude them by name"
+        ]
+
+    def _has_twin(self, geom: int, taken: NDArray[np.bool_]) -> bool:
+        """Whether a geom that is seen stands in the same place, on the same body."""
+        m, plane = self.model, self.model.geom_type == _PLANE
+        weld = m.body_weldid[m.geom_bodyid]
+        others = taken & (weld == weld[geom]) & (plane == plane[geom])
+        away = np.linalg.norm(self.data.geom_xpos[others] - self.data.geom_xpos[geom], axis=1)
+        return bool((away <= np.maximum(m.geom_rbound[others], m.geom_rbound[geom])).any())
+
+    def _reaches(self, geom: int, sensor: Pose, walls: Array) -> bool:
+        """Whether the box around a geom reaches into a sensor's domain."""
+        turn = sensor.rotation.T @ self.data.geom_xmat[geom].reshape(3, 3)
+        at = sensor.inverse().apply(self.data.geom_xpos[geom])
+        if self.model.geom_type[geom] == _PLANE:
+            lowest = np.where(turn[:, 2] > 0, walls[0], walls[1])
+            return bool(turn[:, 2] @ (lowest - at) < 0)
+        box = self.model.geom_aabb[geom]
+        middle, half = at + turn @ box[:3], np.abs(turn) @ box[3:]
+        return bool((middle - half < walls[1]).all() and (middle + half > walls[0]).all())
 
     def robot(self, frame: int) -> set[int]:
         root = self.model.body_rootid

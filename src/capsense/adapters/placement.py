@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
 from capsense.errors import CapSenseError
-from capsense.scene import Body, Layers, Scene, TriMesh
-from capsense.scene.contact import TOUCH, distances, points_on
+from capsense.scene import Body, Scene, TriMesh
+from capsense.scene.contact import Contacts, distances, find_contacts, listed, points_on
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS
 
@@ -21,6 +22,8 @@ _COARSE = 0.05
 _DEEP = 5e-3
 """Deeper than this [m] in the link that carries it, an electrode is not on the link's surface; a
 cover, or a collision shape that is rounder than the real link, is thinner."""
+FAR = 1.0
+"""Few sensors are farther [m] from the origin of the link that carries them."""
 _NOTHING = "nothing is in view, so that every change is exactly 0"
 
 
@@ -38,21 +41,21 @@ def buried(link: Scene, design: Design) -> list[str]:
         link: The bodies of that link, in the sensor frame.
         design: The sensor.
     """
-    found: dict[str, list[str]] = {}
-    depth = 0.0
+    found = Contacts()
     for name, points in _points(design).items():
         for body in link:
             least = -float(distances(body, points).max())
             if least > _DEEP and body.material.is_conductor():
-                found.setdefault(name, []).append(str(body.name))
-                depth = max(depth, least)
-    if not found:
+                found.met.setdefault(name, []).append(str(body.name))
+                found.depth = max(found.depth, least)
+    if not found.met:
         return []
     return [
-        f"{_electrodes(found, 'lies', 'lie')} up to {1e3 * depth:.0f} mm deep inside "
-        f"{_bodies(found)}, on the link that carries the sensor. That link is not seen, so "
-        "readings are as if it did not cover them; a real one would screen them. Move the sensor's "
-        f"frame out to the link's surface, or, if the link is hollow there, {_leave_out(found)}"
+        f"{found.electrodes} {found.verb('lies', 'lie')} up to {1e3 * found.depth:.0f} mm deep "
+        f"inside {listed(found.bodies, 4)}, on the link that carries the sensor. That link is not "
+        "seen, so readings are as if it did not cover them; a real one would screen them. Move the "
+        "sensor's frame out to the link's surface, or, if the link is hollow there, "
+        f"{_leave_out(found)}"
     ]
 
 
@@ -64,7 +67,9 @@ def _points(design: Design) -> dict[str, Array]:
 def sees(simulator: Simulator, scene: Scene) -> bool:
     """Whether a scene changes any reading: a box around a body may be in view, and itself not."""
     try:
-        return bool(len(scene) and simulator.step_batch([scene], threads=1)[0].delta.any())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # findings tell of contacts
+            return bool(len(scene) and simulator.step_batch([scene], threads=1)[0].delta.any())
     except CapSenseError:  # which a reading will raise, too
         return True
 
@@ -83,6 +88,19 @@ def nothing_seen(design: Design) -> str:
     )
 
 
+def far_off(away: float) -> str:
+    """The finding for a sensor that sees nothing and stands far from what carries it.
+
+    Args:
+        away: Its distance from the origin of the link [m].
+    """
+    return (
+        f"{_NOTHING}, and the sensor stands {away:.3g} m from the origin of the link that carries "
+        "it: give its pose in metres (millimetres × 1e-3) and in the frame of that link, not in "
+        "that of the world"
+    )
+
+
 def turned_round(names: list[str]) -> str:
     """The finding for a sensor that has everything at its back."""
     listed = ", ".join(map(repr, names[:4])) + (", …" if len(names) > 4 else "")
@@ -95,48 +113,28 @@ def turned_round(names: list[str]) -> str:
 
 def _contacts(scene: Scene, electrodes: dict[str, Array]) -> list[str]:
     """Electrodes within bodies, and electrodes that touch some: a finding for each of the two."""
-    inside: dict[str, list[str]] = {}
-    touching: dict[str, list[str]] = {}
-    depth = 0.0
-    bodies = [body for body in scene if not isinstance(body.shape, Layers)]
-    for name, points in electrodes.items():
-        for body in bodies:
-            nearest = float(distances(body, points).min())
-            if nearest < TOUCH:
-                found = inside if nearest < -TOUCH else touching
-                found.setdefault(name, []).append(str(body.name))
-                depth = max(depth, -nearest)
+    inside, touching = find_contacts(scene, electrodes)
     out = []
-    if inside:
+    if inside.met:
         out.append(
-            f"{_electrodes(inside, 'lies', 'lie')} inside {_bodies(inside)}, up to "
-            f"{1e3 * depth:.2g} mm deep, and readings mean nothing; {_fix(inside, depth)}"
+            f"{inside.electrodes} {inside.verb('lies', 'lie')} inside {listed(inside.bodies, 4)}, "
+            f"up to {1e3 * inside.depth:.2g} mm deep, and readings mean nothing; {_fix(inside)}"
         )
-    if touching:
+    if touching.met:
         out.append(
-            f"{_electrodes(touching, 'touches', 'touch')} {_bodies(touching)}, as a short circuit "
-            f"would; {_fix(touching, 1e-3)}"
+            f"{touching.electrodes} {touching.verb('touches', 'touch')} "
+            f"{listed(touching.bodies, 4)}, as a short circuit would; {_fix(touching)}"
         )
     return out
 
 
-def _met(found: dict[str, list[str]]) -> list[str]:
-    """The bodies that electrodes meet, each once."""
-    return list(dict.fromkeys(body for bodies in found.values() for body in bodies))
-
-
-def _bodies(found: dict[str, list[str]]) -> str:
-    met = _met(found)
-    return ", ".join(map(repr, met[:4])) + f" and {len(met) - 4} more" * (len(met) > 4)
-
-
-def _fix(found: dict[str, list[str]], depth: float) -> str:
-    move = f"move the sensor's frame at least {1e3 * max(depth, 1e-3):.2g} mm out of it"
+def _fix(found: Contacts) -> str:
+    move = f"move the sensor's frame at least {1e3 * max(found.depth, 1e-3):.2g} mm out of it"
     return f"{move}, or {_leave_out(found)}"
 
 
-def _leave_out(found: dict[str, list[str]]) -> str:
-    met = _met(found)
+def _leave_out(found: Contacts) -> str:
+    met = found.bodies
     more = ", …" * (len(met) > 4)
     return f"leave it out with exclude=[{', '.join(map(repr, met[:4]))}{more}]"
 
@@ -155,11 +153,3 @@ def _coarse(body: Body, panels: int) -> list[str]:
         f"{body.name!r} is a mesh of {area:.2g} m², solved with panels of some {1e3 * width:.0f} "
         "mm; cut it into meshes of 0.4 m or less, or keep only what comes near the sensor"
     ]
-
-
-def _electrodes(found: dict[str, list[str]], one: str, many: str) -> str:
-    names = list(found)
-    if len(names) == 1:
-        return f"electrode {names[0]!r} {one}"
-    listed = ", ".join(map(repr, names[:6])) + (f" and {len(names) - 6} more" * (len(names) > 6))
-    return f"electrodes {listed} {many}"

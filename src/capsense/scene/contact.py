@@ -1,15 +1,17 @@
-"""Whether sheets of a sensor lie inside a body, or touch one."""
+"""Whether electrodes lie inside a body, or touch one, and which."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.scene.mesh_shape import TriangleShape
-from capsense.scene.scene import Body
+from capsense.scene.scene import Body, Scene
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
@@ -109,6 +111,79 @@ def _wound(shape: TriangleShape, points: Array, off: Array) -> NDArray[np.bool_]
         out[alike & left] = abs(angle.sum()) > 2 * math.pi
         left[alike] = False
     return out
+
+
+@dataclass
+class Contacts:
+    """Which electrodes meet which bodies."""
+
+    met: dict[str, list[str]] = field(default_factory=dict)
+    """Electrode → names of bodies."""
+    depth: float = 0.0
+    """How far electrodes lie inside them, at most [m]."""
+
+    @property
+    def electrodes(self) -> str:
+        """The electrodes, as a sentence begins with them."""
+        some = "electrode" if len(self.met) == 1 else "electrodes"
+        return f"{some} {listed(list(self.met), 6)}"
+
+    @property
+    def bodies(self) -> list[str]:
+        """Names of the bodies, each once."""
+        return list(dict.fromkeys(body for bodies in self.met.values() for body in bodies))
+
+    def verb(self, one: str, many: str) -> str:
+        """The form of a verb that goes with the electrodes."""
+        return one if len(self.met) == 1 else many
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """The first names in quotes, and how many more there are."""
+    return ", ".join(map(repr, names[:most])) + f" and {len(names) - most} more" * (
+        len(names) > most
+    )
+
+
+def find_contacts(scene: Scene, electrodes: Mapping[str, Array]) -> tuple[Contacts, Contacts]:
+    """The electrodes that lie inside bodies, and those that touch some; not in depth images.
+
+    Args:
+        scene: The bodies.
+        electrodes: Name → points on it [m], shape (n, 3).
+    """
+    inside, touching = Contacts(), Contacts()
+    bodies = [body for body in scene if body.shape.kind != ShapeKind.LAYERS]
+    for name, points in electrodes.items():
+        for body in bodies:
+            nearest = float(distances(body, points).min())
+            if nearest < TOUCH:
+                found = inside if nearest < -TOUCH else touching
+                found.met.setdefault(name, []).append(str(body.name))
+                found.depth = max(found.depth, -nearest)
+    return inside, touching
+
+
+def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array]) -> None:
+    """Warn that a reading means nothing since bodies go through electrodes or touch them.
+
+    Args:
+        scene: The bodies.
+        electrodes: Name → its triangles [m], shape (t, 3, 3).
+    """
+    inside, touching = find_contacts(scene, {k: points_on(t) for k, t in electrodes.items()})
+    found, how = inside, inside.verb("lies inside", "lie inside")
+    if not inside.met:
+        found, how = touching, touching.verb("touches", "touch")
+    if found.met:
+        deep = f", up to {1e3 * found.depth:.2g} mm deep," if inside.met else ""
+        warnings.warn(
+            f"{found.electrodes} {how} {listed(found.bodies, 4)}{deep} and readings mean nothing "
+            f"until this ends; keep bodies at least {1e3 * TOUCH:g} mm in front of the electrodes. "
+            "This is said once; reading.stats.solver_error then is as large as the largest "
+            "capacitance",
+            stacklevel=4,
+        )
 
 
 def points_on(corners: Array, count: int = 100) -> Array:
