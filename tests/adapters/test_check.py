@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -209,6 +210,38 @@ def test_an_open_mesh_is_entered_as_a_closed_one(tiny_simulator: cs.Simulator) -
             for s in (cs.Sphere(0.03), shell)
         )
         assert [f.partition("up to")[0] for f in whole] == [f.partition("up to")[0] for f in part]
+
+
+def test_bodies_behind_flat_electrodes_are_told(shapes_in: SensorIn) -> None:
+    """A neighbouring link: there it reads thousands of fF that no preset agrees on."""
+    behind = [Thing("finger", cs.Box((0.01, 0.01, 0.02)), cs.Pose((0, 0, -0.013)))]
+    ahead = [Thing("ball", BALL, cs.Pose((0, 0, 0.04)))]
+    with pytest.warns(UserWarning, match="behind electrode"):
+        (found,) = shapes_in(behind + ahead, cs.Pose()).check()
+    assert re.match(r"'.*finger.*' is behind electrodes? '.*, from [345]\.?\d? mm on", found)
+    assert "ball" not in found
+    beside = [Thing("plate", cs.Box((0.02, 0.02, 0.002)), cs.Pose((0, 0, 0.004)))]
+    assert shapes_in(ahead + beside, cs.Pose()).check() == []
+
+
+def test_a_reading_that_the_solver_itself_doubts_is_told(tiny_simulator: cs.Simulator) -> None:
+    """The solver's own estimate, not looked at by most."""
+
+    class Doubtful(cs.AttachedSensor):
+        pose = cs.Pose()
+
+        def scene(self) -> cs.Scene:
+            return cs.Scene([cs.Body(BALL, cs.Pose((0, 0, 0.04)), "steel", name="ball")])
+
+    sensor = Doubtful(tiny_simulator.copy())
+    assert sensor.check() == []
+    reading = sensor.read()
+    largest = float(np.abs(reading.delta).max())
+    rough = replace(reading, stats=replace(reading.stats, solver_error=0.6 * largest))
+    sensor.simulator.step_batch = lambda scenes, threads: [rough]  # type: ignore[method-assign]
+    (found,) = sensor.check()
+    assert f"changes by {1e15 * largest:.2g} fF" in found
+    assert f"an error of {0.6e15 * largest:.2g} fF" in found
 
 
 def test_a_mesh_too_large_for_its_panels(tiny_simulator: cs.Simulator) -> None:

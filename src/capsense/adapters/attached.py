@@ -19,9 +19,8 @@ from capsense.adapters.placement import (
     blind,
     buried,
     far_off,
-    nothing_seen,
+    felt,
     placement,
-    sees,
     turned_round,
 )
 from capsense.adapters.rules import Rules
@@ -154,8 +153,7 @@ class AttachedSensor(ABC):
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
         scene = self.scene()
-        found = placement(scene, self.simulator)
-        return found if sees(self.simulator, scene) else [nothing_seen(self._design)]
+        return felt(self.simulator, scene, placement(scene, self.simulator))
 
     def warn(self) -> None:
         """Warn of what :meth:`check` finds, if the simulator's state is known yet."""

@@ -12,6 +12,7 @@ from capsense.design.model import Design
 from capsense.errors import CapSenseError
 from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import Contacts, distances, find_contacts, listed, points_on
+from capsense.scene.shapes import ShapeKind
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS
 
@@ -24,14 +25,24 @@ _DEEP = 5e-3
 cover, or a collision shape that is rounder than the real link, is thinner."""
 FAR = 1.0
 """Few sensors are farther [m] from the origin of the link that carries them."""
+_BACK = 15e-3
+"""Bodies behind an electrode that are nearer to it than this [m] are told."""
+_FEW = 20
+"""About so many points of each electrode are looked at for that,"""
+_STEP = 2e-3
+"""and how much nearer they come, going back by this [m]."""
+_ROUGH = 0.5
+"""A reading with an expected error of this part of its largest change is told."""
 _NOTHING = "nothing is in view, so that every change is exactly 0"
 
 
 def placement(scene: Scene, simulator: Simulator) -> list[str]:
     """What is wrong with the bodies of a scene, given in the sensor frame."""
     panels = PRESETS[simulator.preset].panels
-    contacts = _contacts(scene, _points(simulator.design))
-    return contacts + [text for body in scene for text in _coarse(body, panels)]
+    contacts, met = _contacts(scene, _points(simulator.design))
+    others = [body for body in scene if str(body.name) not in met]
+    behind = _behind(others, simulator.design)
+    return contacts + behind + [text for body in scene for text in _coarse(body, panels)]
 
 
 def buried(link: Scene, design: Design) -> list[str]:
@@ -64,14 +75,27 @@ def _points(design: Design) -> dict[str, Array]:
     return {e.name: points_on(e.surface.triangles) for e in design.electrodes}
 
 
-def sees(simulator: Simulator, scene: Scene) -> bool:
-    """Whether a scene changes any reading: a box around a body may be in view, and itself not."""
+def felt(simulator: Simulator, scene: Scene, found: list[str]) -> list[str]:
+    """What the reading of a scene adds to the findings, or puts in their place.
+
+    A box around a body may be in view, and itself not: then nothing is.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # findings tell of contacts
-            return bool(len(scene) and simulator.step_batch([scene], threads=1)[0].delta.any())
+            reading = simulator.step_batch([scene], threads=1)[0]
     except CapSenseError:  # which a reading will raise, too
-        return True
+        return found
+    change, error = float(np.abs(reading.delta).max()), reading.stats.solver_error
+    if change == 0.0:
+        return [nothing_seen(simulator.design)]
+    if found or error < _ROUGH * change:
+        return found
+    return [
+        f"the reading is rough: it changes by {1e15 * change:.2g} fF, and the solver itself "
+        f"expects an error of {1e15 * error:.2g} fF, as where bodies lie within one another; leave "
+        "one of them out with exclude, or give those that overlap as one mesh"
+    ]
 
 
 def blind(found: list[str]) -> bool:
@@ -111,8 +135,8 @@ def turned_round(names: list[str]) -> str:
     )
 
 
-def _contacts(scene: Scene, electrodes: dict[str, Array]) -> list[str]:
-    """Electrodes within bodies, and electrodes that touch some: a finding for each of the two."""
+def _contacts(scene: Scene, electrodes: dict[str, Array]) -> tuple[list[str], list[str]]:
+    """Electrodes within bodies, and that touch some: a finding for each; and these bodies."""
     inside, touching = find_contacts(scene, electrodes)
     out = []
     if inside.met:
@@ -125,7 +149,35 @@ def _contacts(scene: Scene, electrodes: dict[str, Array]) -> list[str]:
             f"{touching.electrodes} {touching.verb('touches', 'touch')} "
             f"{listed(touching.bodies, 4)}, as a short circuit would; {_fix(touching)}"
         )
-    return out
+    return out, inside.bodies + touching.bodies
+
+
+def _behind(bodies: list[Body], design: Design) -> list[str]:
+    """Bodies that are nearest to a flat electrode from behind, where the design has its back."""
+    found = Contacts(depth=math.inf)
+    for electrode in design.electrodes:
+        points = points_on(electrode.surface.triangles, _FEW)
+        if np.ptp(points[:, 2]) > 1e-3:
+            continue
+        for body in bodies:
+            if body.shape.kind == ShapeKind.LAYERS:
+                continue
+            off = distances(body, points)
+            k = int(off.argmin())
+            if off[k] > _BACK:
+                continue
+            nearer = off[k] - distances(body, points[[k]] - (0.0, 0.0, _STEP))[0]
+            if nearer > 0.5 * _STEP:
+                found.met.setdefault(electrode.name, []).append(str(body.name))
+                found.depth = min(found.depth, float(off[k]))
+    if not found.met:
+        return []
+    return [
+        f"{listed(found.bodies, 4)} {'is' if len(found.bodies) == 1 else 'are'} behind "
+        f"{found.electrodes}, from {1e3 * found.depth:.2g} mm on. What is behind them is part of "
+        "the design, and other bodies there are read roughly; describe them in the design, move "
+        f"the sensor's frame, or {_leave_out(found)}"
+    ]
 
 
 def _fix(found: Contacts) -> str:
