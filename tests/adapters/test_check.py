@@ -135,6 +135,28 @@ def test_groups_that_leave_a_person_out_are_told(
     assert not any("leaves out" in text for text in quiet.check())
 
 
+def test_markers_are_told(tiny_simulator: cs.Simulator) -> None:
+    """A robot's target of glass: three rods of a metre, read as steel. Not its drawn covers."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    ghost = 'contype="0" conaffinity="0" rgba="0 1 0 .3"'
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><asset><material name="glass"
+        rgba="1 1 1 .5"/></asset><worldbody><site name="pad"/>
+      <body name="target" mocap="true" pos="0 0 .03"><geom type="box" size=".5 .002 .002" {ghost}/>
+        <geom type="box" size=".002 .5 .002" contype="0" conaffinity="0" material="glass"/></body>
+      <body name="cup" pos=".02 .02 .06"><geom size=".01"/><geom size=".011" {ghost}/></body>
+      <body name="drawn" pos="-.02 .02 .06"><geom size=".01" contype="0" conaffinity="0"/></body>
+      <body name="far" pos="9 0 0"><geom size=".01" {ghost}/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with pytest.warns(UserWarning, match="as markers do"):
+        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
+    (found,) = [text for text in sensor.check() if "markers" in text]
+    assert found.startswith("'target/geom0', 'target/geom1' can be seen through")
+    assert found.endswith("exclude=['target']")
+    clean = cs.mujoco.attach(model, data, "pad", tiny_simulator, exclude=["target"])
+    assert not any("markers" in text for text in clean.check())
+
+
 @pytest.mark.parametrize(("height", "told"), [(0.05, False), (0.041, False), (0.02, True)])
 def test_electrodes_within_their_own_link(
     height: float, told: bool, tiny_simulator: cs.Simulator

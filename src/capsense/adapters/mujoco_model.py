@@ -16,7 +16,6 @@ from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, 
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
 from capsense.errors import SceneError
 from capsense.scene import Material, Pose, Shape, TriMesh
-from capsense.scene.contact import listed
 
 if TYPE_CHECKING:
     import mujoco
@@ -29,8 +28,6 @@ GROUNDING_KEY = "capsense.grounding:"
 
 _WIDE = 0.4
 """Terrains of larger half extents [m] are given out in tiles."""
-_PLANE = 0
-"""Type of planes, mjGEOM_PLANE."""
 _HEIGHT_FIELD = 1
 """Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4
@@ -260,15 +257,16 @@ class ModelSource(WorldSource):
                 raise SceneError(
                     f"groups: nothing is in group {group!r}; there are geoms in {sorted(there)}"
                 )
-        self._geoms = [
+        self.geoms = [
             i for i in range(model.ngeom) if groups is None or int(model.geom_group[i]) in groups
         ]
+        """The geoms of these groups."""
         self._chosen = groups is not None
         super().__init__(rules)
 
     def refresh(self) -> None:
         super().refresh()
-        self._reader = ModelReader(self.model, self.rules)
+        self.reader = ModelReader(self.model, self.rules)
         self._made: dict[int, Solid | None] = {}
         self._known = [a.copy() for a in self._sizes()]
         self._set_back = self._bad_numbers()
@@ -276,11 +274,11 @@ class ModelSource(WorldSource):
     def solids(self, own: int | None) -> list[Solid]:
         """All solids but those of a body; of one mesh twice at one place, the first."""
         kept: dict[object, tuple[int, Solid]] = {}
-        for geom in self._geoms:
+        for geom in self.geoms:
             if int(self.model.geom_bodyid[geom]) == own:
                 continue
             if geom not in self._made:
-                self._made[geom] = self._reader.solid(geom)
+                self._made[geom] = self.reader.solid(geom)
             s = self._made[geom]
             if s is not None:  # geoms share the shapes of meshes
                 place = tuple(s.pose.position), tuple(s.pose.quaternion)
@@ -309,71 +307,12 @@ class ModelSource(WorldSource):
             )
         self._chosen = True
 
-    def left_out(self, own: int, sensor: Pose, walls: Array) -> list[str]:
-        """The finding for geoms that ``groups`` leaves out, though they matter.
-
-        These are in range, or on bodies that move, that are not seen otherwise and not of the
-        sensor's robot. A geom in the place of another one of the same body is not missed: robots
-        have geoms that collide and geoms that are drawn.
-
-        Args:
-            own: The body that carries the sensor.
-            sensor: Its frame in the world.
-            walls: Lower and upper corner of its domain [m], shape (2, 3).
-        """
-        m = self.model
-        taken = np.zeros(m.ngeom, dtype=bool)
-        taken[self._geoms] = True
-        missed = [
-            g
-            for g in np.flatnonzero(~taken & (m.geom_bodyid != own)).tolist()
-            if not self._reader.excludes(g) and not self._has_twin(g, taken)
-        ]
-        seen = set(m.geom_bodyid[taken].tolist())
-        root, free = m.body_rootid, (m.body_weldid > 0) | (m.body_mocapid[m.body_rootid] >= 0)
-        near = [g for g in missed if self._reaches(g, sensor, walls)]
-        moving = [
-            g
-            for g in missed
-            if free[b := int(m.geom_bodyid[g])] and b not in seen and root[b] != root[own]
-        ]
-        found = list(dict.fromkeys(near + moving))
-        if not found:
-            return []
-        groups = sorted(set(m.geom_group[self._geoms].tolist()))
-        more = sorted({*groups, *m.geom_group[found].tolist()})
-        names = listed([self._reader.name(g) for g in found], 4)
-        what = "in the sensor's range" if near else "on bodies that move"
-        return [
-            f"groups={groups} leaves out {names}, {what}, so that readings do not tell of "
-            f"{'it' if len(found) == 1 else 'them'}; give groups={more}, or exclude them by name"
-        ]
-
-    def _has_twin(self, geom: int, taken: NDArray[np.bool_]) -> bool:
-        """Whether a geom that is seen stands in the same place, on the same body."""
-        m, plane = self.model, self.model.geom_type == _PLANE
-        weld = m.body_weldid[m.geom_bodyid]
-        others = taken & (weld == weld[geom]) & (plane == plane[geom])
-        away = np.linalg.norm(self.data.geom_xpos[others] - self.data.geom_xpos[geom], axis=1)
-        return bool((away <= np.maximum(m.geom_rbound[others], m.geom_rbound[geom])).any())
-
-    def _reaches(self, geom: int, sensor: Pose, walls: Array) -> bool:
-        """Whether the box around a geom reaches into a sensor's domain."""
-        turn = sensor.rotation.T @ self.data.geom_xmat[geom].reshape(3, 3)
-        at = sensor.inverse().apply(self.data.geom_xpos[geom])
-        if self.model.geom_type[geom] == _PLANE:
-            lowest = np.where(turn[:, 2] > 0, walls[0], walls[1])
-            return bool(turn[:, 2] @ (lowest - at) < 0)
-        box = self.model.geom_aabb[geom]
-        middle, half = at + turn @ box[:3], np.abs(turn) @ box[3:]
-        return bool((middle - half < walls[1]).all() and (middle + half > walls[0]).all())
-
     def robot(self, frame: int) -> set[int]:
         root = self.model.body_rootid
         return set(np.flatnonzero(root == root[frame]).tolist())
 
     def soft(self, own: int | None) -> list[SoftSolid]:
-        soft = [self._reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
+        soft = [self.reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
         return [s for s in soft if s is not None]
 
     def links(self) -> tuple[Array, Array]:
