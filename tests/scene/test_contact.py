@@ -58,6 +58,10 @@ def test_a_simulator_warns_once_of_a_body_in_its_electrodes(
         told = [str(w.message) for w in caught]
         assert len(told) == (words is not None)
         assert all(re.match(words or "", text) for text in told), told
+    if words is not None:
+        unnamed = cs.Scene([cs.Body(cs.Box((0.1, 0.1, 0.02)), place, "steel")])
+        with pytest.warns(UserWarning, match=r"'bodies\[0\]'"):
+            cs.Simulator("six_patch_bare").step(unnamed)
 
 
 def open_box(side: float) -> cs.TriMesh:

@@ -299,8 +299,8 @@ class GeometrySensor(AttachedSensor):
         others = [str(b.name) for b in behind if b.name not in own]
         if others:
             return [turned_round(others), *hidden]
-        own = self._own_frame()
-        away = 0.0 if own is None else math.dist(frames.position[own], frames.sensor_position)
+        link = self._own_frame()
+        away = 0.0 if link is None else math.dist(frames.position[link], frames.sensor_position)
         return ([far_off(away)] if away > FAR else found) + hidden
 
     def _link(self, frames: Frames) -> Scene:

@@ -153,13 +153,17 @@ def find_contacts(scene: Scene, electrodes: Mapping[str, Array]) -> tuple[Contac
         electrodes: Name → points on it [m], shape (n, 3).
     """
     inside, touching = Contacts(), Contacts()
-    bodies = [body for body in scene if body.shape.kind != ShapeKind.LAYERS]
+    bodies = {
+        body.name or f"bodies[{k}]": body
+        for k, body in enumerate(scene)
+        if body.shape.kind != ShapeKind.LAYERS
+    }
     for name, points in electrodes.items():
-        for body in bodies:
+        for body_name, body in bodies.items():
             nearest = float(distances(body, points).min())
             if nearest < TOUCH:
                 found = inside if nearest < -TOUCH else touching
-                found.met.setdefault(name, []).append(str(body.name))
+                found.met.setdefault(name, []).append(body_name)
                 found.depth = max(found.depth, -nearest)
     return inside, touching
 
