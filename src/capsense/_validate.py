@@ -30,10 +30,34 @@ def as_number(value: object) -> float:
     return math.nan
 
 
+SYNONYMS = (
+    ("disc", "disk", "circle", "circular", "round", "dot"),
+    ("rectangle", "square", "box", "cuboid", "cube", "brick", "block", "plate", "rect"),
+    ("ring", "annulus", "donut", "washer", "hoop"),
+    ("sphere", "ball", "orb"),
+    ("ellipsoid", "spheroid", "egg"),
+    ("capsule", "pill", "rod", "limb", "stadium"),
+    ("cylinder", "tube", "pipe", "can"),
+    ("comb", "interdigitated", "interdigital", "idt"),
+    ("meander", "serpentine", "zigzag", "zig-zag", "snake"),
+    ("stripes", "strips", "bars", "lines", "grating"),
+    ("polygon", "outline", "triangle", "hexagon", "path"),
+    ("grounded", "ground", "gnd", "earth", "earthed"),
+    ("floating", "ungrounded", "isolated", "insulated", "float"),
+)
+"""Words for one thing. Which of them is valid differs from place to place."""
+
+
 def nearest(word: str, options: Iterable[str]) -> str | None:
-    """The option most like ``word``, or None if none is like it."""
-    found = difflib.get_close_matches(word.lower(), list(options), n=1, cutoff=0.5)
-    return found[0] if found else None
+    """The option most like ``word``, by meaning or by spelling; None if none is like it.
+
+    A slip of one letter or two is looked for first, then another word for the same.
+    """
+    typed, valid = word.lower(), list(options)
+    slip = difflib.get_close_matches(typed, valid, n=1, cutoff=0.8)
+    same = [o for words in SYNONYMS if typed in words for o in words if o in valid]
+    loose = difflib.get_close_matches(typed, valid, n=1, cutoff=0.5)
+    return next(iter([*slip, *same, *loose]), None)
 
 
 def suggest(word: str, options: Iterable[str]) -> str:

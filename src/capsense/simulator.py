@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
+from capsense.scene.contact import warn_of_contact
 from capsense.scene.depth import DepthFrame
 from capsense.scene.shapes import as_points
 
@@ -143,6 +145,7 @@ class Simulator:
         self._background = background
         self._solver, rest = self._make_solver()
         self._one = OneAtATime()
+        self._contact_told = False
         self._idle: deque[_Solver] = deque()  # for the threads of batches
         self._names = self.design.electrode_names
         self._terminals = Terminals(self.design, rest)
@@ -259,6 +262,9 @@ class Simulator:
     def _of(self, found: Change, scene: Scene, seconds: float) -> Reading:
         """The reading that a solver's result makes, which took some time [s]."""
         terminals = self._terminals
+        if math.isinf(found.error) and not self._contact_told:
+            self._contact_told = True
+            warn_of_contact(scene, {e.name: e.surface.triangles for e in self.design.electrodes})
         change: NDArray[Any] = terminals.screened(found.matrix)
         error = max(found.error, float((found.matrix - change).max()))
         if found.loss is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,114 @@ def test_a_wrong_place_is_told(place: Any, message: str, shapes_in: SensorIn) ->
         sensor = shapes_in(ball_at(*place), cs.Pose())
     (found,) = sensor.check()
     assert any(fix in found for fix in ("exclude=[", "quaternion (1, 0, 0, 0)", "exclude, groups"))
+
+
+@pytest.mark.parametrize("kind", ["site", "link"])
+def test_a_pose_in_the_wrong_unit_or_frame_is_named_as_that(
+    kind: str, tiny_simulator: cs.Simulator
+) -> None:
+    """60 mm written as 60: not for lack of things to see."""
+    message = r"nothing is in view, .*stands 60 m from the origin of the link .*millimetres × 1e-3"
+    if kind == "site":
+        mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+        text = (
+            '<mujoco><worldbody><body><geom size=".01"/><site name="pad" pos="0 0 60"/></body>'
+            '<body pos="0 0 .1"><geom size=".02"/></body></worldbody></mujoco>'
+        )
+        model = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        with pytest.warns(UserWarning, match=message):
+            sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
+        data.site_xpos[0] = (0.0, 0.0, 0.05)
+        assert not any("60 m" in text for text in sensor.check())
+    else:
+        p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+        client = p.connect(p.DIRECT)
+        ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.02, physicsClientId=client)
+        bodies = [
+            p.createMultiBody(0, ball, basePosition=(x, 0, 0), physicsClientId=client)
+            for x in (0, 0.1)
+        ]
+        with pytest.warns(UserWarning, match=message):
+            cs.pybullet.attach(client, bodies[0], -1, cs.Pose((0, 0, 60)), tiny_simulator)
+        p.disconnect(physicsClientId=client)
+
+
+@pytest.mark.parametrize(
+    ("groups", "place", "finding"),
+    [
+        (
+            [2],
+            "0 0 .09",
+            r"groups=\[2\] leaves out 'person/torso', in the sensor's range.*=\[1, 2\]",
+        ),
+        ([2], "9 0 0", r"groups=\[2\] leaves out 'person/torso', on bodies that move.*=\[1, 2\]"),
+        ([1, 2], "0 0 .09", None),
+        (
+            [3],
+            "0 0 .09",
+            r"groups=\[3\] leaves out 'lamp/bulb', 'person/torso', in .*=\[1, 2, 3\]",
+        ),
+        ([2, 3], "9 0 0", r"groups=\[2, 3\] leaves out 'person/torso', on bodies that move"),
+    ],
+)
+def test_groups_that_leave_a_person_out_are_told(
+    groups: list[int], place: str, finding: str | None, tiny_simulator: cs.Simulator
+) -> None:
+    """Not of what collides where the same is drawn, and not of the robot's own links far off."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
+      <body name="arm"><joint/><geom name="seen" size=".01" pos="0 0 -.05" group="2"/>
+        <geom name="hit" size=".012" pos="0 0 -.05" group="3"/><site name="pad"/>
+        <body name="tip" pos="0 0 -.9"><joint/><geom size=".01" group="5"/></body></body>
+      <body name="cup" pos=".02 0 .04"><freejoint/><geom name="drawn" size=".01" group="2"/>
+        <geom name="hull" size=".012" group="3"/></body>
+      <body name="lamp" pos="0 .02 .05"><geom name="bulb" size=".01" group="2"/></body>
+      <body name="person" pos="{place}" mocap="true">
+        <geom name="torso" size=".02" group="1"/></body>
+      <body name="shed" pos="5 5 5"><geom size=".1" group="1"/></body>
+      </worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator, groups=groups)
+    told = [text for text in sensor.check() if "leaves out" in text]
+    if finding is None:
+        assert told == []
+        return
+    assert len(told) == 1
+    assert re.match(finding, told[0]), told[0]
+    with pytest.warns(UserWarning, match="leaves out"):
+        cs.mujoco.attach(model, data, "pad", tiny_simulator, groups=groups)
+    with pytest.warns(UserWarning, match=r"sensor 'pad': groups="):
+        cs.mujoco.attach_skin(model, data, ["pad"], tiny_simulator, groups=groups)
+    named = "lamp/*" if "lamp" in told[0] else "person/*"
+    quiet = cs.mujoco.attach(
+        model, data, "pad", tiny_simulator, groups=groups, exclude=[named, "person/*"]
+    )
+    assert not any("leaves out" in text for text in quiet.check())
+
+
+def test_markers_are_told(tiny_simulator: cs.Simulator) -> None:
+    """A robot's target of glass: three rods of a metre, read as steel. Not its drawn covers."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    ghost = 'contype="0" conaffinity="0" rgba="0 1 0 .3"'
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><asset><material name="glass"
+        rgba="1 1 1 .5"/></asset><worldbody><site name="pad"/>
+      <body name="target" mocap="true" pos="0 0 .03"><geom type="box" size=".5 .002 .002" {ghost}/>
+        <geom type="box" size=".002 .5 .002" contype="0" conaffinity="0" material="glass"/></body>
+      <body name="cup" pos=".02 .02 .06"><geom size=".01"/><geom size=".011" {ghost}/></body>
+      <body name="drawn" pos="-.02 .02 .06"><geom size=".01" contype="0" conaffinity="0"/></body>
+      <body name="far" pos="9 0 0"><geom size=".01" {ghost}/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with pytest.warns(UserWarning, match="as markers do"):
+        sensor = cs.mujoco.attach(model, data, "pad", tiny_simulator)
+    (found,) = [text for text in sensor.check() if "markers" in text]
+    assert found.startswith("'target/geom0', 'target/geom1' can be seen through")
+    assert found.endswith("exclude=['target']")
+    clean = cs.mujoco.attach(model, data, "pad", tiny_simulator, exclude=["target"])
+    assert not any("markers" in text for text in clean.check())
 
 
 @pytest.mark.parametrize(("height", "told"), [(0.05, False), (0.041, False), (0.02, True)])
@@ -125,6 +234,38 @@ def test_an_open_mesh_is_entered_as_a_closed_one(tiny_simulator: cs.Simulator) -
         assert [f.partition("up to")[0] for f in whole] == [f.partition("up to")[0] for f in part]
 
 
+def test_bodies_behind_flat_electrodes_are_told(shapes_in: SensorIn) -> None:
+    """A neighbouring link: there it reads thousands of fF that no preset agrees on."""
+    behind = [Thing("finger", cs.Box((0.01, 0.01, 0.02)), cs.Pose((0, 0, -0.013)))]
+    ahead = [Thing("ball", BALL, cs.Pose((0, 0, 0.04)))]
+    with pytest.warns(UserWarning, match="behind electrode"):
+        (found,) = shapes_in(behind + ahead, cs.Pose()).check()
+    assert re.match(r"'.*finger.*' is behind electrodes? '.*, from [345]\.?\d? mm on", found)
+    assert "ball" not in found
+    beside = [Thing("plate", cs.Box((0.02, 0.02, 0.002)), cs.Pose((0, 0, 0.004)))]
+    assert shapes_in(ahead + beside, cs.Pose()).check() == []
+
+
+def test_a_reading_that_the_solver_itself_doubts_is_told(tiny_simulator: cs.Simulator) -> None:
+    """The solver's own estimate, not looked at by most."""
+
+    class Doubtful(cs.AttachedSensor):
+        pose = cs.Pose()
+
+        def scene(self) -> cs.Scene:
+            return cs.Scene([cs.Body(BALL, cs.Pose((0, 0, 0.04)), "steel", name="ball")])
+
+    sensor = Doubtful(tiny_simulator.copy())
+    assert sensor.check() == []
+    reading = sensor.read()
+    largest = float(np.abs(reading.delta).max())
+    rough = replace(reading, stats=replace(reading.stats, solver_error=0.6 * largest))
+    sensor.simulator.step_batch = lambda scenes, threads: [rough]  # type: ignore[method-assign]
+    (found,) = sensor.check()
+    assert f"changes by {1e15 * largest:.2g} fF" in found
+    assert f"an error of {0.6e15 * largest:.2g} fF" in found
+
+
 def test_a_mesh_too_large_for_its_panels(tiny_simulator: cs.Simulator) -> None:
     """A room in one mesh."""
     mesh = cs.Box((3.0, 3.0, 0.1)).to_trimesh()
@@ -181,7 +322,7 @@ def test_a_skin_warns_where_all_are_blind(tiny_simulator: cs.Simulator) -> None:
     assert [len(found) for found in skin.check().values()] == [0, 1]
     with pytest.warns(UserWarning, match="^sensor 'near': electrodes 'A', 'B' lie inside"):
         attach(0.0)
-    with pytest.warns(UserWarning, match="sensor 'far': nothing is in view"):
+    with pytest.warns(UserWarning, match="sensor 'near' and 1 more: nothing is in view"):
         attach(5.0)
 
 

@@ -70,7 +70,10 @@ def test_a_camera_looks_along_the_sensor(tiny_simulator: cs.Simulator) -> None:
         (("lnk", ON_LINK), "no body named 'lnk'; did you mean 'link'"),
         (("link", (0, 0, 1)), r"pose is \(0, 0, 1\); give a Pose"),
         (("link", ON_LINK, "old"), "has a site named 'old' already"),
-        (("link", cs.Pose((0, 0, 50))), "50 m from body 'link'; lengths are metres, so multiply"),
+        (
+            ("link", cs.Pose((0, 0, 50))),
+            "50 m from body 'link'; .*millimetres × 1e-3.* in the frame of the body",
+        ),
         (("link", ON_LINK, ""), "name is ''; give the new site a name"),
     ],
 )

@@ -378,3 +378,23 @@ def test_no_reading_is_zero_silently(
     )
     told = any("nothing is in view" in text for text in sensor.check())
     assert told == (not sensor.read().delta.any())
+
+
+def test_a_plane_that_is_drawn_is_seen_without_a_word(tiny_simulator: cs.Simulator) -> None:
+    """PyBullet tells its normal of the collision shape only, which is the same plane."""
+    p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+    client = p.connect(p.DIRECT)
+    ball = p.createCollisionShape(p.GEOM_SPHERE, radius=0.01, physicsClientId=client)
+    carrier = p.createMultiBody(0, ball, basePosition=(0, 0, 0.03), physicsClientId=client)
+    plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)
+    p.createMultiBody(0, plane, physicsClientId=client)
+    down = cs.Pose((0, 0, 0), (1, 0, 0, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        seen, solid = (
+            cs.pybullet.attach(client, carrier, -1, down, tiny_simulator, shapes=shapes).read()
+            for shapes in ("visual", "collision")
+        )
+    assert seen.delta.any()
+    np.testing.assert_array_equal(seen.delta, solid.delta)
+    p.disconnect(physicsClientId=client)

@@ -11,15 +11,33 @@ from pathlib import Path
 import pytest
 
 import capsense as cs
-from capsense.cli.console import facts, grouped, seconds, table
+from capsense.cli.console import BuildProgress, facts, grouped, seconds, table
 from capsense.cli.main import COMMANDS, build_parser, main
 
 
 def output_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     assert main(arguments) == 0
     text, errors = capsys.readouterr()
-    assert errors == ""
+    assert errors in ("", "capsense: building the field: panels, 50% done\n")
     return text
+
+
+def test_progress_without_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A line at the start and one every ten seconds; no control characters, none when quiet."""
+    clock = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    with BuildProgress() as progress, BuildProgress(quiet=True) as quiet:
+        for k in range(25):
+            progress("panels" if k < 15 else "fit", k / 24)
+            quiet("panels", k / 24)
+            clock[0] += 1.0
+    assert capsys.readouterr().err.splitlines() == [
+        "capsense: building the field: panels, 0% done",
+        "capsense: building the field: panels, 42% done, 10 s so far",
+        "capsense: building the field: fit, 83% done, 20 s so far",
+    ]
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:

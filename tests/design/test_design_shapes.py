@@ -54,6 +54,19 @@ CASES: list[tuple[str, dict[str, Any], float, tuple[float, float], int, int]] = 
 ]
 
 
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("circle", "disc"), ("Disk", "disc"), ("square", "rectangle"), ("rectangel", "rectangle"),
+        ("annulus", "ring"), ("zigzag", "meander"), ("strip", "stripes"), ("triangle", "polygon"),
+    ],
+)  # fmt: skip
+def test_another_word_for_a_shape(typed: str, meant: str) -> None:
+    """By meaning, not by letters alone: a circle is more like a rectangle to these."""
+    with pytest.raises(DesignError, match=f"did you mean '{meant}'"):
+        surface(typed)
+
+
 @pytest.mark.parametrize(("shape", "keys", "area", "extent", "facets", "rims"), CASES)
 def test_straight_shapes(
     shape: str, keys: dict[str, Any], area: float, extent: tuple[float, ...], facets: int, rims: int

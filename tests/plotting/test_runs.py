@@ -108,3 +108,38 @@ def test_the_style_sheet_has_the_colours_of_all_pictures() -> None:
         assert [f"#{c.lstrip('#')}".upper() for c in colours] == [c.upper() for c in COLOURS]
         assert f"#{matplotlib.rcParams['axes.edgecolor'].lstrip('#')}" == FAINT
         assert f"#{matplotlib.rcParams['axes.labelcolor'].lstrip('#')}" == INK
+
+
+@pytest.mark.parametrize(
+    ("names", "written", "listed"),
+    [
+        (["a", "b", "c"], {"a", "b", "c"}, set()),
+        (
+            [f"finger {k}" for k in range(10)],
+            {"1", "10"},
+            {f"{k + 1}  finger {k}" for k in range(10)},
+        ),
+        ([f"arm/link{k}" for k in range(8)] + ["hand"], {"arm", "hand"}, set()),
+        (["a/1", "a/2", "b", "c", "d/e"], {"1", "2", "3", "4"}, {"1  a", "2  b", "3  c", "4  d/e"}),
+    ],
+)
+def test_names_of_bodies_do_not_cover_one_another(
+    names: list[str], written: set[str], listed: set[str], sim: cs.Simulator
+) -> None:
+    """Bodies on one spot, seen along their row: a list tells the rest. Of many parts, one name."""
+    row = [
+        cs.Body(cs.Sphere(0.02), cs.Pose((0.05 * k - 0.2, 0.0, 0.06)), "steel", name=name)
+        for k, name in enumerate(names)
+    ]
+    moved = [cs.Scene([b.moved(cs.Pose((0, y, 0)) @ b.pose) for b in row]) for y in (0, 0.1, 0.2)]
+    figure = cs.plot([sim.step(s) for s in moved], sim, scenes=moved)
+    figure.draw_without_rendering()
+    seen = set()
+    for axes in figure.axes:
+        boxes = [text.get_window_extent() for text in axes.texts]
+        seen |= {text.get_text() for text in axes.texts}
+        for k, box in enumerate(boxes):
+            assert not any(box.overlaps(other) for other in boxes[:k])
+    assert written <= seen
+    told = {t.get_text() for legend in figure.legends for t in legend.get_texts()}
+    assert told - {"start", "body at the largest change"} == listed

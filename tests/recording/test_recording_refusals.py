@@ -177,7 +177,15 @@ def test_a_readout_of_ones_own(sim: cs.Simulator, path: Path) -> None:
         run.reset()
         again = [run.step(scene(k), 0.1 * k).counts for k in range(3)]
     assert [c.code.tolist() for c in again if c] == [c.code.tolist() for c in first if c]
-    assert cs.replay(path).counts is None
+    found = cs.replay(path)
+    held = sum(len(c) for c in first + again if c)
+    assert (found.counts, found.recorded_counts) == (None, held)
+    assert f"{held} recorded, not compared" in str(found)
+    with cs.record(path, sim, overwrite=True) as run:
+        run.step(scene(0), 0.0)
+    plain = cs.replay(path)
+    assert (plain.counts, plain.recorded_counts) == (None, 0)
+    assert "conversions" not in str(plain)
 
 
 def test_a_chip_by_name_is_set_up_for_the_electrodes(sim: cs.Simulator, path: Path) -> None:
@@ -201,5 +209,7 @@ def test_a_readout_file(sim: cs.Simulator, path: Path, tmp_path: Path) -> None:
     found = cs.replay(path)
     assert found.same
     assert found.counts
+    assert found.counts == found.recorded_counts
+    assert f"conversions  {found.counts}\n" in str(found)
     steps = list(cs.open_recording(path).steps())
     assert any(s.reading.counts is not None and s.reading.counts.touched is not None for s in steps)

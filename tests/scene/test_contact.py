@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.scene.scene import TOUCH, Sheets, distances, points_on
+from capsense.scene.contact import TOUCH, Sheets, distances, points_on
 
 CORNERS = np.array([[[0, 0, 0], [0.03, 0, 0], [0.03, 0.03, 0]]], float)
 PADS = [CORNERS - np.array([0.035, 0, 0]), CORNERS + np.array([0.005, -0.01, 0.002])]
@@ -30,6 +33,35 @@ def test_sheets_meet_what_their_points_meet(shape: cs.Shape | str) -> None:
             assert sheets.meet(body, conducting=False) == expected
             met.append(expected)
     assert 5 < sum(met) < 55
+
+
+@pytest.mark.parametrize(
+    ("height", "words"),
+    [
+        (-0.005, r"electrodes '.*' lie inside 'bar', up to 5 mm deep, and readings mean nothing"),
+        (1e-4, r"electrodes '.*' touch 'bar' and readings mean nothing until this ends; keep bod"),
+        (0.001, None),
+    ],
+)
+def test_a_simulator_warns_once_of_a_body_in_its_electrodes(
+    height: float, words: str | None
+) -> None:
+    """It names electrodes and body, of a step, and of a batch."""
+    place = cs.Pose((0, 0, height + 0.01))
+    scene = cs.Scene([cs.Body(cs.Box((0.1, 0.1, 0.02)), place, "steel", name="bar")])
+    for call in (lambda sim: sim.step(scene), lambda sim: sim.step_batch([scene, scene])):
+        sim = cs.Simulator("six_patch_bare")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            call(sim)
+            call(sim)
+        told = [str(w.message) for w in caught]
+        assert len(told) == (words is not None)
+        assert all(re.match(words or "", text) for text in told), told
+    if words is not None:
+        unnamed = cs.Scene([cs.Body(cs.Box((0.1, 0.1, 0.02)), place, "steel")])
+        with pytest.warns(UserWarning, match=r"'bodies\[0\]'"):
+            cs.Simulator("six_patch_bare").step(unnamed)
 
 
 def open_box(side: float) -> cs.TriMesh:

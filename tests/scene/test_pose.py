@@ -113,6 +113,15 @@ def test_bad_matrices_are_refused(matrix, words):
         Pose.from_matrix(matrix)
 
 
+def test_radians_beyond_a_turn_look_like_degrees(recwarn):
+    """Said once at each place, with the fix; never of degrees."""
+    for yaw in (0.0, 2 * np.pi, 90.0, -180.0):
+        Pose.from_euler((0, 0, 0), (0, 0, yaw))
+    Pose.from_euler((0, 0, 0), (0, 0, 360.5), degrees=True)
+    assert ["degrees=True" in str(w.message) for w in recwarn] == [True]
+    assert recwarn[0].filename == __file__
+
+
 def test_bad_angles_are_refused():
     with pytest.raises(SceneError, match="roll, pitch, yaw"):
         Pose.from_euler((0, 0, 0), (1, 2))

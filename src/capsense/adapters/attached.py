@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
 from capsense.adapters.placement import (
+    FAR,
     blind,
     buried,
-    nothing_seen,
+    far_off,
+    felt,
     placement,
-    sees,
     turned_round,
 )
 from capsense.adapters.rules import Rules
@@ -151,8 +153,7 @@ class AttachedSensor(ABC):
             SceneError: The simulator has not been stepped yet, or has diverged.
         """
         scene = self.scene()
-        found = placement(scene, self.simulator)
-        return found if sees(self.simulator, scene) else [nothing_seen(self._design)]
+        return felt(self.simulator, scene, placement(scene, self.simulator))
 
     def warn(self) -> None:
         """Warn of what :meth:`check` finds, if the simulator's state is known yet."""
@@ -296,7 +297,11 @@ class GeometrySensor(AttachedSensor):
         behind = self.world.scene(frames._replace(sensor_quaternion=np.array(turn.quaternion)))
         own = self.world.names(self.source.robot(self._carrier))
         others = [str(b.name) for b in behind if b.name not in own]
-        return ([turned_round(others)] if others else found) + hidden
+        if others:
+            return [turned_round(others), *hidden]
+        link = self._own_frame()
+        away = 0.0 if link is None else math.dist(frames.position[link], frames.sensor_position)
+        return ([far_off(away)] if away > FAR else found) + hidden
 
     def _link(self, frames: Frames) -> Scene:
         """The bodies of the link that carries the sensor, where these are not seen."""

@@ -24,6 +24,7 @@ from capsense.design.model import Design
 from capsense.errors import SceneError, require_package
 from capsense.readout.readout import Readout
 from capsense.scene import Pose
+from capsense.scene.contact import listed
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 
@@ -39,6 +40,8 @@ __all__ = [
 
 _AWAY = 5.0
 """No sensor is so far [m] from the body that carries it."""
+_PLANE = 0
+"""Type of planes, mjGEOM_PLANE."""
 _SCALAR_LAST = [1, 2, 3, 0]
 _TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
 """MuJoCo's cameras look along -z: half a turn about x."""
@@ -200,6 +203,17 @@ class MujocoSensor(GeometrySensor):
     def _time(self) -> float:
         return float(self.data.time)
 
+    def check(self) -> list[str]:
+        domain, sensor = self._design.domain, self.pose
+        walls = np.array([domain.lower, domain.upper])
+        near = [
+            g for g in range(self.model.ngeom) if _reaches(self.model, self.data, g, sensor, walls)
+        ]
+        own = self._carrier
+        return (
+            super().check() + _left_out(self.source, own, near) + _markers(self.source, own, near)
+        )
+
     def _own_frame(self) -> int | None:
         return self._carrier if self.source.rules.exclude_own and self._carrier else None
 
@@ -210,6 +224,92 @@ class MujocoSensor(GeometrySensor):
         check_stepped(data, self._site)
         mujoco.mju_mulQuat(self._turn, data.xquat[self._carrier], self.model.site_quat[self._site])
         return Frames(position, quaternion, data.site_xpos[self._site], self._turn[_SCALAR_LAST])
+
+
+def _left_out(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
+    """The finding for geoms that ``groups`` leaves out, though they matter.
+
+    These are in range, or on bodies that move, that are not seen otherwise and not of the sensor's
+    robot. A geom in the place of another one of the same body is not missed: robots have geoms
+    that collide and geoms that are drawn.
+
+    Args:
+        source: The solids of the model.
+        own: The body that carries the sensor.
+        near: Geoms that reach into the sensor's domain.
+    """
+    m = source.model
+    taken = np.zeros(m.ngeom, dtype=bool)
+    taken[source.geoms] = True
+    missed = [
+        g
+        for g in np.flatnonzero(~taken & (m.geom_bodyid != own)).tolist()
+        if not source.reader.excludes(g) and not _twins(source, g, taken).any()
+    ]
+    seen, root = set(m.geom_bodyid[taken].tolist()), m.body_rootid
+    free = (m.body_weldid > 0) | (m.body_mocapid[root] >= 0)
+    moving = [
+        g
+        for g in missed
+        if free[b := int(m.geom_bodyid[g])] and b not in seen and root[b] != root[own]
+    ]
+    found = list(dict.fromkeys([g for g in missed if g in near] + moving))
+    if not found:
+        return []
+    groups = sorted(set(m.geom_group[source.geoms].tolist()))
+    more = sorted({*groups, *m.geom_group[found].tolist()})
+    what = "in the sensor's range" if set(found) & set(near) else "on bodies that move"
+    return [
+        f"groups={groups} leaves out {listed([source.reader.name(g) for g in found], 4)}, {what}, "
+        f"so that readings do not tell of {'it' if len(found) == 1 else 'them'}; give "
+        f"groups={more}, or exclude them by name"
+    ]
+
+
+def _markers(source: ModelSource, own: int, near: Sequence[int]) -> list[str]:
+    """The finding for geoms in range that look like markers: see-through, and nothing hits them."""
+    m = source.model
+    collide = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+    clear = m.geom_rgba[:, 3] < 1
+    clear |= (m.geom_matid >= 0) & (np.append(m.mat_rgba[:, 3], 1.0)[m.geom_matid] < 1)
+    found = [
+        g
+        for g in source.geoms
+        if g in near and clear[g] and not collide[g] and m.geom_bodyid[g] != own
+        and not source.reader.excludes(g) and not _twins(source, g, collide).any()
+    ]  # fmt: skip
+    if not found:
+        return []
+    names = [source.reader.name(g) for g in found]
+    bodies = list(dict.fromkeys(name.partition("/")[0] for name in names))
+    exclude = names if "world" in bodies else bodies
+    return [
+        f"{listed(names, 4)} can be seen through and collide with nothing, as markers do, but are "
+        f"read as bodies; leave out what is none with exclude={exclude[:6]}"
+    ]
+
+
+def _twins(source: ModelSource, geom: int, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which geoms stand in the same place as one, on the same body; ``among`` is (ngeom,)."""
+    m, data, plane = source.model, source.data, source.model.geom_type == _PLANE
+    weld = m.body_weldid[m.geom_bodyid]
+    away = np.linalg.norm(data.geom_xpos - data.geom_xpos[geom], axis=1)
+    same = (weld == weld[geom]) & (plane == plane[geom]) & among
+    return np.asarray(same & (away <= np.maximum(m.geom_rbound, m.geom_rbound[geom])))
+
+
+def _reaches(
+    model: mujoco.MjModel, data: mujoco.MjData, geom: int, sensor: Pose, walls: Array
+) -> bool:
+    """Whether the box around a geom reaches into a sensor's domain, corners ``walls`` (2, 3)."""
+    turn = sensor.rotation.T @ data.geom_xmat[geom].reshape(3, 3)
+    at = sensor.inverse().apply(data.geom_xpos[geom])
+    if model.geom_type[geom] == _PLANE:
+        lowest = np.where(turn[:, 2] > 0, walls[0], walls[1])
+        return bool(turn[:, 2] @ (lowest - at) < 0)
+    box = model.geom_aabb[geom]
+    middle, half = at + turn @ box[:3], np.abs(turn) @ box[3:]
+    return bool((middle - half < walls[1]).all() and (middle + half > walls[0]).all())
 
 
 def add_sensor(
@@ -257,8 +357,8 @@ def add_sensor(
     away = math.hypot(*pose.position)
     if away > _AWAY and body != "world":
         raise SceneError(
-            f"pose places the sensor {away:g} m from body {body!r}; lengths are metres, so "
-            "multiply millimetres by 1e-3"
+            f"pose places the sensor {away:g} m from body {body!r}; give it in metres "
+            "(millimetres × 1e-3) and in the frame of the body, not in that of the world"
         )
     taken = {"site": spec.sites, "camera": spec.cameras if camera is not None else []}
     for kind, things in taken.items():

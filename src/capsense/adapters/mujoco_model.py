@@ -68,6 +68,14 @@ class ModelReader:
         self._read_texts()
         rules.check([*self._names, *self._flex_names])
 
+    def excludes(self, geom: int) -> bool:
+        """Whether the rules leave a geom out."""
+        return self.rules.excludes(self._names[geom])
+
+    def name(self, geom: int) -> str:
+        """What a geom is called in scenes and messages."""
+        return self._names[geom][-1]
+
     def solid(self, geom: int) -> Solid | None:
         """A geom as a solid, or None where the rules leave it out.
 
@@ -249,15 +257,16 @@ class ModelSource(WorldSource):
                 raise SceneError(
                     f"groups: nothing is in group {group!r}; there are geoms in {sorted(there)}"
                 )
-        self._geoms = [
+        self.geoms = [
             i for i in range(model.ngeom) if groups is None or int(model.geom_group[i]) in groups
         ]
+        """The geoms of these groups."""
         self._chosen = groups is not None
         super().__init__(rules)
 
     def refresh(self) -> None:
         super().refresh()
-        self._reader = ModelReader(self.model, self.rules)
+        self.reader = ModelReader(self.model, self.rules)
         self._made: dict[int, Solid | None] = {}
         self._known = [a.copy() for a in self._sizes()]
         self._set_back = self._bad_numbers()
@@ -265,11 +274,11 @@ class ModelSource(WorldSource):
     def solids(self, own: int | None) -> list[Solid]:
         """All solids but those of a body; of one mesh twice at one place, the first."""
         kept: dict[object, tuple[int, Solid]] = {}
-        for geom in self._geoms:
+        for geom in self.geoms:
             if int(self.model.geom_bodyid[geom]) == own:
                 continue
             if geom not in self._made:
-                self._made[geom] = self._reader.solid(geom)
+                self._made[geom] = self.reader.solid(geom)
             s = self._made[geom]
             if s is not None:  # geoms share the shapes of meshes
                 place = tuple(s.pose.position), tuple(s.pose.quaternion)
@@ -303,7 +312,7 @@ class ModelSource(WorldSource):
         return set(np.flatnonzero(root == root[frame]).tolist())
 
     def soft(self, own: int | None) -> list[SoftSolid]:
-        soft = [self._reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
+        soft = [self.reader.soft_solid(flex, self.data) for flex in range(self.model.nflex)]
         return [s for s in soft if s is not None]
 
     def links(self) -> tuple[Array, Array]:

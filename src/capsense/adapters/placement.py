@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
 from capsense.errors import CapSenseError
-from capsense.scene import Body, Layers, Scene, TriMesh
-from capsense.scene.scene import TOUCH, distances, points_on
+from capsense.scene import Body, Scene, TriMesh
+from capsense.scene.contact import Contacts, distances, find_contacts, listed, points_on
+from capsense.scene.shapes import ShapeKind
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS
 
@@ -21,14 +23,26 @@ _COARSE = 0.05
 _DEEP = 5e-3
 """Deeper than this [m] in the link that carries it, an electrode is not on the link's surface; a
 cover, or a collision shape that is rounder than the real link, is thinner."""
+FAR = 1.0
+"""Few sensors are farther [m] from the origin of the link that carries them."""
+_BACK = 15e-3
+"""Bodies behind an electrode that are nearer to it than this [m] are told."""
+_FEW = 20
+"""About so many points of each electrode are looked at for that,"""
+_STEP = 2e-3
+"""and how much nearer they come, going back by this [m]."""
+_ROUGH = 0.5
+"""A reading with an expected error of this part of its largest change is told."""
 _NOTHING = "nothing is in view, so that every change is exactly 0"
 
 
 def placement(scene: Scene, simulator: Simulator) -> list[str]:
     """What is wrong with the bodies of a scene, given in the sensor frame."""
     panels = PRESETS[simulator.preset].panels
-    contacts = _contacts(scene, _points(simulator.design))
-    return contacts + [text for body in scene for text in _coarse(body, panels)]
+    contacts, met = _contacts(scene, _points(simulator.design))
+    others = [body for body in scene if str(body.name) not in met]
+    behind = _behind(others, simulator.design)
+    return contacts + behind + [text for body in scene for text in _coarse(body, panels)]
 
 
 def buried(link: Scene, design: Design) -> list[str]:
@@ -38,21 +52,21 @@ def buried(link: Scene, design: Design) -> list[str]:
         link: The bodies of that link, in the sensor frame.
         design: The sensor.
     """
-    found: dict[str, list[str]] = {}
-    depth = 0.0
+    found = Contacts()
     for name, points in _points(design).items():
         for body in link:
             least = -float(distances(body, points).max())
             if least > _DEEP and body.material.is_conductor():
-                found.setdefault(name, []).append(str(body.name))
-                depth = max(depth, least)
-    if not found:
+                found.met.setdefault(name, []).append(str(body.name))
+                found.depth = max(found.depth, least)
+    if not found.met:
         return []
     return [
-        f"{_electrodes(found, 'lies', 'lie')} up to {1e3 * depth:.0f} mm deep inside "
-        f"{_bodies(found)}, on the link that carries the sensor. That link is not seen, so "
-        "readings are as if it did not cover them; a real one would screen them. Move the sensor's "
-        f"frame out to the link's surface, or, if the link is hollow there, {_leave_out(found)}"
+        f"{found.electrodes} {found.verb('lies', 'lie')} up to {1e3 * found.depth:.0f} mm deep "
+        f"inside {listed(found.bodies, 4)}, on the link that carries the sensor. That link is not "
+        "seen, so readings are as if it did not cover them; a real one would screen them. Move the "
+        "sensor's frame out to the link's surface, or, if the link is hollow there, "
+        f"{_leave_out(found)}"
     ]
 
 
@@ -61,12 +75,27 @@ def _points(design: Design) -> dict[str, Array]:
     return {e.name: points_on(e.surface.triangles) for e in design.electrodes}
 
 
-def sees(simulator: Simulator, scene: Scene) -> bool:
-    """Whether a scene changes any reading: a box around a body may be in view, and itself not."""
+def felt(simulator: Simulator, scene: Scene, found: list[str]) -> list[str]:
+    """What the reading of a scene adds to the findings, or puts in their place.
+
+    A box around a body may be in view, and itself not: then nothing is.
+    """
     try:
-        return bool(len(scene) and simulator.step_batch([scene], threads=1)[0].delta.any())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # findings tell of contacts
+            reading = simulator.step_batch([scene], threads=1)[0]
     except CapSenseError:  # which a reading will raise, too
-        return True
+        return found
+    change, error = float(np.abs(reading.delta).max()), reading.stats.solver_error
+    if change == 0.0:
+        return [nothing_seen(simulator.design)]
+    if found or error < _ROUGH * change:
+        return found
+    return [
+        f"the reading is rough: it changes by {1e15 * change:.2g} fF, and the solver itself "
+        f"expects an error of {1e15 * error:.2g} fF, as where bodies lie within one another; leave "
+        "one of them out with exclude, or give those that overlap as one mesh"
+    ]
 
 
 def blind(found: list[str]) -> bool:
@@ -83,6 +112,19 @@ def nothing_seen(design: Design) -> str:
     )
 
 
+def far_off(away: float) -> str:
+    """The finding for a sensor that sees nothing and stands far from what carries it.
+
+    Args:
+        away: Its distance from the origin of the link [m].
+    """
+    return (
+        f"{_NOTHING}, and the sensor stands {away:.3g} m from the origin of the link that carries "
+        "it: give its pose in metres (millimetres × 1e-3) and in the frame of that link, not in "
+        "that of the world"
+    )
+
+
 def turned_round(names: list[str]) -> str:
     """The finding for a sensor that has everything at its back."""
     listed = ", ".join(map(repr, names[:4])) + (", …" if len(names) > 4 else "")
@@ -93,50 +135,58 @@ def turned_round(names: list[str]) -> str:
     )
 
 
-def _contacts(scene: Scene, electrodes: dict[str, Array]) -> list[str]:
-    """Electrodes within bodies, and electrodes that touch some: a finding for each of the two."""
-    inside: dict[str, list[str]] = {}
-    touching: dict[str, list[str]] = {}
-    depth = 0.0
-    bodies = [body for body in scene if not isinstance(body.shape, Layers)]
-    for name, points in electrodes.items():
-        for body in bodies:
-            nearest = float(distances(body, points).min())
-            if nearest < TOUCH:
-                found = inside if nearest < -TOUCH else touching
-                found.setdefault(name, []).append(str(body.name))
-                depth = max(depth, -nearest)
+def _contacts(scene: Scene, electrodes: dict[str, Array]) -> tuple[list[str], list[str]]:
+    """Electrodes within bodies, and that touch some: a finding for each; and these bodies."""
+    inside, touching = find_contacts(scene, electrodes)
     out = []
-    if inside:
+    if inside.met:
         out.append(
-            f"{_electrodes(inside, 'lies', 'lie')} inside {_bodies(inside)}, up to "
-            f"{1e3 * depth:.2g} mm deep, and readings mean nothing; {_fix(inside, depth)}"
+            f"{inside.electrodes} {inside.verb('lies', 'lie')} inside {listed(inside.bodies, 4)}, "
+            f"up to {1e3 * inside.depth:.2g} mm deep, and readings mean nothing; {_fix(inside)}"
         )
-    if touching:
+    if touching.met:
         out.append(
-            f"{_electrodes(touching, 'touches', 'touch')} {_bodies(touching)}, as a short circuit "
-            f"would; {_fix(touching, 1e-3)}"
+            f"{touching.electrodes} {touching.verb('touches', 'touch')} "
+            f"{listed(touching.bodies, 4)}, as a short circuit would; {_fix(touching)}"
         )
-    return out
+    return out, inside.bodies + touching.bodies
 
 
-def _met(found: dict[str, list[str]]) -> list[str]:
-    """The bodies that electrodes meet, each once."""
-    return list(dict.fromkeys(body for bodies in found.values() for body in bodies))
+def _behind(bodies: list[Body], design: Design) -> list[str]:
+    """Bodies that are nearest to a flat electrode from behind, where the design has its back."""
+    found = Contacts(depth=math.inf)
+    for electrode in design.electrodes:
+        points = points_on(electrode.surface.triangles, _FEW)
+        if np.ptp(points[:, 2]) > 1e-3:
+            continue
+        for body in bodies:
+            if body.shape.kind == ShapeKind.LAYERS:
+                continue
+            off = distances(body, points)
+            k = int(off.argmin())
+            if off[k] > _BACK:
+                continue
+            nearer = off[k] - distances(body, points[[k]] - (0.0, 0.0, _STEP))[0]
+            if nearer > 0.5 * _STEP:
+                found.met.setdefault(electrode.name, []).append(str(body.name))
+                found.depth = min(found.depth, float(off[k]))
+    if not found.met:
+        return []
+    return [
+        f"{listed(found.bodies, 4)} {'is' if len(found.bodies) == 1 else 'are'} behind "
+        f"{found.electrodes}, from {1e3 * found.depth:.2g} mm on. What is behind them is part of "
+        "the design, and other bodies there are read roughly; describe them in the design, move "
+        f"the sensor's frame, or {_leave_out(found)}"
+    ]
 
 
-def _bodies(found: dict[str, list[str]]) -> str:
-    met = _met(found)
-    return ", ".join(map(repr, met[:4])) + f" and {len(met) - 4} more" * (len(met) > 4)
-
-
-def _fix(found: dict[str, list[str]], depth: float) -> str:
-    move = f"move the sensor's frame at least {1e3 * max(depth, 1e-3):.2g} mm out of it"
+def _fix(found: Contacts) -> str:
+    move = f"move the sensor's frame at least {1e3 * max(found.depth, 1e-3):.2g} mm out of it"
     return f"{move}, or {_leave_out(found)}"
 
 
-def _leave_out(found: dict[str, list[str]]) -> str:
-    met = _met(found)
+def _leave_out(found: Contacts) -> str:
+    met = found.bodies
     more = ", …" * (len(met) > 4)
     return f"leave it out with exclude=[{', '.join(map(repr, met[:4]))}{more}]"
 
@@ -155,11 +205,3 @@ def _coarse(body: Body, panels: int) -> list[str]:
         f"{body.name!r} is a mesh of {area:.2g} m², solved with panels of some {1e3 * width:.0f} "
         "mm; cut it into meshes of 0.4 m or less, or keep only what comes near the sensor"
     ]
-
-
-def _electrodes(found: dict[str, list[str]], one: str, many: str) -> str:
-    names = list(found)
-    if len(names) == 1:
-        return f"electrode {names[0]!r} {one}"
-    listed = ", ".join(map(repr, names[:6])) + (f" and {len(names) - 6} more" * (len(names) > 6))
-    return f"electrodes {listed} {many}"

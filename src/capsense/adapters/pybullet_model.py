@@ -223,6 +223,9 @@ class ClientSource(WorldSource):
             to_mass = Pose(*dynamics[3:5]).inverse()  # visual shapes stand in the URDF frame
             flat = lost = False
             for entry in drawn:
+                if entry[2] == p.GEOM_PLANE:  # its normal is told of the collision shape only
+                    flat = True
+                    continue
                 if self._is_nothing(link, entry):
                     continue
                 try:

@@ -14,6 +14,7 @@ from capsense.errors import ReadoutError, SceneError
 from capsense.reading import Reading
 from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene import Pose
+from capsense.scene.contact import listed
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign, make_simulators, read_all
 
@@ -89,15 +90,15 @@ class AttachedSkin:
         except SceneError:  # which the first reading will raise, too
             return
         unseen = sum(blind(texts) for texts in found.values())
-        listed = [
-            f"sensor {name!r}: {text}"
-            for name, texts in found.items()
-            for text in texts
-            if not blind([text]) or unseen == len(self)
-        ]
-        if listed:
-            more = f";\nand {len(listed) - 4} more, see check()" if len(listed) > 4 else ""
-            warnings.warn(";\n".join(listed[:4]) + more, stacklevel=3)
+        told: dict[str, list[str]] = {}  # finding → sensors
+        for name, texts in found.items():
+            for text in texts:
+                if not blind([text]) or unseen == len(self):
+                    told.setdefault(text, []).append(name)
+        lines = [f"sensor {listed(names, 1)}: {text}" for text, names in told.items()]
+        if lines:
+            more = f";\nand {len(lines) - 4} more, see check()" if len(lines) > 4 else ""
+            warnings.warn(";\n".join(lines[:4]) + more, stacklevel=3)
 
     @property
     def poses(self) -> dict[str, Pose]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +23,8 @@ OK, FAILED, BAD_INPUT, TARGET_MISSED, DIFFERS, INTERRUPTED = 0, 1, 2, 3, 3, 130
 """Exit codes."""
 PICTURES = (".png", ".svg", ".pdf")
 """Endings of files that pictures are written to."""
+EVERY = 10.0
+"""Seconds between lines that tell of progress where there is no terminal."""
 
 
 @dataclass(frozen=True)
@@ -117,17 +121,19 @@ class Interrupt:
 class BuildProgress:
     """A progress callback for :class:`capsense.Simulator`: ``progress(stage, fraction)``.
 
-    The bar appears at the first call, so that a field from the cache shows none.
+    A bar on a terminal; else a line at the start and one every :data:`EVERY` seconds. They appear
+    at the first call, so that a field from the cache shows none.
 
     Args:
-        shown: Whether there is a terminal to draw on.
+        quiet: Show nothing.
         prefix: What stands before the stage's name.
     """
 
-    def __init__(self, *, shown: bool, prefix: str = "building the field: ") -> None:
-        self._shown = shown
+    def __init__(self, *, quiet: bool = False, prefix: str = "building the field: ") -> None:
+        self._quiet = quiet
         self._prefix = prefix
         self._bar: Any = None
+        self._started = self._told = -math.inf
 
     def __enter__(self) -> BuildProgress:
         return self
@@ -138,7 +144,10 @@ class BuildProgress:
 
     def __call__(self, stage: str, fraction: float) -> None:
         """Show that ``stage`` is done to ``fraction``, from 0 to 1."""
-        if not self._shown:
+        if self._quiet:
+            return
+        if not sys.stderr.isatty():
+            self._line(stage, fraction)
             return
         if self._bar is None:
             from tqdm import tqdm
@@ -148,6 +157,17 @@ class BuildProgress:
         self._bar.set_description(f"{self._prefix}{stage}", refresh=False)
         self._bar.n = min(max(fraction, 0.0), 1.0)
         self._bar.refresh()
+
+    def _line(self, stage: str, fraction: float) -> None:
+        """Say it in a line, unless that was done only just."""
+        now = time.monotonic()
+        if now - self._told < EVERY:
+            return
+        first = math.isinf(self._told)
+        self._started = now if first else self._started
+        self._told = now
+        so_far = "" if first else f", {now - self._started:.0f} s so far"
+        say(f"{self._prefix}{stage}, {min(max(fraction, 0.0), 1.0):.0%} done{so_far}")
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

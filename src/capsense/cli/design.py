@@ -16,7 +16,6 @@ from capsense.cli.console import (
     facts,
     field_figures,
     grouped,
-    progress_shown,
     table,
 )
 from capsense.errors import DesignError
@@ -82,7 +81,7 @@ def _design(args: argparse.Namespace) -> int:
     if not args.no_build:
         import capsense
 
-        with BuildProgress(shown=progress_shown(args.quiet)) as progress:
+        with BuildProgress(quiet=args.quiet) as progress:
             simulator = capsense.Simulator(design, progress=progress)
         print(f"\n{describe_field(simulator)}")
     return OK

@@ -16,7 +16,6 @@ from capsense.cli.console import (
     add_quiet,
     check_picture,
     facts,
-    grouped,
     progress_shown,
     say,
     seconds,
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from capsense.readout.presets import Chip
     from capsense.readout.readout import Readout
     from capsense.readout.recording import CapacitanceRecord
-    from capsense.recording.reader import Replay
 
 
 def _replay_recording_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +72,7 @@ def _replay_recording(args: argparse.Namespace) -> int:
     shown = progress_shown(args.quiet)
     with (
         tqdm(unit=" steps", file=sys.stderr, disable=not shown) as bar,
-        BuildProgress(shown=shown) as progress,
+        BuildProgress(quiet=args.quiet) as progress,
     ):
         found = replay(
             recording,
@@ -84,26 +82,13 @@ def _replay_recording(args: argparse.Namespace) -> int:
             each=lambda _: bar.update(),
         )
     if not args.quiet:
-        print(_replay_report(found))
+        print(found)
     if found.same:
         return OK
     say(f"the readings differ; first, {found.first}")
     for key, (then, now) in found.changed.items():
         say(f"recorded with {key} {then}, replayed with {now}")
     return DIFFERS
-
-
-def _replay_report(found: Replay) -> str:
-
-    lines = [("steps", grouped(found.steps))]
-    if found.counts is not None:
-        lines.append(("conversions", grouped(found.counts)))
-    verdict = "same to the last bit"
-    if found.largest > 0 or not found.same:
-        verdict = f"{found.differing} steps differ; " if not found.same else ""
-        verdict += f"capacitances by at most {found.largest:.3g} F"
-    lines.append(("readings", verdict))
-    return facts(lines)
 
 
 REPLAY = Command(

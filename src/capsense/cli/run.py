@@ -159,7 +159,7 @@ def build_simulator(scenario: Scenario, *, quiet: bool) -> Simulator:
     """The simulator that a scenario asks for, with a bar while its field is built."""
     import capsense
 
-    with BuildProgress(shown=progress_shown(quiet)) as progress:
+    with BuildProgress(quiet=quiet) as progress:
         return capsense.Simulator(scenario.design, method=scenario.method, progress=progress)
 
 

@@ -92,7 +92,7 @@ def _serve(args: argparse.Namespace) -> int:
         tuple(args.origin), _limits(args), args.watch,
     )  # fmt: skip
     logger = _logger(quiet=args.quiet)
-    with BuildProgress(shown=progress_shown(args.quiet)) as progress:
+    with BuildProgress(quiet=not progress_shown(args.quiet)) as progress:  # lines are JSON here
         server = Server(options, progress=progress, logger=logger)
     sys.setswitchinterval(SWITCH_INTERVAL)
     asyncio.run(_run(server))
@@ -267,7 +267,7 @@ def _player(args: argparse.Namespace) -> Playback:
     """What is to be shown, ready to play."""
     from capsense.viewer.player import Player
 
-    with BuildProgress(shown=progress_shown(args.quiet)) as progress:
+    with BuildProgress(quiet=args.quiet) as progress:
         if args.connect is not None:
             from capsense.viewer.show import Follower
             from capsense.viewer.source import Watched

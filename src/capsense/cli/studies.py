@@ -246,7 +246,7 @@ def _carry_out(name: str, study: Study, folder: Path, *, reduced: bool) -> int:
     """Run a study, write and print what it found; return how many rows missed their target."""
     from capsense.reproduce.harness import ROW_HEADER, row_cells, write_outcome
 
-    with BuildProgress(shown=sys.stderr.isatty(), prefix=f"{name}: ") as progress:
+    with BuildProgress(prefix=f"{name}: ") as progress:
         outcome = study(folder, reduced=reduced, report=progress)
     written = write_outcome(outcome, folder, reduced=reduced)
     title = outcome.title + (", reduced" if reduced else "")

@@ -11,7 +11,7 @@ from trimesh.triangles import closest_point
 
 from capsense.design import Design
 from capsense.scene import Body, Capsule, Cylinder, Scene
-from capsense.scene.scene import distances, points_on
+from capsense.scene.contact import distances, points_on
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh, kuhn_tets
 from capsense.mesh.tetmesh import GROUND
 from capsense.scene import Scene
-from capsense.scene.scene import met
+from capsense.scene.contact import met
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]

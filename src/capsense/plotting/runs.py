@@ -13,6 +13,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._style import (
@@ -79,13 +80,15 @@ def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes)
     corners = {0: middle[0] - span / 2, 1: middle[1] - span / 2, 2: floor}
     name = run.design.name
     views = ((above, (0, 1), f"{name}, from above"), (side, (across, 2), "from the side"))
+    tags = _tags(run.scenes[peak])
     for axes, (a, b), title in views:
         _draw_domain(run.design, axes, a, b)
         if b == 1:
             _sensor_from_above(run.design, colours, axes)
         else:
             _sensor_from_the_side(run.design, colours, axes, a)
-        _draw_bodies(run.scenes, peak, axes, [a, b], (corners[a], corners[a] + span))
+        _draw_bodies(run.scenes, peak, axes, [a, b])
+        _name_bodies(run.scenes[peak], tags, axes, [a, b], (corners[a], corners[b], span))
         for track in np.moveaxis(positions[:, :, [a, b]] * 1e3, 1, 0):
             here = ~np.isnan(track).any(axis=1)
             if np.ptp(track[here], axis=0).max(initial=0.0) > 0.01:
@@ -104,6 +107,13 @@ def draw_views(run: Run, peak: int, colours: list[str], above: Axes, side: Axes)
             style: dict[str, Any] = {"marker": "o", "ls": "--", "color": INK, "mfc": "white"}
             handles.insert(0, Line2D([], [], lw=0.9, label="start", **style))
         above.figure.legend(handles=handles, loc="outside lower right", ncols=2, **LEGEND)
+    listed = {tag: _owner(n, list(tags)) for n, tag in tags.items() if tag.isdigit() and tag != n}
+    if listed:
+        handles = [Line2D([], [], ls="", label=f"{tag}  {name}") for tag, name in listed.items()]
+        above.figure.legend(
+            handles=handles, loc="outside lower left", ncols=7, handlelength=0, handletextpad=0,
+            columnspacing=1.4, **LEGEND,
+        )  # fmt: skip
 
 
 def _window(run: Run, positions: Array, peak: int) -> tuple[Array, Array]:
@@ -133,9 +143,7 @@ def _draw_domain(design: Design, axes: Axes, a: int, b: int) -> None:
     axes.add_patch(outline_patch(walls, fc="none", ec=FAINT, lw=1.0))
 
 
-def _draw_bodies(
-    scenes: Sequence[Scene], peak: int, axes: Axes, plane: list[int], shown: tuple[float, float]
-) -> None:
+def _draw_bodies(scenes: Sequence[Scene], peak: int, axes: Axes, plane: list[int]) -> None:
     """Bodies at the peak, dashed where they stood at the start."""
     for body in scenes[0] if peak else ():
         outline = _silhouette(body, plane)
@@ -143,11 +151,66 @@ def _draw_bodies(
     for body in scenes[peak]:
         outline = _silhouette(body, plane)
         axes.add_patch(outline_patch(outline, fc=to_rgba(INK, 0.12), ec=INK, lw=0.9))
-        left, _, right, top = outline.bounds
-        axes.annotate(
-            body.name or "", (float(np.clip((left + right) / 2, *shown)), top), xytext=(0, 3),
-            textcoords="offset points", ha="center", fontsize=8, color=INK, zorder=6,
-            annotation_clip=True,
+
+
+def _tags(scene: Scene) -> dict[str, str]:
+    """What stands in the picture for each name: the name; of many, a number.
+
+    Of many, the parts of one body, such as ``arm/hand`` and ``arm/wrist``, share a number.
+    """
+    names = list(dict.fromkeys(body.name for body in scene if body.name))
+    if len(names) <= FEW:
+        return {name: name for name in names}
+    owners = {name: _owner(name, names) for name in names}
+    numbers = {owner: str(k + 1) for k, owner in enumerate(dict.fromkeys(owners.values()))}
+    if len(numbers) <= FEW:
+        return owners
+    return {name: numbers[owner] for name, owner in owners.items()}
+
+
+def _owner(name: str, names: Sequence[str]) -> str:
+    """The body that a name such as ``arm/hand`` is a part of, where others are too."""
+    body = name.partition("/")[0]
+    return body if sum(other.partition("/")[0] == body for other in names) > 1 else name
+
+
+def _name_bodies(
+    scene: Scene, tags: dict[str, str], axes: Axes, plane: list[int], window: Sequence[float]
+) -> None:
+    """Write each tag once, over the largest of its bodies, where there is room for it.
+
+    Args:
+        scene: The bodies.
+        tags: Name → what is written.
+        axes: Where.
+        plane: The two axes of the view.
+        window: Lower left corner and width of what is shown [mm].
+    """
+    left, bottom, span = window
+    point = span / VIEW_WIDTH
+    largest: dict[str, Any] = {}
+    for body in scene:
+        tag, outline = tags.get(body.name or ""), _silhouette(body, plane)
+        if tag and (tag not in largest or outline.area > largest[tag].area):
+            largest[tag] = outline
+    taken: list[Any] = []
+    for tag, outline in largest.items():
+        low, _, high, top = outline.bounds
+        half, height = 2.6 * len(tag) * point, 9 * point
+        x = float(np.clip((low + high) / 2, left, left + span))
+        for row in range(2 if tag.isdigit() else 5):
+            y = top + 3 * point + row * height
+            place = shapely.geometry.box(x - half, y, x + half, y + height)
+            if not any(place.intersects(other) for other in taken):
+                break
+        else:
+            continue  # the other view, or the list, tells
+        if not bottom <= y <= bottom + span:
+            continue
+        taken.append(place)
+        axes.text(
+            x, y, tag, ha="center", va="bottom", fontsize=8, color=INK, zorder=6,
+            path_effects=[Stroke(linewidth=2, foreground="white"), Normal()],
         )  # fmt: skip
 
 
@@ -191,6 +254,10 @@ def _draw_way(axes: Axes, track: Array, times: Array) -> None:
     axes.plot(*track[0], "o", ms=5, mfc="white", mec=INK, mew=1.0, zorder=5)
 
 
+FEW = 3
+"""So many bodies are named in the views; of more, numbers stand there."""
+VIEW_WIDTH = 170.0
+"""About the width of a view [points]."""
 PLAIN_ELECTRODE = "#c08a3e"
 MAX_LINES = 8
 """So many lines of a family are coloured; the rest, the weakest, stay grey."""

@@ -241,7 +241,10 @@ class Replay:
     largest: float
     """Largest difference of a capacitance [F], allowed or not."""
     counts: int | None
-    """Conversions of the readout that were compared; None where it cannot be built again."""
+    """Conversions of the readout that were repeated; None where that cannot be built again, or
+    where there was none: :attr:`recorded_counts` tells these apart."""
+    recorded_counts: int
+    """Conversions that the recording holds."""
     changed: dict[str, tuple[str, str]]
     """Versions and the processor, where they are others: as recorded, and here."""
 
@@ -249,6 +252,22 @@ class Replay:
     def same(self) -> bool:
         """Whether all numbers were the same, or within what was allowed."""
         return self.first is None
+
+    def __str__(self) -> str:
+        """What was compared, and what came of it, in a few lines."""
+        lines = [f"steps        {self.steps}"]
+        if self.counts is not None:
+            lines.append(f"conversions  {self.counts}")
+        elif self.recorded_counts:
+            lines.append(
+                f"conversions  {self.recorded_counts} recorded, not compared: the recording cannot "
+                "build its readout again; give Recorder(readout=…) a chip's name or a file"
+            )
+        verdict = "same to the last bit"
+        if self.largest > 0 or not self.same:
+            verdict = "" if self.same else f"{self.differing} steps differ; "
+            verdict += f"capacitances by at most {self.largest:.3g} F"
+        return "\n".join([*lines, f"readings     {verdict}"])
 
 
 def replay(
@@ -288,7 +307,7 @@ def replay(
     readout = session.new_readout()
     compare = _Comparison(session, tolerance)
     compare.baseline(simulator.baseline)
-    episode, n, conversions = 0, 0, 0
+    episode, n, conversions, held = 0, 0, 0, 0
     for step in recording.steps():
         if step.episode != episode:
             episode = step.episode
@@ -297,6 +316,7 @@ def replay(
                 readout.reset()
         reading = simulator.step(step.scene)
         compare.step(step.index, step.time, step.reading, reading)
+        held += 0 if step.reading.counts is None else len(step.reading.counts)
         if readout is not None:
             counts = readout.sample(step.time, reading)
             conversions += len(counts)
@@ -306,7 +326,7 @@ def replay(
             each(n)
     return Replay(
         n, recording.complete, len(compare.differing), compare.first, compare.largest,
-        None if readout is None else conversions, _changed(session),
+        None if readout is None else conversions, held, _changed(session),
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -144,10 +145,18 @@ class Pose(Frozen):
             angles: Roll, pitch, yaw [rad], or degrees where ``degrees`` is set.
             degrees: Whether the angles are in degrees.
 
+        Radians beyond ±2π look like degrees, and are warned of once at each place.
+
         Raises:
             SceneError: A number is missing or not finite.
         """
         rpy = checked_floats(angles, 3, "angles", "give three numbers (roll, pitch, yaw)")
+        if not degrees and max(map(abs, rpy)) > 2 * math.pi:
+            warnings.warn(
+                "Pose.from_euler was given an angle beyond ±2π rad; if it is in degrees, write "
+                "Pose.from_euler(position, angles, degrees=True), or else take off whole turns",
+                stacklevel=2,
+            )
         half = [0.5 * (math.radians(a) if degrees else a) for a in rpy]
         (cr, cp, cy), (sr, sp, sy) = map(math.cos, half), map(math.sin, half)
         return cls(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from capsense.errors import SceneError
 from capsense.scene.materials import Grounding, Material, checked_grounding
 from capsense.scene.materials import material as find_material
-from capsense.scene.mesh_shape import SHEET_THICKNESS, RestSurface, SurfaceMesh, TriangleShape
+from capsense.scene.mesh_shape import SHEET_THICKNESS, RestSurface, SurfaceMesh
 from capsense.scene.pose import Pose
-from capsense.scene.shapes import Shape, ShapeKind
+from capsense.scene.shapes import Shape
 
 Array = NDArray[np.float64]
 
@@ -272,109 +271,3 @@ class Scene:
         place_bodies(table, rotation, bounds)
         kinds = table[:, 0].astype(np.int64)
         return PackedScene(kinds, table[:, 1:4], rotation, table[:, 11:], bounds, shapes)
-
-
-TOUCH = 2e-4
-"""What is nearer to an electrode than this [m] touches it."""
-_FEW = 10
-"""About so many points of each electrode are looked at first."""
-
-
-class Sheets:
-    """The electrodes of a sensor, as points.
-
-    Args:
-        sheets: Triangles of each electrode [m], shapes (t, 3, 3).
-    """
-
-    def __init__(self, sheets: Sequence[Array]) -> None:
-        few = np.concatenate([points_on(corners, _FEW) for corners in sheets])
-        self._few = np.unique(few, axis=0)
-        self._many = np.concatenate([points_on(corners) for corners in sheets])
-        apart = np.linalg.norm(self._many[:, None] - self._few, axis=2)
-        self._nearest = apart.argmin(axis=1)
-        self._reach = apart.min(axis=1) + TOUCH
-        self._middle = self._few.mean(axis=0, keepdims=True)
-        arms = np.concatenate([self._few, self._many]) - self._middle
-        self._radius = float(np.linalg.norm(arms, axis=1).max()) + TOUCH
-        self.bounds = np.array([self._few.min(axis=0) - TOUCH, self._few.max(axis=0) + TOUCH])
-        """Corners of a box around all of them [m], shape (2, 3)."""
-
-    def meet(self, body: Body, conducting: bool) -> bool:
-        """Whether one of them lies inside a body, or touches one that conducts.
-
-        A depth image has no inside.
-        """
-        if body.shape.kind == ShapeKind.LAYERS:
-            return False
-        if distances(body, self._middle, each=False)[0] > self._radius:
-            return False
-        off = distances(body, self._few, each=False)
-        close = off[self._nearest] <= self._reach  # others are no nearer than the few around them
-        if close.any():
-            off = np.concatenate([off, distances(body, self._many[close], each=False)])
-        return met(off, conducting)
-
-
-def met(off: Array, conducting: bool) -> bool:
-    """Whether points at such distances from a body [m] mean that it holds an electrode.
-
-    One lies inside it, or touches it where it conducts.
-    """
-    return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
-
-
-def distances(body: Body, points: Array, *, each: bool = True) -> Array:
-    """Distances of points to a body [m], negative inside; of an open mesh, by its winding.
-
-    Of the points that rays find inside an open mesh, ``each`` is made sure, or the deepest only.
-    """
-    local, shape = body.pose.inverse().apply(points), body.shape
-    if not isinstance(shape, TriangleShape) or shape.closed or not len(points):
-        return shape.signed_distance(local)
-    off = np.minimum(shape.ray_distance(local), shape.ray_distance(local, down=True))
-    inside = off < 0
-    if not each:
-        deepest = int(off.argmin())
-        if off[deepest] < -TOUCH and not _wound(shape, local[[deepest]], -off[[deepest]])[0]:
-            inside[:] = False
-    else:
-        inside[inside] = _wound(shape, local[inside], -off[inside])
-    return np.where(inside, off, np.abs(off))
-
-
-def _wound(shape: TriangleShape, points: Array, off: Array) -> NDArray[np.bool_]:
-    """Points that an open surface winds round by more than a half.
-
-    Points nearer to one another than one of them is to the surface, ``off`` [m], are alike.
-
-    A. Jacobson, L. Kavan, O. Sorkine-Hornung, *Robust inside-outside segmentation using
-    generalized winding numbers* (2013); solid angles after A. van Oosterom and J. Strackee (1983).
-    """
-    out = np.zeros(len(points), dtype=bool)
-    left = np.ones(len(points), dtype=bool)
-    for k in np.argsort(-off).tolist():
-        if not left[k]:
-            continue
-        arms = shape.vertices[shape.faces] - points[k]
-        a, b, c = arms[:, 0], arms[:, 1], arms[:, 2]
-        u, v, w = (np.linalg.norm(x, axis=1) for x in (a, b, c))
-        below = u * v * w + (a * b).sum(1) * w + (b * c).sum(1) * u + (c * a).sum(1) * v
-        angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below)
-        alike = np.linalg.norm(points - points[k], axis=1) <= off[k]
-        out[alike & left] = abs(angle.sum()) > 2 * math.pi
-        left[alike] = False
-    return out
-
-
-def points_on(corners: Array, count: int = 100) -> Array:
-    """Corners of triangles (t, 3, 3), and some ``count`` points spread evenly [m], shape (n, 3)."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normals, axis=1)
-    steps = np.arange(count) + 0.5
-    triangle = np.searchsorted(np.cumsum(area) / area.sum(), steps / count)
-    u, v = np.sqrt(steps * 0.7548776662 % 1.0), steps * 0.5698402910 % 1.0  # Roberts' R2 sequence
-    shares = np.stack([1 - u, u * (1 - v), u * v], axis=1)
-    spread = (shares[:, :, None] * corners[np.minimum(triangle, len(area) - 1)]).sum(axis=1)
-    few = corners.reshape(-1, 3)[:: max(1, 3 * len(corners) // count)]
-    return np.concatenate([few, spread])

@@ -21,8 +21,9 @@ from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import pack_green
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
+from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
-from capsense.scene.scene import PackedScene, Sheets
+from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.step import Solution, potential_change, solve, solve_each, solve_lossy
 
