@@ -309,6 +309,19 @@ def test_near_misses_load(changes: tuple[tuple[str, Any], ...]) -> None:
     parse_design(changed(*changes))
 
 
+@pytest.mark.parametrize("one", ["ground", "shield", "floating"])
+@pytest.mark.parametrize("other", ["ground", "shield", "floating"])
+def test_which_conductors_may_touch(one: str, other: str) -> None:
+    """Grounds touch grounds, and shields shields, along an edge; all else is a short circuit."""
+    beside = {**POUR, "size": [0.1, 0.02], "center": [0.0, 0.05], "z": -0.001, "role": other}
+    data = changed((BACK + "role", one), ("conductor.+", beside))
+    if one == other != "floating":
+        assert len(parse_design(data).conductors) == 2
+    else:
+        with pytest.raises(DesignError, match=r'conductor "back".*"pour".*short circuit'):
+            parse_design(data)
+
+
 def test_height_within_a_micrometre_is_snapped_to_the_face() -> None:
     """A sheet half a micrometre off a layer's face lies exactly on it."""
     design = parse_design(changed((B + "center", [0.03, 0.0, 5e-7])))
