@@ -337,7 +337,7 @@ def test_leaps_are_refused():
     """A clock that does not start at zero, as that of the day, is no reason to run for hours."""
     readout = plain()
     matrix = random_maxwell(np.random.default_rng(0), 3)
-    with pytest.raises(ReadoutError, match="more than 2e.07 conversions"):
+    with pytest.raises(ReadoutError, match=r"more than 2e.07 conversions"):
         readout.sample(1.01 * 20e6 / 3 * readout.schedule.period, matrix)
     for leap in (lambda: readout.sample(1.7e9, matrix), lambda: readout.due(1.7e9),
                  lambda: readout([0.0, 1.7e9], [matrix, matrix])):  # fmt: skip
