@@ -112,6 +112,19 @@ def test_everything_is_taken_over():
     [
         ('chip = "fdc1004"', "seed", 0, 2**63 - 1),
         ('chip = "fdc1004"', "nonlinearity", -0.1, 0.1),
+        ('chip = "fdc1004"', "capdac", 0, 10**6),
+        ('chip = "fdc1004"', "rate", 1e-3, 1e7),
+        ('chip = "fdc1004"', "period", 1e-6, 1e6),
+        ('chip = "fdc1004"', "latency", 0.0, 1e3),
+        ('chip = "fdc1004"', "expected", 1e-15, 1e-6),
+        ('chip = "fdc2214"\n[tank]', "inductance", 1e-9, 1.0),
+        ('chip = "fdc2214"\n[tank]', "capacitance", 1e-15, 1e-3),
+        ('chip = "fdc2214"\n[tank]', "reference", 1e5, 1e9),
+        ('chip = "sdr"\n[front_end]', "frequency", 1.0, 1e10),
+        ('chip = "sdr"\n[front_end]', "shunt", 1e-3, 1e12),
+        ('chip = "sdr"\n[front_end]', "amplitude", 1e-6, 1e6),
+        ('chip = "sdr"\n[front_end]', "bandwidth", 1.0, 1e12),
+        ('chip = "sdr"\n[front_end]', "parasitic", 0.0, 1e-6),
         ('chip = "sdr"\n[front_end]', "full_scale", 1e-9, 1e6),
         ('chip = "sdr"\n[front_end]', "gain", 1e-6, 1e9),
         ('chip = "sdr"\n[front_end]', "bits", 2, 32),
@@ -143,10 +156,14 @@ def test_everything_is_taken_over():
 )
 def test_numbers_up_to_their_limits(text, key, low, high):
     """Limits: what lies beyond is refused by its key, the ends are not."""
-    step = 1 if isinstance(low, int) else 1e-6 * high
+    below, above = (
+        (low - 1, high + 1)
+        if isinstance(low, int)
+        else (low - 1e-6 * (abs(low) or high), high * 1.000001)
+    )
     for value in (low, high):
         assert f"{key} = " not in told(f"{text}\n{key} = {value!r}\n")
-    for value in (low - step, high + step):
+    for value in (below, above):
         assert f"{key} = " in told(f"{text}\n{key} = {value!r}\n")
 
 
