@@ -64,7 +64,7 @@ def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
     for facet in surface.facets:
         z = float(facet.origin[2])
         near = [level for level in levels if 0.0 < abs(level - z) <= TOUCH]
-        if near and bool(np.all(facet.axes[:2, 2] == 0.0)):
+        if near:
             moved = near[0] - z
             facet = Facet(facet.polygon, facet.origin + np.array([0.0, 0.0, moved]), facet.axes)
         facets.append(facet)
