@@ -18,6 +18,7 @@ from capsense.field.boundary import Accuracy, BoundarySolution, build_model, ter
 from capsense.field.green import (
     TABLES,
     GreenFunction,
+    _rounded,
     basis,
     build_green,
     from_arrays,
@@ -314,6 +315,16 @@ def test_spread_takes_the_farthest_point_every_time() -> None:
     closest = np.where(np.eye(40, dtype=bool), np.inf, gaps).min()
     reach = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
     assert reach.max() <= closest
+
+
+def test_tables_are_rounded_to_the_nearest() -> None:
+    """Analytic: twelve binary digits are kept, the first of which is not stored."""
+    rng = np.random.default_rng(0)
+    table = (rng.normal(size=1000) * 10.0 ** rng.integers(-20, 20, 1000)).astype(np.float32)
+    fraction, exponent = np.frexp(table.astype(float))
+    expected = np.ldexp(np.round(fraction * 2.0**12), exponent - 12)
+    np.testing.assert_array_equal(_rounded(table), expected)
+    np.testing.assert_array_equal(_rounded(_rounded(table)), expected)
 
 
 def test_stored_to_the_last_bit(built: BackgroundField, tmp_path: Path) -> None:
