@@ -22,7 +22,6 @@ from capsense.errors import FieldError
 from capsense.field import bem_kernels as kernels
 from capsense.field.facets import (
     FAR_PLANE,
-    PLANE_TOL,
     interfaces,
     plane_spacings,
     smallest_gaps,
@@ -139,10 +138,8 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
     for body in design.sheets:
         owner = names.index(body.name) if body.name in names else GROUND
         for facet in body.surface.facets:
-            on_floor = abs(facet.axes[2, 2]) > 1 - 1e-9 and abs(facet.origin[2] - floor) < PLANE_TOL
-            if not on_floor:
-                sheets.append((facet, owner))
-                flat.append(len(body.surface.facets) <= _FEW_FACETS)
+            sheets.append((facet, owner))
+            flat.append(len(body.surface.facets) <= _FEW_FACETS)
     rims = np.concatenate([b.surface.rims for b in design.sheets])
     gaps, spacings = np.full(len(sheets), np.inf), np.full(len(sheets), FAR_PLANE)
     few = np.flatnonzero(flat)
