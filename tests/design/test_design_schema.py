@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -332,8 +333,10 @@ def test_numbers_up_to_their_limits(
     changes: tuple[tuple[str, Any], ...], key: str, low: float, high: float
 ) -> None:
     """Limits: what lies beyond is refused by its key, the ends are not."""
-    step = 1 if isinstance(low, int) else 1e-6
-    for value, refused in ((low - step, True), (low, False), (high, False), (high + step, True)):
+    beyond = (low - 1, high + 1)
+    if isinstance(low, float):
+        beyond = math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
+    for value, refused in ((low, False), (high, False), (beyond[0], True), (beyond[1], True)):
         told = ""
         try:
             parse_design(changed(*changes, (key, value)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import dataclass, replace
 
@@ -156,14 +157,12 @@ def test_everything_is_taken_over():
 )
 def test_numbers_up_to_their_limits(text, key, low, high):
     """Limits: what lies beyond is refused by its key, the ends are not."""
-    below, above = (
-        (low - 1, high + 1)
-        if isinstance(low, int)
-        else (low - 1e-6 * (abs(low) or high), high * 1.000001)
-    )
+    beyond = (low - 1, high + 1)
+    if isinstance(low, float):
+        beyond = math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
     for value in (low, high):
         assert f"{key} = " not in told(f"{text}\n{key} = {value!r}\n")
-    for value in (below, above):
+    for value in beyond:
         assert f"{key} = " in told(f"{text}\n{key} = {value!r}\n")
 
 
