@@ -384,10 +384,15 @@ def test_a_hollow_ball():
 
 
 def test_two_loose_balls_exchange_no_charge():
-    """Field along the line of two balls of eps 80, 20 radii apart: each answers for itself."""
+    """Field along the line of two balls of eps 80, 20 radii apart: each answers for itself.
+
+    Charge that both were given together stays free to come, in equilibrium.
+    """
     panels = panels_of(np.concatenate([ball(3), ball(3) + np.array([20.0, 0, 0])]), 640)
     free = free_block(panels)
     z = impedance(panels, free)
+    rest = np.linalg.solve(free, np.ones(len(panels)))
+    assert np.abs(z @ rest).max() < 1e-8 * np.abs(z).max() * np.abs(rest).sum()
     volume = 2 * 4 / 3 * math.pi
     got = polarisability(panels, free, z, 80.0, volume)
     np.testing.assert_allclose(got, 3 * 79 / 82, rtol=0.04)
