@@ -191,8 +191,9 @@ def test_wrong_input_is_refused():
     mesh = faces(crooked(), 0, "low", "high").with_groups(node_groups={"none": []})
     with pytest.raises(FieldError, match="eps_r must be a number or have shape"):
         capacitance_p1(mesh, np.ones(3), ["low"], ["high"])
-    with pytest.raises(FieldError, match="positive and finite"):
-        capacitance_p1(mesh, 0.0, ["low"], ["high"])
+    for eps_r in (0.0, -1.0, np.nan, np.inf, np.where(np.arange(mesh.n_tets) == 7, -2.0, 1.0)):
+        with pytest.raises(FieldError, match="positive and finite"):
+            capacitance_p1(mesh, eps_r, ["low"], ["high"])
     with pytest.raises(FieldError, match="unknown solver 'lu'; known: direct, cg"):
         capacitance_p1(mesh, 1.0, ["low"], ["high"], "lu")  # type: ignore[arg-type]
     with pytest.raises(MeshError, match="no node group 'E1'"):
