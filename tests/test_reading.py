@@ -19,6 +19,7 @@ def test_mutual_capacitances_are_positive() -> None:
     assert (mutual[off] > 0).all()
     assert not np.diag(mutual).any()
     assert (np.diag(reading.capacitance) > 0).all()
+    assert "_shield_coupling" not in repr(reading)
 
 
 def test_shields_take_charge_away() -> None:
@@ -33,3 +34,14 @@ def test_shields_take_charge_away() -> None:
     np.testing.assert_allclose(reading.self_capacitance, expected, rtol=1e-12)
     assert (reading.self_capacitance < np.diag(reading.capacitance)).all()
     assert (reading.self_capacitance > 0).all()
+
+
+def test_the_empty_reading_took_no_work() -> None:
+    """Definition: nothing was solved, nothing changed, and no chip has seen it."""
+    simulator = cs.Simulator("six_patch")
+    empty = simulator.empty
+    assert (empty.stats.solver_error, empty.stats.wall_time) == (0.0, 0.0)
+    assert (empty.stats.unknowns, empty.stats.iterations) == (0, 0)
+    np.testing.assert_array_equal(empty.capacitance, simulator.baseline)
+    assert not empty.delta.any()
+    assert empty.counts is empty.jacobian is empty.conductance is None

@@ -69,8 +69,10 @@ def test_a_step_equals_a_fresh_solve(masked):
 
 def test_impedances_are_refused(masked):
     """Invariant: what the scheme cannot represent is an error that says so."""
-    with pytest.raises(SceneError, match="grounded and floating"):
-        masked.step(cs.Scene([bar(0.02, grounding=1e-12)]))
+    for name, called in ({}, "body 1 "), ({"name": "arm"}, "body arm "):
+        tied = bar(0.02, grounding=1e-12, **name)
+        with pytest.raises(SceneError, match=f"{called}is tied.* 1e-12 F.*grounded and floating"):
+            masked.step(cs.Scene([ball(), tied]))
 
 
 def test_open_surfaces_are_refused(masked):

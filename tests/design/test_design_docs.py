@@ -35,7 +35,7 @@ def test_example_loads(text: str, tmp_path: Path) -> None:
 
 
 def test_page_lists_every_material() -> None:
-    """The page names all materials that layers may have."""
+    """The page names all materials that layers may have, with their permittivity."""
     listed = " ".join(PAGE.split()).lower()
-    for name in LAYER_EPS_R:
-        assert re.search(rf"\b{re.escape(name)}\b", listed), name
+    for name, eps_r in LAYER_EPS_R.items():
+        assert re.search(rf"\b{re.escape(name)} \({eps_r:g}\)", listed), name

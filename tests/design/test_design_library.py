@@ -5,11 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 
 from capsense.design import Design, Role, available_designs, load_design
+from capsense.design.geometry import Facet
 
 NAMES = ("meander", "patch", "six_patch", "six_patch_bare", "stripe", "three_stripes")
 
@@ -45,6 +48,27 @@ def test_loads_fast_and_the_same_again(name: str) -> None:
             assert facet.polygon.is_valid
             assert facet.polygon.exterior.is_ccw
             assert not any(hole.is_ccw for hole in facet.polygon.interiors)
+
+
+def test_hash_tells_outlines_apart() -> None:
+    """Invariant: any corner of any outline counts, where an outline begins and runs to does not."""
+    first = load_design("six_patch")
+    pad = first.electrodes[0]
+    rings = [[(0, 0), (9, 0), (9, 5), (0, 5)], [(1, 1), (2, 1), (2, 2)], [(4, 1), (7, 1), (6, 3)]]
+
+    def of(*rings: list[tuple[float, float]]) -> str:
+        polygon = shapely.Polygon(rings[0], rings[1:])
+        facet = Facet(shapely.transform(polygon, lambda p: 1e-3 * p), np.zeros(3), np.eye(3))
+        electrode = replace(pad, surface=replace(pad.surface, facets=(facet,)))
+        return replace(first, electrodes=(electrode, *first.electrodes[1:])).content_hash()
+
+    whole = of(*rings)
+    assert of(rings[0][2:] + rings[0][:2], rings[2][::-1], rings[1]) == whole
+    for k, ring in enumerate(rings):
+        for j, (x, y) in enumerate(ring):
+            moved = [*ring[:j], (x + 0.1, y + 0.1), *ring[j + 1 :]]
+            assert of(*rings[:k], moved, *rings[k + 1 :]) != whole
+    assert of(*rings[:2]) != whole
 
 
 def test_six_patch() -> None:

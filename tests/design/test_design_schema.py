@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,14 @@ COMB = (
     (A + "finger_size", [0.002, 0.02]),
     (A + "spine_width", 0.002),
 )
+MEANDER = (
+    (A + "shape", "meander"),
+    (A + "size", DROP),
+    (A + "width", 1e-5),
+    (A + "pitch", 2e-5),
+    (A + "length", 0.01),
+)
+PLATE_OF_ITS_OWN = ((PLATE + "material", DROP),)
 STRIPES = (A + "shape", "stripes"), (A + "size", [0.004, 0.03]), (A + "count", 3)
 
 # what is changed; what the message must contain: the item, the value, the fix
@@ -307,6 +316,46 @@ def test_refused_with_name_value_and_mend(case: str) -> None:
 def test_near_misses_load(changes: tuple[tuple[str, Any], ...]) -> None:
     """What is right, if only just, is not refused."""
     parse_design(changed(*changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "low", "high"),
+    [
+        ((), "build.resolution", 0.25, 4.0),
+        (PLATE_OF_ITS_OWN, PLATE + "eps_r", 1.0, 1000.0),
+        ((), A + "rotation", -360.0, 360.0),
+        (COMB, A + "fingers", 1, 1000),
+        (STRIPES, A + "count", 1, 1000),
+        (MEANDER, A + "turns", 1, 1000),
+    ],
+)
+def test_numbers_up_to_their_limits(
+    changes: tuple[tuple[str, Any], ...], key: str, low: float, high: float
+) -> None:
+    """Limits: what lies beyond is refused by its key, the ends are not."""
+    beyond = (low - 1, high + 1)
+    if isinstance(low, float):
+        beyond = math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
+    for value, refused in ((low, False), (high, False), (beyond[0], True), (beyond[1], True)):
+        told = ""
+        try:
+            parse_design(changed(*changes, (key, value)))
+        except DesignError as error:
+            told = str(error)
+        assert (f": {key.split('.')[-1]} = " in told) == refused, told
+
+
+@pytest.mark.parametrize("one", ["ground", "shield", "floating"])
+@pytest.mark.parametrize("other", ["ground", "shield", "floating"])
+def test_which_conductors_may_touch(one: str, other: str) -> None:
+    """Grounds touch grounds, and shields shields, along an edge; all else is a short circuit."""
+    beside = {**POUR, "size": [0.1, 0.02], "center": [0.0, 0.05], "z": -0.001, "role": other}
+    data = changed((BACK + "role", one), ("conductor.+", beside))
+    if one == other != "floating":
+        assert len(parse_design(data).conductors) == 2
+    else:
+        with pytest.raises(DesignError, match=r'conductor "back".*"pour".*short circuit'):
+            parse_design(data)
 
 
 def test_height_within_a_micrometre_is_snapped_to_the_face() -> None:

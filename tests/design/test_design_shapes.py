@@ -118,6 +118,19 @@ def test_comb_sides_put_the_spine_where_they_say() -> None:
         assert np.sign(np.round(np.array(polygon.centroid.coords[0]), 9)).tolist() == list(way)
 
 
+@pytest.mark.parametrize("fingers", [2, 3, 12])
+@pytest.mark.parametrize("shape", ["comb", "meander"])
+def test_fingers_and_runs_that_would_merge_are_refused(shape: str, fingers: int) -> None:
+    """Limits: a pitch as large as the width is too small; a little more is not."""
+    width, sizes = 0.001, {"fingers": fingers, "finger_size": [0.001, 0.02], "spine_width": 0.003}
+    if shape == "meander":
+        sizes = {"turns": fingers, "width": width, "length": 0.02}
+    for pitch in (0.5 * width, width):
+        with pytest.raises(DesignError, match=r"pitch = .* must exceed"):
+            surface(shape, **sizes, pitch=pitch)
+    assert len(surface(shape, **sizes, pitch=1.001 * width).facets) == 1
+
+
 def test_combs_interleave() -> None:
     """Two combs facing each other and shifted by half a pitch keep their gap."""
     design(

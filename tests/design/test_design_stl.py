@@ -259,8 +259,9 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
     for content in (b"", b"PK\x03\x04 not a mesh", b"solid x\nvertex 0 0 0\nvertex 1 0 0\n"):
         (tmp_path / "part.stl").write_bytes(content)
         refused(lambda: stl(tmp_path), 'electrode "E"', "part.stl", "export it anew")
-    (tmp_path / "part.stl").write_bytes(b"solid empty\nendsolid\n")
-    refused(lambda: stl(tmp_path), 'electrode "E"', "no triangles", "export it anew")
+    for content in (b"solid empty\nendsolid\n", bytes(84)):
+        (tmp_path / "part.stl").write_bytes(content)
+        refused(lambda: stl(tmp_path), 'electrode "E"', "no triangles", "export it anew")
     for word in (b"x", b"nan"):
         (tmp_path / "part.stl").write_bytes(
             b"solid\n vertex 0 0 0\n vertex 1 0 0\n vertex 0 1 " + word + b"\nendsolid"

@@ -320,6 +320,23 @@ def test_shares_of_parts(areas_of: list[float], count: int) -> None:
     np.testing.assert_allclose(density, density[:1].repeat(large.sum()), rtol=0.02)
 
 
+def test_slivers_are_halved_where_there_are_triangles_enough() -> None:
+    """By hand: long ones down to about the usual length, short ones never, nor what is none."""
+    right = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    usual = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.05, 0.0866, 0]]) + np.zeros((190, 1, 1))
+    strip = right[None] * [1.0, 0.01, 0.0]
+    short = right * [[[0.05, 0.0005, 0.0]]] * np.ones((9, 1, 1))
+    corners = np.concatenate([usual, strip, short])
+    found = triangles._halved(corners, np.zeros(corners.shape[:2], bool), 200)
+    np.testing.assert_array_equal(found[:190], usual)
+    np.testing.assert_array_equal(found[191:200], short)
+    assert areas(found).sum() == pytest.approx(areas(corners).sum(), rel=1e-12)
+    pieces = np.concatenate([found[190:191], found[200:]])
+    longest = np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=2).max(axis=1)
+    assert 0.05 < longest.min() <= longest.max() < 0.13
+    assert len(found) <= 1.25 * 200
+
+
 @pytest.mark.parametrize("count", [30, 77, 400])
 def test_halved_triangles_cover_the_same_surface(count: int) -> None:
     """Invariant: as many as wanted, alike in size; smaller at sharp edges where these are told."""

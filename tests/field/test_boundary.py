@@ -137,6 +137,15 @@ def test_large_array_is_cut_to_what_fits():
     assert 6_000 < build_model(pads).panels.size < 10_000
 
 
+@pytest.mark.parametrize(("size", "along"), [(0.3, 8), (1.0, 12)])
+def test_walls_are_cut_evenly_whatever_is_inside(size, along):
+    """Analytic: squares of about 40 mm, or 80 mm in a box of 1 m, on the five faces of the box."""
+    design = patches(rectangle((size / 2 - 0.05, 0), (0.03, 0.03)), size=size, backplane=size / 2)
+    model = build_model(design, Accuracy(fitted=False))
+    walls = model.panels.areas[model.owner == boundary.GROUND]
+    np.testing.assert_allclose(walls, [(size / along) ** 2] * (5 * along**2))
+
+
 def test_two_stripes():
     """Measured against the carried-over figures: 0.1 % on the diagonal, 0.2 % beside it."""
     case = figures()["two_stripes"]

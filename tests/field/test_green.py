@@ -19,6 +19,7 @@ from capsense.field.cache import load_background, save_background
 from capsense.field.green import (
     TABLES,
     GreenFunction,
+    _rounded,
     basis,
     build_green,
     from_arrays,
@@ -27,6 +28,7 @@ from capsense.field.green import (
 from capsense.field.green_points import (
     GreenSettings,
     Surroundings,
+    far_points,
     openness,
     spread,
     training_points,
@@ -231,6 +233,34 @@ def test_single_precision_is_enough(name: str) -> None:
     assert (np.abs((single**2).sum(axis=1) - size) < 1e-5 * size).all()
 
 
+def test_first_modes_hold_what_is_met_far_away() -> None:
+    """Analytic: no other few combinations of modes hold more of the values far away (Eckart and
+    Young 1936), but for the weights of distances; the others end with what is least nearby.
+    """
+    it = case("flat")
+    sources, kept = it.green.near_sources.astype(float), it.green.far_modes.shape[1]
+    surface = Surroundings(it.design, it.solution.model)
+    away, near = (
+        basis(points, sources, it.green.floor) @ it.green.near_modes
+        for points, _ in (far_points(surface, sources, FEW), training_points(surface, sources, FEW))
+    )
+    held, most = (away**2).sum(axis=0), np.linalg.svd(away, compute_uv=False) ** 2
+    assert held[:kept].sum() == pytest.approx(most[:kept].sum(), rel=1e-5)
+    assert held[0] == pytest.approx(most[0], rel=0.01)
+    rest = (near[:, kept:] ** 2).sum(axis=0)
+    assert rest[-1] < 1e-3 * rest[0]
+
+
+def test_misfit_is_that_of_the_points_of_the_fit() -> None:
+    """Analytic, but for the weights of distances, which it counts and this does not."""
+    it = case("flat")
+    sources = it.green.near_sources.astype(float)
+    points = training_points(Surroundings(it.design, it.solution.model), sources, FEW)[0][::4]
+    exact, psi = it.answer(points), basis(points, sources, it.green.floor) @ it.green.near_modes
+    misfit = np.linalg.norm(psi @ psi.T - exact) / np.linalg.norm(exact)
+    assert it.green.misfit == pytest.approx(misfit, rel=0.3)
+
+
 @pytest.mark.parametrize("name", DESIGNS)
 def test_charges_lie_where_no_body_can_be(name: str) -> None:
     it = case(name)
@@ -256,22 +286,24 @@ def test_openness_of_plates_and_housings() -> None:
     assert aside > 0.7
 
 
-@pytest.mark.parametrize("backplane", [0.002, 0.01])
-def test_charges_behind_a_plate_stay_above_the_floor(backplane: float) -> None:
+@pytest.mark.parametrize(("backplane", "slope"), [(0.002, 0), (0.01, 0), (0.01, 12)])
+def test_charges_behind_a_plate_stay_above_the_floor(backplane: float, slope: int) -> None:
     """Analytic: as deep as asked for, and at most six tenths of the way to the floor."""
     design = flat(
         domain={"size": [0.2, 0.2, 0.2], "backplane": backplane},
-        electrode=[square("A", 0.0, 0.06)],
+        electrode=[{**square("A", 0.0, 0.06), "tilt": [slope, 0, 0]}],
     )
     surface = Surroundings(design, build_model(design, Accuracy(4.0)))
-    chosen = np.flatnonzero(
-        (np.abs(surface.points[:, :2]).max(axis=1) < 0.02) & (surface.points[:, 2] == 0)
-    )
+    chosen = np.flatnonzero(np.abs(surface.points[:, :2]).max(axis=1) < 0.02)
     assert len(chosen) > 10
-    np.testing.assert_array_equal(surface.normals[chosen], [[0.0, 0.0, 1.0]] * len(chosen))
+    angle = np.radians(slope)
+    normal = np.array([0.0, -np.sin(angle), np.cos(angle)])
+    np.testing.assert_allclose(surface.normals[chosen], [normal] * len(chosen), atol=1e-12)
+    room = (surface.points[chosen, 2] - design.domain.floor) / np.cos(angle)
     for depth in (0.1 * backplane, 0.5 * backplane, 0.7 * backplane, 1.0):
         found = surface.behind(chosen, np.full(len(chosen), depth))
-        expected = surface.points[chosen] - [0.0, 0.0, min(depth, 0.6 * backplane)]
+        deep = np.minimum(depth, 0.6 * room)
+        expected = surface.points[chosen] - deep[:, None] * normal
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
@@ -283,6 +315,16 @@ def test_spread_takes_the_farthest_point_every_time() -> None:
     closest = np.where(np.eye(40, dtype=bool), np.inf, gaps).min()
     reach = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
     assert reach.max() <= closest
+
+
+def test_tables_are_rounded_to_the_nearest() -> None:
+    """Analytic: twelve binary digits are kept, the first of which is not stored."""
+    rng = np.random.default_rng(0)
+    table = (rng.normal(size=1000) * 10.0 ** rng.integers(-20, 20, 1000)).astype(np.float32)
+    fraction, exponent = np.frexp(table.astype(float))
+    expected = np.ldexp(np.round(fraction * 2.0**12), exponent - 12)
+    np.testing.assert_array_equal(_rounded(table), expected)
+    np.testing.assert_array_equal(_rounded(_rounded(table)), expected)
 
 
 def test_stored_to_the_last_bit(built: BackgroundField, tmp_path: Path) -> None:

@@ -60,6 +60,7 @@ def test_sheets_hold_the_nodes_on_them() -> None:
     axes = plan_axes(DESIGN, MeshSettings())
     owner = hold_nodes(DESIGN, axes)
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    assert max(FREE, WALL) < 0, "terminals are numbered from 0 on"
     expected = np.full(owner.shape, FREE)
     for who, (body, level) in enumerate(
         [*((e, 0.0) for e in DESIGN.electrodes), (DESIGN.conductors[1], -0.004)]

@@ -197,8 +197,9 @@ def test_wrong_input_is_refused():
     mesh = faces(crooked(), 0, "low", "high").with_groups(node_groups={"none": []})
     with pytest.raises(FieldError, match="eps_r must be a number or have shape"):
         solved(mesh, np.ones(3), ["low"], ["high"])
-    with pytest.raises(FieldError, match="positive and finite"):
-        solved(mesh, 0.0, ["low"], ["high"])
+    for eps_r in (0.0, -1.0, np.nan, np.inf, np.where(np.arange(mesh.n_tets) == 7, -2.0, 1.0)):
+        with pytest.raises(FieldError, match="positive and finite"):
+            solved(mesh, eps_r, ["low"], ["high"])
     with pytest.raises(MeshError, match="no node group 'E1'"):
         solved(mesh, 1.0, ["E1"], ["high"])
     with pytest.raises(MeshError, match="'none' is empty"):

@@ -114,6 +114,19 @@ def test_families():
     assert [(p.sense, dict(p.drive)) for p in chosen] == [("A", {"C": 1.0})]
 
 
+def test_what_can_be_measured_at_once():
+    """By hand: receivers of one transmitter, unless the rest floats or is driven along."""
+    for rest, times in (("grounded", 4), ("guard", 10), ("floating", 10)):
+        patterns = mutual_patterns(NAMES, rest=rest)
+        assert len({p.excitation for p in patterns}) == times
+        assert len({p.excitation for p in self_patterns(NAMES, rest=rest)}) == 5
+    base = {"sense": "A", "drive": {"B": 1.0}}
+    apart = ({"drive": {"B": 2.0}}, {"drive": {"C": 1.0}}, {"floating": ("C",)}, {"shield": 1.0})
+    for change in apart:
+        assert Pattern(**{**base, **change}).excitation != Pattern(**base).excitation
+    assert Pattern("C", {"B": 1.0}, name="x").excitation == Pattern(**base).excitation
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import dataclass, replace
 
@@ -111,20 +112,56 @@ def test_everything_is_taken_over():
     [
         ('chip = "fdc1004"', "seed", 0, 2**63 - 1),
         ('chip = "fdc1004"', "nonlinearity", -0.1, 0.1),
+        ('chip = "fdc1004"', "capdac", 0, 10**6),
+        ('chip = "fdc1004"', "rate", 1e-3, 1e7),
+        ('chip = "fdc1004"', "period", 1e-6, 1e6),
+        ('chip = "fdc1004"', "latency", 0.0, 1e3),
+        ('chip = "fdc1004"', "expected", 1e-15, 1e-6),
+        ('chip = "fdc2214"\n[tank]', "inductance", 1e-9, 1.0),
+        ('chip = "fdc2214"\n[tank]', "capacitance", 1e-15, 1e-3),
+        ('chip = "fdc2214"\n[tank]', "reference", 1e5, 1e9),
+        ('chip = "sdr"\n[front_end]', "frequency", 1.0, 1e10),
+        ('chip = "sdr"\n[front_end]', "shunt", 1e-3, 1e12),
+        ('chip = "sdr"\n[front_end]', "amplitude", 1e-6, 1e6),
+        ('chip = "sdr"\n[front_end]', "bandwidth", 1.0, 1e12),
+        ('chip = "sdr"\n[front_end]', "parasitic", 0.0, 1e-6),
         ('chip = "sdr"\n[front_end]', "full_scale", 1e-9, 1e6),
         ('chip = "sdr"\n[front_end]', "gain", 1e-6, 1e9),
         ('chip = "sdr"\n[front_end]', "bits", 2, 32),
         ('chip = "fdc1004"\n[climate]', "temperature", -273.15, 1000.0),
         ('chip = "fdc1004"\n[climate]', "gain_per_kelvin", -1.0, 1.0),
+        ('chip = "fdc1004"\n[climate]', "gain_per_percent", -1.0, 1.0),
+        ('chip = "fdc1004"\n[climate]', "offset_per_kelvin", -1e-9, 1e-9),
+        ('chip = "fdc1004"\n[climate]', "offset_per_percent", -1e-9, 1e-9),
+        ('chip = "fdc1004"\n[climate]', "humidity", -273.15, 1000.0),
         ('chip = "fdc1004"\n[[channel]]\nsense = "E1"', "shield", -1e3, 1e3),
+        ('chip = "fdc1004"\n[[channel]]\nsense = "E1"\n[channel.drive]', "E2", -1e3, 1e3),
+        ('chip = "fdc1004"\n[wiring]', "trace", 0.0, 1e-6),
+        ('chip = "fdc1004"\n[wiring]', "shield_gain", 0.0, 1.0),
+        ('chip = "fdc1004"\n[wiring]', "crosstalk", -1.0, 1.0),
+        ('chip = "fdc1004"\n[noise]', "white", 0.0, 1e-9),
+        ('chip = "fdc1004"\n[noise]', "flicker", 0.0, 1e-9),
+        ('chip = "fdc1004"\n[noise]', "walk", 0.0, 1e-9),
+        ('chip = "fdc1004"\n[noise]', "mains", 0.0, 1e-9),
+        ('chip = "fdc1004"\n[noise]', "mains_frequency", 1.0, 1e3),
+        ('chip = "fdc1004"\n[detector]', "touch", 1e-9, 1e12),
+        ('chip = "fdc1004"\n[detector]\ntouch = 5', "release", 1e-9, 5.0),
+        ('chip = "fdc1004"\n[detector]\ntouch = 5', "samples", 1e-3, 1e9),
+        ('chip = "fdc1004"\n[detector]\ntouch = 5', "debounce", 1, 10**6),
+        ('chip = "fdc1004"\n[calibration]', "gain", -1e6, 1e6),
+        ('chip = "fdc1004"\n[calibration]', "offset", -1e-6, 1e-6),
+        ('chip = "fdc1004"\n[calibration]', "drift", -1e-6, 1e-6),
+        ('chip = "fdc1004"\n[calibration]', "epoch", -1e12, 1e12),
     ],
 )
 def test_numbers_up_to_their_limits(text, key, low, high):
     """Limits: what lies beyond is refused by its key, the ends are not."""
-    step = 1 if isinstance(low, int) else 1e-6 * high
+    beyond = (low - 1, high + 1)
+    if isinstance(low, float):
+        beyond = math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
     for value in (low, high):
         assert f"{key} = " not in told(f"{text}\n{key} = {value!r}\n")
-    for value in (low - step, high + step):
+    for value in beyond:
         assert f"{key} = " in told(f"{text}\n{key} = {value!r}\n")
 
 

@@ -116,6 +116,19 @@ def test_bad_detectors_are_refused(make, words):
         make()
 
 
+def test_limits_are_allowed():
+    """Limits: what lies at the ends of a range is taken."""
+    for touch, release, debounce in ((10, 10, 1), (0.5, 0.25, 2), (1e12, 1e-9, 10**6)):
+        made = Detector(touch, release, STILL, debounce)
+        assert (made.touch, made.release, made.debounce) == (touch, release, debounce)
+    assert ExponentialTracker(1e-9).samples == 1e-9
+    for value in (0, 255):
+        assert Filter(value, value, value, value).delay == value
+        for name in ("max_half_delta", "noise_half_delta", "noise_count", "delay"):
+            with pytest.raises(ReadoutError, match=f"{name} is"):
+                Filter(**{name: 256 if value else -1})
+
+
 def test_small_signals_are_taken_over_at_once():
     """Up to twice the half delta of 3 codes: 6 are, 7 are not."""
     tracker = SteppingTracker(away=Filter(max_half_delta=3, noise_half_delta=1, noise_count=9))

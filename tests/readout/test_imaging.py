@@ -225,6 +225,10 @@ def test_landweber_takes_many_frames(field):
             lambda: sensitivity(np.zeros((1, *SHAPE[1:], 1)), (AXES[0][:1], *AXES[1:]), []),
             "at least",
         ),
+        (
+            lambda: sensitivity(np.zeros((*SHAPE, 1)), (AXES[0], AXES[1][:, None], AXES[2]), []),
+            "axis y must hold",
+        ),
         (lambda: sensitivity(np.zeros((*SHAPE, 1)), AXES[:2], []), "2 axes are given"),
         (lambda: sensitivity(np.zeros((*SHAPE, 1)), AXES, [(0, 0.5)]), "an electrode is 0.5"),
         (lambda: sensitivity(np.zeros((*SHAPE, 1)), AXES, [(0, 0, 0)]), "names 3 electrodes"),

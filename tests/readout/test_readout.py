@@ -303,6 +303,7 @@ def test_counts_by_channel_and_in_rows():
         counts.table("touched")
     with pytest.raises(ReadoutError, match="no counts to join"):
         join([])
+    assert same(join([counts]), counts)
 
 
 def test_representations_are_short():
@@ -334,6 +335,8 @@ def test_leaps_are_refused():
     """A clock that does not start at zero, as that of the day, is no reason to run for hours."""
     readout = plain()
     matrix = random_maxwell(np.random.default_rng(0), 3)
+    with pytest.raises(ReadoutError, match=r"more than 2e.07 conversions"):
+        readout.sample(1.01 * 20e6 / 3 * readout.schedule.period, matrix)
     for leap in (lambda: readout.sample(1.7e9, matrix), lambda: readout.due(1.7e9),
                  lambda: readout([0.0, 1.7e9], [matrix, matrix])):  # fmt: skip
         with pytest.raises(ReadoutError, match=r"1.7e\+09 s is .*begin there: reset\(start=…\)"):

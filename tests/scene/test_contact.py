@@ -64,6 +64,25 @@ def test_a_simulator_warns_once_of_a_body_in_its_electrodes(
             cs.Simulator("six_patch_bare").step(unnamed)
 
 
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.parametrize(
+    ("gap", "touched", "inside"),
+    [(0.01, False, False), (3e-4, False, False), (1e-4, True, False), (0.0, True, False),
+     (-1e-4, True, False), (-3e-4, True, True), (-0.005, True, True)],
+)  # fmt: skip
+def test_conductors_touch_and_all_matter_surrounds(
+    side: int, mesh: bool, gap: float, touched: bool, inside: bool
+) -> None:
+    """Analytic: a wide plate above or below both sheets; 0.2 mm count as nothing."""
+    plate = cs.Box((0.2, 0.2, 0.02))
+    shape = cs.TriMesh(plate.to_trimesh().vertices, plate.to_trimesh().faces) if mesh else plate
+    face = 0.002 if side > 0 else 0.0
+    body = cs.Body(shape, cs.Pose((0.01, 0.0, face + side * (gap + 0.01))))
+    assert Sheets(PADS).meet(body, conducting=True) is touched
+    assert Sheets(PADS).meet(body, conducting=False) is inside
+
+
 def open_box(side: float) -> cs.TriMesh:
     """A cube about the origin without its lid, the face at the top."""
     mesh = cs.Box((side, side, side)).to_trimesh()

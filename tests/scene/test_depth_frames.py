@@ -129,6 +129,8 @@ def test_every_pixel_order_is_the_same_world():
             flip = np.s_[:: 1 if rows == "+y" else -1, :: 1 if columns == "+x" else -1]
             camera = OrthographicCamera(0.3, 0.2, pose, rows=rows, columns=columns)
             frame = DepthFrame(depth[flip], eps[flip], camera)
+            for image in (depth, np.stack([depth, eps])):
+                np.testing.assert_array_equal(camera.upright(image[..., *flip]), image)
             a, b = plain.points(), frame.points()
             np.testing.assert_allclose(a[np.lexsort(a.T)], b[np.lexsort(b.T)], atol=1e-12)
             bodies = {body.material.name: body for body in frame.scene()}

@@ -73,6 +73,7 @@ def test_distances_match_the_slow_twins(name):
     around = solid_angles(triangles, p)
     np.testing.assert_array_equal(found < 0, around > 0.5)
     assert 100 < (found < 0).sum() < 800
+    np.testing.assert_allclose(shape.ray_distance(p, down=True), found, atol=1e-15)
 
 
 @pytest.mark.parametrize("shape", [Box((0.1, 0.06, 0.04)), Box((0.05, 0.002, 0.05))])

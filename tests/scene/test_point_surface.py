@@ -55,6 +55,21 @@ def test_normals_of_their_own() -> None:
     assert ((found * points).sum(axis=1) < 0).all()
 
 
+@pytest.mark.parametrize("cells", [(12, 2, 3), (3, 12, 2), (2, 3, 12)])
+def test_merging_cell_by_cell(cells: tuple[int, int, int]) -> None:
+    """Differential: means over cells of a grid that are told apart one by one."""
+    points = np.random.default_rng(1).uniform(-0.01, 0.01 * np.array(cells) - 0.01, (900, 3))
+    wanted: dict[tuple[float, ...], list[np.ndarray]] = {}
+    for point in points:
+        wanted.setdefault(tuple(np.floor(point / 0.01)), []).append(point)
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    found = frames(cs.point_surface(points, normals, spacing=0.01))[0]
+    expected = np.array([np.mean(group, axis=0) for group in wanted.values()])
+    assert len(found) == len(expected) == np.prod(cells)
+    found, expected = (x[np.lexsort(np.floor(x / 0.01).T)] for x in (found, expected))
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
 def test_merging() -> None:
     """Invariant: one point a cell, in the middle of its points, with the mean of their normals."""
     first = plane(z=0.031) + np.array([0.001, 0.001, 0])

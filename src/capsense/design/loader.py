@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -291,13 +292,11 @@ def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
     facets, moved = [], 0.0
     for facet in surface.facets:
         z = float(facet.origin[2])
-        near = [level for level in levels if 0.0 < abs(level - z) <= TOUCH]
-        if near and bool(np.all(facet.axes[:2, 2] == 0.0)):
-            moved = near[0] - z
-            facet = Facet(facet.polygon, facet.origin + np.array([0.0, 0.0, moved]), facet.axes)
+        off = min((level - z for level in levels), key=abs, default=math.inf)
+        if abs(off) <= TOUCH:
+            moved = off or moved
+            facet = Facet(facet.polygon, facet.origin + np.array([0.0, 0.0, off]), facet.axes)
         facets.append(facet)
-    if moved == 0.0:
-        return surface
     return Surface(tuple(facets), surface.rims + np.array([0.0, 0.0, moved]))
 
 

@@ -23,7 +23,6 @@ from capsense.field import bem_kernels as kernels
 from capsense.field.bem_kernels import Panels
 from capsense.field.panels import (
     FAR_PLANE,
-    PLANE_TOL,
     Grading,
     concatenate,
     cut_facet,
@@ -143,10 +142,8 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
     for body in design.sheets:
         owner = names.index(body.name) if body.name in names else GROUND
         for facet in body.surface.facets:
-            on_floor = abs(facet.axes[2, 2]) > 1 - 1e-9 and abs(facet.origin[2] - floor) < PLANE_TOL
-            if not on_floor:
-                sheets.append((facet, owner))
-                flat.append(len(body.surface.facets) <= _FEW_FACETS)
+            sheets.append((facet, owner))
+            flat.append(len(body.surface.facets) <= _FEW_FACETS)
     rims = np.concatenate([b.surface.rims for b in design.sheets])
     gaps, spacings = np.full(len(sheets), np.inf), np.full(len(sheets), FAR_PLANE)
     few = np.flatnonzero(flat)

@@ -88,7 +88,6 @@ class Conversion:
 
     def __init__(self, law: Law, dac: CapDac | None, channels: int) -> None:
         self._law, self._dac, self._channels = law, dac, channels
-        self._unset = True
         if dac is not None:
             self._actual = dac.actual()
             self.dac_codes = np.full(channels, -1 if dac.start == "auto" else dac.start)
@@ -122,7 +121,7 @@ class Conversion:
     ) -> tuple[Ints, Array, Flags] | None:
         """Convert with the DAC's codes as they stand; None if any would change on the way."""
         used = self.dac_codes[channel]
-        if self._unset and (used < 0).any():
+        if (used < 0).any():
             return None
         code, flags = quantise(self._law, value - self._actual[used])
         if dac.follow and flags.any():
@@ -138,7 +137,6 @@ class Conversion:
         if dac.follow:
             used = np.where(flags > 0, _next_code(dac, self._law, used, flags), used)
         self.dac_codes[channel] = used
-        self._unset = bool((self.dac_codes < 0).any())
         return code, reported, flags
 
 

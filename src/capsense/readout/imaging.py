@@ -181,8 +181,8 @@ def tikhonov(matrix: ArrayLike, strength: float = 1e-2, *, standardised: bool = 
     inverse = np.asarray(np.linalg.solve(loaded, j).T, dtype=float)
     if not standardised:
         return inverse
-    own = np.sqrt(np.maximum((inverse * j.T).sum(axis=1), 0.0))
-    return np.asarray(inverse / np.where(own > 0, own, 1.0)[:, None], dtype=float)
+    own = (inverse * j.T).sum(axis=1)
+    return np.asarray(inverse / np.sqrt(np.where(own > 0, own, 1.0))[:, None], dtype=float)
 
 
 def landweber(
