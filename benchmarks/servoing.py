@@ -27,9 +27,8 @@ import capsense as cs
 from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.field.background import BuildSettings
 from capsense.learning.envs.randomisation import Randomisation
-from capsense.learning.network import PoseNetwork
-from capsense.learning.servo import Belief, LimbPose, PoseEstimator, limb_pose
-from capsense.learning.spec import load_spec
+from capsense.learning.scenes import load_spec
+from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork, limb_pose
 from capsense.mesh.lattice import MeshSettings
 
 Array = NDArray[np.float64]

@@ -90,10 +90,10 @@ def load_data_set(path: str | Path) -> DataSet:
         MissingDependencyError: Episodes need Gymnasium and MuJoCo.
     """
     from capsense._validate import read_toml
-    from capsense.learning import episodes, spec
+    from capsense.learning import episodes, scenes
 
     kind = read_toml(Path(path), "data set", ScenarioError)
-    return episodes.load_episodes(path) if "environment" in kind else spec.load_spec(path)
+    return episodes.load_episodes(path) if "environment" in kind else scenes.load_spec(path)
 
 
 def files_named(texts: Iterable[str], folder: Path) -> dict[str, str]:
