@@ -26,7 +26,7 @@ from servoing_world import GAPS, Estimator, LimbRide, ride
 import capsense as cs
 from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.field.background import BuildSettings
-from capsense.learning.envs.randomisation import Randomisation
+from capsense.learning.envs.base import Randomisation
 from capsense.learning.scenes import load_spec
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork, limb_pose
 from capsense.mesh.lattice import MeshSettings

@@ -22,7 +22,7 @@ pytest.importorskip("mujoco")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from capsense.learning.envs import IDS  # noqa: E402
-from capsense.learning.envs.randomisation import Randomisation  # noqa: E402
+from capsense.learning.envs.base import Randomisation  # noqa: E402
 from capsense.learning.envs.signals import (  # noqa: E402
     KEY,
     CapacitiveObservation,

@@ -221,7 +221,7 @@ def test_ride_along_an_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmark, briefly: along a swaying arm, on the field, through a chip."""
     import servoing_world as world
 
-    from capsense.learning.envs.randomisation import Randomisation
+    from capsense.learning.envs.base import Randomisation
 
     monkeypatch.setattr(world, "WAY", 0.025)
     env = world.LimbRide("arm", 0.05, Randomisation())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import runpy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -44,6 +44,8 @@ CHUNK = 1000
 _EPISODES_OF_FILE = 10_000
 """Episodes whose facts go into one file."""
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+OBSERVED = ("observation.state", "action")
+"""Columns of the spaces."""
 NUMBERED = {
     "timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
     "task_index": "int64",
@@ -94,28 +96,103 @@ class Episodes(DataSet):
 
     def file(self, shard: int) -> str:
         """LeRobot's names."""
-        return place(shard)
+        return DATA.format(**_numbers(shard))
+
+    @cached_property
+    def columns(self) -> tuple[Features, int]:
+        """What LeRobot is told of the columns, by name; and frames a second.
+
+        Beside observations and actions: reward, whether the episode ends, and the numbers among
+        the facts that the first step tells, all of what follows the action (``next.…``).
+        """
+        env = self.make()
+        env.reset(seed=0)
+        facts = env.step(np.zeros(env.action_space.shape, env.action_space.dtype))[4]
+        world = env.unwrapped
+        names = [getattr(world, f"{what}_names", None) for what in ("observation", "action")]
+        spaces = (env.observation_space, env.action_space)
+        out = {
+            key: _feature("float32", space.shape[0], told)
+            for key, space, told in zip(OBSERVED, spaces, names, strict=True)
+        }
+        out |= {"next.reward": _feature("float32"), "next.done": _feature("bool")}
+        for name, value in facts.items():
+            if np.ndim(value) == 0 and isinstance(value, bool | int | float | np.number | np.bool_):
+                kind = "bool" if isinstance(value, bool | np.bool_) else "float32"
+                out[f"next.{name}"] = _feature(kind)
+        env.close()
+        out |= {name: _feature(kind) for name, kind in NUMBERED.items()}
+        return out, round(world.metadata["render_fps"])
 
     def table(self, shard: int) -> Any:
-        """The frames of a shard; see :func:`frames`."""
+        """The frames of a shard; ``index`` counts from 0 until :meth:`finish`."""
+        import pyarrow as pa
+
         env, policy = self.make(), self._policy()
-        features, rate = described(env)
-        episodes = {k: self._episode(k, env, policy, features) for k in self.numbers(shard)}
+        episodes = {k: self._episode(k, env, policy) for k in self.numbers(shard)}
         env.close()
-        return frames(features, episodes, rate)
+        features, rate = self.columns
+        lengths = [len(e["action"]) for e in episodes.values()]
+        steps = np.concatenate([np.arange(n) for n in lengths])
+        counts = {
+            "timestamp": steps / rate, "frame_index": steps,
+            "episode_index": np.repeat(list(episodes), lengths), "index": np.arange(len(steps)),
+            "task_index": np.zeros(len(steps)),
+        }  # fmt: skip
+        columns = {}
+        for name, told in features.items():
+            values = counts.get(name)
+            if values is None:
+                values = np.concatenate([e[name] for e in episodes.values()])
+            flat, size = pa.array(values.astype(told["dtype"]).ravel()), told["shape"][0]
+            columns[name] = flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+        return pa.table(columns)
 
     def about(self) -> dict[str, Any]:
         """Rate and columns."""
-        env = self.make()
-        features, rate = described(env)
-        env.close()
+        features, rate = self.columns
         return {"fps": rate, "features": features}
 
     def finish(self, folder: Path) -> None:
-        """Number the frames through, and write LeRobot's ``meta/``."""
-        told = self.about()
-        numbered(folder, self.shards)
-        write_meta(folder, self.name, told["features"], told["fps"], self.task, self.shards)
+        """Number the frames through; write the card and LeRobot's ``meta/``.
+
+        ``info.json`` comes last, and says that all is there.
+        """
+        import pyarrow as pa
+
+        files = [folder / self.file(k) for k in range(self.shards)]
+        _number(files)
+        features, rate = self.columns
+        rows: list[dict[str, Any]] = []
+        for place, path in zip(map(_numbers, range(self.shards)), files, strict=True):
+            first = rows[-1]["dataset_to_index"] if rows else 0
+            for row in _episodes_of(path, features, first):
+                rows.append({**row, "tasks": [self.task], **_placed("data", place)})
+        for number in range(0, len(rows), _EPISODES_OF_FILE):
+            place = _numbers(number // _EPISODES_OF_FILE)
+            part = [
+                {**row, **_placed("meta/episodes", place)}
+                for row in rows[number : number + _EPISODES_OF_FILE]
+            ]
+            write_table(pa.Table.from_pylist(part), folder / EPISODES.format(**place))
+        write_table(_tasks(self.task), folder / "meta/tasks.parquet")
+        everything = {
+            name: _statistics(np.concatenate([_column(path, name) for path in files]))
+            for name in features
+        }
+        write_json(everything, folder / "meta/stats.json")
+        count, total = len(rows), rows[-1]["dataset_to_index"]
+        with replacing(folder / "README.md") as card:
+            text = _CARD.format(name=self.name, task=self.task, episodes=count, frames=total)
+            card.write_text(text, encoding="utf-8")
+        info = {
+            "codebase_version": VERSION, "robot_type": None, "total_episodes": count,
+            "total_frames": total, "total_tasks": 1, "chunks_size": CHUNK,
+            "data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "fps": rate,
+            "splits": {"train": f"0:{count}"}, "data_path": DATA, "video_path": None,
+            "features": features,
+        }  # fmt: skip
+        write_json(info, folder / "meta/info.json")
 
     def make(self) -> Any:
         """The environment.
@@ -163,13 +240,11 @@ class Episodes(DataSet):
         policy: Policy = found
         return policy
 
-    def _episode(
-        self, number: int, env: Any, policy: Policy | None, features: Features
-    ) -> dict[str, Array]:
+    def _episode(self, number: int, env: Any, policy: Policy | None) -> dict[str, Array]:
         """An episode, which depends on the settings and its number alone."""
         rng = np.random.default_rng(np.random.SeedSequence((self.seed, number)))
         observation, _ = env.reset(seed=int(rng.integers(2**31)))
-        rows: dict[str, list[Any]] = {n: [] for n in features if n not in NUMBERED}
+        rows: dict[str, list[Any]] = {n: [] for n in self.columns[0] if n not in NUMBERED}
         over = cut = False
         while not (over or cut):
             action = self._action(observation, env.action_space, policy, rng)
@@ -190,29 +265,6 @@ class Episodes(DataSet):
 
     def _error(self, message: str) -> ScenarioError:
         return ScenarioError(f"{self.source}: {message}")
-
-
-def described(env: Any) -> tuple[Features, int]:
-    """Columns of an environment's episodes, and its steps a second.
-
-    Beside observations and actions: reward, whether the episode ends, and the numbers among the
-    facts that the first step tells, all of what follows the action (``next.…``).
-    """
-    env.reset(seed=0)
-    facts = env.step(np.zeros(env.action_space.shape, env.action_space.dtype))[4]
-    world = env.unwrapped
-    names = [getattr(world, f"{what}_names", None) for what in ("observation", "action")]
-    out = {
-        "observation.state": feature("float32", env.observation_space.shape[0], names[0]),
-        "action": feature("float32", env.action_space.shape[0], names[1]),
-        "next.reward": feature("float32"), "next.done": feature("bool"),
-    }  # fmt: skip
-    for name, value in facts.items():
-        if np.ndim(value) == 0 and isinstance(value, bool | int | float | np.number | np.bool_):
-            kind = "bool" if isinstance(value, bool | np.bool_) else "float32"
-            out[f"next.{name}"] = feature(kind)
-    out |= {name: feature(kind) for name, kind in NUMBERED.items()}
-    return out, round(world.metadata["render_fps"])
 
 
 def load_episodes(path: str | Path) -> Episodes:
@@ -244,55 +296,29 @@ def load_episodes(path: str | Path) -> Episodes:
     return spec
 
 
-def feature(kind: str, size: int = 1, names: Sequence[str] | None = None) -> dict[str, Any]:
+def _feature(kind: str, size: int = 1, names: Sequence[str] | None = None) -> dict[str, Any]:
     """What is told of a column: its type, how many numbers it has, and their names."""
     return {"dtype": kind, "shape": [size], "names": None if names is None else list(names)}
 
 
-def place(number: int, pattern: str = DATA) -> str:
-    """Where file ``number`` lies."""
-    chunk, file = divmod(number, CHUNK)
-    return pattern.format(chunk_index=chunk, file_index=file)
+def _numbers(file: int) -> dict[str, int]:
+    """Numbers of a file and of its folder in the names of files."""
+    chunk, index = divmod(file, CHUNK)
+    return {"chunk_index": chunk, "file_index": index}
 
 
-def frames(
-    features: Features, episodes: Mapping[int, Mapping[str, NDArray[Any]]], rate: float
-) -> Any:
-    """The frames of some episodes as a table; ``index`` counts from 0, see :func:`numbered`.
-
-    Args:
-        features: All columns but the numbered ones.
-        episodes: Episode → column → values, shape (frames, size).
-        rate: Frames a second.
-    """
-    import pyarrow as pa
-
-    lengths = [len(next(iter(e.values()))) for e in episodes.values()]
-    steps = np.concatenate([np.arange(n) for n in lengths])
-    counts = {
-        "timestamp": steps / rate, "frame_index": steps,
-        "episode_index": np.repeat(list(episodes), lengths), "index": np.arange(len(steps)),
-        "task_index": np.zeros(len(steps)),
-    }  # fmt: skip
-    columns = {}
-    for name, told in features.items():
-        if name in NUMBERED:
-            columns[name] = pa.array(counts[name].astype(NUMBERED[name]))
-            continue
-        values = np.concatenate([e[name] for e in episodes.values()]).astype(told["dtype"])
-        flat = pa.array(values.ravel())
-        size = told["shape"][0]
-        columns[name] = flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
-    return pa.table(columns)
+def _placed(what: str, place: Mapping[str, int]) -> dict[str, int]:
+    """The columns that tell where something of an episode is."""
+    return {f"{what}/{key}": number for key, number in place.items()}
 
 
-def numbered(folder: Path, files: int) -> None:
+def _number(files: Sequence[Path]) -> None:
     """Count ``index`` on from file to file; what is right already is left as it is."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     first = 0
-    for path in (folder / place(k) for k in range(files)):
+    for path in files:
         schema, rows = pq.read_schema(path), pq.read_metadata(path).num_rows
         said = json.loads(schema.metadata[KEY])
         if said.get("first") != first:
@@ -304,73 +330,20 @@ def numbered(folder: Path, files: int) -> None:
         first += rows
 
 
-def write_meta(
-    folder: Path, name: str, features: Features, rate: int, task: str, files: int
-) -> None:
-    """Write the card and all of ``meta/``; ``info.json`` comes last, and says that all is there.
-
-    Args:
-        folder: Of the data set, whose frames are there and :func:`numbered`.
-        name: Of the data set.
-        features: All columns.
-        rate: Frames a second.
-        task: What is done in all episodes, in words.
-        files: How many files of frames there are.
-    """
-    import pyarrow as pa
-
-    rows: list[dict[str, Any]] = []
-    for file in range(files):
-        rows += _episodes_of(folder, file, features, task, rows[-1] if rows else None)
-    for number in range(0, len(rows), _EPISODES_OF_FILE):
-        part = rows[number : number + _EPISODES_OF_FILE]
-        at = number // _EPISODES_OF_FILE
-        chunk, index = divmod(at, CHUNK)
-        for row in part:
-            row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": index}
-        write_table(pa.Table.from_pylist(part), folder / place(at, EPISODES))
-    write_table(_tasks(task), folder / "meta/tasks.parquet")
-    everything = {
-        name: _statistics(np.concatenate([_column(folder / place(k), name) for k in range(files)]))
-        for name in features
-    }
-    write_json(everything, folder / "meta/stats.json")
-    count, total = len(rows), rows[-1]["dataset_to_index"]
-    with replacing(folder / "README.md") as part_of:
-        card = _CARD.format(name=name, task=task, episodes=count, frames=total)
-        part_of.write_text(card, encoding="utf-8")
-    info = {
-        "codebase_version": VERSION, "robot_type": None, "total_episodes": count,
-        "total_frames": total, "total_tasks": 1, "chunks_size": CHUNK,
-        "data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "fps": rate,
-        "splits": {"train": f"0:{count}"}, "data_path": DATA, "video_path": None,
-        "features": features,
-    }  # fmt: skip
-    write_json(info, folder / "meta/info.json")
-
-
-def _episodes_of(
-    folder: Path, file: int, features: Features, task: str, before: dict[str, Any] | None
-) -> list[dict[str, Any]]:
-    """What is told of the episodes of a file."""
-    path = folder / place(file)
+def _episodes_of(path: Path, features: Features, first: int) -> Iterator[dict[str, Any]]:
+    """What is told of the episodes of a file, whose frames count from ``first`` on."""
     episode = _column(path, "episode_index")[:, 0]
     starts = np.flatnonzero(np.diff(episode, prepend=-1))
     columns = {name: np.split(_column(path, name), starts[1:]) for name in features}
-    first = 0 if before is None else before["dataset_to_index"]
-    chunk, index = divmod(file, CHUNK)
-    rows = []
     for k, number in enumerate(episode[starts].tolist()):
         length = len(columns["index"][k])
-        rows.append({
-            "episode_index": number, "tasks": [task], "length": length,
+        yield {
+            "episode_index": number, "length": length,
             "dataset_from_index": first, "dataset_to_index": first + length,
-            "data/chunk_index": chunk, "data/file_index": index,
             **{f"stats/{name}/{what}": value for name, parts in columns.items()
                for what, value in _statistics(parts[k]).items()},
-        })  # fmt: skip
+        }  # fmt: skip
         first += length
-    return rows
 
 
 def _column(path: Path, name: str) -> NDArray[Any]:

@@ -164,13 +164,7 @@ class ServedSensor:
         return BodiesMessage(message.sensor, message.sequence, message.time, bodies, self._tables)
 
     def _world(self, frame: Frame) -> Scene | DepthFrame:
-        if isinstance(frame, BodiesMessage):
-            return Scene(frame.bodies)
-        wanted = self.options
-        eps_r = wanted.material if frame.eps_r is None else frame.eps_r
-        return DepthFrame(
-            frame.depth, eps_r, wanted.camera, grounding=wanted.grounding, back=wanted.back
-        )
+        return Scene(frame.bodies) if isinstance(frame, BodiesMessage) else self.options.seen(frame)
 
     def _check_time(self, time: float) -> None:
         """Refuse a time that the readout cannot go to."""
