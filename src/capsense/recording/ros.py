@@ -83,16 +83,18 @@ def _maker(type_name: str) -> Callable[[Any], Any]:
     """A function that makes a message of its fields, given by name or all of them in order."""
     kind = _store().types[type_name]
     fields = {name: _field(*what) for name, what in fields_of(type_name)}
-    plain = all(of is _same for of, _ in fields.values())
+    makers = [of for of, _ in fields.values()]
+    plain = all(of is _same for of in makers)
 
     def make(given: Any) -> Any:
-        if not isinstance(given, Mapping):
-            if plain:
-                return kind(*given)
-            given = dict(zip(fields, given, strict=True))
-        if not given.keys() <= fields.keys():
-            raise TypeError(f"{type_name} has no field {', '.join(given.keys() - fields.keys())}")
-        return kind(*(of(given[n]) if n in given else zero for n, (of, zero) in fields.items()))
+        if isinstance(given, Mapping):
+            if not given.keys() <= fields.keys():
+                unknown = ", ".join(given.keys() - fields.keys())
+                raise TypeError(f"{type_name} has no field {unknown}")
+            return kind(*[of(given[n]) if n in given else zero for n, (of, zero) in fields.items()])
+        if plain:
+            return kind(*given)
+        return kind(*[of(value) for of, value in zip(makers, given, strict=True)])
 
     return make
 
@@ -107,7 +109,8 @@ def _field(node: Any, what: Any) -> tuple[Callable[[Any], Any], Any]:
         return _maker(what), _maker(what)({})
     (node, what), size = what
     if node == Nodetype.NAME:
-        return lambda values: [_maker(what)(value) for value in values], []
+        make = _maker(what)
+        return lambda values: [make(value) for value in values], []
     return _same, [] if what[0] == "string" else np.zeros(size, what[0])
 
 

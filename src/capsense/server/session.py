@@ -7,6 +7,7 @@ import json
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
@@ -201,12 +202,11 @@ class ClientSession:
             return
         self._solver = asyncio.create_task(self._solve_all())
         try:
-            async for message in self._connection:
-                size = BINARY_UNIT if isinstance(message, bytes) else TEXT_UNIT
-                await self._pace(1 + len(message) / size)
-                await self._handle(message)
-        except ConnectionClosed:
-            pass
+            with suppress(ConnectionClosed):
+                async for message in self._connection:
+                    size = BINARY_UNIT if isinstance(message, bytes) else TEXT_UNIT
+                    await self._pace(1 + len(message) / size)
+                    await self._handle(message)
         finally:
             self._left = True
             self._wake.set()
@@ -230,11 +230,9 @@ class ClientSession:
     async def dismiss(self, code: str, text: str, close_code: int = POLICY) -> None:
         """Say what is wrong, and close the connection."""
         self._server.log("dismissed", client=self.number, code=code, message=text[:200])
-        try:
+        with suppress(ConnectionClosed):
             await self._send(json.dumps(messages.error_message(code, text)))
             await self._connection.close(close_code, code)
-        except ConnectionClosed:
-            pass
 
     # -- the reader -----------------------------------------------------------------------------
 
@@ -257,12 +255,11 @@ class ClientSession:
         if not self._server.options.admits(hello.token):
             raise ProtocolError("the token is missing or wrong", "token")
         self._server.log("hello", client=self.number, name=hello.client)
-        limits = self._limits
+        told = ("sensors", "pixels", "bodies", "message")
         await self._tell(
             "welcome", protocol=PROTOCOL, server=f"capsense {self._server.version}",
             designs=self._server.design_names,
-            limits={"sensors": limits.sensors, "pixels": limits.pixels, "bodies": limits.bodies,
-                    "message": limits.message},
+            limits={name: getattr(self._limits, name) for name in told},
         )  # fmt: skip
 
     async def _pace(self, cost: float) -> None:
@@ -374,26 +371,21 @@ class ClientSession:
 
     async def _solve_all(self) -> None:
         """Solve the newest frames of all sensors in turn until the client leaves."""
-        while not self._left:
-            await self._wake.wait()
-            self._wake.clear()
-            for sensor in tuple(self.sensors.values()):
-                async with sensor.lock:
-                    frame = sensor.take()
-                    if frame is not None:
-                        self._wake.set()  # another may have come meanwhile
-                        await self._solve(sensor, frame)
-                if self._left:
-                    return
-            await self._send_shown()
-
-    async def _send_shown(self) -> None:
-        shown, self._to_show = self._to_show, ()
-        try:
-            for message in shown:
-                await self._send(message)
-        except ConnectionClosed:
-            self._left = True
+        with suppress(ConnectionClosed):
+            while not self._left:
+                await self._wake.wait()
+                self._wake.clear()
+                for sensor in tuple(self.sensors.values()):
+                    async with sensor.lock:
+                        frame = sensor.take()
+                        if frame is not None:
+                            self._wake.set()  # another may have come meanwhile
+                            await self._solve(sensor, frame)
+                    if self._left:
+                        return
+                shown, self._to_show = self._to_show, ()
+                for message in shown:
+                    await self._send(message)
 
     async def _solve(self, sensor: ServedSensor, frame: Frame) -> None:
         try:
@@ -402,12 +394,9 @@ class ClientSession:
             sensor.show(frame, reading)
             self.readings += 1
         except ConnectionClosed:
-            self._left = True
+            raise
         except Exception as error:
-            try:
-                await self._refuse(error, sensor=frame.sensor, sequence=frame.sequence)
-            except ConnectionClosed:
-                self._left = True
+            await self._refuse(error, sensor=frame.sensor, sequence=frame.sequence)
 
     # -- answers --------------------------------------------------------------------------------
 

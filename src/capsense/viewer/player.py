@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -32,22 +32,20 @@ RETRY = 0.5
 """Pause after a failure [s]."""
 
 
-class Playback(ABC):
-    """What a page shows, and how it is moved about in.
+class _Playing:
+    """What both have in common: a thread that takes instants, and what a page shows of them.
 
-    Whoever watches looks at :attr:`newest`; what comes between two looks is not shown, and nobody
-    who watches holds anything up. All methods may be called from any thread.
+    Whoever watches looks at ``newest``; what comes between two looks is not shown, and nobody who
+    watches holds anything up. All methods may be called from any thread.
 
     Args:
-        source: Used by the thread of the playback alone from now on; closed by :meth:`stop`.
+        source: Used by the thread alone from now on; closed by ``stop``.
     """
 
     live: ClassVar[bool]
     """Whether time goes on by itself, so that there is no speed and no end."""
 
-    def __init__(self, source: Source) -> None:
-        self.source = source
-        """Where instants come from."""
+    def __init__(self, source: Source, run: Callable[[], None]) -> None:
         self.loop = not self.live
         """Whether the end is followed by the beginning."""
         self.plane: Plane | None = None
@@ -56,77 +54,33 @@ class Playback(ABC):
         """The last one whose potentials were taken."""
         self.failure: CapSenseError | None = None
         """What stopped it; None again once it goes on."""
+        self._channels = source.channels
         self._levels = read_channels(source.channels, source.empty)
         self._field_taken = -np.inf
         name = f"capsense {type(self).__name__.lower()}"
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-
-    @property
-    @abstractmethod
-    def newest(self) -> Frame | None:
-        """What is to be shown; None before there is any."""
-
-    @property
-    @abstractmethod
-    def playing(self) -> bool:
-        """Whether time runs, or the newest sample is shown."""
-
-    @property
-    @abstractmethod
-    def span(self) -> tuple[int, int]:
-        """Numbers of the first and the last sample that can be shown."""
-
-    @abstractmethod
-    def history(self, index: int) -> tuple[Array, Array]:
-        """The samples known up to one, for charts; those that were skipped are not among them.
-
-        Returns:
-            Times [s], shape (n,), and changes of the channels from the empty scene [F], shape
-            (n, K).
-        """
-
-    @abstractmethod
-    def play(self) -> None:
-        """Let time run."""
-
-    @abstractmethod
-    def pause(self) -> None:
-        """Stop time."""
-
-    @abstractmethod
-    def go(self, index: int) -> None:
-        """Stop time, and show a sample, or the first or last if there is none of that number."""
-
-    @abstractmethod
-    def step(self, count: int) -> None:
-        """Stop time, and go ``count`` samples on, or back."""
-
-    @abstractmethod
-    def stop(self) -> None:
-        """End the thread, and close the source."""
-
-    @abstractmethod
-    def _run(self) -> None:
-        """What the thread does."""
+        self._thread = threading.Thread(target=run, name=name, daemon=True)
 
     def _changes_of(self, frame: Frame) -> Array:
-        return read_channels(self.source.channels, frame.reading) - self._levels
+        """Changes of the channels from the empty scene [F], shape (K,)."""
+        return read_channels(self._channels, frame.reading) - self._levels
 
 
-class Player(Playback):
+class Player(_Playing):
     """Asks a source for its samples, in their order.
 
     Args:
-        source: As of a playback.
+        source: Used by the player's thread alone from now on; closed by :meth:`stop`.
         speed: Seconds of the source a second; 0 for as fast as it goes.
     """
 
     live = False
-    source: Seekable
 
     def __init__(self, source: Seekable, *, speed: float = 1.0) -> None:
-        super().__init__(source)
-        self._newest: Frame | None = None
+        super().__init__(source, self._run)
+        self.source = source
+        """Where instants come from."""
+        self.newest: Frame | None = None
+        """What is to be shown; None before there is any."""
         self._changes: Array = np.full((len(source.times), len(source.channels)), np.nan)
         self._speed, self._playing, self._stopped = speed, False, False
         self._target: int | None = 0
@@ -136,18 +90,22 @@ class Player(Playback):
         self._thread.start()
 
     @property
-    def newest(self) -> Frame | None:
-        return self._newest
-
-    @property
     def playing(self) -> bool:
+        """Whether time runs."""
         return self._playing
 
     @property
     def span(self) -> tuple[int, int]:
+        """Numbers of the first and the last sample."""
         return 0, len(self.source.times) - 1
 
     def history(self, index: int) -> tuple[Array, Array]:
+        """The samples known up to one, for charts; those that were skipped are not among them.
+
+        Returns:
+            Times [s], shape (n,), and changes of the channels from the empty scene [F], shape
+            (n, K).
+        """
         known = np.flatnonzero(~np.isnan(self._changes[: index + 1, 0]))
         return self.source.times[known], self._changes[known]
 
@@ -166,12 +124,14 @@ class Player(Playback):
             self.go(self._position)
 
     def go(self, index: int) -> None:
+        """Stop time, and show a sample, or the first or last if there is none of that number."""
         with self._wake:
             self._playing = False
             self._target = min(max(index, 0), len(self.source.times) - 1)
             self._wake.notify()
 
     def step(self, count: int) -> None:
+        """Stop time, and go ``count`` samples on, or back."""
         with self._wake:
             start = self._position if self._target is None else self._target
             self.go(start + count)
@@ -184,6 +144,7 @@ class Player(Playback):
             self._wake.notify()
 
     def stop(self) -> None:
+        """End the thread, and close the source."""
         with self._wake:
             self._stopped = True
             self._wake.notify()
@@ -205,7 +166,7 @@ class Player(Playback):
         self._changes[index] = self._changes_of(frame)
         if frame.potentials is not None:
             self.with_field, self._field_taken = frame, now
-        self._newest, self.failure = frame, None
+        self.newest, self.failure = frame, None
 
     def _next(self) -> int | None:
         """Wait until a sample is due; None to end."""
@@ -246,17 +207,21 @@ class Player(Playback):
         self._anchor = (time.monotonic(), float(self.source.times[self._position]))
 
 
-class Follower(Playback):
+class Follower(_Playing):
     """Takes what a stream brings, and shows the newest.
 
     Samples come in and are kept whether time runs or not; what :meth:`pause` stops is the page.
+
+    Args:
+        source: Used by the follower's thread alone from now on; closed by :meth:`stop`.
     """
 
     live = True
-    source: Stream
 
     def __init__(self, source: Stream) -> None:
-        super().__init__(source)
+        super().__init__(source, self._run)
+        self.source = source
+        """Where instants come from."""
         self._frames: list[Frame] = []
         self._first = 0
         self._shown: int | None = None
@@ -268,15 +233,18 @@ class Follower(Playback):
 
     @property
     def playing(self) -> bool:
+        """Whether the newest sample is shown."""
         return self._shown is None
 
     @property
     def span(self) -> tuple[int, int]:
+        """Numbers of the first and the last sample that are kept."""
         with self._lock:
             return self._first, self._first + max(len(self._frames) - 1, 0)
 
     @property
     def newest(self) -> Frame | None:
+        """What is to be shown; None before there is any."""
         with self._lock:
             if not self._frames:
                 return None
@@ -285,6 +253,7 @@ class Follower(Playback):
             return self._frames[max(self._shown - self._first, 0)]
 
     def history(self, index: int) -> tuple[Array, Array]:
+        """The samples kept up to one, for charts; as of :meth:`Player.history`."""
         with self._lock:
             stop = max(index - self._first, 0) + 1
             return self._times[:stop].copy(), self._changes[:stop].copy()
@@ -298,13 +267,16 @@ class Follower(Playback):
         self.go(self._position())
 
     def go(self, index: int) -> None:
+        """Show one sample, or the first or last if there is none of that number."""
         first, last = self.span
         self._shown = min(max(index, first), last)
 
     def step(self, count: int) -> None:
+        """Show the sample ``count`` on, or back."""
         self.go(self._position() + count)
 
     def stop(self) -> None:
+        """End the thread, and close the source."""
         self._stopped.set()
         self._thread.join()
         self.source.close()
@@ -349,3 +321,7 @@ class Follower(Playback):
             found = self.source.potentials(frame, plane)
             self.with_field = replace(frame, plane=plane, potentials=found)
             self._field_taken = now
+
+
+Playback = Player | Follower
+"""What a page shows, and how it is moved about in."""

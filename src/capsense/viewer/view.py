@@ -121,16 +121,14 @@ SETTLE = 0.12
 """Time for a sample to reach the page [s]."""
 
 
-class ExportControls:
+def add_exports(gui: GuiApi, player: Playback) -> None:
     """Buttons that hand the picture, or a video from the first sample to the last, to a browser."""
-
-    def __init__(self, gui: GuiApi, player: Playback) -> None:
-        with gui.add_folder("export", expand_by_default=False):
-            picture = gui.add_button("Picture (.png)")
-            picture.on_click(lambda event: send_picture(event.client))
-            if not player.live:
-                video = gui.add_button("Video (.webp)")
-                video.on_click(lambda event: send_video(event.client, player))
+    with gui.add_folder("export", expand_by_default=False):
+        picture = gui.add_button("Picture (.png)")
+        picture.on_click(lambda event: send_picture(event.client))
+        if not player.live:
+            video = gui.add_button("Video (.webp)")
+            video.on_click(lambda event: send_video(event.client, player))
 
 
 def send_picture(client: Any) -> None:
@@ -208,7 +206,7 @@ class LiveView:
         self.time = TimeControls(gui, player)
         """The controls of time."""
         self._plane = PlaneControls(gui, player) if source.green is not None else None
-        ExportControls(gui, player)
+        add_exports(gui, player)
         panel = gui.add_panel()
         tab = panel.add_tab("signals")
         self._charts = make_charts(gui, tab, source.channels)
