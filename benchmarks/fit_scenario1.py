@@ -18,6 +18,7 @@ from scenario1_fit import (
     Fit,
     Grid,
     ResponseTable,
+    changed,
     fit,
     fit_without,
     own_figures,
@@ -85,7 +86,7 @@ def likeness(
 def level_boards(setup: Scenario1Setup) -> Scenario1Setup:
     """The same with both boards at one height, which is no longer fitted."""
     kept = {key: u for key, u in setup.uncertainty.items() if key != "patch.height"}
-    return replace(setup.changed({"patch.height": 0.0}), uncertainty=kept)
+    return replace(changed(setup, {"patch.height": 0.0}), uncertainty=kept)
 
 
 def held_out(setup: Scenario1Setup, tables: dict[str, ResponseTable]) -> dict[str, Scenario1Setup]:

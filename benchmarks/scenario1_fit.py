@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
@@ -97,6 +98,24 @@ def predicted(setup: Scenario1Setup, panel: str, table: ResponseTable) -> Array:
     return setup.level_of(shown) * (1 + share * table.change(place[:, 0], place[:, 2]))
 
 
+def changed(setup: Scenario1Setup, values: Mapping[str, float]) -> Scenario1Setup:
+    """The same set-up with other figures, by the names of :meth:`Scenario1Setup.value`."""
+    out: dict[str, Any] = {
+        "zigzag": setup.zigzag, "boards": dict(setup.boards), "panels": dict(setup.panels)
+    }  # fmt: skip
+    for key, value in values.items():
+        name, _, own = key.rpartition(".")
+        change: dict[str, Any] = {own: float(value)}
+        if not name:
+            out |= change
+        elif name == "zigzag":
+            out[name] = replace(out[name], **change)
+        else:
+            group = out["boards" if name in setup.boards else "panels"]
+            group[name] = replace(group[name], **change)
+    return replace(setup, **out)
+
+
 @dataclass(frozen=True)
 class Fit:
     """The outcome of a fit."""
@@ -117,7 +136,7 @@ class Fit:
         random = np.random.default_rng(seed)
         values = [self.setup.value(key) for key in self.keys]
         draws = random.multivariate_normal(values, self.covariance, count, method="cholesky")
-        return [self.setup.changed(dict(zip(self.keys, draw, strict=True))) for draw in draws]
+        return [changed(self.setup, dict(zip(self.keys, draw, strict=True))) for draw in draws]
 
 
 def fit(
@@ -150,7 +169,7 @@ def fit(
     scale = np.where(start == 0, 1.0, np.abs(start))
 
     def residuals(vector: Array) -> Array:
-        trial = setup.changed(dict(zip(keys, vector * scale, strict=True)))
+        trial = changed(setup, dict(zip(keys, vector * scale, strict=True)))
         return np.concatenate(_curves(trial, tables, names)) - np.concatenate(measured)
 
     best = None
@@ -169,7 +188,7 @@ def fit(
     deviation = np.sqrt(np.diag(covariance))
     values = dict(zip(keys, best.x * scale, strict=True))
     uncertainty = dict(setup.uncertainty) | dict(zip(keys, deviation.tolist(), strict=True))
-    fitted = replace(setup.changed(values), uncertainty=uncertainty)
+    fitted = replace(changed(setup, values), uncertainty=uncertainty)
     return Fit(fitted, float(best.cost), memory, tuple(keys), covariance)
 
 
@@ -181,7 +200,7 @@ def own_figures(
     before = np.concatenate(_curves(setup, tables, others))
     moved = {
         key: np.concatenate(
-            _curves(setup.changed({key: setup.value(key) + deviation}), tables, others)
+            _curves(changed(setup, {key: setup.value(key) + deviation}), tables, others)
         )
         for key, deviation in setup.uncertainty.items()
     }

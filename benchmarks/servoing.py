@@ -26,10 +26,9 @@ from servoing_world import GAPS, Estimator, LimbRide, ride
 import capsense as cs
 from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.field.background import BuildSettings, MeshSettings
-from capsense.learning.envs.randomisation import Randomisation
-from capsense.learning.network import PoseNetwork
-from capsense.learning.servo import Belief, LimbPose, PoseEstimator, limb_pose
-from capsense.learning.spec import load_spec
+from capsense.learning.envs.base import Randomisation
+from capsense.learning.scenes import load_spec
+from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork, limb_pose
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 import capsense as cs
 from capsense.humans import Limb, arm, leg
-from capsense.learning.envs.base import CONTROL, CapacitiveEnv
-from capsense.learning.envs.follow import LOST
-from capsense.learning.envs.randomisation import Randomisation
+from capsense.learning.envs.base import CONTROL, CapacitiveEnv, Randomisation
 from capsense.learning.envs.signals import UNIT
+from capsense.learning.envs.tasks import LOST
 from capsense.learning.servo import LimbPose, follow, limb_pose
 
 Array = NDArray[np.float64]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -92,13 +93,8 @@ class Skin:
             SkinError: Some sensors failed; it holds the readings of the others.
         """
         self._check_names("views", views)
-
-        def task(simulator: Simulator, view: Scene | DepthFrame) -> Callable[[], Reading]:
-            return lambda: simulator.step(view)
-
-        return read_all(
-            self._pool, {n: task(self.simulators[n], view) for n, view in views.items()}
-        )
+        tasks = {name: partial(self.simulators[name].step, view) for name, view in views.items()}
+        return read_all(self._pool, tasks)
 
     def reset(self) -> None:
         """Forget the previous step."""

@@ -11,8 +11,7 @@ import urllib.request
 from typing import Any
 
 from capsense.server.client import Client
-from capsense.server.connection import ServerOptions
-from capsense.server.server import Server
+from capsense.server.server import Server, ServerOptions
 
 WAIT = 20.0
 """Longest wait for a server to start or stop [s]."""

@@ -19,9 +19,8 @@ import capsense as cs
 from capsense.cli.main import main
 from capsense.errors import MissingDependencyError
 from capsense.learning.labels import Outline
-from capsense.learning.scenes import COLUMNS
+from capsense.learning.scenes import COLUMNS, Spec, load_spec
 from capsense.learning.shards import missing, run
-from capsense.learning.spec import Spec, load_spec
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")

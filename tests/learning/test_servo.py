@@ -11,8 +11,7 @@ import pytest
 import capsense as cs
 from capsense.errors import SceneError
 from capsense.humans import arm
-from capsense.learning.network import PoseNetwork
-from capsense.learning.servo import Belief, LimbPose, PoseEstimator, follow, limb_pose
+from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork, follow, limb_pose
 
 KNOWN = Belief(radius=0.045, radius_spread=0.0)
 POSES = [LimbPose(0.01, 0.05, 0.1, -0.1), LimbPose(-0.02, 0.03, -0.05, 0.2), LimbPose(0, 0.07)]
@@ -222,7 +221,7 @@ def test_ride_along_an_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmark, briefly: along a swaying arm, on the field, through a chip."""
     import servoing_world as world
 
-    from capsense.learning.envs.randomisation import Randomisation
+    from capsense.learning.envs.base import Randomisation
 
     monkeypatch.setattr(world, "WAY", 0.025)
     env = world.LimbRide("arm", 0.05, Randomisation())

@@ -25,21 +25,19 @@ from capsense.codec import (
     shape_fields,
 )
 from capsense.errors import RecordingError
-from capsense.recording.ros import PACKAGE, Messages
+from capsense.recording.ros import PACKAGE, Moment, StepMessages, decode, encode, make
 from capsense.recording.session import describe
-from capsense.recording.steps import Moment, StepMessages
 from capsense.scene import RestSurface, SurfaceMesh
 
-MESSAGES = Messages()
 Recorded = tuple[Path, list[cs.Reading]]
 
 
 def through(body: cs.Body) -> cs.Body:
     """The body, encoded and decoded."""
-    shape = MESSAGES.make(f"{PACKAGE}/Shape", id=1, **shape_fields(body.shape))
-    shape = MESSAGES.decode(MESSAGES.encode(shape), f"{PACKAGE}/Shape")
-    message = MESSAGES.make(f"{PACKAGE}/Body", id=2, shape=1, **body_fields(body))
-    message = MESSAGES.decode(MESSAGES.encode(message), f"{PACKAGE}/Body")
+    shape = make(f"{PACKAGE}/Shape", id=1, **shape_fields(body.shape))
+    shape = decode(encode(shape), f"{PACKAGE}/Shape")
+    message = make(f"{PACKAGE}/Body", id=2, shape=1, **body_fields(body))
+    message = decode(encode(message), f"{PACKAGE}/Body")
     return read_body(message, {1: read_shape(shape)})
 
 
@@ -70,8 +68,8 @@ def shape_message(**fields: object) -> Any:
     """A ``Shape`` message that was written and read; fields not given are empty."""
     none = {"sizes": np.empty(0), "vertices": np.empty(0)}
     none |= {"faces": np.empty(0, np.uint32), "values": np.empty(0, np.float32)}
-    message = MESSAGES.make(f"{PACKAGE}/Shape", **{"id": 1, **none, **fields})
-    return MESSAGES.decode(MESSAGES.encode(message), f"{PACKAGE}/Shape")
+    message = make(f"{PACKAGE}/Shape", **{"id": 1, **none, **fields})
+    return decode(encode(message), f"{PACKAGE}/Shape")
 
 
 def test_surfaces() -> None:
@@ -98,8 +96,8 @@ def test_surfaces() -> None:
 
 def test_steps_of_a_deforming_surface(sim: cs.Simulator) -> None:
     """Of a surface that moves, only the vertices come again; a reader puts all together."""
-    session = describe(sim, "sensor", "", readout=None, empty=sim.empty)
-    writer = StepMessages(MESSAGES, session)
+    session = describe(sim, "sensor")
+    writer = StepMessages(session)
     foil = cs.DeformableSurface(np.eye(3), [[0, 1, 2]], material="steel", name="foil")
     bodies, kinds = [], []
     shapes: dict[int, Any] = {}

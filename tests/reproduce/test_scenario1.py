@@ -21,7 +21,7 @@ from capsense.reproduce.scenario1_setup import (
 )
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-from scenario1_fit import fit, fit_without, own_figures, predicted, tabulate
+from scenario1_fit import changed, fit, fit_without, own_figures, predicted, tabulate
 
 SETUP = load_setup()
 STRIPE = SETUP.boards["stripe"]
@@ -68,9 +68,9 @@ def test_zig_zag() -> None:
 def test_figures_by_name() -> None:
     """What is changed is changed, and nothing else."""
     values = {"gap": 0.02, "stripe_T2.level": 0.9, "patch.depth": 0.1, "zigzag.pitch": 0.02}
-    other = SETUP.changed(values)
+    other = changed(SETUP, values)
     assert {key: other.value(key) for key in values} == values
-    assert other.changed({key: SETUP.value(key) for key in values}) == SETUP
+    assert changed(other, {key: SETUP.value(key) for key in values}) == SETUP
 
 
 def test_uncertainties_are_those_of_figures() -> None:

@@ -11,9 +11,8 @@ from running_server import RunningServer
 
 import capsense as cs
 from capsense.errors import CapSenseError, ProtocolError, ServerError
-from capsense.server.connection import Limits, ServerOptions
 from capsense.server.sensor import ServedSensor
-from capsense.server.server import Server
+from capsense.server.server import Limits, Server, ServerOptions
 from capsense.simulator import Simulator
 
 TOKEN = "correct horse"

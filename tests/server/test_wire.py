@@ -25,9 +25,9 @@ from running_server import RunningServer
 from stopped_clock import StoppedClock
 
 from capsense.errors import ProtocolError
-from capsense.server import connection
-from capsense.server.connection import AdmissionControl, RateLimitedConnection
+from capsense.server import session
 from capsense.server.frames import HEADER, pack_depth
+from capsense.server.session import AdmissionControl, RateLimitedConnection
 
 
 @pytest.fixture(autouse=True)
@@ -142,7 +142,7 @@ def test_newcomers_are_let_in_slowly(
     clock: StoppedClock, dome: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beyond so many in a second, they are closed; those before stay, later ones come in."""
-    monkeypatch.setattr(connection, "ARRIVALS", 3)
+    monkeypatch.setattr(session, "ARRIVALS", 3)
     with RunningServer() as server, server.client() as client:
         sensor = client.open()
         server.client().close()

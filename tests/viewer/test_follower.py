@@ -10,13 +10,13 @@ import pytest
 from view_sources import Queued, until
 
 from capsense.errors import ProtocolError
-from capsense.viewer import show
-from capsense.viewer.show import Follower
+from capsense.viewer import player as players
+from capsense.viewer.player import Follower
 
 
 @pytest.fixture
 def followed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Queued, Follower]]:
-    monkeypatch.setattr(show, "KEPT", 10)
+    monkeypatch.setattr(players, "KEPT", 10)
     stream = Queued()
     player = Follower(stream)  # type: ignore[arg-type]
     player.plane = object()
@@ -82,7 +82,7 @@ def test_goes_on_after_a_failure(
     followed: tuple[Queued, Follower], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What went wrong is told until something comes again."""
-    monkeypatch.setattr(show, "RETRY", 0.05)
+    monkeypatch.setattr(players, "RETRY", 0.05)
     stream, player = followed
     stream.put(2)
     stream.items.put(ProtocolError("the client has left"))

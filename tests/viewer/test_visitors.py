@@ -21,8 +21,7 @@ from websockets.sync.client import connect
 import capsense as cs
 from capsense.viewer.player import Player
 from capsense.viewer.source import ScenarioSource
-from capsense.viewer.view import LiveView
-from capsense.viewer.visitors import welcome
+from capsense.viewer.view import LiveView, welcome
 
 
 @pytest.fixture(scope="module")

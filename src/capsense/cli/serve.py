@@ -24,8 +24,7 @@ from capsense.cli.console import (
 from capsense.cli.run import build_simulator, chosen_scenario
 
 if TYPE_CHECKING:
-    from capsense.server.connection import Limits
-    from capsense.server.server import Server
+    from capsense.server.server import Limits, Server
     from capsense.viewer.player import Playback
     from capsense.viewer.view import LiveView
 
@@ -84,8 +83,7 @@ def _serve(args: argparse.Namespace) -> int:
     """
     import asyncio
 
-    from capsense.server.connection import ServerOptions
-    from capsense.server.server import Server
+    from capsense.server.server import Server, ServerOptions
 
     options = ServerOptions(
         tuple(args.design), args.readout, args.host, args.port, read_token(args.token_file),
@@ -100,7 +98,7 @@ def _serve(args: argparse.Namespace) -> int:
 
 
 def _limits(args: argparse.Namespace) -> Limits:
-    from capsense.server.connection import Limits
+    from capsense.server.server import Limits
 
     values = {name: getattr(args, f"max_{name}") for name in _LIMITS}
     return Limits(**{name: value for name, value in values.items() if value is not None})
@@ -265,11 +263,10 @@ def _check_view(args: argparse.Namespace) -> None:
 
 def _player(args: argparse.Namespace) -> Playback:
     """What is to be shown, ready to play."""
-    from capsense.viewer.player import Player
+    from capsense.viewer.player import Follower, Player
 
     with BuildProgress(quiet=args.quiet) as progress:
         if args.connect is not None:
-            from capsense.viewer.show import Follower
             from capsense.viewer.source import Watched
 
             token = read_token(args.token_file) or ""

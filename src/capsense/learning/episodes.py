@@ -1,9 +1,14 @@
-"""Data sets of episodes: rollouts of an environment of Gymnasium, written as LeRobot reads them."""
+"""Data sets of episodes: rollouts of an environment of Gymnasium, written as LeRobot reads them.
+
+Version 3.0, as LeRobot's own writer lays it out: https://huggingface.co/docs/lerobot/lerobot-dataset-v3.
+``lerobot.datasets.LeRobotDataset(repo_id, root=folder)`` reads it.
+"""
 
 from __future__ import annotations
 
+import json
 import runpy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,12 +20,13 @@ from numpy.typing import NDArray
 
 from capsense._validate import read_toml
 from capsense.errors import ScenarioError
-from capsense.learning import lerobot
-from capsense.learning.shards import DataSet, files_named
+from capsense.learning.shards import KEY, DataSet, files_named, write_json, write_table
+from capsense.recording.tables import replacing
 from capsense.scenario.loader import ScenarioTable
 
 Array = NDArray[Any]
 Policy = Callable[[Array], Array]
+Features = dict[str, dict[str, Any]]
 
 TOP_KEYS = (
     "name", "description", "environment", "options", "episodes", "shard_size", "seed", "steps",
@@ -30,6 +36,34 @@ RANDOM = "random"
 """The policy that draws from the space of actions."""
 _FORMAT = 1
 """Goes up when the same file comes to mean other episodes or columns."""
+VERSION = "v3.0"
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+CHUNK = 1000
+"""Files of a folder at most."""
+_EPISODES_OF_FILE = 10_000
+"""Episodes whose facts go into one file."""
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+OBSERVED = ("observation.state", "action")
+"""Columns of the spaces."""
+NUMBERED = {
+    "timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
+    "task_index": "int64",
+}  # fmt: skip
+"""Columns that every such data set has, and their types."""
+_CARD = """\
+---
+tags:
+- LeRobot
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---
+
+# {name}
+
+{task}: {episodes} episodes, {frames} frames, made by CapSense. `manifest.json` holds the settings.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,28 +96,103 @@ class Episodes(DataSet):
 
     def file(self, shard: int) -> str:
         """LeRobot's names."""
-        return lerobot.place(shard)
+        return DATA.format(**_numbers(shard))
+
+    @cached_property
+    def columns(self) -> tuple[Features, int]:
+        """What LeRobot is told of the columns, by name; and frames a second.
+
+        Beside observations and actions: reward, whether the episode ends, and the numbers among
+        the facts that the first step tells, all of what follows the action (``next.…``).
+        """
+        env = self.make()
+        env.reset(seed=0)
+        facts = env.step(np.zeros(env.action_space.shape, env.action_space.dtype))[4]
+        world = env.unwrapped
+        names = [getattr(world, f"{what}_names", None) for what in ("observation", "action")]
+        spaces = (env.observation_space, env.action_space)
+        out = {
+            key: _feature("float32", space.shape[0], told)
+            for key, space, told in zip(OBSERVED, spaces, names, strict=True)
+        }
+        out |= {"next.reward": _feature("float32"), "next.done": _feature("bool")}
+        for name, value in facts.items():
+            if np.ndim(value) == 0 and isinstance(value, bool | int | float | np.number | np.bool_):
+                kind = "bool" if isinstance(value, bool | np.bool_) else "float32"
+                out[f"next.{name}"] = _feature(kind)
+        env.close()
+        out |= {name: _feature(kind) for name, kind in NUMBERED.items()}
+        return out, round(world.metadata["render_fps"])
 
     def table(self, shard: int) -> Any:
-        """The frames of a shard; see :func:`capsense.learning.lerobot.frames`."""
+        """The frames of a shard; ``index`` counts from 0 until :meth:`finish`."""
+        import pyarrow as pa
+
         env, policy = self.make(), self._policy()
-        features, rate = described(env)
-        episodes = {k: self._episode(k, env, policy, features) for k in self.numbers(shard)}
+        episodes = {k: self._episode(k, env, policy) for k in self.numbers(shard)}
         env.close()
-        return lerobot.frames(features, episodes, rate)
+        features, rate = self.columns
+        lengths = [len(e["action"]) for e in episodes.values()]
+        steps = np.concatenate([np.arange(n) for n in lengths])
+        counts = {
+            "timestamp": steps / rate, "frame_index": steps,
+            "episode_index": np.repeat(list(episodes), lengths), "index": np.arange(len(steps)),
+            "task_index": np.zeros(len(steps)),
+        }  # fmt: skip
+        columns = {}
+        for name, told in features.items():
+            values = counts.get(name)
+            if values is None:
+                values = np.concatenate([e[name] for e in episodes.values()])
+            flat, size = pa.array(values.astype(told["dtype"]).ravel()), told["shape"][0]
+            columns[name] = flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+        return pa.table(columns)
 
     def about(self) -> dict[str, Any]:
         """Rate and columns."""
-        env = self.make()
-        features, rate = described(env)
-        env.close()
+        features, rate = self.columns
         return {"fps": rate, "features": features}
 
     def finish(self, folder: Path) -> None:
-        """Number the frames through, and write LeRobot's ``meta/``."""
-        told = self.about()
-        lerobot.numbered(folder, self.shards)
-        lerobot.write_meta(folder, self.name, told["features"], told["fps"], self.task, self.shards)
+        """Number the frames through; write the card and LeRobot's ``meta/``.
+
+        ``info.json`` comes last, and says that all is there.
+        """
+        import pyarrow as pa
+
+        files = [folder / self.file(k) for k in range(self.shards)]
+        _number(files)
+        features, rate = self.columns
+        rows: list[dict[str, Any]] = []
+        for place, path in zip(map(_numbers, range(self.shards)), files, strict=True):
+            first = rows[-1]["dataset_to_index"] if rows else 0
+            for row in _episodes_of(path, features, first):
+                rows.append({**row, "tasks": [self.task], **_placed("data", place)})
+        for number in range(0, len(rows), _EPISODES_OF_FILE):
+            place = _numbers(number // _EPISODES_OF_FILE)
+            part = [
+                {**row, **_placed("meta/episodes", place)}
+                for row in rows[number : number + _EPISODES_OF_FILE]
+            ]
+            write_table(pa.Table.from_pylist(part), folder / EPISODES.format(**place))
+        write_table(_tasks(self.task), folder / "meta/tasks.parquet")
+        everything = {
+            name: _statistics(np.concatenate([_column(path, name) for path in files]))
+            for name in features
+        }
+        write_json(everything, folder / "meta/stats.json")
+        count, total = len(rows), rows[-1]["dataset_to_index"]
+        with replacing(folder / "README.md") as card:
+            text = _CARD.format(name=self.name, task=self.task, episodes=count, frames=total)
+            card.write_text(text, encoding="utf-8")
+        info = {
+            "codebase_version": VERSION, "robot_type": None, "total_episodes": count,
+            "total_frames": total, "total_tasks": 1, "chunks_size": CHUNK,
+            "data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "fps": rate,
+            "splits": {"train": f"0:{count}"}, "data_path": DATA, "video_path": None,
+            "features": features,
+        }  # fmt: skip
+        write_json(info, folder / "meta/info.json")
 
     def make(self) -> Any:
         """The environment.
@@ -131,13 +240,11 @@ class Episodes(DataSet):
         policy: Policy = found
         return policy
 
-    def _episode(
-        self, number: int, env: Any, policy: Policy | None, features: lerobot.Features
-    ) -> dict[str, Array]:
+    def _episode(self, number: int, env: Any, policy: Policy | None) -> dict[str, Array]:
         """An episode, which depends on the settings and its number alone."""
         rng = np.random.default_rng(np.random.SeedSequence((self.seed, number)))
         observation, _ = env.reset(seed=int(rng.integers(2**31)))
-        rows: dict[str, list[Any]] = {n: [] for n in features if n not in lerobot.NUMBERED}
+        rows: dict[str, list[Any]] = {n: [] for n in self.columns[0] if n not in NUMBERED}
         over = cut = False
         while not (over or cut):
             action = self._action(observation, env.action_space, policy, rng)
@@ -158,29 +265,6 @@ class Episodes(DataSet):
 
     def _error(self, message: str) -> ScenarioError:
         return ScenarioError(f"{self.source}: {message}")
-
-
-def described(env: Any) -> tuple[lerobot.Features, int]:
-    """Columns of an environment's episodes, and its steps a second.
-
-    Beside observations and actions: reward, whether the episode ends, and the numbers among the
-    facts that the first step tells, all of what follows the action (``next.…``).
-    """
-    env.reset(seed=0)
-    facts = env.step(np.zeros(env.action_space.shape, env.action_space.dtype))[4]
-    world = env.unwrapped
-    names = [getattr(world, f"{what}_names", None) for what in ("observation", "action")]
-    out = {
-        "observation.state": lerobot.feature("float32", env.observation_space.shape[0], names[0]),
-        "action": lerobot.feature("float32", env.action_space.shape[0], names[1]),
-        "next.reward": lerobot.feature("float32"), "next.done": lerobot.feature("bool"),
-    }  # fmt: skip
-    for name, value in facts.items():
-        if np.ndim(value) == 0 and isinstance(value, bool | int | float | np.number | np.bool_):
-            kind = "bool" if isinstance(value, bool | np.bool_) else "float32"
-            out[f"next.{name}"] = lerobot.feature(kind)
-    out |= {name: lerobot.feature(kind) for name, kind in lerobot.NUMBERED.items()}
-    return out, round(world.metadata["render_fps"])
 
 
 def load_episodes(path: str | Path) -> Episodes:
@@ -210,3 +294,86 @@ def load_episodes(path: str | Path) -> Episodes:
     spec.make().close()
     spec._policy()
     return spec
+
+
+def _feature(kind: str, size: int = 1, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """What is told of a column: its type, how many numbers it has, and their names."""
+    return {"dtype": kind, "shape": [size], "names": None if names is None else list(names)}
+
+
+def _numbers(file: int) -> dict[str, int]:
+    """Numbers of a file and of its folder in the names of files."""
+    chunk, index = divmod(file, CHUNK)
+    return {"chunk_index": chunk, "file_index": index}
+
+
+def _placed(what: str, place: Mapping[str, int]) -> dict[str, int]:
+    """The columns that tell where something of an episode is."""
+    return {f"{what}/{key}": number for key, number in place.items()}
+
+
+def _number(files: Sequence[Path]) -> None:
+    """Count ``index`` on from file to file; what is right already is left as it is."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    first = 0
+    for path in files:
+        schema, rows = pq.read_schema(path), pq.read_metadata(path).num_rows
+        said = json.loads(schema.metadata[KEY])
+        if said.get("first") != first:
+            table = pq.read_table(path)
+            index = pa.array(np.arange(first, first + rows))
+            table = table.set_column(table.column_names.index("index"), "index", index)
+            write_table(table.replace_schema_metadata({KEY: json.dumps({**said, "first": first})}),
+                        path)  # fmt: skip
+        first += rows
+
+
+def _episodes_of(path: Path, features: Features, first: int) -> Iterator[dict[str, Any]]:
+    """What is told of the episodes of a file, whose frames count from ``first`` on."""
+    episode = _column(path, "episode_index")[:, 0]
+    starts = np.flatnonzero(np.diff(episode, prepend=-1))
+    columns = {name: np.split(_column(path, name), starts[1:]) for name in features}
+    for k, number in enumerate(episode[starts].tolist()):
+        length = len(columns["index"][k])
+        yield {
+            "episode_index": number, "length": length,
+            "dataset_from_index": first, "dataset_to_index": first + length,
+            **{f"stats/{name}/{what}": value for name, parts in columns.items()
+               for what, value in _statistics(parts[k]).items()},
+        }  # fmt: skip
+        first += length
+
+
+def _column(path: Path, name: str) -> NDArray[Any]:
+    """A column of a file, shape (frames, size)."""
+    import pyarrow.parquet as pq
+
+    column = pq.read_table(path, columns=[name]).column(0).combine_chunks()
+    flat = column.flatten() if hasattr(column, "flatten") else column
+    return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(len(column), -1)
+
+
+def _statistics(values: NDArray[Any]) -> dict[str, list[float]]:
+    """Statistics over frames, of each number of a column."""
+    x = values.astype(float)
+    out = {"min": x.min(axis=0), "max": x.max(axis=0), "mean": x.mean(axis=0), "std": x.std(axis=0)}
+    out |= dict(zip(_QUANTILES, np.quantile(x, list(_QUANTILES.values()), axis=0), strict=True))
+    return {**{k: v.tolist() for k, v in out.items()}, "count": [len(x)]}
+
+
+def _tasks(task: str) -> Any:
+    """The table of tasks: Pandas finds them as its index."""
+    import pyarrow as pa
+
+    def told(name: str, kind: str, of_numpy: str) -> dict[str, Any]:
+        return {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": of_numpy,
+                "metadata": None}  # fmt: skip
+
+    about = {
+        "index_columns": ["task"], "column_indexes": [],
+        "columns": [told("task_index", "int64", "int64"), told("task", "unicode", "object")],
+    }  # fmt: skip
+    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [task]})
+    return table.replace_schema_metadata({b"pandas": json.dumps(about)})

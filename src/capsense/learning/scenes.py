@@ -1,16 +1,49 @@
-"""What the shards of a data set of scenes hold: matrices, counts and labels."""
+"""Data sets of random scenes: the file that describes one, and what its shards hold."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast, get_args
 
-from capsense.errors import SceneError, SolveError
-from capsense.learning.settle import settled, settling
-from capsense.learning.spec import Spec
+import numpy as np
+from numpy.random import Generator
+
+from capsense._validate import read_toml
+from capsense.design import Design
+from capsense.errors import MeshError, ScenarioError, SceneError, SolveError
+from capsense.humans import Build, arm, leg
+from capsense.learning.labels import Near, Outline
+from capsense.learning.shards import DataSet, files_named
+from capsense.reading import Reading
 from capsense.readout.config import make_readout
+from capsense.readout.conversions import Held
 from capsense.readout.readout import Readout
-from capsense.simulator import Simulator
+from capsense.scenario.loader import (
+    ScenarioTable,
+    read_body,
+    read_design,
+    read_grounding,
+    read_material,
+    read_pose,
+)
+from capsense.scene import Body, Pose, Scene
+from capsense.simulator import PresetName, Simulator
 
+TOP_KEYS = (
+    "name", "description", "design", "scenes", "shard_size", "seed", "preset", "readout",
+    "clearance", "body",
+)  # fmt: skip
+LIMBS = {"arm": arm, "leg": leg}
+"""Shapes that are limbs of people, beside those of scenarios."""
+LIMB_KEYS = (
+    "name", "shape", "material", "grounding", "pose", "sex", "percentile", "girth", "side",
+    "segment", "angles",
+)  # fmt: skip
+_FORMAT = 1
+"""Goes up when the same file comes to mean other scenes or columns."""
 COLUMNS = {
     "scene": "number of the scene",
     "capacitance": "Maxwell capacitance matrix, row by row, M × M, F",
@@ -29,86 +62,277 @@ COLUMNS = {
     "bodies": "how many bodies the scene holds",
 }
 """Columns, and what they are; those of a readout only where one is given."""
+_TRIES = 1000
+"""A scene is drawn so many times at most until nothing touches the sensor."""
 
 
-def about(spec: Spec) -> dict[str, Any]:
-    """What the manifest says of the sensor and the columns."""
-    simulator = Simulator(spec.design, preset=spec.preset)
-    readout = spec_readout(spec, simulator)
-    return {
-        "design": spec.design.name, "electrodes": simulator.electrode_names,
-        "baseline_F": simulator.baseline.tolist(),
-        "channels": () if readout is None else readout.channel_names, "columns": COLUMNS,
-    }  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class Spec(DataSet):
+    """A data set of scenes as its file describes it; made by :func:`load_spec`."""
 
+    unit = "scenes"
+    design: Design
+    preset: PresetName
+    readout: str | None
+    """Name of a chip, or a file, which ends in ``.toml``."""
+    clearance: float
+    """No body comes nearer to the sensor than this [m]."""
+    bodies: tuple[Mapping[str, Any], ...]
+    """The tables ``[[body]]`` as they stand in the file."""
 
-def spec_readout(spec: Spec, simulator: Simulator) -> Readout | None:
-    """The readout of a data set, if it has one.
-
-    Raises:
-        ReadoutError: There is no such chip or file, or the file is wrong.
-    """
-    choice = spec.readout
-    if isinstance(choice, str) and choice.endswith(".toml"):
-        choice = spec.folder / choice
-    return None if choice is None else make_readout(choice, simulator)
-
-
-def _row(spec: Spec, number: int, simulator: Simulator, readout: Readout | None) -> dict[str, Any]:
-    scene, near, rng = spec.scene(number)
-    try:
-        reading = simulator.step(scene)
-    except (SceneError, SolveError) as error:
-        raise type(error)(f"scene {number}: {error}") from None
-    row: dict[str, Any] = {
-        "scene": number,
-        "capacitance": reading.capacitance.ravel(),
-        "delta": reading.delta.ravel(),
-        "self_delta": reading.self_capacitance - simulator.empty.self_capacitance,
-        "bodies": len(scene),
-    }
-    if readout is not None:
-        readout.reset(seed=int(rng.integers(2**63)))
-        empty = settled(readout, simulator.empty, 0.0)
-        held = settled(readout, reading, settling(readout))
-        row |= {"code": held.code, "code_delta": held.capacitance - empty.capacitance}
-    if near is not None:
-        row |= {
-            "distance": near.distance, "closest_point": near.point, "normal": near.normal,
-            "axis": near.axis, "body": near.body.name, "material": near.body.material.name,
-            "eps_r": near.body.material.eps_r, "sigma": near.body.material.sigma,
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """All that the numbers depend on, but for versions; contents of files by their SHA-256."""
+        return {
+            "format": _FORMAT, "design": self.design.content_hash(), "scenes": self.count,
+            "shard_size": self.shard_size, "seed": self.seed, "preset": self.preset,
+            "readout": self.readout, "clearance": self.clearance, "bodies": list(self.bodies),
+            "files": files_named(_texts([*self.bodies, self.readout]), self.folder),
         }  # fmt: skip
-    return row
+
+    def file(self, shard: int) -> str:
+        """The names that Hugging Face's ``datasets`` knows."""
+        return f"data/train-{shard:05d}-of-{self.shards:05d}.parquet"
+
+    def table(self, shard: int) -> Any:
+        """A shard as a table of plain columns and lists of fixed size.
+
+        Raises:
+            ScenarioError: A scene cannot be drawn.
+            SceneError: A scene is none that can be solved; the message names it.
+            SolveError: A scene was not solved; the message names it.
+        """
+        import pyarrow as pa
+
+        simulator, readout = self._sensor()
+        rows = [self._row(number, simulator, readout) for number in self.numbers(shard)]
+        electrodes = len(simulator.electrode_names)
+        channels = 0 if readout is None else len(readout.channel_names)
+        number, three = pa.float64(), pa.list_(pa.float64(), 3)
+        matrix = pa.list_(number, electrodes**2)
+        kinds = {
+            "scene": pa.int64(), "capacitance": matrix, "delta": matrix,
+            "self_delta": pa.list_(number, electrodes),
+            "code": pa.list_(pa.int64(), channels), "code_delta": pa.list_(number, channels),
+            "closest_point": three, "normal": three, "axis": three,
+            "body": pa.string(), "material": pa.string(), "bodies": pa.int64(),
+        }  # fmt: skip
+        names = [name for name in COLUMNS if channels or not name.startswith("code")]
+        schema = pa.schema(
+            pa.field(n, kinds.get(n, number), metadata={"meaning": COLUMNS[n]}) for n in names
+        )
+        return pa.Table.from_pylist(rows, schema=schema)
+
+    def about(self) -> dict[str, Any]:
+        """What the manifest says of the sensor and the columns."""
+        simulator, readout = self._sensor()
+        return {
+            "design": self.design.name, "electrodes": simulator.electrode_names,
+            "baseline_F": simulator.baseline.tolist(),
+            "channels": () if readout is None else readout.channel_names, "columns": COLUMNS,
+        }  # fmt: skip
+
+    def _sensor(self) -> tuple[Simulator, Readout | None]:
+        """The simulator, and the readout if there is one.
+
+        Raises:
+            ReadoutError: There is no such chip or file, or the file is wrong.
+        """
+        simulator, choice = Simulator(self.design, preset=self.preset), self.readout
+        if choice is not None and choice.endswith(".toml"):
+            return simulator, make_readout(self.folder / choice, simulator)
+        return simulator, None if choice is None else make_readout(choice, simulator)
+
+    def _row(self, number: int, simulator: Simulator, readout: Readout | None) -> dict[str, Any]:
+        """The columns of a scene that are not null."""
+        scene, near, rng = self.scene(number)
+        try:
+            reading = simulator.step(scene)
+        except (SceneError, SolveError) as error:
+            raise type(error)(f"scene {number}: {error}") from None
+        row: dict[str, Any] = {
+            "scene": number,
+            "capacitance": reading.capacitance.ravel(),
+            "delta": reading.delta.ravel(),
+            "self_delta": reading.self_capacitance - simulator.empty.self_capacitance,
+            "bodies": len(scene),
+        }
+        if readout is not None:
+            readout.reset(seed=int(rng.integers(2**63)))
+            empty = settled(readout, simulator.empty, 0.0)
+            held = settled(readout, reading, settling(readout))
+            row |= {"code": held.code, "code_delta": held.capacitance - empty.capacitance}
+        if near is not None:
+            matter = near.body.material
+            row |= {
+                "distance": near.distance, "closest_point": near.point, "normal": near.normal,
+                "axis": near.axis, "body": near.body.name, "material": matter.name,
+                "eps_r": matter.eps_r, "sigma": matter.sigma,
+            }  # fmt: skip
+        return row
+
+    @cached_property
+    def outline(self) -> Outline:
+        """Where the sensor's surfaces are."""
+        return Outline(self.design)
+
+    def scene(self, number: int) -> tuple[Scene, Near | None, Generator]:
+        """A scene, which depends on the file's settings, the seed and its number alone.
+
+        Returns:
+            The scene in the sensor frame; what of it is nearest to the electrodes, if anything is
+            there; and the generator that drew it, for what else is random about it.
+
+        Raises:
+            ScenarioError: A table is wrong, or whatever is drawn touches the sensor.
+        """
+        rng = np.random.default_rng(np.random.SeedSequence((self.seed, number)))
+        for _ in range(_TRIES):
+            scene = Scene(b for raw in self.bodies for b in self._drawn(raw, rng))
+            near = self.outline.nearest(scene)
+            if near is None or self.outline.gap(scene) >= self.clearance:
+                return scene, near, rng
+        raise ScenarioError(
+            f"{self.source}: scene {number} came within clearance = {self.clearance:g} m of the "
+            f"sensor in {_TRIES} draws; move the bodies away, or lower the clearance"
+        )
+
+    def _drawn(self, raw: Mapping[str, Any], rng: Generator) -> list[Body]:
+        """The bodies that a table stands for, in one scene."""
+        table = ScenarioTable(raw, self.source, f'body "{raw.get("name")}"')
+        chance = table.number("chance", 0.0, 1.0, 1.0)
+        if rng.random() >= chance:
+            return []
+        data = {k: _draw(v, rng, table) for k, v in raw.items() if k != "chance"}
+        table = ScenarioTable(data, self.source, table.item)
+        try:
+            if data.get("shape") in LIMBS:
+                return _limb(table)
+            table.raw("pose", "{ position = [x, y, z] }")
+            return [read_body(table, table.string("name"), self.folder).body]
+        except (SceneError, MeshError) as error:
+            raise table.error(str(error)) from None
 
 
-def table(spec: Spec, shard: int) -> Any:
-    """A shard as a table of plain columns and lists of fixed size.
+def load_spec(path: str | Path) -> Spec:
+    """Load the file of a data set, and see that its first scenes can be drawn.
+
+    Args:
+        path: The ``.toml`` file. What it names is relative to its folder.
 
     Raises:
-        ScenarioError: A scene cannot be drawn.
-        SceneError: A scene is none that can be solved; the message names it.
-        SolveError: A scene was not solved; the message names it.
+        ScenarioError: There is no such file, or anything in it is wrong.
+        DesignError: Something is wrong in the design file it names.
     """
-    import pyarrow as pa
+    file = Path(path)
+    top = ScenarioTable(read_toml(file, "data set", ScenarioError), file.name, "data set")
+    top.only(TOP_KEYS)
+    folder = file.resolve().parent
+    bodies = tuple(top.tables("body"))
+    if not bodies:
+        raise top.error("holds no body; add a [[body]]")
+    names = [
+        ScenarioTable(b, file.name, f"body {n}").string("name") for n, b in enumerate(bodies, 1)
+    ]
+    if len(set(names)) < len(names):
+        raise top.error(f"names of bodies repeat: {', '.join(names)}; names must differ")
+    spec = Spec(
+        name=top.string("name"), design=read_design(top, folder),
+        count=top.integer("scenes", 1, 10**9),
+        shard_size=top.integer("shard_size", 1, 10**6, 1000),
+        seed=top.integer("seed", 0, 2**63 - 1, 0),
+        preset=cast("PresetName", top.choice("preset", get_args(PresetName), "standard")),
+        readout=top.string("readout") if "readout" in top else None,
+        clearance=top.length("clearance", 1e-3), bodies=bodies,
+        source=file.name, folder=folder,
+    )  # fmt: skip
+    for number in range(min(10, spec.count)):
+        spec.scene(number)
+    return spec
 
-    simulator = Simulator(spec.design, preset=spec.preset)
-    readout = spec_readout(spec, simulator)
-    rows = [_row(spec, number, simulator, readout) for number in spec.numbers(shard)]
-    electrodes = len(simulator.electrode_names)
-    channels = 0 if readout is None else len(readout.channel_names)
-    number, three = pa.float64(), pa.list_(pa.float64(), 3)
-    matrix = pa.list_(number, electrodes**2)
-    kinds = {
-        "scene": pa.int64(), "capacitance": matrix, "delta": matrix,
-        "self_delta": pa.list_(number, electrodes),
-        "code": pa.list_(pa.int64(), channels), "code_delta": pa.list_(number, channels),
-        "distance": number, "closest_point": three, "normal": three, "axis": three,
-        "body": pa.string(), "material": pa.string(), "eps_r": number, "sigma": number,
-        "bodies": pa.int64(),
-    }  # fmt: skip
-    names = [name for name in COLUMNS if channels or not name.startswith("code")]
-    fields = [pa.field(n, kinds[n], metadata={"meaning": COLUMNS[n]}) for n in names]
-    return pa.Table.from_arrays(
-        [pa.array([row.get(n) for row in rows], kinds[n]) for n in names],
-        schema=pa.schema(fields),
+
+def _texts(value: Any) -> Iterator[str]:
+    """All strings within nested lists and tables."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(item)
+
+
+def _draw(value: Any, rng: Generator, table: ScenarioTable) -> Any:
+    """A value with everything random in it decided.
+
+    ``{ from = a, to = b }`` is a number, ``{ any = [...] }`` one of several, and
+    ``quaternion = "uniform"`` any orientation.
+    """
+    if isinstance(value, list):
+        return [_draw(v, rng, table) for v in value]
+    if not isinstance(value, Mapping):
+        return value
+    if "any" in value:
+        options = value["any"]
+        if len(value) > 1 or not isinstance(options, list) or not options:
+            raise table.error(f"{dict(value)} must be {{ any = [one, another, …] }}")
+        return _draw(options[rng.integers(len(options))], rng, table)
+    if "from" in value or "to" in value:
+        return _number(ScenarioTable(value, table.source, f"{table.item}: {{ from, to }}"), rng)
+    out = {k: _draw(v, rng, table) for k, v in value.items()}
+    if out.get("quaternion") == "uniform":
+        four = rng.standard_normal(4)
+        out["quaternion"] = (four / np.linalg.norm(four)).tolist()
+    return out
+
+
+def _number(span: ScenarioTable, rng: Generator) -> float:
+    """A number between two; with ``log`` uniform in its logarithm, with ``steps`` one of so many.
+
+    Steps suit sizes: a body of new proportions takes the solver many times as long as others.
+    """
+    span.only(("from", "to", "log", "steps"))
+    log = span.boolean("log", False)
+    low = span.number("from", 1e-300 if log else -1e12, 1e12)
+    high = span.number("to", low, 1e12)
+    steps = span.integer("steps", 2, 10**6, 0)
+    share = rng.integers(steps) / (steps - 1) if steps else rng.random()
+    return float(low * (high / low) ** share if log else low + (high - low) * share)
+
+
+def _limb(table: ScenarioTable) -> list[Body]:
+    """An arm or a leg; its pose is that of the middle of one segment, z along the segment."""
+    table.only(LIMB_KEYS)
+    build = Build(
+        table.choice("sex", ("female", "male"), "male"),  # type: ignore[arg-type]
+        percentile=table.number("percentile", 0.1, 99.9, 50.0),
+        girth=table.number("girth", 0.5, 2.0, 1.0),
     )
+    side = table.choice("side", ("left", "right"), "right")
+    limb = LIMBS[table.string("shape")](build, side)  # type: ignore[arg-type]
+    angles = ScenarioTable(table.data.get("angles", {}), table.source, f"{table.item}: angles")
+    bent = {joint: angles.number(joint, -180.0, 180.0) for joint in angles.data}
+    named = {s.name: s for s in limb.segments}
+    segment = named[table.choice("segment", list(named), limb.segments[1].name)]
+    pose = read_pose(
+        ScenarioTable(table.raw("pose", "{ position = [x, y, z] }"), table.source, table.item)
+    )
+    ends = np.array([p for part in segment.parts for p in (part.start, part.end)])
+    middle = Pose(0.5 * (ends.min(axis=0) + ends.max(axis=0)))
+    root = pose @ (limb.forward(bent, degrees=True)[segment.name] @ middle).inverse()
+    grounding = read_grounding(table) if "grounding" in table else 100e-12
+    material = read_material(table) if "material" in table else "human"
+    bodies = limb.bodies(root, bent, degrees=True, material=material, grounding=grounding)
+    name = table.string("name")
+    short = len(limb.name) + 1
+    return [Body(b.shape, b.pose, b.material, b.grounding, f"{name}_{str(b.name)[short:]}")
+            for b in bodies]  # fmt: skip
+
+
+def settling(readout: Readout) -> float:
+    """Time after which every channel has reported what it sees now [s]."""
+    return 2 * readout.schedule.period + readout.schedule.lag
+
+
+def settled(readout: Readout, reading: Reading, start: float) -> Held:
+    """The registers after a reading has stood from ``start`` [s] for the time of settling."""
+    readout.sample(start, reading)
+    return readout.sample(start + settling(readout), reading).held()

@@ -19,7 +19,7 @@ from secrets import token_hex
 from typing import Any, ClassVar
 
 from capsense._thread_pool import processors
-from capsense.errors import AdapterError, MissingDependencyError, ScenarioError
+from capsense.errors import AdapterError, ScenarioError, require_package
 from capsense.recording.session import versions
 from capsense.recording.tables import replacing
 
@@ -90,10 +90,10 @@ def load_data_set(path: str | Path) -> DataSet:
         MissingDependencyError: Episodes need Gymnasium and MuJoCo.
     """
     from capsense._validate import read_toml
-    from capsense.learning import episodes, spec
+    from capsense.learning import episodes, scenes
 
     kind = read_toml(Path(path), "data set", ScenarioError)
-    return episodes.load_episodes(path) if "environment" in kind else spec.load_spec(path)
+    return episodes.load_episodes(path) if "environment" in kind else scenes.load_spec(path)
 
 
 def files_named(texts: Iterable[str], folder: Path) -> dict[str, str]:
@@ -107,12 +107,7 @@ def files_named(texts: Iterable[str], folder: Path) -> dict[str, str]:
 
 def require_pyarrow() -> None:
     """Raise a MissingDependencyError where pyarrow is not installed."""
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError:
-        raise MissingDependencyError(
-            "data sets need pyarrow; pip install 'capsense[dataset]'"
-        ) from None
+    require_package("pyarrow.parquet", "pyarrow, which data sets need,", "dataset")
 
 
 def make_shard(spec: DataSet, folder: Path, shard: int) -> int:
@@ -222,13 +217,10 @@ def _made(
 
 def _on_cluster(job: Callable[[int], int], todo: Iterable[int], scheduler: str) -> Iterator[int]:
     """The same on Dask's workers; the scheduler gives the shards of one that died to another."""
-    try:
-        from distributed import Client, KilledWorker
-        from distributed import as_completed as completed
-    except ImportError:
-        raise MissingDependencyError(
-            "--scheduler needs Dask; pip install 'capsense[cluster]'"
-        ) from None
+    require_package("distributed", "Dask, which --scheduler needs,", "cluster")
+    from distributed import Client, KilledWorker
+    from distributed import as_completed as completed
+
     try:
         client = Client(scheduler)
     except (OSError, TimeoutError, ValueError) as error:
@@ -264,16 +256,17 @@ def _about(spec: DataSet, folder: Path, shard: int) -> dict[str, Any] | None:
         about = json.loads((pq.read_schema(path).metadata or {}).get(KEY, b"{}"))
     except (FileNotFoundError, pa.ArrowInvalid):
         return None
-    if about.get("identity") != spec.identity:
-        raise _other(spec, path)
+    _check(spec, path, about.get("identity"))
     return about
 
 
-def _other(spec: DataSet, path: Path) -> ScenarioError:
-    return ScenarioError(
-        f"{path} is of other settings than {spec.source} has now; give another folder (-o), or "
-        "remove this one"
-    )
+def _check(spec: DataSet, path: Path, identity: object) -> None:
+    """Raise a ScenarioError where a file belongs to another data set."""
+    if identity != spec.identity:
+        raise ScenarioError(
+            f"{path} is of other settings than {spec.source} has now; give another folder (-o), "
+            "or remove this one"
+        )
 
 
 def _begin_manifest(spec: DataSet, folder: Path) -> None:
@@ -287,8 +280,7 @@ def _begin_manifest(spec: DataSet, folder: Path) -> None:
     path = folder / MANIFEST
     if path.exists():
         told = json.loads(path.read_text(encoding="utf-8"))
-        if told["identity"] != spec.identity:
-            raise _other(spec, path)
+        _check(spec, path, told["identity"])
         if not told["complete"] or not missing(spec, folder):
             return
         path.unlink(missing_ok=True)  # shards have been removed since

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from importlib import resources
 from itertools import islice
 from pathlib import Path
@@ -26,64 +26,15 @@ from capsense.recording.tables import (
     replacing,
     write_counts,
 )
-from capsense.scenario.model import Channel
+from capsense.scenario.model import read_channels
+
+Array = NDArray[np.float64]
 
 MAX_LINES = 8
 """So many channels are drawn in a chart, the strongest."""
 _LAYOUT = resources.files("capsense.recording") / "layout.json"
 """What Foxglove is told of every recording: the scene, and how a chart looks."""
 
-
-def layout(name: str, channels: Sequence[Channel], peaks: NDArray[np.float64]) -> str:
-    """The layout of a recording, as JSON that Foxglove imports.
-
-    Args:
-        name: Of the sensor.
-        channels: Those in its ``signals``.
-        peaks: Their largest changes [F], shape (K,).
-    """
-    data = json.loads(_LAYOUT.read_text(encoding="utf-8").replace("NAME", name))
-    panels: dict[str, Any] = {"3D!sensor": data["scene"]}
-    for key, title, own in (("own", "electrodes", True), ("pairs", "pairs", False)):
-        found = [k for k, c in enumerate(channels) if (c.row == c.column) == own]
-        strongest = sorted(sorted(found, key=lambda k: -peaks[k])[:MAX_LINES])
-        if strongest:
-            drawn = [channels[k] for k in strongest]
-            paths = [_path(name, channel, COLOURS[k]) for k, channel in enumerate(drawn)]
-            head = {"foxglovePanelTitle": f"{title}, change [fF]", "paths": paths}
-            panels[f"Plot!{key}"] = head | data["chart"]
-    return json.dumps(
-        {
-            "configById": panels,
-            "globalVariables": {},
-            "userNodes": {},
-            "playbackConfig": {"speed": 1},
-            "layout": _beside([key for key in panels if key.startswith("Plot")]),
-        },
-        indent=1,
-    )
-
-
-def _beside(charts: Sequence[str]) -> Any:
-    """The scene on the left, charts below each other on the right."""
-    right: Any = charts[0]
-    if len(charts) > 1:
-        right = {"direction": "column", "first": charts[0], "second": charts[1]}
-    return {"direction": "row", "first": "3D!sensor", "second": right, "splitPercentage": 55}
-
-
-def _path(name: str, channel: Channel, colour: str) -> dict[str, Any]:
-    """A line of a chart."""
-    return {
-        "value": f'/{name}/signals.channels[:]{{name=="{channel.column_name}"}}.change',
-        "label": channel.label,
-        "color": colour,
-        "enabled": True,
-        "timestampMethod": "receiveTime",
-    }
-
-
-Array = NDArray[np.float64]
 
 ENDINGS = (".csv", ".npz", ".parquet", ".mcap", ".json")
 """What a recording is exported to, by the ending of the file."""
@@ -130,12 +81,15 @@ def export(recording: Recording, path: Path, *, counts: bool = False) -> int:
         return writers[ending](recording, part)
 
 
+def _values(recording: Recording) -> Iterator[tuple[Step, Array]]:
+    """The steps, each with the capacitances of the session's channels [F], shape (K,)."""
+    for step in recording.steps():
+        yield step, read_channels(recording.session.channels, step.reading)
+
+
 def _levels(session: Session) -> Array:
-    return np.array([c.read(session.empty) for c in session.channels])
-
-
-def _values(session: Session, step: Step) -> Array:
-    return np.array([c.read(step.reading) for c in session.channels])
+    """Capacitances of the channels with an empty scene [F], shape (K,)."""
+    return read_channels(session.channels, session.empty)
 
 
 def _csv(recording: Recording, path: Path) -> int:
@@ -143,8 +97,8 @@ def _csv(recording: Recording, path: Path) -> int:
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow([*(name for name, _ in column_meanings(session.channels)), "episode"])
-        for step in recording.steps():
-            rows.writerow([*csv_row(step.clock, _values(session, step), levels), step.episode])
+        for step, values in _values(recording):
+            rows.writerow([*csv_row(step.clock, values, levels), step.episode])
             n += 1
     return n
 
@@ -153,17 +107,16 @@ def _parquet(recording: Recording, path: Path) -> int:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    session, levels = recording.session, _levels(recording.session)
-    meanings = column_meanings(session.channels)
+    levels, meanings = _levels(recording.session), column_meanings(recording.session.channels)
     fields = [pa.field(name, pa.float64(), metadata={"meaning": text}) for name, text in meanings]
     schema = pa.schema([*fields, pa.field("episode", pa.int64())])
-    n, steps = 0, recording.steps()
+    n, steps = 0, _values(recording)
     with pq.ParquetWriter(path, schema) as writer:
         while batch := list(islice(steps, _BATCH)):
-            values = np.array([_values(session, s) for s in batch])
-            columns = [np.array([s.clock for s in batch]), *values.T, *(values - levels).T]
-            arrays = [pa.array(c) for c in columns]
-            arrays.append(pa.array([s.episode for s in batch], pa.int64()))
+            values = np.array([v for _, v in batch])
+            columns = [[s.clock for s, _ in batch], *values.T, *(values - levels).T]
+            columns.append([s.episode for s, _ in batch])
+            arrays = [pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
             n += len(batch)
     return n
@@ -216,11 +169,33 @@ def _counts_parquet(recording: Recording, path: Path) -> int:
 
 
 def _layout(recording: Recording, path: Path) -> int:
+    """A layout that Foxglove imports: the scene on the left, charts below each other beside it."""
     session, levels = recording.session, _levels(recording.session)
     peaks = np.zeros(len(levels))
-    for step in recording.steps():
-        peaks = np.maximum(peaks, np.abs(_values(session, step) - levels))
-    path.write_text(layout(session.name, session.channels, peaks) + "\n", encoding="utf-8")
+    for _, values in _values(recording):
+        peaks = np.maximum(peaks, np.abs(values - levels))
+    data = json.loads(_LAYOUT.read_text(encoding="utf-8").replace("NAME", session.name))
+    panels: dict[str, Any] = {"3D!sensor": data["scene"]}
+    for key, title, own in (("own", "electrodes", True), ("pairs", "pairs", False)):
+        found = [k for k, c in enumerate(session.channels) if (c.row == c.column) == own]
+        strongest = sorted(sorted(found, key=lambda k: -peaks[k])[:MAX_LINES])
+        paths = [
+            {"value": f'/{session.name}/signals.channels[:]{{name=="{c.column_name}"}}.change',
+             "label": c.label, "color": colour, "enabled": True, "timestampMethod": "receiveTime"}
+            for c, colour in zip([session.channels[k] for k in strongest], COLOURS, strict=False)
+        ]  # fmt: skip
+        if paths:
+            head = {"foxglovePanelTitle": f"{title}, change [fF]", "paths": paths}
+            panels[f"Plot!{key}"] = head | data["chart"]
+    first, *others = [key for key in panels if key.startswith("Plot")]
+    right = {"direction": "column", "first": first, "second": others[0]} if others else first
+    content = {
+        "configById": panels, "globalVariables": {}, "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": {"direction": "row", "first": "3D!sensor", "second": right,
+                   "splitPercentage": 55},
+    }  # fmt: skip
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return 1
 
 

@@ -18,7 +18,7 @@ from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
 from capsense.errors import RecordingError
-from capsense.recording.ros import Messages, offered_qos
+from capsense.recording import ros
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
@@ -241,7 +241,6 @@ class McapFile:
         from mcap.writer import Writer
 
         self.path = path
-        self.messages = Messages()
         self.failure: OSError | None = None
         """Why the file could not be written the last time that was tried, if it failed."""
         self._disk = Disk(path, overwrite=overwrite)
@@ -256,24 +255,26 @@ class McapFile:
         self._thread = threading.Thread(target=self._flush_often, daemon=True)
         self._thread.start()
 
-    def metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a record of names and values."""
+    def begin(self, name: str, values: Mapping[str, str], files: Mapping[str, str]) -> None:
+        """Write what is said once: a record of names and values, and files of JSON; flush.
+
+        Raises:
+            OSError: That failed.
+        """
         with self._lock:
             self._writer.add_metadata(name, dict(values))
-
-    def attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Write a file within the file."""
-        with self._lock:
-            self._writer.add_attachment(0, 0, name, media_type, data)
+            for file, text in files.items():
+                self._writer.add_attachment(0, 0, file, "application/json", text.encode())
+        self.flush()
 
     def write(self, stamp: int, messages: Sequence[tuple[str, Any]]) -> None:
         """Write messages that belong together, each with its topic.
 
         Args:
             stamp: Their time on the clock of the recording [ns].
-            messages: Made by :attr:`messages`.
+            messages: Made by :func:`~capsense.recording.ros.make`.
         """
-        data = [(topic, m.__msgtype__, self.messages.encode(m)) for topic, m in messages]
+        data = [(topic, m.__msgtype__, ros.encode(m)) for topic, m in messages]
         with self._lock:
             for topic, type_name, content in data:
                 channel = self._channels.get(topic) or self._channel(topic, type_name)
@@ -329,13 +330,13 @@ class McapFile:
 
     def _channel(self, topic: str, type_name: str) -> int:
         if type_name not in self._schemas:
-            text = self.messages.definition(type_name)
+            text = ros.definition(type_name)
             self._schemas[type_name] = self._writer.register_schema(
                 type_name, "ros2msg", text.encode()
             )
         notes = {
-            "offered_qos_profiles": offered_qos(topic),
-            "topic_type_hash": self.messages.type_hash(type_name),
+            "offered_qos_profiles": ros.offered_qos(topic),
+            "topic_type_hash": ros.type_hash(type_name),
         }
         channel = self._writer.register_channel(topic, "cdr", self._schemas[type_name], notes)
         self._channels[topic] = channel

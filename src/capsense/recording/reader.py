@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capsense.codec import CHANGING, design_from_json, read_body, read_rest, read_shape
 from capsense.errors import RecordingError, SceneError
 from capsense.reading import Reading, StepStats
 from capsense.readout.conversions import Counts
-from capsense.recording.ros import PACKAGE, Messages, require
+from capsense.recording.ros import PACKAGE, decode, require
 from capsense.recording.session import (
     DESIGN,
     NAME,
@@ -129,7 +128,6 @@ class _Builder:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._messages = Messages()
         self._shapes: dict[int, Shape] = {}
         self._rests: dict[int, RestSurface] = {}
         self._bodies: dict[int, Body] = {}
@@ -138,7 +136,7 @@ class _Builder:
 
     def take(self, record: Any, type_name: str) -> Step | None:
         """The step that a message completes, if it does."""
-        m = self._messages.decode(record.data, type_name)
+        m = decode(record.data, type_name)
         match type_name.rpartition("/")[2]:
             case "Shape":
                 if m.kind == "rest":
@@ -203,9 +201,6 @@ def _counts(m: Any) -> Counts:
         tuple(m.channel_names), m.time, m.channel.astype(np.int64), m.code, m.capacitance, m.flags,
         baseline, touched,
     )  # fmt: skip
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -305,8 +300,8 @@ def replay(
     simulator = session.simulator(method=method, cache_dir=cache_dir, progress=progress)
     simulator.reset()  # as the recorder did; the masked method keeps a solution from its making
     readout = session.new_readout()
-    compare = _Comparison(session, tolerance)
-    compare.baseline(simulator.baseline)
+    compare = _Comparison(session.design.electrode_names, tolerance)
+    compare.readings(-1, 0.0, session.empty, simulator.empty)
     episode, n, conversions, held = 0, 0, 0, 0
     for step in recording.steps():
         if step.episode != episode:
@@ -315,7 +310,7 @@ def replay(
             if readout is not None:
                 readout.reset()
         reading = simulator.step(step.scene)
-        compare.step(step.index, step.time, step.reading, reading)
+        compare.readings(step.index, step.time, step.reading, reading)
         held += 0 if step.reading.counts is None else len(step.reading.counts)
         if readout is not None:
             counts = readout.sample(step.time, reading)
@@ -333,24 +328,27 @@ def replay(
 class _Comparison:
     """Compares numbers, and remembers the first that differs."""
 
-    def __init__(self, session: Session, tolerance: float) -> None:
-        self._session, self._tolerance = session, tolerance
-        self._names = session.design.electrode_names
+    def __init__(self, electrodes: Sequence[str], tolerance: float) -> None:
+        pairs = [f"({a}, {b}) [F]" for a in electrodes for b in electrodes]
+        self._names = [f"{what}{pair}" for what in ("C", "delta") for pair in pairs]
+        self._names += [f"shield coupling of {n} [F]" for n in electrodes]
+        self._tolerance = tolerance
         self.first: Difference | None = None
         self.largest = 0.0
         self.differing: set[int] = set()
 
-    def baseline(self, baseline: Array) -> None:
-        """Compare the matrix of the empty domain."""
-        self._matrices(-1, 0.0, "C", self._session.empty.capacitance, baseline)
-
-    def step(self, index: int, time: float, recorded: Reading, replayed: Reading) -> None:
+    def readings(self, index: int, time: float, recorded: Reading, replayed: Reading) -> None:
         """Compare two readings."""
-        self._matrices(index, time, "C", recorded.capacitance, replayed.capacitance)
-        self._matrices(index, time, "delta", recorded.delta, replayed.delta)
-        was, now = shield_coupling(recorded), shield_coupling(replayed)
-        names = [f"shield coupling of {n} [F]" for n in self._names]
-        self._farads(index, time, names, was, now)
+        was, now = (
+            np.concatenate([r.capacitance.ravel(), r.delta.ravel(), shield_coupling(r)])
+            for r in (recorded, replayed)
+        )
+        if np.array_equal(was, now):
+            return
+        gap = np.abs(now - was)
+        self.largest = max(self.largest, float(np.max(gap)))
+        for k in np.flatnonzero(~(gap <= self._tolerance))[:1].tolist():
+            self._differs(index, time, self._names[k], float(was[k]), float(now[k]))
 
     def counts(self, index: int, time: float, recorded: Counts | None, replayed: Counts) -> None:
         """Compare what a readout reported; bit by bit, as codes are whole numbers."""
@@ -367,20 +365,6 @@ class _Comparison:
                     channel = recorded.channel_names[int(recorded.channel[k])]
                     self._differs(index, time, f"{name} of {channel}", float(a[k]), float(b[k]))
                     return
-
-    def _matrices(self, index: int, time: float, what: str, was: Array, now: Array) -> None:
-        names = [f"{what}({a}, {b}) [F]" for a in self._names for b in self._names]
-        self._farads(index, time, names, was.ravel(), now.ravel())
-
-    def _farads(self, index: int, time: float, names: list[str], was: Array, now: Array) -> None:
-        if np.array_equal(was, now):
-            return
-        gap = np.abs(now - was)
-        self.largest = max(self.largest, float(np.max(gap)))
-        wrong = np.flatnonzero(~(gap <= self._tolerance))
-        if len(wrong):
-            k = int(wrong[0])
-            self._differs(index, time, names[k], float(was[k]), float(now[k]))
 
     def _differs(self, index: int, time: float, what: str, was: float, now: float) -> None:
         if index >= 0:

@@ -1,4 +1,4 @@
-"""What other programs look at: transforms, matrices, images and markers as ROS 2 messages.
+"""What a step is for other programs: transforms, matrices, images and markers as ROS 2 messages.
 
 Standard messages come with ``rosbags``; those of ``capsense_msgs`` lie in a ROS 2 package of that
 name beside this module. Stored schemas hold the definition and those of all messages in it, as
@@ -7,7 +7,7 @@ ROS 2 wants.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from typing import Any, NamedTuple
@@ -15,15 +15,44 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.design.model import Design
+from capsense._style import signal_colours
+from capsense.codec import CHANGING, body_fields, shape_fields
 from capsense.errors import RecordingError, require_package
-from capsense.scene import Box, Capsule, Cylinder, DepthFrame, Ellipsoid, Pose, Shape, Sphere
-from capsense.scene.scene import Body
+from capsense.reading import Reading
+from capsense.recording.session import Session, shield_coupling
+from capsense.scenario.model import read_channels
+from capsense.scene import (
+    Body,
+    Box,
+    Capsule,
+    Cylinder,
+    DepthFrame,
+    Ellipsoid,
+    Pose,
+    RestSurface,
+    Scene,
+    Shape,
+    Sphere,
+    SurfaceMesh,
+)
+
+Array = NDArray[np.float64]
+Colour = tuple[float, float, float, float]
+Topics = list[tuple[str, Any]]
+"""Messages in the order in which they are written, each with its topic."""
 
 PACKAGE = "capsense_msgs/msg"
 OWN = ("Shape", "Body", "Step", "Counts", "Signal", "Signals")
 """Messages of ``capsense_msgs``."""
 _LASTING = {"markers": 1, "electrodes": 1, "shapes": 1000, "bodies": 1000}
+WORLD = "world"
+"""Frame in which the sensor moves."""
+METAL: Colour = (0.72, 0.74, 0.78, 1.0)
+PLASTIC: Colour = (0.35, 0.6, 0.9, 0.6)
+_CUBE, _SPHERE, _CYLINDER, _TRIANGLES, _DELETE_ALL = 1, 2, 3, 11, 3
+SHADES = 32
+"""Colours of an electrode between no signal and the largest."""
+_SMALLEST, _DECADES = 1e-16, 4.0
 
 
 def require() -> None:
@@ -47,6 +76,46 @@ def _store() -> Any:
         text = (folder / f"{name}.msg").read_text()
         store.register(get_types_from_msg(text, f"{PACKAGE}/{name}"))
     return store
+
+
+@cache
+def _maker(type_name: str) -> Callable[[Any], Any]:
+    """A function that makes a message of its fields, given by name or all of them in order."""
+    kind = _store().types[type_name]
+    fields = {name: _field(*what) for name, what in fields_of(type_name)}
+    makers = [of for of, _ in fields.values()]
+    plain = all(of is _same for of in makers)
+
+    def make(given: Any) -> Any:
+        if isinstance(given, Mapping):
+            if not given.keys() <= fields.keys():
+                unknown = ", ".join(given.keys() - fields.keys())
+                raise TypeError(f"{type_name} has no field {unknown}")
+            return kind(*[of(given[n]) if n in given else zero for n, (of, zero) in fields.items()])
+        if plain:
+            return kind(*given)
+        return kind(*[of(value) for of, value in zip(makers, given, strict=True)])
+
+    return make
+
+
+def _field(node: Any, what: Any) -> tuple[Callable[[Any], Any], Any]:
+    """What makes the value of a field, and its value where none is given."""
+    from rosbags.interfaces import Nodetype
+
+    if node == Nodetype.BASE:
+        return _same, {"string": "", "bool": False}.get(what[0], 0)
+    if node == Nodetype.NAME:
+        return _maker(what), _maker(what)({})
+    (node, what), size = what
+    if node == Nodetype.NAME:
+        make = _maker(what)
+        return lambda values: [make(value) for value in values], []
+    return _same, [] if what[0] == "string" else np.zeros(size, what[0])
+
+
+def _same(value: Any) -> Any:
+    return value
 
 
 def lasting(topic: str) -> int:
@@ -77,215 +146,237 @@ def offered_qos(topic: str) -> str:
     return dump_qos_v8([profile])
 
 
-class Messages:
-    """Makes, encodes and decodes messages by the names of their types."""
+def make(type_name: str, **fields: Any) -> Any:
+    """A message; fields that are not given are zero or empty.
 
-    def __init__(self) -> None:
-        self._store = _store()
-        self._types: dict[str, Any] = self._store.types
-
-    def make(self, type_name: str, **fields: Any) -> Any:
-        """A message; every field must be given."""
-        return self._types[type_name](**fields)
-
-    def encode(self, message: Any) -> bytes:
-        """The CDR form of a message, little-endian."""
-        return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
-
-    def decode(self, data: bytes, type_name: str) -> Any:
-        """The message of a CDR form.
-
-        Raises:
-            RecordingError: It is none of that type.
-        """
-        from rosbags.serde import SerdeError
-
-        try:
-            return self._store.deserialize_cdr(data, type_name)
-        except (SerdeError, KeyError, AssertionError, IndexError) as error:
-            raise RecordingError(f"a message is no {type_name}: {error}") from None
-
-    def definition(self, type_name: str) -> str:
-        """Definition of a type and of all types in it, encoding ``ros2msg``."""
-        return self._store.generate_msgdef(type_name, ros_version=2)[0]
-
-    def type_hash(self, type_name: str) -> str:
-        """The hash by which ROS 2 tells types apart (REP 2011)."""
-        return self._store.hash_rihs01(type_name)
-
-    def fields(self, type_name: str) -> list[tuple[str, Any]]:
-        """Names of a type's fields, each with its kind as ``rosbags`` describes it."""
-        return list(self._store.fielddefs[type_name][1])
+    Messages in it are given as dicts of their fields, or as all of their fields in order.
+    """
+    return _maker(type_name)(fields)
 
 
-Array = NDArray[np.float64]
-Colour = tuple[float, float, float, float]
-
-WORLD = "world"
-"""Frame in which the sensor moves."""
-METAL: Colour = (0.72, 0.74, 0.78, 1.0)
-PLASTIC: Colour = (0.35, 0.6, 0.9, 0.6)
-_CUBE, _SPHERE, _CYLINDER, _TRIANGLES, _DELETE_ALL = 1, 2, 3, 11, 3
+def encode(message: Any) -> bytes:
+    """The CDR form of a message, little-endian."""
+    return bytes(_store().serialize_cdr(message, message.__msgtype__, little_endian=True))
 
 
-class Composer:
-    """Makes the messages of one sensor.
+def decode(data: bytes, type_name: str) -> Any:
+    """The message of a CDR form.
+
+    Raises:
+        RecordingError: It is none of that type.
+    """
+    from rosbags.serde import SerdeError
+
+    try:
+        return _store().deserialize_cdr(data, type_name)
+    except (SerdeError, KeyError, AssertionError, IndexError) as error:
+        raise RecordingError(f"a message is no {type_name}: {error}") from None
+
+
+def definition(type_name: str) -> str:
+    """Definition of a type and of all types in it, encoding ``ros2msg``."""
+    return _store().generate_msgdef(type_name, ros_version=2)[0]
+
+
+def type_hash(type_name: str) -> str:
+    """The hash by which ROS 2 tells types apart (REP 2011)."""
+    return _store().hash_rihs01(type_name)
+
+
+def fields_of(type_name: str) -> list[tuple[str, Any]]:
+    """Names of a type's fields, each with its kind as ``rosbags`` describes it."""
+    return list(_store().fielddefs[type_name][1])
+
+
+def strength(changes: Any) -> Any:
+    """How strongly electrodes light up, 0 to 1: the logarithm of 1 + change / 0.1 fF, 1 at 1 pF."""
+    return np.clip(np.log10(1.0 + np.abs(changes) / _SMALLEST) / _DECADES, 0.0, 1.0)
+
+
+class Moment(NamedTuple):
+    """When a step was taken."""
+
+    stamp: int
+    """On the recording's clock [ns]."""
+    episode: int
+    """How often the simulator had been reset since the recording began."""
+    time: float
+    """On the clock of the scenario or simulator [s]."""
+
+
+class StepMessages:
+    """Turns steps into messages; shapes and bodies go ahead of the first step that has them.
 
     Args:
-        messages: Where message types come from.
-        name: The sensor's frame.
+        session: Whose steps these are.
     """
 
-    def __init__(self, messages: Messages, name: str) -> None:
-        self._make = messages.make
-        self.name = name
+    def __init__(self, session: Session) -> None:
+        self._name, self._design = session.name, session.design
+        self._camera = f"{session.name}/depth_camera"
+        self._channels = session.channels
+        self._levels = read_channels(session.channels, session.empty)
+        self._lit: list[float] = []
+        self._shapes: dict[Shape | RestSurface, int] = {}
+        self._bodies: dict[tuple[Any, ...], int] = {}
+        self._ids = 0
+        self._drawn: list[tuple[str, int]] | None = None
 
-    def header(self, stamp: int, frame: str | None = None) -> Any:
-        """A header; ``stamp`` in ns, in the sensor's frame by default."""
-        sec, nanosec = divmod(stamp, 10**9)
-        time = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        return self._make(
-            "std_msgs/msg/Header", stamp=time, frame_id=self.name if frame is None else frame
-        )
+    def of(
+        self, moment: Moment, scene: Scene, reading: Reading, frame: DepthFrame | None,
+        pose: Pose | None,
+    ) -> Topics:  # fmt: skip
+        """Messages of a step; what lacks the last of them, of type ``Step``, is not whole.
 
-    def pose(self, pose: Pose) -> Any:
-        """A ``geometry_msgs/Pose``."""
-        return self._make(
-            "geometry_msgs/msg/Pose",
-            position=self._vector("Point", pose.position),
-            orientation=self._quaternion(pose),
-        )
+        Args:
+            moment: When.
+            scene: What the simulator was given.
+            reading: What it returned.
+            frame: The depth frame that the scene was made from, if it was.
+            pose: Where the sensor stands in the world, if that is known.
 
-    def matrix(self, values: Array) -> Any:
-        """A square matrix as ``std_msgs/Float64MultiArray``, row by row."""
-        n = len(values)
-        dims = [
-            self._make("std_msgs/msg/MultiArrayDimension", label=label, size=n, stride=stride)
-            for label, stride in (("row", n * n), ("column", n))
-        ]
-        layout = self._make("std_msgs/msg/MultiArrayLayout", dim=dims, data_offset=0)
-        data = np.ascontiguousarray(values).ravel()
-        return self._make("std_msgs/msg/Float64MultiArray", layout=layout, data=data)
-
-    def transforms(self, stamp: int, frames: Sequence[tuple[str, str, Pose]]) -> Any:
-        """Poses of frames: (parent, child, pose)."""
-        return self._make(
-            "tf2_msgs/msg/TFMessage",
-            transforms=[
-                self._make(
-                    "geometry_msgs/msg/TransformStamped",
-                    header=self.header(stamp, parent),
-                    child_frame_id=child,
-                    transform=self._make(
-                        "geometry_msgs/msg/Transform",
-                        translation=self._vector("Vector3", pose.position),
-                        rotation=self._quaternion(pose),
-                    ),
-                )
-                for parent, child, pose in frames
-            ],
-        )
-
-    def image(self, stamp: int, frame: DepthFrame, values: Array) -> Any:
-        """The first layer of a depth frame's ``values``, as 32-bit floats.
-
-        Rows grow along the camera's y and columns along its x, as in optical frames of ROS.
+        Raises:
+            RecordingError: The scene holds a shape that messages do not have.
         """
-        pixels = np.ascontiguousarray(frame.camera.upright(values[0]), dtype="<f4")
-        rows, columns = pixels.shape
-        return self._make(
-            "sensor_msgs/msg/Image", header=self.header(stamp, self.camera), height=rows,
-            width=columns, encoding="32FC1", is_bigendian=0, step=4 * columns,
-            data=pixels.view(np.uint8).ravel(),
+        stamp = moment.stamp
+        out: Topics = []
+        ids = self._introduce(scene, out)
+        frames = [] if pose is None else [(WORLD, self._name, pose)]
+        solid: list[tuple[str, int, Body]] = []
+        for k, (body, number) in enumerate(zip(scene, ids, strict=True)):
+            if not isinstance(body.shape, CHANGING):
+                solid.append((f"{self._name}/{body.name or f'body{k}'}", number, body))
+        frames += [(self._name, child, body.pose) for child, _, body in solid]
+        if frame is not None:
+            frames.append((self._name, self._camera, frame.camera.pose))
+            self._images(stamp, frame, out)
+        transforms = [
+            (self._header(stamp, parent), child, (pose.position, pose.quaternion))
+            for parent, child, pose in frames
+        ]
+        out.append(("/tf", make("tf2_msgs/msg/TFMessage", transforms=transforms)))
+        drawn = [(child, number) for child, number, _ in solid]
+        if drawn != self._drawn:
+            self._drawn = drawn
+            self._draw(stamp, [(child, body) for child, _, body in solid], out)
+        header = self._header(stamp)
+        counts = reading.counts
+        if counts is not None and len(counts):
+            self._add(
+                out, "counts", f"{PACKAGE}/Counts", header=header,
+                channel_names=list(counts.channel_names), time=counts.time,
+                channel=counts.channel.astype(np.uint32), code=counts.code.astype(np.int64),
+                capacitance=counts.capacitance, flags=counts.flags.astype(np.uint8),
+                baseline=np.empty(0) if counts.baseline is None else counts.baseline,
+                touched=np.empty(0, bool) if counts.touched is None else counts.touched,
+            )  # fmt: skip
+        self._light_up(stamp, reading, out)
+        names = [c.column_name for c in self._channels]
+        values = read_channels(self._channels, reading)
+        femtofarads = (1e15 * values).tolist(), (1e15 * (values - self._levels)).tolist()
+        signals = list(zip(names, *femtofarads, strict=True))
+        self._add(out, "signals", f"{PACKAGE}/Signals", header=header, channels=signals)
+        for topic, matrix in (("capacitance", reading.capacitance), ("delta", reading.delta)):
+            n = len(matrix)
+            self._add(
+                out, topic, "std_msgs/msg/Float64MultiArray",
+                layout=([("row", n, n * n), ("column", n, n)], 0), data=matrix.ravel(),
+            )  # fmt: skip
+        self._add(
+            out, "step", f"{PACKAGE}/Step", header=header, episode=moment.episode,
+            time=moment.time, bodies=np.array(ids, np.uint32),
+            poses=[(b.pose.position, b.pose.quaternion) for b in scene],
+            capacitance=reading.capacitance.ravel(), delta=reading.delta.ravel(),
+            shield_coupling=shield_coupling(reading), iterations=reading.stats.iterations,
+            error_estimate=reading.stats.solver_error, wall_time=reading.stats.wall_time,
         )  # fmt: skip
+        return out
 
-    def camera_info(self, stamp: int, frame: DepthFrame) -> Any:
-        """The camera of a depth frame.
+    def _header(self, stamp: int, frame: str | None = None) -> tuple[tuple[int, int], str]:
+        """A header; ``stamp`` in ns, in the sensor's frame by default."""
+        return divmod(stamp, 10**9), frame or self._name
 
-        ``p`` takes points of the camera's frame to pixels by parallel rays, its last row being
-        0, 0, 0, 1. ``k`` is zero, which tells ROS that there is no pinhole.
+    def _add(self, out: Topics, topic: str, type_name: str, **fields: Any) -> None:
+        out.append((f"/{self._name}/{topic}", make(type_name, **fields)))
+
+    def _introduce(self, scene: Scene, out: Topics) -> list[int]:
+        """Ids of the bodies; messages of those that are new, and of new shapes, are put out."""
+        shapes, bodies = dict[Shape | RestSurface, int](), dict[tuple[Any, ...], int]()
+        ids = []
+
+        def known(shape: Shape | RestSurface) -> int:
+            number = self._shapes.get(shape, shapes.get(shape))
+            if number is None:
+                rest = known(shape.rest) if isinstance(shape, SurfaceMesh) else None
+                fields = shape_fields(shape, rest)
+                number = shapes[shape] = self._new_id()
+                self._add(out, "shapes", f"{PACKAGE}/Shape", id=number, **fields)
+            return number
+
+        for body in scene:
+            key = (body.shape, body.material, body.grounding, body.name)
+            number = self._bodies.get(key)
+            if number is None:
+                shape = known(body.shape)
+                number = bodies[key] = self._new_id()
+                fields = {"id": number, "shape": shape, **body_fields(body)}
+                self._add(out, "bodies", f"{PACKAGE}/Body", **fields)
+            ids.append(number)
+        self._shapes.update((s, n) for s, n in shapes.items() if not isinstance(s, CHANGING))
+        self._bodies.update((k, n) for k, n in bodies.items() if not isinstance(k[0], CHANGING))
+        return ids
+
+    def _new_id(self) -> int:
+        self._ids += 1
+        return self._ids
+
+    def _images(self, stamp: int, frame: DepthFrame, out: Topics) -> None:
+        """The first layer of depths [m] and of permittivities, and their camera.
+
+        Rows grow along the camera's y and columns along its x, as in optical frames of ROS. In the
+        camera's message ``p`` takes points of its frame to pixels by parallel rays, its last row
+        being 0, 0, 0, 1. ``k`` is zero, which tells ROS that there is no pinhole.
         """
         rows, columns = frame.resolution
-        c = frame.camera
-        p = [columns / c.width, 0, 0, 0.5 * columns - 0.5]
-        p += [0, rows / c.height, 0, 0.5 * rows - 0.5, 0, 0, 0, 1]
-        roi = self._make(
-            "sensor_msgs/msg/RegionOfInterest",
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+        size = {"header": self._header(stamp, self._camera), "height": rows, "width": columns}
+        camera = frame.camera
+        depth = np.where(frame.valid, frame.depth, np.nan)
+        for topic, values in (("image", depth), ("permittivity", frame.permittivity)):
+            pixels = np.ascontiguousarray(camera.upright(values[0]), dtype="<f4")
+            self._add(
+                out, f"depth/{topic}", "sensor_msgs/msg/Image", **size, encoding="32FC1",
+                step=4 * columns, data=pixels.view(np.uint8).ravel(),
+            )  # fmt: skip
+        p = [columns / camera.width, 0, 0, 0.5 * columns - 0.5]
+        p += [0, rows / camera.height, 0, 0.5 * rows - 0.5, 0, 0, 0, 1]
+        self._add(
+            out, "depth/camera_info", "sensor_msgs/msg/CameraInfo", **size,
+            distortion_model="orthographic", r=np.eye(3).ravel(), p=np.array(p, dtype=float),
         )  # fmt: skip
-        return self._make(
-            "sensor_msgs/msg/CameraInfo", header=self.header(stamp, self.camera), height=rows,
-            width=columns, distortion_model="orthographic", d=np.empty(0), k=np.zeros(9),
-            r=np.eye(3).ravel(), p=np.array(p, dtype=float), binning_x=0, binning_y=0, roi=roi,
-        )  # fmt: skip
 
-    @property
-    def camera(self) -> str:
-        """The camera's frame."""
-        return f"{self.name}/depth_camera"
-
-    def electrodes(self, stamp: int, design: Design, colours: Array) -> Any:
-        """Electrodes for drawing, in colours from 0 to 1, shape (M, 3)."""
-        markers = []
-        for k, (electrode, (r, g, b)) in enumerate(
-            zip(design.electrodes, colours.tolist(), strict=True)
-        ):
-            part = Part(_TRIANGLES, points=electrode.surface.triangles.reshape(-1, 3))
-            header = self.header(stamp)
-            markers.append(self._marker(header, electrode.name, k, part, (r, g, b, 1.0)))
-        return self._make("visualization_msgs/msg/MarkerArray", markers=markers)
-
-    def signals(self, stamp: int, names: Sequence[str], values: Array, changes: Array) -> Any:
-        """Channels by their names, with their capacitances and changes [F]."""
-        channels = [
-            self._make(f"{PACKAGE}/Signal", name=name, capacitance=value, change=change)
-            for name, value, change in zip(
-                names, (1e15 * values).tolist(), (1e15 * changes).tolist(), strict=True
-            )
+    def _light_up(self, stamp: int, reading: Reading, out: Topics) -> None:
+        """Colour the electrodes by the changes of their own capacitances, where that is seen."""
+        shades = np.rint(SHADES * strength(np.nan_to_num(np.diagonal(reading.delta))))
+        if shades.tolist() == self._lit:
+            return
+        self._lit = shades.tolist()
+        colours = (signal_colours(shades / SHADES) / 255.0).tolist()
+        markers = [
+            _marker(self._header(stamp), e.name, k, _triangles(e.surface.triangles), (r, g, b, 1.0))
+            for k, (e, (r, g, b)) in enumerate(zip(self._design.electrodes, colours, strict=True))
         ]
-        return self._make(f"{PACKAGE}/Signals", header=self.header(stamp), channels=channels)
+        self._add(out, "electrodes", "visualization_msgs/msg/MarkerArray", markers=markers)
 
-    def markers(self, stamp: int, bodies: Sequence[tuple[str, Body]]) -> Any:
+    def _draw(self, stamp: int, bodies: Sequence[tuple[str, Body]], out: Topics) -> None:
         """Bodies for drawing; each moves with the frame it is given with."""
-        out = [self._marker(self.header(stamp), "", 0, Part(_CUBE), METAL, _DELETE_ALL)]
+        markers = [_marker(self._header(stamp), "", 0, Part(_CUBE), METAL, _DELETE_ALL)]
         for frame, body in bodies:
             colour = METAL if body.material.is_conductor() else PLASTIC
-            out += [
-                self._marker(self.header(stamp, frame), frame, k, part, colour)
+            markers += [
+                _marker(self._header(stamp, frame), frame, k, part, colour)
                 for k, part in enumerate(_parts(body.shape))
             ]
-        return self._make("visualization_msgs/msg/MarkerArray", markers=out)
-
-    def _marker(
-        self, header: Any, group: str, number: int, part: Part, colour: Colour, action: int = 0
-    ) -> Any:
-        make, v = self._make, self._vector
-        zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-        texture = make(
-            "sensor_msgs/msg/CompressedImage",
-            header=self.header(0, ""), format="", data=np.empty(0, np.uint8),
-        )  # fmt: skip
-        r, g, b, a = colour
-        return make(
-            "visualization_msgs/msg/Marker", header=header, ns=group, id=number,
-            type=part.kind, action=action, pose=self.pose(Pose((0.0, 0.0, part.height))),
-            scale=v("Vector3", part.size), color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
-            lifetime=zero, frame_locked=True,
-            points=[v("Point", p) for p in part.points.tolist()], colors=[],
-            texture_resource="", texture=texture, uv_coordinates=[], text="", mesh_resource="",
-            mesh_file=make(
-                "visualization_msgs/msg/MeshFile", filename="", data=np.empty(0, np.uint8)
-            ),
-            mesh_use_embedded_materials=False,
-        )  # fmt: skip
-
-    def _vector(self, kind: str, values: Sequence[float]) -> Any:
-        x, y, z = values
-        return self._make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
-
-    def _quaternion(self, pose: Pose) -> Any:
-        x, y, z, w = pose.quaternion
-        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+        self._add(out, "markers", "visualization_msgs/msg/MarkerArray", markers=markers)
 
 
 class Part(NamedTuple):
@@ -295,6 +386,21 @@ class Part(NamedTuple):
     size: Sequence[float] = (1.0, 1.0, 1.0)
     height: float = 0.0
     points: Array = np.empty((0, 3))
+
+
+def _marker(
+    header: Any, group: str, number: int, part: Part, colour: Colour, action: int = 0
+) -> dict[str, Any]:
+    """The fields of a marker that are not zero or empty."""
+    return {
+        "header": header, "ns": group, "id": number, "type": part.kind, "action": action,
+        "pose": ((0.0, 0.0, part.height), (0.0, 0.0, 0.0, 1.0)), "scale": part.size,
+        "color": colour, "frame_locked": True, "points": part.points.tolist(),
+    }  # fmt: skip
+
+
+def _triangles(corners: Array) -> Part:
+    return Part(_TRIANGLES, points=corners.reshape(-1, 3))
 
 
 def _parts(shape: Shape) -> list[Part]:
@@ -313,4 +419,4 @@ def _parts(shape: Shape) -> list[Part]:
             return [Part(_CYLINDER, (2 * radius, 2 * radius, length)), *ends]
         case _:
             mesh = shape.to_trimesh()
-            return [Part(_TRIANGLES, points=mesh.vertices[mesh.faces].reshape(-1, 3))]
+            return [_triangles(mesh.vertices[mesh.faces])]

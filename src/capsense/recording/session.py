@@ -20,25 +20,15 @@ from capsense.field.background import NUMERICS, BuildSettings, MeshSettings
 from capsense.reading import Reading, StepStats
 from capsense.readout.config import parse_readout
 from capsense.readout.readout import Readout
-from capsense.scenario.model import FORMER_METHODS, METHODS, Channel, Excitation, channels_of
+from capsense.scenario.model import (
+    FORMER_METHODS,
+    METHODS,
+    Channel,
+    Excitation,
+    Scenario,
+    channels_of,
+)
 from capsense.simulator import Method, PresetName, Simulator
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the packages that compute and the fields' numerics; the processor."""
-    out = {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "processor": get_host_cpu_name(),
-        "numerics": str(NUMERICS),
-    }
-    for package in ("capsense", "numpy", "scipy", "numba"):
-        try:
-            out[package] = version(package)
-        except PackageNotFoundError:
-            out[package] = "not installed"
-    return out
-
 
 Array = NDArray[np.float64]
 
@@ -50,6 +40,23 @@ DESIGN, SESSION = "design.json", "session.json"
 """The attachments."""
 GONE = ("perturbation",)
 """Methods of earlier versions, which no longer exist; what they recorded can still be read."""
+
+
+def version_of(package: str) -> str:
+    """Version of a package, or that it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the packages that compute and the fields' numerics; the processor."""
+    return {
+        "python": platform.python_version(), "platform": platform.platform(),
+        "processor": get_host_cpu_name(), "numerics": str(NUMERICS),
+        **{package: version_of(package) for package in ("capsense", "numpy", "scipy", "numba")},
+    }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,48 +130,29 @@ class Session:
     def metadata(self) -> dict[str, str]:
         """What readers of MCAP show."""
         return {
-            "format": str(FORMAT),
-            "name": self.name,
-            "title": self.title,
-            "design": self.design.name,
-            "design_hash": self.design.content_hash(),
-            "method": self.method,
-            **self.versions,
-        }
+            "format": str(FORMAT), "name": self.name, "title": self.title,
+            "design": self.design.name, "design_hash": self.design.content_hash(),
+            "method": self.method, **self.versions,
+        }  # fmt: skip
 
     def to_json(self) -> str:
         """Everything but the design."""
-        return json.dumps(
-            {
-                "format": FORMAT,
-                "name": self.name,
-                "title": self.title,
-                "method": self.method,
-                "preset": self.preset,
-                "frequency_Hz": self.excitation_frequency,
-                "settings": asdict(self.settings),
-                "electrodes": list(self.design.electrode_names),
-                "empty_F": self.empty.capacitance.tolist(),
-                "empty_shield_coupling_F": shield_coupling(self.empty).tolist(),
-                "excitation": self.excitation.value,
-                "pairs": [list(p) for p in self.pairs],
-                "readout": self.readout,
-                "versions": dict(self.versions),
-            },
-            indent=1,
-        )
+        content = {
+            "format": FORMAT, "name": self.name, "title": self.title, "method": self.method,
+            "preset": self.preset, "frequency_Hz": self.excitation_frequency,
+            "settings": asdict(self.settings), "electrodes": self.design.electrode_names,
+            "empty_F": self.empty.capacitance.tolist(),
+            "empty_shield_coupling_F": shield_coupling(self.empty).tolist(),
+            "excitation": self.excitation, "pairs": self.pairs, "readout": self.readout,
+            "versions": self.versions,
+        }  # fmt: skip
+        return json.dumps(content, indent=1)
 
 
 def describe(
-    simulator: Simulator,
-    name: str,
-    title: str,
-    *,
-    readout: Mapping[str, Any] | None,
-    excitation: Excitation = Excitation.MATRIX,
-    pairs: tuple[tuple[str, str], ...] = (),
-    empty: Reading,
-) -> Session:
+    simulator: Simulator, name: str, readout: Mapping[str, Any] | None = None,
+    scenario: Scenario | None = None,
+) -> Session:  # fmt: skip
     """The session of a simulator as it is.
 
     Raises:
@@ -173,8 +161,12 @@ def describe(
     s = simulator
     if s.mesh is not None:
         raise RecordingError("a simulator on a mesh cannot be recorded; use one of a design")
+    title, excitation = "", Excitation.MATRIX
+    pairs: tuple[tuple[str, str], ...] = ()
+    if scenario is not None:
+        title, excitation, pairs = scenario.name, scenario.excitation, scenario.pairs
     return Session(
-        name, title, s.design, s.method, s.preset, s.excitation_frequency, s.settings, empty,
+        name, title, s.design, s.method, s.preset, s.excitation_frequency, s.settings, s.empty,
         excitation, pairs, readout, versions(),
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from capsense.reading import Reading
 from capsense.readout.conversions import Counts
 from capsense.recording.session import versions
 from capsense.scenario import Sample, Scenario
-from capsense.scenario.model import Channel
+from capsense.scenario.model import Channel, read_channels
 from capsense.scene import Scene
 
 Array = NDArray[np.float64]
@@ -29,12 +29,12 @@ Array = NDArray[np.float64]
 
 def column_meanings(channels: Sequence[Channel]) -> list[tuple[str, str]]:
     """Columns of ``readings.csv``, each with what it is."""
-    out = [("time_s", "time since the start, s")]
-    out += [(f"{c.column_name}_F", f"{c.meaning}, F") for c in channels]
-    out += [
-        (f"d{c.column_name}_F", f"{c.meaning}, change from the empty scene, F") for c in channels
+    change = "change from the empty scene"
+    return [
+        ("time_s", "time since the start, s"),
+        *((f"{c.column_name}_F", f"{c.meaning}, F") for c in channels),
+        *((f"d{c.column_name}_F", f"{c.meaning}, {change}, F") for c in channels),
     ]
-    return out
 
 
 def csv_row(time: float, values: Array, levels: Array) -> list[str]:
@@ -65,20 +65,16 @@ class Run:
     readings: list[Reading] = field(default_factory=list)
     scenes: list[Scene] = field(default_factory=list)
 
-    def values_of(self, reading: Reading) -> Array:
-        """Capacitance of each channel in a reading [F], shape (K,)."""
-        return np.array([c.read(reading) for c in self.channels])
-
     @cached_property
     def levels(self) -> Array:
         """Capacitance of each channel with an empty scene [F], shape (K,)."""
-        return self.values_of(self.empty)
+        return read_channels(self.channels, self.empty)
 
     @property
     def values(self) -> Array:
         """Capacitance of each channel [F], shape (n, K)."""
         shape = len(self.times), len(self.channels)
-        return np.reshape([self.values_of(r) for r in self.readings], shape)
+        return np.reshape([read_channels(self.channels, r) for r in self.readings], shape)
 
     def poses(self) -> tuple[tuple[str, ...], Array, Array]:
         """Names of the B bodies, and their places in the sensor frame.
@@ -124,12 +120,9 @@ class Run:
 def counts_columns(counts: Counts) -> dict[str, NDArray[Any]]:
     """Columns of a table of counts, one row per conversion."""
     out: dict[str, NDArray[Any]] = {
-        "time_s": counts.time,
-        "channel": np.array(counts.channel_names)[counts.channel],
-        "code": counts.code,
-        "capacitance_F": counts.capacitance,
-        "flags": counts.flags,
-    }
+        "time_s": counts.time, "channel": np.array(counts.channel_names)[counts.channel],
+        "code": counts.code, "capacitance_F": counts.capacitance, "flags": counts.flags,
+    }  # fmt: skip
     if counts.baseline is not None and counts.touched is not None:
         out.update(baseline=counts.baseline, touched=counts.touched)
     return out
@@ -251,40 +244,29 @@ class RunWriter:
         """What ``summary.json`` holds."""
         scenario, n = self.scenario, self.count
         stats = [r.stats for r in self.run.readings]
+        design, columns = scenario.design, self.run.values.T
         return {
-            "scenario": scenario.name,
-            "design": scenario.design.name,
-            "design_hash": scenario.design.content_hash(),
-            "electrodes": list(scenario.design.electrode_names),
-            "shields": sum(c.role == "shield" for c in scenario.design.conductors),
-            "bodies": list(self.run.bodies),
-            "field": field,
-            "method": scenario.method,
-            "excitation": scenario.excitation.value,
-            "sample_rate_Hz": scenario.sample_rate,
-            "samples": n,
-            "samples_planned": scenario.count,
-            "interrupted": interrupted,
-            "failure": failure,
+            "scenario": scenario.name, "design": design.name,
+            "design_hash": design.content_hash(), "electrodes": design.electrode_names,
+            "shields": sum(c.role == "shield" for c in design.conductors),
+            "bodies": self.run.bodies, "field": field, "method": scenario.method,
+            "excitation": scenario.excitation, "sample_rate_Hz": scenario.sample_rate,
+            "samples": n, "samples_planned": scenario.count,
+            "interrupted": interrupted, "failure": failure,
             "step_time_s": _quantiles([s.wall_time for s in stats]),
             "unknowns": _quantiles([s.unknowns for s in stats]),
             "iterations": _quantiles([s.iterations for s in stats]),
             "largest_error_estimate_F": max((s.solver_error for s in stats), default=None),
             "channels": [
-                {
-                    "name": channel.column_name,
-                    "meaning": channel.meaning,
-                    "baseline_F": float(level),
-                    "min_F": float(values.min()) if n else None,
-                    "max_F": float(values.max()) if n else None,
-                }
+                {"name": channel.column_name, "meaning": channel.meaning,
+                 "baseline_F": float(level), "min_F": float(values.min()) if n else None,
+                 "max_F": float(values.max()) if n else None}
                 for channel, level, values in zip(
-                    scenario.channels, self.run.levels, self.run.values.T, strict=True
+                    scenario.channels, self.run.levels, columns, strict=True
                 )
             ],
-            "columns": dict(column_meanings(scenario.channels)),
-            "versions": versions(),
-        }
+            "columns": dict(column_meanings(scenario.channels)), "versions": versions(),
+        }  # fmt: skip
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write ``summary.json``."""
@@ -296,8 +278,5 @@ class RunWriter:
 def _quantiles(values: Sequence[float]) -> dict[str, float] | None:
     if not len(values):
         return None
-    return {
-        "median": float(np.median(values)),
-        "p95": float(np.percentile(values, 95)),
-        "max": float(max(values)),
-    }
+    median, p95, most = np.percentile(values, (50, 95, 100)).tolist()
+    return {"median": median, "p95": p95, "max": most}

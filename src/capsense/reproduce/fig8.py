@@ -13,7 +13,7 @@ import platform
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,9 +126,8 @@ def measure(store: Store, method: Method, setting: str, steps: int) -> Point:
 
 def _simulator(method: Method, setting: str) -> tuple[cs.Simulator, float]:
     """The simulator, and the number of its tetrahedra."""
-    for preset in get_args(PresetName):
-        if method == "surface" and preset == setting:
-            return cs.Simulator(DESIGN, preset=preset), 0.0
+    if method == "surface":
+        return cs.Simulator(DESIGN, preset=cast("PresetName", setting)), 0.0
     mesh = BuildSettings().mesh.refined(float(setting))
     sim = cs.Simulator(DESIGN, settings=BuildSettings(mesh=mesh), method=method)
     return sim, 6.0 * float(np.prod([len(c) - 1 for c in plan_axes(sim.design, mesh)]))

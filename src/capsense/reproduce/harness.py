@@ -6,12 +6,10 @@ import csv
 import hashlib
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -20,6 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import capsense
+from capsense.recording.session import version_of
+from capsense.recording.tables import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -154,15 +154,17 @@ def write_outcome(outcome: Outcome, folder: Path, *, reduced: bool = False) -> l
         with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(table.columns)
-            writer.writerows([[_exact(cell) for cell in row] for row in table.rows])
+            writer.writerows([[_text(cell, 10) for cell in row] for row in table.rows])
         names.append(f"{name}.csv")
     for name, figure in outcome.plots.items():
         figure.savefig(folder / f"{name}.png", dpi=110)
         names.append(f"{name}.png")
     rows = [asdict(row) for row in outcome.rows]
     found = {"title": outcome.title, "reduced": reduced, "rows": rows}
-    _write(folder / "rows.json", json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False))
-    _write(folder / "report.md", markdown(outcome, reduced=reduced))
+    told = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    for name, text in (("rows.json", told), ("report.md", markdown(outcome, reduced=reduced))):
+        with replacing(folder / name) as part:
+            part.write_text(text, encoding="utf-8")
     return [*names, "rows.json", "report.md"]
 
 
@@ -181,7 +183,7 @@ def markdown(outcome: Outcome, *, reduced: bool = False) -> str:
     blocks += [f"![{name.replace('_', ' ')}]({name}.png)" for name in outcome.plots]
     short = {n: t for n, t in outcome.tables.items() if len(t.rows) <= MAX_ROWS}
     for name, table in short.items():
-        cells = [tuple(_short(cell) for cell in row) for row in table.rows]
+        cells = [tuple(_text(cell, 5) for cell in row) for row in table.rows]
         blocks.append(f"## {name.replace('_', ' ')}\n\n{_grid(table.columns, cells)}")
     long = [f"- [{n}.csv]({n}.csv), {len(t.rows)} rows" for n, t in outcome.tables.items()
             if n not in short]  # fmt: skip
@@ -197,18 +199,8 @@ def _grid(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _short(cell: Cell) -> str:
-    return f"{cell:.5g}" if isinstance(cell, float) else str(cell)
-
-
-def _exact(cell: Cell) -> str:
-    return f"{cell:.10g}" if isinstance(cell, float) else str(cell)
-
-
-def _write(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text + ("" if text.endswith("\n") else "\n"), encoding="utf-8")
-    os.replace(part, path)
+def _text(cell: Cell, digits: int) -> str:
+    return f"{cell:.{digits}g}" if isinstance(cell, float) else str(cell)
 
 
 Arrays = dict[str, NDArray[Any]]
@@ -260,24 +252,18 @@ class Store:
             return found
         arrays = {key: np.asarray(value) for key, value in compute().items()}
         self.folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            with part.open("wb") as file:
-                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        with replacing(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
         self.computed += 1
         return arrays
 
 
 def _load(path: Path) -> Arrays | None:
+    """What a file holds; None where it is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return {key: file[key] for key in file.files}
-    except FileNotFoundError:
-        return None
-    except Exception:  # damaged, of which zip, inflate and numpy's reader each complain differently
+    except Exception:  # of damage, zip, inflate and numpy's reader each complain differently
         return None
 
 
@@ -311,10 +297,7 @@ def code_version() -> str:
         if place.parts[0] not in ABOVE:
             digest.update(str(place).encode() + b"\0" + path.read_bytes() + b"\0")
     for package in ("numpy", "scipy", "numba", "mujoco", "pybullet"):
-        try:
-            digest.update(f"{package} {version(package)}\n".encode())
-        except PackageNotFoundError:
-            digest.update(f"{package} is not installed\n".encode())
+        digest.update(f"{package} {version_of(package)}\n".encode())
     return digest.hexdigest()
 
 

@@ -261,22 +261,6 @@ class ArmFit:
         return float(np.abs(np.subtract(self.slopes, ARM)).max())
 
 
-class _Model:
-    """Slopes over edge, offset and tare, by interpolation of curves."""
-
-    def __init__(self, edges: ArrayLike, distance: Array, change: Array) -> None:
-        self._spline = RectBivariateSpline(np.log(edges), np.log(distance), np.log(change))
-        self._nearest, self._farthest = distance[0], distance[-1]
-        self._z = distances(6)
-        self._z = self._z[self._z > 0.009]
-
-    def slopes(self, figures: ArrayLike) -> Array:
-        edge, offset, tare = np.asarray(figures, dtype=float)
-        z = np.clip(np.append(self._z, 0.15) + offset, self._nearest, self._farthest)
-        reading = np.exp(self._spline.ev(np.log(edge), np.log(z)))
-        return np.array(slopes(self._z, reading[:-1] - tare * reading[-1]))
-
-
 def fit_arm(edges: ArrayLike, distance: Array, change: Array) -> ArmFit:
     """Fit edge, offset and tare by least squares, and look where else all slopes are near enough.
 
@@ -285,21 +269,27 @@ def fit_arm(edges: ArrayLike, distance: Array, change: Array) -> ArmFit:
         distance: From the electrode to the skin [m], rising, shape (n,).
         change: Readings less those without a limb [F], shape (e, n).
     """
-    model = _Model(edges, distance, np.asarray(change))
+    spline = RectBivariateSpline(np.log(edges), np.log(distance), np.log(change))
+    z = distances(6)
+    z = z[z > 0.009]
+
+    def apart_at(figures: Array) -> Array:
+        """Differences of the slopes from the data's; NaN where all is tared."""
+        edge, offset, tare = figures
+        at = np.clip(np.append(z, 0.15) + offset, distance[0], distance[-1])
+        reading = np.exp(spline.ev(np.log(edge), np.log(at)))
+        return np.array(slopes(z, reading[:-1] - tare * reading[-1])) - ARM
+
     low, high = np.array(SPAN)
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, STEPS, strict=True)]
     tried = np.array(list(product(*axes)))
-    apart = np.abs([model.slopes(figures) - ARM for figures in tried])  # NaN where all is tared
+    apart = np.abs([apart_at(figures) for figures in tried])
     near = tried[apart.max(axis=1) < WITHIN]
-    best = least_squares(
-        lambda figures: model.slopes(figures) - ARM,
-        tried[np.nanargmin((apart**2).sum(axis=1))],
-        x_scale=(0.02, 0.005, 0.1),
-        bounds=(low, high),
-    ).x
+    start = tried[np.nanargmin((apart**2).sum(axis=1))]
+    best = least_squares(apart_at, start, x_scale=(0.02, 0.005, 0.1), bounds=(low, high)).x
     ranges = [(float(c.min()), float(c.max())) for c in near.T] if len(near) else []
-    a, b, c = (float(value) for value in best)
-    return ArmFit((a, b, c), tuple(model.slopes(best).tolist()), tuple(ranges))
+    a, b, c = best.tolist()
+    return ArmFit((a, b, c), tuple((apart_at(best) + ARM).tolist()), tuple(ranges))
 
 
 def plot_approach(

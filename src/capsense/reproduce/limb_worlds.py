@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,19 +160,8 @@ WIDTH = 0.5
 """Width and height of the depth image [m], as wide as the domain."""
 
 
-class LimbWorld(Protocol):
-    """A simulated world with a sensor in it."""
-
-    sensor: AttachedSensor
-
-    def move(self, pose: Pose) -> None:
-        """Put the sensor frame at a pose in the world."""
-
-
 class MujocoWorld:
     """The limb and the sensor in MuJoCo; its depth camera needs no OpenGL."""
-
-    sensor: AttachedSensor
 
     def __init__(self, place: Course, sim: cs.Simulator, view: View, grounding: Grounding) -> None:
         import mujoco
@@ -187,12 +176,13 @@ class MujocoWorld:
         )
         self._data = mujoco.MjData(self._model)
         self.move(sensor_pose(0.0, 0.0, place.thickest + GAP[0], 0.0, 0.0))
-        self.sensor = cs.mujoco.attach(
+        self.sensor: AttachedSensor = cs.mujoco.attach(
             self._model, self._data, "pad", sim, perception=view, default_material="human",
             default_grounding=grounding,
         )  # fmt: skip
 
     def move(self, pose: Pose) -> None:
+        """Put the sensor frame at a pose in the world."""
         import mujoco
 
         x, y, z, w = pose.quaternion
@@ -203,8 +193,6 @@ class MujocoWorld:
 
 class PybulletWorld:
     """The limb and the sensor in PyBullet; its depth camera is TinyRenderer."""
-
-    sensor: AttachedSensor
 
     def __init__(
         self, client: int, place: Course, sim: cs.Simulator, view: View, grounding: Grounding
@@ -224,17 +212,22 @@ class PybulletWorld:
             {"size": WIDTH, "resolution": PIXELS} if view == "depth_camera" else {}
         )
         self.move(sensor_pose(0.0, 0.0, place.thickest + GAP[0], 0.0, 0.0))
-        self.sensor = cs.pybullet.attach(
+        self.sensor: AttachedSensor = cs.pybullet.attach(
             client, self._body, design=sim, perception=view, default_material="human",
             default_grounding=grounding, **image,
         )  # fmt: skip
 
     def move(self, pose: Pose) -> None:
+        """Put the sensor frame at a pose in the world."""
         import pybullet as p
 
         p.resetBasePositionAndOrientation(
             self._body, pose.position, pose.quaternion, physicsClientId=self._client
         )
+
+
+LimbWorld = MujocoWorld | PybulletWorld
+"""A simulated world with a sensor in it."""
 
 
 @contextmanager

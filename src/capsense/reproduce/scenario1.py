@@ -214,8 +214,13 @@ def run(folder: Path, *, reduced: bool, report: Report) -> Outcome:
         "comparison": compared, "hardware_of_the_paper_eq12": _table_1(setup),
         "fitted": _fitted(setup), "curves": _listed(curves),
     }  # fmt: skip
-    tables |= {f"panel_{name}": _panel(shown[name], panels[name]) for name in panels}
-    tables |= {curve.case.name: _curve(curve) for curve in curves}
+    noise = ("reading", "reading with noise")
+    header = ("measured", "the paper's simulation", "CapSense", "CapSense with noise")
+    for name, p in panels.items():
+        c = shown[name]
+        tables[f"panel_{name}"] = _samples(header, p.measured, p.simulated, c.reading, c.noisy)
+    for c in curves:
+        tables[c.case.name] = _samples(("time [s]", *noise), c.times, c.reading, c.noisy)
     plots = {
         "panels": plot_panels({n: (c.reading, panels.get(n)) for n, c in shown.items()}),
         "trajectories": plot_trajectories(
@@ -245,14 +250,14 @@ def _compare(
     }
     ways = {TRIANGLE: "triangle", ZIGZAG: "zig-zag"}
     for name, panel in panels.items():
-        curve, measured, paper = shown[name], panel.measured, panel.simulated
+        curve, measured = shown[name], panel.measured
         title = f"{curve.case.panel.board}, {ways[curve.case.panel.trajectory]}"
         for what, measure in measures.items():
-            ours, theirs = measure(curve.reading, measured), measure(paper, measured)
+            ours, theirs = measure(curve.reading, measured), measure(panel.simulated, measured)
             label, source = f"{title}: {what}", "the paper's simulation"
-            if what == "rms error":
+            if measure is rmse:
                 rows.append(judged(label, ours, below=theirs, source=source))
-            elif what == "zero-mean correlation":
+            elif measure is cross_correlation:
                 rows.append(judged(label, ours, above=theirs, source=source))
             else:
                 rows.append(Row(label, ours))
@@ -289,14 +294,7 @@ def _listed(curves: list[Curve]) -> ReportTable:
     )  # fmt: skip
 
 
-def _panel(curve: Curve, panel: PaperCurves) -> ReportTable:
-    columns = (panel.measured, panel.simulated, curve.reading, curve.noisy)
-    rows = zip(range(1, len(curve.times) + 1), *(c.tolist() for c in columns), strict=True)
-    header = ("sample", "measured", "the paper's simulation", "CapSense", "CapSense with noise")
-    return ReportTable(header, tuple(rows))
-
-
-def _curve(curve: Curve) -> ReportTable:
-    columns = (curve.times, curve.reading, curve.noisy)
-    rows = zip(range(1, len(curve.times) + 1), *(c.tolist() for c in columns), strict=True)
-    return ReportTable(("sample", "time [s]", "reading", "reading with noise"), tuple(rows))
+def _samples(header: tuple[str, ...], *columns: Array) -> ReportTable:
+    """Columns of numbers, a row for each sample."""
+    rows = zip(range(1, len(columns[0]) + 1), *(c.tolist() for c in columns), strict=True)
+    return ReportTable(("sample", *header), tuple(rows))

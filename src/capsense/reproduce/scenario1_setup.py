@@ -9,7 +9,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,9 +133,6 @@ class Scenario1Setup:
     uncertainty: Mapping[str, float]
     """Standard uncertainties; its keys are those of the fitted figures, see :meth:`value`."""
 
-    def _parts(self, name: str) -> dict[str, Any]:
-        return {"zigzag": self.zigzag, **self.boards, **self.panels}[name].__dict__
-
     def value(self, key: str) -> float:
         """A figure by name, like ``"gap"``, ``"stripe.depth"`` or ``"patch_T2.pace"``.
 
@@ -144,24 +140,8 @@ class Scenario1Setup:
             KeyError: There is no such figure.
         """
         name, _, own = key.rpartition(".")
-        return float((self._parts(name) if name else self.__dict__)[own])
-
-    def changed(self, values: Mapping[str, float]) -> Scenario1Setup:
-        """The same with other figures, by the names of :meth:`value`."""
-        out: dict[str, Any] = {
-            "zigzag": self.zigzag, "boards": dict(self.boards), "panels": dict(self.panels)
-        }  # fmt: skip
-        for key, value in values.items():
-            name, _, own = key.rpartition(".")
-            change: dict[str, Any] = {own: float(value)}
-            if not name:
-                out |= change
-            elif name == "zigzag":
-                out[name] = dataclasses.replace(out[name], **change)
-            else:
-                group = out["boards" if name in self.boards else "panels"]
-                group[name] = dataclasses.replace(group[name], **change)
-        return dataclasses.replace(self, **out)
+        parts = {"": self, "zigzag": self.zigzag, **self.boards, **self.panels}
+        return float(vars(parts[name])[own])
 
     def level_of(self, panel: Panel) -> float:
         """What a panel's reading without an object is normalised to."""

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from capsense.reading import Reading
     from capsense.simulator import Method, Simulator
 
+Array = NDArray[np.float64]
+
 
 class Excitation(StrEnum):
     """How the electrodes are driven and read."""
@@ -105,7 +107,10 @@ def channels_of(
     return tuple(Channel(excitation, i, j, (names[i], names[j])) for i, j in chosen)
 
 
-Array = NDArray[np.float64]
+def read_channels(channels: Sequence[Channel], reading: Reading) -> Array:
+    """Capacitance of each channel in a reading [F], shape (K,)."""
+    return np.array([c.read(reading) for c in channels])
+
 
 MAX_SAMPLES = 1_000_000
 """A scenario of more samples is refused."""

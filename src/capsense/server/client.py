@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -156,17 +156,7 @@ class Client:
             ProtocolError: The server answered an error, or nothing in time.
         """
         self.send(json.dumps(message))
-        limit = time.monotonic() + self.timeout
-        while True:
-            found = self.receive(limit - time.monotonic())
-            if isinstance(found, ReadingMessage):
-                self._keep(found)
-            elif isinstance(found, DepthMessage):
-                continue
-            elif found["type"] == "error":
-                raise ProtocolError(found["message"], found["code"])
-            elif found["type"] == answer:
-                return found
+        return self._receive_until(lambda m: isinstance(m, dict) and m["type"] == answer)
 
     def receive(
         self, timeout: float | None = None
@@ -197,23 +187,34 @@ class Client:
             ProtocolError: The server answered that frame with an error, or not in time.
         """
         kept = self.sensors[sensor].kept
+        while kept:
+            reading = kept.popleft()
+            if reading.sequence == sequence:
+                return reading
+        wanted = sensor, sequence
+        return self._receive_until(
+            lambda m: isinstance(m, ReadingMessage) and (m.sensor, m.sequence) == wanted, sensor
+        )
+
+    def _receive_until(self, wanted: Callable[[Any], bool], sensor: int | None = None) -> Any:
+        """The first message that is wanted; readings of other sensors are kept.
+
+        Raises:
+            ProtocolError: The server answered an error, to this sensor if one is given, or nothing
+                in time.
+        """
         limit = time.monotonic() + self.timeout
         while True:
-            while kept:
-                reading = kept.popleft()
-                if reading.sequence == sequence:
-                    return reading
             found = self.receive(limit - time.monotonic())
+            if wanted(found):
+                return found
             if isinstance(found, ReadingMessage):
-                self._keep(found)
-            elif isinstance(found, DepthMessage):
-                continue
-            elif found["type"] == "error" and found.get("sensor", sensor) == sensor:
+                if found.sensor in self.sensors and found.sensor != sensor:
+                    self.sensors[found.sensor].kept.append(found)
+            elif isinstance(found, dict) and (
+                found["type"] == "error" and sensor in (None, found.get("sensor", sensor))
+            ):
                 raise ProtocolError(found["message"], found["code"])
-
-    def _keep(self, reading: ReadingMessage) -> None:
-        if reading.sensor in self.sensors:
-            self.sensors[reading.sensor].kept.append(reading)
 
 
 class RemoteSensor:

@@ -26,10 +26,10 @@ from capsense.scenario.loader import (
     read_material,
     read_pose,
 )
-from capsense.scene import Body, Material, Pose
+from capsense.scene import Body, DepthFrame, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.materials import Grounding
-from capsense.server.frames import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL
+from capsense.server.frames import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
 
 MAX_TEXT = 65536
 """Largest control message [bytes]."""
@@ -87,6 +87,11 @@ class Open:
     back: Literal["fill"] | float
     table: Mapping[str, Any] = field(default_factory=dict, compare=False)
     """The message itself."""
+
+    def seen(self, image: DepthMessage) -> DepthFrame:
+        """What the sensor's camera saw."""
+        eps_r = self.material if image.eps_r is None else image.eps_r
+        return DepthFrame(image.depth, eps_r, self.camera, grounding=self.grounding, back=self.back)
 
 
 @dataclass(frozen=True)
@@ -180,15 +185,11 @@ def read_open(table: MessageTable) -> Open:
     back: Literal["fill"] | float = "fill"
     if table.data.get("back", "fill") != "fill":
         back = table.length("back")
+    camera = _read_camera(MessageTable(table.data.get("camera", {}), "message", "camera"))
     return Open(
-        _sensor(table),
-        table.text("design"),
-        _read_camera(MessageTable(table.data.get("camera", {}), "message", "camera")),
-        read_material(options),
-        read_grounding(options),
-        back,
-        table.data,
-    )
+        _sensor(table), table.text("design"), camera, read_material(options),
+        read_grounding(options), back, table.data,
+    )  # fmt: skip
 
 
 def read_watch(table: MessageTable) -> Watch:
@@ -210,14 +211,11 @@ def _read_camera(table: MessageTable) -> OrthographicCamera:
     if "pose" in table:
         pose = read_pose(ScenarioTable(table.data["pose"], "message", "camera: pose"))
     return OrthographicCamera(
-        table.length("width", 0.5),
-        table.length("height", 0.5),
-        pose,
-        table.length("near", 0.0, zero=True),
-        table.length("far", 0.5),
+        table.length("width", 0.5), table.length("height", 0.5), pose,
+        table.length("near", 0.0, zero=True), table.length("far", 0.5),
         cast("Literal['+y', '-y']", table.choice("rows", ("+y", "-y"), "+y")),
         cast("Literal['+x', '-x']", table.choice("columns", ("+x", "-x"), "+x")),
-    )
+    )  # fmt: skip
 
 
 def read_scene(table: MessageTable, max_bodies: int) -> BodiesMessage:
@@ -238,7 +236,7 @@ def read_scene(table: MessageTable, max_bodies: int) -> BodiesMessage:
             raise table.error("meshes and trajectories are not taken here; send depth frames, or "
                               "a new pose for every step")  # fmt: skip
     bodies = read_bodies(ScenarioTable({"body": raw}, "message", "scene"), Path())
-    return BodiesMessage(*read_address(table), tuple(b.body for b in bodies), tuple(raw))
+    return BodiesMessage(*_address(table), tuple(b.body for b in bodies), tuple(raw))
 
 
 def read_poses(table: MessageTable, max_bodies: int) -> PosesMessage:
@@ -258,7 +256,7 @@ def read_poses(table: MessageTable, max_bodies: int) -> PosesMessage:
         name: read_pose(ScenarioTable(pose, "message", f"pose of {name!r}"))
         for name, pose in raw.items()
     }
-    return PosesMessage(*read_address(table), poses)
+    return PosesMessage(*_address(table), poses)
 
 
 def read_sensor(table: MessageTable) -> int:
@@ -271,17 +269,10 @@ def read_sensor(table: MessageTable) -> int:
     return _sensor(table)
 
 
-def read_address(table: MessageTable) -> tuple[int, int, float]:
-    """Sensor, sequence number and time [s] of a scene.
-
-    Raises:
-        ProtocolError: One is missing or out of range.
-    """
-    return (
-        _sensor(table),
-        table.integer("sequence", 0, MAX_SEQUENCE),
-        table.number("time", -1e300, 1e300, 0.0, unit="s"),
-    )
+def _address(table: MessageTable) -> tuple[int, int, float]:
+    """Sensor, sequence number and time [s] of a scene."""
+    sequence = table.integer("sequence", 0, MAX_SEQUENCE)
+    return _sensor(table), sequence, table.number("time", -1e300, 1e300, 0.0, unit="s")
 
 
 def _sensor(table: MessageTable) -> int:

@@ -16,7 +16,6 @@ from capsense.reading import Reading
 from capsense.readout.conversions import Counts
 from capsense.readout.readout import Readout
 from capsense.scene import Body, Scene
-from capsense.scene.depth import DepthFrame
 from capsense.server.frames import (
     CONVERSION,
     NO_DETECTOR,
@@ -121,7 +120,10 @@ class ServedSensor:
         """
         self._check_time(frame.time)
         try:
-            reading = self.simulator.step(self._world(frame))
+            if isinstance(frame, BodiesMessage):
+                reading = self.simulator.step(Scene(frame.bodies))
+            else:
+                reading = self.simulator.step(self.options.seen(frame))
         except Exception:
             self.simulator.reset()  # a step that failed is no starting point for the next one
             raise
@@ -162,15 +164,6 @@ class ServedSensor:
         moved = {name: self._bodies[name].moved(pose) for name, pose in message.poses.items()}
         bodies = tuple({**self._bodies, **moved}.values())
         return BodiesMessage(message.sensor, message.sequence, message.time, bodies, self._tables)
-
-    def _world(self, frame: Frame) -> Scene | DepthFrame:
-        if isinstance(frame, BodiesMessage):
-            return Scene(frame.bodies)
-        wanted = self.options
-        eps_r = wanted.material if frame.eps_r is None else frame.eps_r
-        return DepthFrame(
-            frame.depth, eps_r, wanted.camera, grounding=wanted.grounding, back=wanted.back
-        )
 
     def _check_time(self, time: float) -> None:
         """Refuse a time that the readout cannot go to."""

@@ -1,27 +1,55 @@
-"""One client of the server: its messages in, its readings out."""
+"""One client of the server: its connection, which bounds what it can do, and its messages."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import socket
+import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
-
-from websockets.exceptions import ConnectionClosed
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 from capsense.codec import design_to_json
-from capsense.errors import CapSenseError, ProtocolError
+from capsense.errors import CapSenseError, MissingDependencyError, ProtocolError
 from capsense.server import messages
-from capsense.server.connection import POLICY, Allowance
 from capsense.server.frames import PROTOCOL, unpack_depth
+from capsense.server.messages import BodiesMessage, PosesMessage
 from capsense.server.sensor import Frame, ServedSensor
 
-if TYPE_CHECKING:
-    from websockets.asyncio.server import ServerConnection
+try:
+    from websockets.asyncio.server import ServerConnection, serve
+    from websockets.datastructures import Headers
+    from websockets.exceptions import ConnectionClosed
+    from websockets.frames import Frame as WebSocketFrame
+    from websockets.frames import Opcode
+    from websockets.http11 import Request, Response
+except ImportError as error:
+    raise MissingDependencyError(
+        'the server needs websockets; install it with: pip install "capsense[serve]"'
+    ) from error
 
+if TYPE_CHECKING:
     from capsense.server.server import Server
 
-T = TypeVar("T")
+__all__ = ["Headers", "Request", "Response", "ServerConnection", "serve"]  # for the server
+
+POLICY, TRY_LATER = 1008, 1013
+"""Codes with which connections are closed on errors, and when there are too many."""
+FLOOD = "flood"
+"""Reason with which a client that talks idly is cut off."""
+READ_SIZE = 16384
+"""Bytes that are read at a time: then it is the others' turn."""
+SEND_BUFFER = 262144
+"""What the system may hold for a client that does not receive [bytes]."""
+SMALL = 1024
+"""Size [bytes] from which on a fragment of a message counts as content."""
+ARRIVALS = 100.0
+"""Connections that a server takes at once, and again every second; others are closed."""
+IDLE_FRAMES = 100.0
+"""Pings, pongs and small fragments that a client may send at once, and again every second."""
 ALLOWANCE, ALL_ALLOWANCES = 5000.0, 10000.0
 """Work that a client, and that all of them, may cause a second without being slowed, in units of a
 small message, which takes the event loop some 50 µs."""
@@ -31,6 +59,104 @@ BINARY_UNIT, TEXT_UNIT = 16384, 512
 """Bytes that count as much as a message: JSON takes longer to read than pixels."""
 OPENING, MISTAKE = 250.0, 100.0
 """What it takes to open a sensor, and to answer an error."""
+
+
+class Allowance:
+    """A token bucket that can be overdrawn.
+
+    Args:
+        most: What can be spent at once, after a rest.
+        rate: What comes back a second.
+        first: What can be spent at the start; by default ``most``.
+    """
+
+    def __init__(self, most: float, rate: float, first: float | None = None) -> None:
+        self.most, self.rate = most, rate
+        self._left = most if first is None else first
+        self._counted = time.monotonic()
+
+    def spend(self, cost: float) -> float:
+        """Spend some, and return what is left: below zero, more was spent than there was."""
+        now = time.monotonic()
+        regained = (now - self._counted) * self.rate
+        self._counted = now
+        self._left = min(self.most, self._left + regained) - cost
+        return self._left
+
+
+@dataclass
+class AdmissionControl:
+    """Connections of a server, those that still shake hands included."""
+
+    most: int
+    """More are closed at once."""
+    open: int = 0
+    arrivals: Allowance = field(default_factory=lambda: Allowance(ARRIVALS, ARRIVALS))
+
+    def admits(self) -> bool:
+        """Whether the connection that was just made may stay."""
+        if self.open > self.most:
+            return False
+        if self.arrivals.spend(1) < 0:
+            self.arrivals.spend(-1)  # those that are turned away keep nobody out
+            return False
+        return True
+
+
+class RateLimitedConnection(ServerConnection, asyncio.BufferedProtocol):
+    """A connection that reads a little at a time, and is cut off when its client talks idly.
+
+    Whole messages are paced by their session. Pings, pongs and fragments of a message that never
+    ends do not get that far, yet would keep the event loop busy and fill the memory.
+    """
+
+    def __init__(self, *args: Any, admission: AdmissionControl, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.flooded = False
+        """Whether it was cut off."""
+        self._admission = admission
+        self._buffer = bytearray(READ_SIZE)
+        self._idle_frames = Allowance(IDLE_FRAMES, IDLE_FRAMES)
+
+    # -- called by asyncio ------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._admission.open += 1
+        super().connection_made(transport)
+        raw = transport.get_extra_info("socket")
+        if raw is not None:
+            raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        if not self._admission.admits():
+            cast(asyncio.Transport, transport).abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._admission.open -= 1
+        super().connection_lost(exc)
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.data_received(bytes(memoryview(self._buffer)[:nbytes]))
+
+    # -- called by websockets ---------------------------------------------------------------------
+
+    def process_event(self, event: Any) -> None:
+        if self.flooded:
+            return
+        if isinstance(event, WebSocketFrame) and _idle(event) and self._idle_frames.spend(1) < 0:
+            self.flooded = True
+            self.protocol.fail(POLICY, FLOOD)
+            for data in filter(None, self.protocol.data_to_send()):
+                self.transport.write(data)
+            self.transport.close()
+            return
+        super().process_event(event)
+
+
+def _idle(frame: WebSocketFrame) -> bool:
+    """Whether a frame is none that sessions hear of; what ends a message is."""
+    return frame.opcode in (Opcode.PING, Opcode.PONG) or (not frame.fin and len(frame.data) < SMALL)
 
 
 class ClientSession:
@@ -60,8 +186,9 @@ class ClientSession:
         self._to_show: tuple[str | bytes, ...] = ()
         self._allowance = Allowance(AT_ONCE, ALLOWANCE, AT_FIRST)
         self._handlers: dict[str, Callable[[messages.MessageTable], Any]] = {
-            "open": self._open, "close": self._close, "reset": self._reset,
-            "scene": self._scene, "poses": self._poses, "watch": self._watch,
+            "open": self._open, "close": self._close, "reset": self._reset, "watch": self._watch,
+            "scene": partial(self._frame, messages.read_scene),
+            "poses": partial(self._frame, messages.read_poses),
         }  # fmt: skip
 
     async def run(self) -> None:
@@ -75,12 +202,11 @@ class ClientSession:
             return
         self._solver = asyncio.create_task(self._solve_all())
         try:
-            async for message in self._connection:
-                size = BINARY_UNIT if isinstance(message, bytes) else TEXT_UNIT
-                await self._pace(1 + len(message) / size)
-                await self._handle(message)
-        except ConnectionClosed:
-            pass
+            with suppress(ConnectionClosed):
+                async for message in self._connection:
+                    size = BINARY_UNIT if isinstance(message, bytes) else TEXT_UNIT
+                    await self._pace(1 + len(message) / size)
+                    await self._handle(message)
         finally:
             self._left = True
             self._wake.set()
@@ -104,11 +230,9 @@ class ClientSession:
     async def dismiss(self, code: str, text: str, close_code: int = POLICY) -> None:
         """Say what is wrong, and close the connection."""
         self._server.log("dismissed", client=self.number, code=code, message=text[:200])
-        try:
+        with suppress(ConnectionClosed):
             await self._send(json.dumps(messages.error_message(code, text)))
             await self._connection.close(close_code, code)
-        except ConnectionClosed:
-            pass
 
     # -- the reader -----------------------------------------------------------------------------
 
@@ -131,12 +255,11 @@ class ClientSession:
         if not self._server.options.admits(hello.token):
             raise ProtocolError("the token is missing or wrong", "token")
         self._server.log("hello", client=self.number, name=hello.client)
-        limits = self._limits
+        told = ("sensors", "pixels", "bodies", "message")
         await self._tell(
             "welcome", protocol=PROTOCOL, server=f"capsense {self._server.version}",
             designs=self._server.design_names,
-            limits={"sensors": limits.sensors, "pixels": limits.pixels, "bodies": limits.bodies,
-                    "message": limits.message},
+            limits={name: getattr(self._limits, name) for name in told},
         )  # fmt: skip
 
     async def _pace(self, cost: float) -> None:
@@ -230,14 +353,12 @@ class ClientSession:
             sensor.restart()
         await self._tell("reset", sensor=sensor.options.sensor)
 
-    async def _scene(self, table: messages.MessageTable) -> None:
-        scene = await self._server.work(lambda: messages.read_scene(table, self._limits.bodies))
-        self._sensor(scene.sensor).offer(scene)
-        self._wake.set()
-
-    async def _poses(self, table: messages.MessageTable) -> None:
-        poses = await self._server.work(lambda: messages.read_poses(table, self._limits.bodies))
-        self._sensor(poses.sensor).offer(poses)
+    async def _frame(
+        self, read: Callable[[messages.MessageTable, int], BodiesMessage | PosesMessage],
+        table: messages.MessageTable,
+    ) -> None:  # fmt: skip
+        frame = await self._server.work(lambda: read(table, self._limits.bodies))
+        self._sensor(frame.sensor).offer(frame)
         self._wake.set()
 
     def _sensor(self, number: int) -> ServedSensor:
@@ -250,26 +371,21 @@ class ClientSession:
 
     async def _solve_all(self) -> None:
         """Solve the newest frames of all sensors in turn until the client leaves."""
-        while not self._left:
-            await self._wake.wait()
-            self._wake.clear()
-            for sensor in tuple(self.sensors.values()):
-                async with sensor.lock:
-                    frame = sensor.take()
-                    if frame is not None:
-                        self._wake.set()  # another may have come meanwhile
-                        await self._solve(sensor, frame)
-                if self._left:
-                    return
-            await self._send_shown()
-
-    async def _send_shown(self) -> None:
-        shown, self._to_show = self._to_show, ()
-        try:
-            for message in shown:
-                await self._send(message)
-        except ConnectionClosed:
-            self._left = True
+        with suppress(ConnectionClosed):
+            while not self._left:
+                await self._wake.wait()
+                self._wake.clear()
+                for sensor in tuple(self.sensors.values()):
+                    async with sensor.lock:
+                        frame = sensor.take()
+                        if frame is not None:
+                            self._wake.set()  # another may have come meanwhile
+                            await self._solve(sensor, frame)
+                    if self._left:
+                        return
+                shown, self._to_show = self._to_show, ()
+                for message in shown:
+                    await self._send(message)
 
     async def _solve(self, sensor: ServedSensor, frame: Frame) -> None:
         try:
@@ -278,12 +394,9 @@ class ClientSession:
             sensor.show(frame, reading)
             self.readings += 1
         except ConnectionClosed:
-            self._left = True
+            raise
         except Exception as error:
-            try:
-                await self._refuse(error, sensor=frame.sensor, sequence=frame.sequence)
-            except ConnectionClosed:
-                self._left = True
+            await self._refuse(error, sensor=frame.sensor, sequence=frame.sequence)
 
     # -- answers --------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Charts of signals, the matrix as a heat map, and the plane of potentials."""
+"""Charts of signals, the matrix as a heat map, and the plane of potentials with its controls."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from capsense.design import Design
     from capsense.field.green import GreenFunction
+    from capsense.viewer.player import Playback
 
 
 Array = NDArray[np.float64]
@@ -152,6 +153,7 @@ REACH = 0.12
 """Planes end so far from the electrodes [m]; twice as far along z."""
 OCTAVES = 8
 """Potentials down to two to the minus this are drawn."""
+AXES = ("x", "y", "z")
 NEAR = 1e-3
 """Points closer than this to a point charge of the sensor's field are not drawn [m]."""
 
@@ -270,3 +272,89 @@ def palette() -> NDArray[np.uint8]:
     from matplotlib import colormaps
 
     return colormaps["YlGnBu"](np.linspace(0.25, 1.0, 2 * OCTAVES), bytes=True)[:, :3]
+
+
+class PlaneControls:
+    """Which plane, and whose potential."""
+
+    def __init__(self, gui: GuiApi, player: Playback) -> None:
+        assert player.source.green is not None
+        self._player, self._green = player, player.source.green
+        design = player.source.design
+        self._names = design.electrode_names
+        self._region = region(design)
+        self._centres = [1e3 * e.surface.bounds.mean(axis=0) for e in design.electrodes]
+        self._plane: Plane | None = None
+        middle = np.mean(self._centres, axis=0)
+        first = int(np.argmin(np.linalg.norm(self._centres - middle, axis=1).round(3)))
+        with gui.add_folder("potential"):
+            self._on = gui.add_checkbox("shown", True)
+            self._charge = gui.add_checkbox("charge on the bodies", True)
+            self._driven = gui.add_dropdown("1 V at", self._names, initial_value=self._names[first])
+            self._across = gui.add_dropdown("plane across", AXES, initial_value="y")
+            self._at: list[Any] = [
+                gui.add_slider(f"{a} [mm]", low, high, 0.5, place, visible=a == "y")
+                for a, (low, high), place in zip(
+                    AXES, np.round(1e3 * self._region, 1).tolist(), self._places(), strict=True
+                )
+            ]
+            gui.add_html(legend())
+        self._lay()
+        self._on.on_update(self._ask)
+        self._driven.on_update(self._centre)
+        self._across.on_update(lambda _: self._lay())
+        for slider in self._at:
+            slider.on_update(lambda _: self._lay())
+
+    @property
+    def driven(self) -> int:
+        """Number of the electrode at 1 V."""
+        return self._names.index(self._driven.value)
+
+    @property
+    def charge(self) -> bool:
+        """Whether charges are wanted, too."""
+        return bool(self._charge.value and self._on.value)
+
+    @property
+    def plane(self) -> Plane | None:
+        """The plane; None where it is not wanted."""
+        return self._plane if self._on.value else None
+
+    def _places(self) -> list[float]:
+        """Where planes cross the middle of the driven electrode, or 20 mm above it [mm]."""
+        x, y, z = self._centres[self.driven]
+        return [round(2 * v) / 2 for v in (x, y, min(z + 20.0, 1e3 * self._region[2, 1]))]
+
+    def _centre(self, _: object) -> None:
+        for slider, place in zip(self._at, self._places(), strict=True):
+            slider.value = place
+        self._lay()
+
+    def _lay(self) -> None:
+        axis = AXES.index(self._across.value)
+        for k, slider in enumerate(self._at):
+            if slider.visible != (k == axis):
+                slider.visible = k == axis
+        at = 1e-3 * float(self._at[axis].value)
+        if self._plane is None or (self._plane.axis, self._plane.at) != (axis, at):
+            self._plane = Plane(self._green, self._region, axis, at)
+            self._ask()
+
+    def _ask(self, _: object = None) -> None:
+        """Tell the player where potentials are wanted, and to take them while time stands still."""
+        self._player.plane = self.plane
+        if self._player.plane is not None and not self._player.playing:
+            self._player.pause()
+
+
+def legend() -> str:
+    """The colours of the potential, as HTML."""
+    cells = "".join(
+        f'<td style="background:rgb({r},{g},{b})">&nbsp;</td>' for r, g, b in palette().tolist()
+    )
+    return (
+        '<div style="padding:0 0.8em 0.6em;font-size:12px"><table style="width:100%;'
+        f'border-spacing:0;line-height:0.8"><tr>{cells}</tr></table><span style="float:right">1 V'
+        f"</span>{1e3 * 2.0**-OCTAVES:.0f} mV, doubling from line to second next</div>"
+    )

@@ -1,16 +1,19 @@
-"""Shows instants in the order and at the pace that was asked for: :class:`Player`."""
+"""Shows instants of a source: :class:`Player` at a pace, :class:`Follower` as they come."""
 
 from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.errors import CapSenseError
-from capsense.viewer.source import Frame, Seekable, Source
+from capsense.scenario.model import read_channels
+from capsense.viewer.source import Frame, Seekable, Source, Stream
 
 if TYPE_CHECKING:
     from capsense.viewer.charts import Plane
@@ -21,71 +24,49 @@ LATE = 0.25
 """A player that is this late [s] does not try to make up for it."""
 FIELD_PERIOD = 0.1
 """While time runs, potentials are taken no more often [s]."""
+KEPT = 3000
+"""A follower keeps at least so many samples, and up to twice as many."""
+WAIT = 0.05
+"""Longest wait for a sample before potentials are looked after [s]."""
+RETRY = 0.5
+"""Pause after a failure [s]."""
 
 
-class Playback(Protocol):
-    """What a page shows, and how it is moved about in.
+class _Playing:
+    """What both have in common: a thread that takes instants, and what a page shows of them.
 
-    Whoever watches looks at :attr:`newest`; what comes between two looks is not shown, and nobody
-    who watches holds anything up. All methods may be called from any thread.
+    Whoever watches looks at ``newest``; what comes between two looks is not shown, and nobody who
+    watches holds anything up. All methods may be called from any thread.
+
+    Args:
+        source: Used by the thread alone from now on; closed by ``stop``.
     """
 
-    live: bool
+    live: ClassVar[bool]
     """Whether time goes on by itself, so that there is no speed and no end."""
-    loop: bool
-    """Whether the end is followed by the beginning."""
-    plane: Plane | None
-    """Where potentials are wanted; None where they are not."""
-    with_field: Frame | None
-    """The last one whose potentials were taken."""
-    failure: CapSenseError | None
-    """What stopped it; None again once it goes on."""
 
-    @property
-    def newest(self) -> Frame | None:
-        """What is to be shown; None before there is any."""
+    def __init__(self, source: Source, run: Callable[[], None]) -> None:
+        self.loop = not self.live
+        """Whether the end is followed by the beginning."""
+        self.plane: Plane | None = None
+        """Where potentials are wanted; None where they are not."""
+        self.with_field: Frame | None = None
+        """The last one whose potentials were taken."""
+        self.failure: CapSenseError | None = None
+        """What stopped it; None again once it goes on."""
+        self._channels = source.channels
+        self._levels = read_channels(source.channels, source.empty)
+        self._field_taken = -np.inf
+        name = f"capsense {type(self).__name__.lower()}"
+        self._thread = threading.Thread(target=run, name=name, daemon=True)
 
-    @property
-    def source(self) -> Source:
-        """Where instants come from."""
-
-    @property
-    def playing(self) -> bool:
-        """Whether time runs."""
-
-    @property
-    def span(self) -> tuple[int, int]:
-        """Numbers of the first and the last sample."""
-
-    def history(self, index: int) -> tuple[Array, Array]:
-        """The samples known up to one, for charts.
-
-        Returns:
-            Times [s], shape (n,), and changes of the channels from the empty scene [F], shape
-            (n, K).
-        """
-
-    def play(self) -> None:
-        """Let time run."""
-
-    def pause(self) -> None:
-        """Stop time."""
-
-    def go(self, index: int) -> None:
-        """Stop time, and show a sample, or the first or last if there is none of that number."""
-
-    def step(self, count: int) -> None:
-        """Stop time, and go ``count`` samples on, or back."""
-
-    def set_speed(self, speed: float) -> None:
-        """Set how many seconds of the source pass a second; 0 for as fast as it goes."""
-
-    def stop(self) -> None:
-        """End it, and close the source."""
+    def _changes_of(self, frame: Frame) -> Array:
+        """Changes of the channels from the empty scene [F], shape (K,)."""
+        return read_channels(self._channels, frame.reading) - self._levels
 
 
-class Player:
-    """Asks a source for its samples, in a thread of its own. A :class:`Playback`.
+class Player(_Playing):
+    """Asks a source for its samples, in their order.
 
     Args:
         source: Used by the player's thread alone from now on; closed by :meth:`stop`.
@@ -95,21 +76,17 @@ class Player:
     live = False
 
     def __init__(self, source: Seekable, *, speed: float = 1.0) -> None:
+        super().__init__(source, self._run)
         self.source = source
-        self.loop = True
-        self.plane: Plane | None = None
+        """Where instants come from."""
         self.newest: Frame | None = None
-        self.with_field: Frame | None = None
-        self.failure: CapSenseError | None = None
+        """What is to be shown; None before there is any."""
         self._changes: Array = np.full((len(source.times), len(source.channels)), np.nan)
-        self._levels = np.array([c.read(source.empty) for c in source.channels])
         self._speed, self._playing, self._stopped = speed, False, False
         self._target: int | None = 0
         self._position = 0
         self._anchor = (0.0, 0.0)
-        self._field_taken = -np.inf
         self._wake = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name="capsense player", daemon=True)
         self._thread.start()
 
     @property
@@ -123,7 +100,12 @@ class Player:
         return 0, len(self.source.times) - 1
 
     def history(self, index: int) -> tuple[Array, Array]:
-        """See :class:`Playback`; samples that were skipped are not among them."""
+        """The samples known up to one, for charts; those that were skipped are not among them.
+
+        Returns:
+            Times [s], shape (n,), and changes of the channels from the empty scene [F], shape
+            (n, K).
+        """
         known = np.flatnonzero(~np.isnan(self._changes[: index + 1, 0]))
         return self.source.times[known], self._changes[known]
 
@@ -142,7 +124,7 @@ class Player:
             self.go(self._position)
 
     def go(self, index: int) -> None:
-        """Stop time, and step sample ``index``, or the first or last if there is none."""
+        """Stop time, and show a sample, or the first or last if there is none of that number."""
         with self._wake:
             self._playing = False
             self._target = min(max(index, 0), len(self.source.times) - 1)
@@ -169,8 +151,6 @@ class Player:
         self._thread.join()
         self.source.close()
 
-    # -- the thread -----------------------------------------------------------------------------
-
     def _run(self) -> None:
         while (index := self._next()) is not None:
             try:
@@ -183,8 +163,7 @@ class Player:
         now = time.monotonic()
         due = not self._playing or now - self._field_taken >= FIELD_PERIOD
         frame = self.source.frame(index, self.plane if due else None)
-        values = [c.read(frame.reading) for c in self.source.channels]
-        self._changes[index] = np.array(values) - self._levels
+        self._changes[index] = self._changes_of(frame)
         if frame.potentials is not None:
             self.with_field, self._field_taken = frame, now
         self.newest, self.failure = frame, None
@@ -226,3 +205,123 @@ class Player:
 
     def _set_anchor(self) -> None:
         self._anchor = (time.monotonic(), float(self.source.times[self._position]))
+
+
+class Follower(_Playing):
+    """Takes what a stream brings, and shows the newest.
+
+    Samples come in and are kept whether time runs or not; what :meth:`pause` stops is the page.
+
+    Args:
+        source: Used by the follower's thread alone from now on; closed by :meth:`stop`.
+    """
+
+    live = True
+
+    def __init__(self, source: Stream) -> None:
+        super().__init__(source, self._run)
+        self.source = source
+        """Where instants come from."""
+        self._frames: list[Frame] = []
+        self._first = 0
+        self._shown: int | None = None
+        self._times = np.empty(2 * KEPT)
+        self._changes = np.empty((2 * KEPT, len(source.channels)))
+        self._lock = threading.Lock()
+        self._stopped = threading.Event()
+        self._thread.start()
+
+    @property
+    def playing(self) -> bool:
+        """Whether the newest sample is shown."""
+        return self._shown is None
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Numbers of the first and the last sample that are kept."""
+        with self._lock:
+            return self._first, self._first + max(len(self._frames) - 1, 0)
+
+    @property
+    def newest(self) -> Frame | None:
+        """What is to be shown; None before there is any."""
+        with self._lock:
+            if not self._frames:
+                return None
+            if self._shown is None:
+                return self._frames[-1]
+            return self._frames[max(self._shown - self._first, 0)]
+
+    def history(self, index: int) -> tuple[Array, Array]:
+        """The samples kept up to one, for charts; as of :meth:`Player.history`."""
+        with self._lock:
+            stop = max(index - self._first, 0) + 1
+            return self._times[:stop].copy(), self._changes[:stop].copy()
+
+    def play(self) -> None:
+        """Show the newest, always."""
+        self._shown = None
+
+    def pause(self) -> None:
+        """Keep showing what is shown."""
+        self.go(self._position())
+
+    def go(self, index: int) -> None:
+        """Show one sample, or the first or last if there is none of that number."""
+        first, last = self.span
+        self._shown = min(max(index, first), last)
+
+    def step(self, count: int) -> None:
+        """Show the sample ``count`` on, or back."""
+        self.go(self._position() + count)
+
+    def stop(self) -> None:
+        """End the thread, and close the source."""
+        self._stopped.set()
+        self._thread.join()
+        self.source.close()
+
+    def _position(self) -> int:
+        shown = self._shown
+        return self.span[1] if shown is None else shown
+
+    def _run(self) -> None:
+        while not self._stopped.is_set():
+            try:
+                self._take_potentials()
+                frame = self.source.next(WAIT)
+                if frame is not None:
+                    self._keep(frame)
+                self.failure = None
+            except CapSenseError as error:
+                self.failure = error
+                self._stopped.wait(RETRY)
+
+    def _keep(self, frame: Frame) -> None:
+        with self._lock:
+            count = len(self._frames)
+            if count == 2 * KEPT:
+                count = KEPT
+                self._first += KEPT
+                del self._frames[:KEPT]
+                self._times[:KEPT] = self._times[KEPT:]
+                self._changes[:KEPT] = self._changes[KEPT:]
+            self._times[count] = frame.time
+            self._changes[count] = self._changes_of(frame)
+            self._frames.append(frame)
+
+    def _take_potentials(self) -> None:
+        """Take those of what is shown, when they are wanted and it is time."""
+        frame, plane, now = self.newest, self.plane, time.monotonic()
+        if plane is None or frame is None:
+            return
+        last = self.with_field
+        taken = last is not None and (last.index, last.plane) == (frame.index, plane)
+        if not taken and now - self._field_taken >= FIELD_PERIOD:
+            found = self.source.potentials(frame, plane)
+            self.with_field = replace(frame, plane=plane, potentials=found)
+            self._field_taken = now
+
+
+Playback = Player | Follower
+"""What a page shows, and how it is moved about in."""

@@ -64,10 +64,7 @@ class SceneDrawing:
         self._draw_scale(design)
         if len(design.electrodes) <= MAX_LABELS:
             for k, e in enumerate(design.electrodes):
-                self._scene.add_label(
-                    f"/labels/{k}", e.name, position=e.surface.bounds.mean(axis=0),
-                    anchor="center-center", font_screen_scale=0.8,
-                )  # fmt: skip
+                self._label(f"/labels/{k}", e.name, e.surface.bounds.mean(axis=0))
         low, high = np.array([e.surface.bounds for e in design.electrodes]).transpose(1, 0, 2)
         middle = (low.min(axis=0) + high.max(axis=0)) / 2
         reach = max(0.08, float(np.ptp([low.min(axis=0), high.max(axis=0)], axis=0).max()))
@@ -111,9 +108,8 @@ class SceneDrawing:
             self._bodies = [self._named(k, b) for k, b in enumerate(bodies)]
             self._spots = [spots_of(b) for b in bodies]
         for body, (_, *handles) in zip(bodies, self._bodies, strict=True):
-            x, y, z, w = body.pose.quaternion
             for handle in handles:
-                handle.wxyz, handle.position = (w, x, y, z), body.pose.position
+                _put(handle, body.pose)
 
     def show_around(self, solids: Sequence[tuple[Shape, Pose]]) -> None:
         """Put a robot's solids where they stand; those of other shapes are made anew."""
@@ -121,18 +117,11 @@ class SceneDrawing:
             for _, handle in self._around:
                 handle.remove()
             self._around = [
-                (shape, self._opaque(f"/robot/{k}", shape)) for k, (shape, _) in enumerate(solids)
+                (shape, self._solid(f"/robot/{k}", shape, CONDUCTIVE, side="double"))
+                for k, (shape, _) in enumerate(solids)
             ]
         for (_, pose), (_, handle) in zip(solids, self._around, strict=True):
-            x, y, z, w = pose.quaternion
-            handle.wxyz, handle.position = (w, x, y, z), pose.position
-
-    def _opaque(self, name: str, shape: Shape) -> Any:
-        mesh = shape.to_trimesh()
-        return self._scene.add_mesh_simple(
-            name, mesh.vertices, mesh.faces, color=CONDUCTIVE, flat_shading=shape.kind in _FACETED,
-            side="double", cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            _put(handle, pose)
 
     def show_plane(self, plane: Plane, potential: Array) -> None:
         """Draw lines of the potential at a plane's points [V], shape (n,)."""
@@ -187,28 +176,41 @@ class SceneDrawing:
                 position=(layer.lower + layer.upper) / 2, cast_shadow=False,
             )  # fmt: skip
         for k, conductor in enumerate(design.conductors):
-            value = ROLE_COLOURS[conductor.role].removeprefix("#")
-            red, green, blue = bytes.fromhex(value)
-            self._sheet(f"/conductors/{k}", conductor.surface, (red, green, blue))
+            colour = bytes.fromhex(ROLE_COLOURS[conductor.role].removeprefix("#"))
+            self._sheet(f"/conductors/{k}", conductor.surface, tuple(colour))
 
-    def _sheet(self, name: str, surface: Surface, colour: Colour) -> Any:
+    def _sheet(self, name: str, surface: Surface, colour: Any) -> None:
         corners = surface.triangles.reshape(-1, 3)
-        return self._scene.add_mesh_simple(
-            name, corners, np.arange(len(corners)).reshape(-1, 3), color=colour, side="double",
-            flat_shading=True, cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        self._mesh(name, corners, faces, colour, flat_shading=True, side="double")
 
     def _named(self, number: int, body: Body) -> tuple[Any, ...]:
         """A body, what is drawn of it, and its name, if it has one and there are not too many."""
-        solid = self._solid(f"/bodies/{number}", body)
+        name, shape = f"/bodies/{number}", body.shape
+        colour = CONDUCTIVE if body.material.is_conductor() else DIELECTRIC
+        if isinstance(shape, Layers):
+            drawn = self._dots(name, shape, colour)
+        else:
+            side = "double" if shape.kind == ShapeKind.SURFACE else "front"
+            drawn = self._solid(name, shape, colour, side=side, opacity=0.4)
         if body.name is None or number >= MAX_LABELS:
-            return body, solid
-        return (
-            body,
-            solid,
-            self._scene.add_label(
-                f"/names/{number}", body.name, anchor="center-center", font_screen_scale=0.8
-            ),
+            return body, drawn
+        return body, drawn, self._label(f"/names/{number}", body.name)
+
+    def _solid(self, name: str, shape: Shape, colour: Colour, **options: Any) -> Any:
+        mesh = shape.to_trimesh()
+        flat = shape.kind in _FACETED
+        return self._mesh(name, mesh.vertices, mesh.faces, colour, flat_shading=flat, **options)
+
+    def _mesh(self, name: str, vertices: Any, faces: Any, colour: Any, **options: Any) -> Any:
+        return self._scene.add_mesh_simple(
+            name, vertices, faces, color=colour, cast_shadow=False, receive_shadow=False, **options
+        )
+
+    def _label(self, name: str, text: str, position: Any = (0.0, 0.0, 0.0), **options: Any) -> Any:
+        options = {"anchor": "center-center", **options}
+        return self._scene.add_label(
+            name, text, position=position, font_screen_scale=0.8, **options
         )
 
     def _draw_scale(self, design: Design) -> None:
@@ -228,17 +230,6 @@ class SceneDrawing:
             font_screen_scale=0.8,
         )  # fmt: skip
 
-    def _solid(self, name: str, body: Body) -> Any:
-        colour = CONDUCTIVE if body.material.is_conductor() else DIELECTRIC
-        if isinstance(body.shape, Layers):
-            return self._dots(name, body.shape, colour)
-        mesh = body.shape.to_trimesh()
-        return self._scene.add_mesh_simple(
-            name, mesh.vertices, mesh.faces, color=colour, opacity=0.4, cast_shadow=False,
-            flat_shading=body.shape.kind in _FACETED, receive_shadow=False,
-            side="double" if body.shape.kind == ShapeKind.SURFACE else "front",
-        )  # fmt: skip
-
     def _dots(self, name: str, layers: Layers, colour: Colour) -> Any:
         """What a depth camera saw: a dot for every pixel, with gaps to look through."""
         slot, row, column = np.nonzero(layers.hit)
@@ -250,6 +241,12 @@ class SceneDrawing:
             name, points, colour, point_size=0.2 * min(width, height), point_shape="circle",
             point_shading="flat",
         )  # fmt: skip
+
+
+def _put(handle: Any, pose: Pose) -> None:
+    """Put what is drawn to a pose."""
+    x, y, z, w = pose.quaternion
+    handle.wxyz, handle.position = (w, x, y, z), pose.position
 
 
 def spots_of(body: Body) -> Array:

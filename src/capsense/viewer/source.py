@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import json
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.codec import design_from_json
-from capsense.design import Design
 from capsense.errors import ProtocolError, RecordingError, ServerError
 from capsense.field.background import Charges
 from capsense.reading import Reading, StepStats
 from capsense.recording.session import GONE, reading_of
 from capsense.scenario import Channel, Scenario
 from capsense.scenario.model import Excitation, channels_of
-from capsense.scene import Body, DepthFrame, Pose, Scene, Shape
+from capsense.scene import Body, Pose, Scene, Shape
 from capsense.server.client import Client
 from capsense.server.frames import DepthMessage, ReadingMessage
 from capsense.server.messages import MessageTable, Open, read_open, read_scene
 from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
-    from capsense.field.green import GreenFunction
     from capsense.recording.reader import Recording
     from capsense.viewer.charts import Plane
 
@@ -55,31 +54,24 @@ class Frame:
     of the bodies."""
 
 
-class Source(Protocol):
-    """A sensor, and instants of it."""
+class Source:
+    """A sensor, and instants of it.
+
+    Args:
+        simulator: Potentials come from it.
+    """
 
     title: str
-    design: Design
     channels: tuple[Channel, ...]
     """What charts show."""
     empty: Reading
     """The reading with nothing in front of the sensor."""
-    green: GreenFunction | None
-    """Of the sensor, where potentials can be had; None where they cannot."""
 
-    def close(self) -> None:
-        """Let go of what is held."""
-
-
-class Stream(Source, Protocol):
-    """Instants that come by themselves."""
-
-    def next(self, timeout: float) -> Frame | None:
-        """The next one; None if none came within a time [s].
-
-        Raises:
-            CapSenseError: There will be none, or not before another call finds a new beginning.
-        """
+    def __init__(self, simulator: Simulator) -> None:
+        self.design = simulator.design
+        self.green = simulator.background.green if simulator.method == "surface" else None
+        """Of the sensor, where potentials can be had; None where they cannot."""
+        self._simulator = simulator
 
     def potentials(self, frame: Frame, plane: Plane) -> Array:
         """Potentials of an instant at a plane's points [V], shape (n, terminals).
@@ -87,14 +79,32 @@ class Stream(Source, Protocol):
         Raises:
             CapSenseError: They could not be had.
         """
+        self._simulator.step(frame.scene)
+        return self._simulator.potentials(plane.points)
+
+    def close(self) -> None:
+        """Let go of what is held."""
 
 
-class Seekable(Source, Protocol):
+class Stream(Source, ABC):
+    """Instants that come by themselves."""
+
+    @abstractmethod
+    def next(self, timeout: float) -> Frame | None:
+        """The next one; None if none came within a time [s].
+
+        Raises:
+            CapSenseError: There will be none, or not before another call finds a new beginning.
+        """
+
+
+class Seekable(Source, ABC):
     """A row of instants, any of which can be asked for."""
 
     times: Array
     """Of the instants [s], increasing, shape (N,)."""
 
+    @abstractmethod
     def frame(self, index: int, plane: Plane | None = None) -> Frame:
         """The instant of a number.
 
@@ -107,28 +117,7 @@ class Seekable(Source, Protocol):
         """
 
 
-class Simulated:
-    """What sources have in common that ask a simulator of their own.
-
-    Args:
-        simulator: Potentials come from it.
-    """
-
-    def __init__(self, simulator: Simulator) -> None:
-        self.design = simulator.design
-        self.green = simulator.background.green if simulator.method == "surface" else None
-        self._simulator = simulator
-
-    def potentials(self, frame: Frame, plane: Plane) -> Array:
-        """See :class:`Stream`."""
-        self._simulator.step(frame.scene)
-        return self._simulator.potentials(plane.points)
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-class ScenarioSource(Simulated):
+class ScenarioSource(Seekable):
     """Simulates a scenario, sample by sample as they are asked for.
 
     Args:
@@ -143,7 +132,6 @@ class ScenarioSource(Simulated):
         self.empty = simulator.empty
 
     def frame(self, index: int, plane: Plane | None = None) -> Frame:
-        """See :class:`Seekable`."""
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
         reading = self._simulator.step(scene)
@@ -153,7 +141,7 @@ class ScenarioSource(Simulated):
         return Frame(index, time, scene, reading, plane, found, self._simulator.charges())
 
 
-class RecordingSource(Simulated):
+class RecordingSource(Seekable):
     """Shows what a recording holds; the simulator is asked for potentials only.
 
     Those of a recording of a method that is gone come from ``"surface"``.
@@ -181,7 +169,6 @@ class RecordingSource(Simulated):
         self.channels, self.empty = session.channels, session.empty
 
     def frame(self, index: int, plane: Plane | None = None) -> Frame:
-        """See :class:`Seekable`."""
         step = self._steps[index]
         frame = Frame(index, float(self.times[index]), step.scene, step.reading)
         if plane is None:
@@ -197,8 +184,8 @@ RETRY = 0.5
 """While there is nothing to watch, the server is asked so often [s]."""
 
 
-class Watched(Simulated):
-    """Watches a sensor that a client of a server opened. A :class:`~capsense.viewer.source.Stream`.
+class Watched(Stream):
+    """Watches a sensor that a client of a server opened.
 
     Nothing is sent to the server but the wish to watch. Times are those of arrival, since clients
     need not give any. When the client leaves, or the server stops, the next sensor of the same
@@ -237,7 +224,6 @@ class Watched(Simulated):
         self._scene = Scene()
 
     def next(self, timeout: float) -> Frame | None:
-        """See :class:`~capsense.viewer.source.Stream`."""
         try:
             if self._client is None:
                 self._client = self._begin_anew()
@@ -318,7 +304,7 @@ class Watched(Simulated):
     def _frame(self, answer: ReadingMessage) -> Frame:
         assert self._seen is not None
         if isinstance(self._seen, DepthMessage):
-            self._scene = self._depth_scene(self._seen)
+            self._scene = self._open.seen(self._seen).scene()
         else:
             bodies = read_scene(
                 MessageTable(self._seen, "message", "scene"), len(self._seen["body"])
@@ -326,16 +312,9 @@ class Watched(Simulated):
             self._scene = _alike(self._scene, Scene(bodies.bodies))
         coupling = answer.self_capacitance - np.diag(answer.capacitance)
         stats = StepStats(answer.solver_error, answer.wall_time, iterations=answer.iterations)
-        reading: Reading = reading_of(
-            self.design, answer.capacitance, answer.delta, coupling, stats
-        )
+        reading = reading_of(self.design, answer.capacitance, answer.delta, coupling, stats)
         self._count += 1
         return Frame(self._count - 1, time.monotonic() - self._began, self._scene, reading)
-
-    def _depth_scene(self, seen: DepthMessage) -> Scene:
-        o = self._open
-        matter = o.material if seen.eps_r is None else seen.eps_r
-        return DepthFrame(seen.depth, matter, o.camera, grounding=o.grounding, back=o.back).scene()
 
 
 def _opened(told: Mapping[str, Any]) -> Open:

@@ -1,28 +1,34 @@
-"""A page in a browser that shows what a player plays."""
+"""A page in a browser that shows what a player plays, to whom the page is for."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import html
 import io
+import ipaddress
+import logging
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Iterator
+from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from capsense.errors import MissingDependencyError, ServerError
 from capsense.scene import Scene
-from capsense.viewer.charts import OCTAVES, Plane, heat_map, make_charts, palette, region, strip
-from capsense.viewer.player import Playback
+from capsense.viewer.charts import PlaneControls, heat_map, make_charts, strip
+from capsense.viewer.player import Playback, Player
 from capsense.viewer.scene_drawing import SceneDrawing
 
 try:
     from viser import ViserServer
-
-    from capsense.viewer.visitors import guarded
+    from websockets.asyncio import server as websockets_server
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
 except ImportError as error:
     raise MissingDependencyError(
         'the view needs viser; install it with: pip install "capsense[view]"'
@@ -33,9 +39,10 @@ if TYPE_CHECKING:
 
     from capsense.viewer.source import Frame
 
+_log = logging.getLogger("capsense.viewer")
+Handler = Callable[[ServerConnection], Awaitable[None]]
 
 SPEEDS = {"0.1 ×": 0.1, "0.3 ×": 0.3, "1 ×": 1.0, "3 ×": 3.0, "as fast as it goes": 0.0}
-AXES = ("x", "y", "z")
 
 
 class TimeControls:
@@ -50,7 +57,7 @@ class TimeControls:
             steps = gui.add_button_group("step", ("|<", "<", ">", ">|"))
             self.slider: Any = gui.add_slider("sample", 0, 1, 1, 0)
             """The number of the sample that is shown."""
-            if not player.live:
+            if isinstance(player, Player):
                 speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 ×")
                 speed.on_update(lambda _: player.set_speed(SPEEDS[speed.value]))
                 loop = gui.add_checkbox("loop", player.loop)
@@ -79,92 +86,6 @@ class TimeControls:
     def _scrub(self, event: Any) -> None:
         if event.client is not None:  # moved by somebody, not by show()
             self._player.go(int(self.slider.value))
-
-
-class PlaneControls:
-    """Which plane, and whose potential."""
-
-    def __init__(self, gui: GuiApi, player: Playback) -> None:
-        assert player.source.green is not None
-        self._player, self._green = player, player.source.green
-        design = player.source.design
-        self._names = design.electrode_names
-        self._region = region(design)
-        self._centres = [1e3 * e.surface.bounds.mean(axis=0) for e in design.electrodes]
-        self._plane: Plane | None = None
-        middle = np.mean(self._centres, axis=0)
-        first = int(np.argmin(np.linalg.norm(self._centres - middle, axis=1).round(3)))
-        with gui.add_folder("potential"):
-            self._on = gui.add_checkbox("shown", True)
-            self._charge = gui.add_checkbox("charge on the bodies", True)
-            self._driven = gui.add_dropdown("1 V at", self._names, initial_value=self._names[first])
-            self._across = gui.add_dropdown("plane across", AXES, initial_value="y")
-            self._at: list[Any] = [
-                gui.add_slider(f"{a} [mm]", low, high, 0.5, place, visible=a == "y")
-                for a, (low, high), place in zip(
-                    AXES, np.round(1e3 * self._region, 1).tolist(), self._places(), strict=True
-                )
-            ]
-            gui.add_html(legend())
-        self._lay()
-        self._on.on_update(self._ask)
-        self._driven.on_update(self._centre)
-        self._across.on_update(lambda _: self._lay())
-        for slider in self._at:
-            slider.on_update(lambda _: self._lay())
-
-    @property
-    def driven(self) -> int:
-        """Number of the electrode at 1 V."""
-        return self._names.index(self._driven.value)
-
-    @property
-    def charge(self) -> bool:
-        """Whether charges are wanted, too."""
-        return bool(self._charge.value and self._on.value)
-
-    @property
-    def plane(self) -> Plane | None:
-        """The plane; None where it is not wanted."""
-        return self._plane if self._on.value else None
-
-    def _places(self) -> list[float]:
-        """Where planes cross the middle of the driven electrode, or 20 mm above it [mm]."""
-        x, y, z = self._centres[self.driven]
-        return [round(2 * v) / 2 for v in (x, y, min(z + 20.0, 1e3 * self._region[2, 1]))]
-
-    def _centre(self, _: object) -> None:
-        for slider, place in zip(self._at, self._places(), strict=True):
-            slider.value = place
-        self._lay()
-
-    def _lay(self) -> None:
-        axis = AXES.index(self._across.value)
-        for k, slider in enumerate(self._at):
-            if slider.visible != (k == axis):
-                slider.visible = k == axis
-        at = 1e-3 * float(self._at[axis].value)
-        if self._plane is None or (self._plane.axis, self._plane.at) != (axis, at):
-            self._plane = Plane(self._green, self._region, axis, at)
-            self._ask()
-
-    def _ask(self, _: object = None) -> None:
-        """Tell the player where potentials are wanted, and to take them while time stands still."""
-        self._player.plane = self.plane
-        if self._player.plane is not None and not self._player.playing:
-            self._player.pause()
-
-
-def legend() -> str:
-    """The colours of the potential, as HTML."""
-    cells = "".join(
-        f'<td style="background:rgb({r},{g},{b})">&nbsp;</td>' for r, g, b in palette().tolist()
-    )
-    return (
-        '<div style="padding:0 0.8em 0.6em;font-size:12px"><table style="width:100%;'
-        f'border-spacing:0;line-height:0.8"><tr>{cells}</tr></table><span style="float:right">1 V'
-        f"</span>{1e3 * 2.0**-OCTAVES:.0f} mV, doubling from line to second next</div>"
-    )
 
 
 def status(player: Playback, frame: Frame, largest: float) -> str:
@@ -200,16 +121,14 @@ SETTLE = 0.12
 """Time for a sample to reach the page [s]."""
 
 
-class ExportControls:
+def add_exports(gui: GuiApi, player: Playback) -> None:
     """Buttons that hand the picture, or a video from the first sample to the last, to a browser."""
-
-    def __init__(self, gui: GuiApi, player: Playback) -> None:
-        with gui.add_folder("export", expand_by_default=False):
-            picture = gui.add_button("Picture (.png)")
-            picture.on_click(lambda event: send_picture(event.client))
-            if not player.live:
-                video = gui.add_button("Video (.webp)")
-                video.on_click(lambda event: send_video(event.client, player))
+    with gui.add_folder("export", expand_by_default=False):
+        picture = gui.add_button("Picture (.png)")
+        picture.on_click(lambda event: send_picture(event.client))
+        if not player.live:
+            video = gui.add_button("Video (.webp)")
+            video.on_click(lambda event: send_video(event.client, player))
 
 
 def send_picture(client: Any) -> None:
@@ -287,7 +206,7 @@ class LiveView:
         self.time = TimeControls(gui, player)
         """The controls of time."""
         self._plane = PlaneControls(gui, player) if source.green is not None else None
-        ExportControls(gui, player)
+        add_exports(gui, player)
         panel = gui.add_panel()
         tab = panel.add_tab("signals")
         self._charts = make_charts(gui, tab, source.channels)
@@ -378,3 +297,79 @@ def check_address(host: str, port: int) -> None:
             f"cannot listen at {host}, port {port}: {error}; give another --host or --port, or "
             "--port 0 for any free one"
         ) from None
+
+
+def welcome(host: str, origin: str | None, listening: str) -> bool:
+    """Whether a request is one that the page's own user can have made.
+
+    Another page that is open in the user's browser sends its own ``Origin``; a name that was made
+    to point to this machine shows in ``Host``. Programs other than browsers send no ``Origin``.
+
+    Args:
+        host: Header ``Host``.
+        origin: Header ``Origin``, if there is one.
+        listening: Address or name that the server listens at.
+    """
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        own = origin is None or urlsplit(origin).netloc.lower() == host.lower()
+    except ValueError:
+        return False
+    own_name = socket.gethostname().lower()
+    known = {"localhost", listening.lower(), own_name, f"{own_name}.local"}
+    return own and (name in known or _is_address(name))
+
+
+def _is_address(name: str) -> bool:
+    """Whether a host is given by its number, which no other page can make point elsewhere."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def guarded(listening: str) -> Iterator[None]:
+    """Servers of viser that start meanwhile refuse strangers, and say little of broken messages.
+
+    Viser has no place for that, so what it starts its server with is replaced.
+    """
+    serve = websockets_server.serve
+    quiet = _log.getChild("websockets")  # broken handshakes are the clients' fault
+    quiet.setLevel(logging.CRITICAL)
+
+    def start(handler: Handler, *address: Any, process_request: Any, **options: Any) -> Any:
+        def check(connection: ServerConnection, request: Request) -> Response | None:
+            hosts, origins = (request.headers.get_all(k) for k in ("Host", "Origin"))
+            single = len(hosts) == 1 and len(origins) < 2
+            if single and welcome(hosts[0], origins[0] if origins else None, listening):
+                return process_request(connection, request)
+            return connection.respond(
+                HTTPStatus.FORBIDDEN, "This page is for its own user; open it by its address.\n"
+            )
+
+        return serve(_patient(handler), *address, process_request=check, logger=quiet, **options)
+
+    websockets_server.serve = start  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets_server.serve = serve  # type: ignore[misc]
+
+
+def _patient(handler: Handler) -> Handler:
+    """``handler``, with one line for a client whose messages make no sense, in place of a trace."""
+
+    def complain(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        _log.warning("a message to the view failed: %.200s", repr(context.get("exception")))
+
+    async def handle(connection: ServerConnection) -> None:
+        asyncio.get_running_loop().set_exception_handler(complain)
+        try:
+            await handler(connection)
+        except Exception as error:
+            _log.warning("a client of the view sent no message of its page: %.200s", repr(error))
+            await connection.close(1002, "no message of the page")
+
+    return handle

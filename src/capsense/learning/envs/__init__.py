@@ -16,14 +16,14 @@ except ImportError:
     ) from None
 
 IDS = {
-    "capsense/LimbFollow-v0": ("follow", "LimbFollow", 250),
-    "capsense/Dressing-v0": ("dressing", "Dressing", 400),
-    "capsense/ApproachStop-v0": ("approach", "ApproachStop", 300),
+    "capsense/LimbFollow-v0": ("LimbFollow", 250),
+    "capsense/Dressing-v0": ("Dressing", 400),
+    "capsense/ApproachStop-v0": ("ApproachStop", 300),
 }
-"""Name → its module and class, and the steps of an episode at most."""
+"""Name → its class, and the steps of an episode at most."""
 
-for _name, (_where, _class, _steps) in IDS.items():
+for _name, (_class, _steps) in IDS.items():
     register(
-        _name, f"{__name__}.{_where}:{_class}", max_episode_steps=_steps,
+        _name, f"{__name__}.tasks:{_class}", max_episode_steps=_steps,
         vector_entry_point=f"{__name__}.vector:{_class}Vector",
     )  # fmt: skip
