@@ -208,9 +208,9 @@ def test_deep_in_the_sensor_a_reading_says_that_it_is_rough(sim):
 
 
 def test_what_lies_behind_the_sensor_is_screened(sim):
-    """Measured: a plate in the gap between sensor and floor reads 0.2 % of C at most."""
+    """Measured: a plate in the gap between sensor and floor reads 0.35 % of C at most."""
     plate = cs.Body(cs.Box((0.1, 0.08, 0.001)), cs.Pose((0, 0, -0.0095)))
-    assert np.abs(sim.step(cs.Scene([plate])).delta).max() < 5e-15
+    assert np.abs(sim.step(cs.Scene([plate])).delta).max() < 7.5e-15
 
 
 @pytest.mark.parametrize(("one", "other"), [(999.0, 1001.0), (9_990.0, 10_010.0)])

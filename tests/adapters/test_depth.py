@@ -163,7 +163,7 @@ def test_wrong_options_are_refused(adapter: str, attached: Callable[..., Any]) -
     things = [Thing("block", BLOCK, AHEAD)]
     cases: list[tuple[dict[str, Any], str]] = [
         ({"back": "full"}, "back is 'full'"),
-        ({"default_grounding": 0.0}, "grounding is 0.0 F"),
+        ({"default_grounding": 0.0}, "grounding is 0.0, not a positive"),
     ]
     if adapter != "coppeliasim":
         cases += [

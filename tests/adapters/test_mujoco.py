@@ -189,7 +189,7 @@ def test_texts_of_the_model_say_what_things_are(tiny_simulator: cs.Simulator) ->
     [
         ('name="capsense.material:z*" data="human"', "no geom or body fits 'z\\*'"),
         ('name="capsense.material:b" data="humam"', 'text name="capsense.material:b">: unknown'),
-        ('name="capsense.grounding:b" data="-3"', "grounding is -3.0 F"),
+        ('name="capsense.grounding:b" data="-3"', "grounding is -3.0, not a positive"),
         ('name="capsense.grounding:b" data="loose"', "grounding is 'loose'"),
         ('name="capsense.grouding:b" data="floating"', "is not known; write capsense.material"),
     ],

@@ -289,10 +289,8 @@ def checked_grounding(grounding: object) -> Grounding:
     if isinstance(grounding, str) and grounding in get_args(_Tie):
         return cast("_Tie", grounding)
     farads = math.nan if isinstance(grounding, str | bool) else as_float(grounding)
-    if math.isnan(farads):
-        raise SceneError(f"grounding is {grounding!r}; {fix}")
     if not 0 < farads < math.inf:
-        raise SceneError(f"grounding is {farads} F, not a positive finite capacitance; {fix}")
+        raise SceneError(f"grounding is {grounding!r}, not a positive finite capacitance; {fix}")
     if farads > _LARGEST:
         raise SceneError(
             f"grounding is {farads:g} farads, more than anything has; 100 pF are 100e-12, and a "
