@@ -11,8 +11,9 @@ fingertip, a forearm, a ball, a tilted box, and for bodies that overlap: a bent 
   entries above 10 %. "fall": how many of the six entries ever fall while they are above 10 %, and
   in how many steps. An entry may truly fall while a body approaches, where another part of it
   screens the electrode, but hardly ever, and by little.
-- slide along x at 12 mm; turn about the sensor's z, and about its y, in a height that leaves
-  8 mm free.
+- slide along x at 12 mm; "wall": on along x at 20 mm, through the wall of the domain, until the
+  largest entry is a hundredth of what it was; turn about the sensor's z, and about its y, in a
+  height that leaves 8 mm free.
 - contact: from 8 mm down to 0.05 mm; as C goes like one over the gap, a step from 0.10 to 0.05 mm
   may double it. Then through the electrode plane to -1 mm. Not finite, not symmetric, or not
   positive semidefinite are counted ("wrong").
@@ -47,6 +48,8 @@ PLACE = (0.012, 0.007)
 """Where bodies stand over the sensor [m]."""
 SLIDE_GAP, SLIDE_TO, TURN_GAP, TURN_TO = 0.012, 0.02, 0.008, 30.0
 """Height and half length of the slide [m]; least height of the turns [m] and their angle [°]."""
+WALL_GAP, WALL_TO, WALL_LEFT = 0.02, 0.45, 0.01
+"""Height and end of the slide through the wall [m], and what is left of the largest entry."""
 SHOWN, FALLING = 0.03, 0.10
 """Entries above these fractions of the scene's largest are judged."""
 WRONG_BY = 1e-3
@@ -227,6 +230,9 @@ def judge(mover: Mover) -> dict[str, object]:
         at = steps_from(-SLIDE_TO, SLIDE_TO) if name == "slide" else steps_from(
             -TURN_TO, TURN_TO, TURN)  # fmt: skip
         out[name] = second_difference(mover.read([way(v) for v in at]))
+    across = mover.read([mover.scene(WALL_GAP, x) for x in steps_from(0.0, WALL_TO)])
+    largest = diagonals(across).max(axis=1)
+    out["wall"] = second_difference(across[largest > WALL_LEFT * largest[0]])
     gaps = steps_from(0.008, 0.05e-3)
     near = mover.read([mover.scene(g) for g in gaps])
     out["contact"] = bands(near, gaps)
@@ -242,7 +248,7 @@ def show(name: str, found: dict[str, object]) -> None:
     contact = " ".join(f"{100 * v:6.2f}" for v in found["contact"])  # type: ignore[attr-defined]
     print(f"{name:11s} {found['approach']:9.1e} {100 * found['jump']:7.2f} "
           f"{entries:3d} {steps:5d} {100 * depth:7.2f}  {found['slide']:9.1e} "
-          f"{found['turn z']:9.1e} {found['turn y']:9.1e}  {contact}  "
+          f"{found['wall']:9.1e} {found['turn z']:9.1e} {found['turn y']:9.1e}  {contact}  "
           f"{found['wrong'][0]:4d} {found['wrong'][1]:4d}  {found['memory']:8.1e}",
           flush=True)  # fmt: skip
 
@@ -264,10 +270,11 @@ def main() -> None:
         chosen = {"method": method} if method else {}
         sim = cs.Simulator(DESIGN, **chosen, **parse_settings(args.settings))
         print(f"\n{method or 'default'} {args.settings}\n"
-              f"{'':11s} {'approach':^34s}  {'slide':>9s} {'turn z':>9s} {'turn y':>9s}  "
+              f"{'':11s} {'approach':^34s}  {'slide':>9s} {'wall':>9s} "
+              f"{'turn z':>9s} {'turn y':>9s}  "
               f"{'contact: jump %, gap in mm':^27s}  {'wrong':^9s}  {'memory':>8s}\n"
               f"{'':11s} {'2nd diff':>9s} {'jump %':>7s} {'fall':>3s} {'steps':>4s} "
-              f"{'by %':>7s}  {'2nd diff':>9s} {'2nd diff':>9s} {'2nd diff':>9s}  "
+              f"{'by %':>7s}  {'2nd diff':>9s} {'2nd diff':>9s} {'2nd diff':>9s} {'2nd diff':>9s}  "
               f"{'8-2':>6s} {'2-1':>6s} {'1-0.5':>6s} {'-0.05':>6s}  {'open':>4s} {'in':>4s}",
               flush=True)  # fmt: skip
         results[method or "default"] = {}

@@ -43,11 +43,11 @@ def smoothness(path: Path) -> str:
     lines = []
     for name, f in next(iter(found.values())).items():
         contact = ", ".join(f"{100 * v:.2f}" for v in f["contact"])
-        lines.append((name, f"{f['approach']:.1e}", f"{f['slide']:.1e}", f"{f['turn z']:.1e}",
-                      f"{f['turn y']:.1e}", f["falls"][1], contact, sum(f["wrong"]),
-                      f"{f['memory']:g}"))  # fmt: skip
-    head = ("body", "approach", "slide", "turn about z", "about y", "steps in which C falls",
-            "jump, %: 8–2, 2–1, 1–0.5, 0.5–0.05 mm", "wrong", "memory")  # fmt: skip
+        ways = [f"{f[w]:.1e}" for w in ("approach", "slide", "wall", "turn z", "turn y")]
+        lines.append((name, *ways, f["falls"][1], contact, sum(f["wrong"]), f"{f['memory']:g}"))
+    head = ("body", "approach", "slide", "through a wall", "turn about z", "about y",
+            "steps in which C falls", "jump, %: 8–2, 2–1, 1–0.5, 0.5–0.05 mm", "wrong",
+            "memory")  # fmt: skip
     return table(head, lines)
 
 
