@@ -35,7 +35,7 @@ yaw = 180
 side = { from = 0.004, to = 0.022, start = 0.008 }
 [design]
 name = "pads"
-domain = { size = [0.1, 0.1, 0.1], backplane = 0.01 }
+domain = { size = [0.2, 0.2, 0.2], backplane = 0.01 }
 electrode = [
   { name = "A", shape = "rectangle", size = ["=side", "=side"], center = ["=-0.03 + side/2", 0.0] },
   { name = "B", shape = "rectangle", size = ["=side", "=side"], center = ["=0.03-side/2", 0.0] },
