@@ -26,6 +26,8 @@ SCENES = {
     "floating ball": (Placed(BALL, (0.02, 0.01, 0.045), floating=True),),
     "box": (Placed(BOX, (0.01, 0.0, 0.05), (0.1, 0.2, 0.3)),),
     "box far off": (Placed(BOX, (0.01, 0.0, 0.11), (0.1, 0.2, 0.3)),),
+    "arm through a wall": (Placed(ARM, (0.2, 0.01, 0.06), ACROSS),),
+    "floating arm through a wall": (Placed(ARM, (0.15, 0.01, 0.07), ACROSS, floating=True),),
     "arm of eps 3": (Placed(ARM, (0.0, 0.01, 0.07), ACROSS, eps_r=3.0),),
     "ball of eps 80": (Placed(BALL, (0.02, 0.01, 0.045), eps_r=80.0),),
     "two fingers": (
