@@ -1,4 +1,4 @@
-"""Threads that do the same kind of work for many sensors or scenes, and what is handed to them."""
+"""Threads that do the same kind of work for many sensors or scenes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -71,23 +70,6 @@ class OneAtATime:
 
     def __reduce__(self) -> tuple[type[OneAtATime], tuple[()]]:
         return OneAtATime, ()
-
-
-class Frozen:
-    """A frozen dataclass that is pickled and copied by its fields alone.
-
-    What was worked out from them is left behind, and worked out again by the copy. Arrays that the
-    copy holds are read-only, as those of the original are.
-    """
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        for value in state.values():
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
-        self.__dict__.update(state)
 
 
 class ThreadPool:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from capsense._dense import cholesky
+from capsense._frozen import Frozen
 from capsense._jit import compiled
-from capsense._thread_pool import Frozen
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._thread_pool import Frozen
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
 from capsense.scene.shapes import Shape, ShapeKind, as_points
 from capsense.scene.surface import (

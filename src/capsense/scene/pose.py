@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._thread_pool import Frozen
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._thread_pool import Frozen
+from capsense._frozen import Frozen
 from capsense.errors import SceneError
 from capsense.scene.pose import Vec3, checked_floats
 
