@@ -393,6 +393,23 @@ def test_walls_are_crossed_smoothly(sim, material):
     assert read[-1] == 0.0
 
 
+def test_a_wall_is_crossed_smoothly_by_parts_of_a_person(simulators):
+    """Invariant: a long part on a potential of its own attracts nothing from behind the wall."""
+    turn = (0.5696, -0.3989, -0.5887, 0.4122)
+
+    def read(x):
+        parts = [
+            cs.Body(cs.Capsule(radius, length), cs.Pose((x + dx, y, z), turn), grounding=1.4e-11)
+            for radius, length, (dx, y, z) in (
+                (0.0246, 0.2378, (0.0, 0.0, 0.064)), (0.0132, 0.1627, (0.2, -0.0243, 0.0486)),
+            )
+        ]  # fmt: skip
+        return simulators("six_patch").step(cs.Scene(parts)).delta[0, 0]
+
+    values = np.array([read(x) for x in np.arange(-0.312, -0.297, 5e-4)])
+    assert np.abs(np.diff(values, 2)).max() < 1e-3 * values.min()
+
+
 # -- Jacobian, potentials ---------------------------------------------------------------------
 
 

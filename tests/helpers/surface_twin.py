@@ -292,7 +292,7 @@ def reduced(
 # ---- scores ----
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
-CROSSED, LARGE = 0.3, (0.12, 0.16)
+CROSSED, LARGE = 0.3, (0.08, 0.12)
 LONG, SHORE = (0.03, 0.06), 5e-3
 
 

@@ -34,7 +34,7 @@ _CROSSED = 0.3
 """Least score of large clusters that cross a wall: so much that functions are fully faded in. Their
 points lie among the sources that stand for the wall, 40 mm behind it, and would attract themselves
 so much that no definite matrix were left."""
-_WIDE = 0.12, 0.16
+_WIDE = 0.08, 0.12
 """Clusters come to be large between these extents [m]."""
 _PARTED = 0.1
 """Fade of a function from which on its two clusters are represented by their parts alone."""
