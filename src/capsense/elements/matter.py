@@ -16,6 +16,7 @@ from capsense.elements.rigid import RigidShape
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
 from capsense.scene.materials import Grounding, Material
 from capsense.scene.scene import PackedScene
+from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -108,18 +109,23 @@ class Matter:
         """
         if not self.free.any():
             return self
+        low, high = packed.bounds[chosen, 0] - 0.5 * _TOUCH, packed.bounds[chosen, 1] + 0.5 * _TOUCH
+        near = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2)
+        near &= self.conducting & (self.free[:, None] | self.free)
+        first, second = np.nonzero(np.triu(near, 1))
+        ends, radius = _axes(packed, chosen)
+        apart = segment_distance(ends[first], ends[second]) - radius[first] - radius[second]
         group = np.arange(len(chosen))
-        for a in np.flatnonzero(self.free).tolist():
-            near = (
-                (packed.bounds[chosen, 0] <= packed.bounds[chosen[a], 1] + _TOUCH)
-                & (packed.bounds[chosen, 1] >= packed.bounds[chosen[a], 0] - _TOUCH)
-            ).all(axis=1) & self.conducting  # fmt: skip
-            for b in np.flatnonzero(near).tolist():
-                if group[a] != group[b] and touch(scene[int(chosen[a])], scene[int(chosen[b])]):
-                    group[group == max(group[a], group[b])] = min(group[a], group[b])
-        total = np.zeros(len(chosen))
-        np.add.at(total, group, self.ground)
-        return replace(self, ground=total[group], group=group)
+        for a, b, gap in zip(first.tolist(), second.tolist(), apart.tolist(), strict=True):
+            if group[a] == group[b]:
+                continue
+            if math.isnan(gap):
+                meet = touch(scene[int(chosen[a])], scene[int(chosen[b])])
+            else:
+                meet = gap <= _TOUCH
+            if meet:
+                group[group == max(group[a], group[b])] = min(group[a], group[b])
+        return _grouped(self, tuple(group.tolist()))
 
     def repeated(self, places: Sequence[int]) -> Matter:
         """The same for parts of bodies; those of one conductor share its net charge.
@@ -129,10 +135,7 @@ class Matter:
         """
         if len(places) == len(self.eps) == len(set(places)):
             return self
-        at = np.array(places, dtype=np.int64)
-        first: dict[int, int] = {}
-        group = [first.setdefault(g, k) for k, g in enumerate(self.group[at].tolist())]
-        return Matter(self.eps[at], self.ground[at], np.array(group, dtype=np.int64))
+        return _repeated(self, tuple(places))
 
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
         """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
@@ -165,6 +168,21 @@ def _matter(bodies: tuple[tuple[Material, Grounding], ...], frequency: float) ->
     return Matter(eps, np.array(ground, float), np.arange(len(bodies)))
 
 
+@lru_cache(maxsize=64)
+def _grouped(matter: Matter, group: tuple[int, ...]) -> Matter:
+    total, joint = np.zeros(len(group)), np.array(group)
+    np.add.at(total, joint, matter.ground)
+    return replace(matter, ground=total[joint], group=joint)
+
+
+@lru_cache(maxsize=64)
+def _repeated(matter: Matter, places: tuple[int, ...]) -> Matter:
+    at = np.array(places, dtype=np.int64)
+    first: dict[int, int] = {}
+    group = [first.setdefault(g, k) for k, g in enumerate(matter.group[at].tolist())]
+    return Matter(matter.eps[at], matter.ground[at], np.array(group, dtype=np.int64))
+
+
 def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> Array:
     """Capacitances of bodies in free space over 4π eps0 [m], shape (n,)."""
     return records["scale"] * np.array([s.capacitance for s in shapes])
@@ -177,7 +195,7 @@ def touch(first: Body, second: Body) -> bool:
     ends, others = _axis(first), _axis(second)
     if ends is not None and others is not None:
         apart = segment_distance(ends[0], others[0])
-        return apart <= ends[1] + others[1] + _TOUCH
+        return bool(apart <= ends[1] + others[1] + _TOUCH)
     for axis, other in ((ends, second), (others, first)):
         if axis is not None:
             points = axis[0][0] + _ALONG[:, None] * (axis[0][1] - axis[0][0])
@@ -198,20 +216,32 @@ def _axis(body: Body) -> tuple[Array, float] | None:
     return body.pose.apply([[0.0, 0.0, -half], [0.0, 0.0, half]]), body.shape.radius
 
 
-def segment_distance(first: Array, second: Array) -> float:
-    """Distance of two line segments [m], each given by its ends, (2, 3).
+def _axes(packed: PackedScene, chosen: NDArray[np.intp]) -> tuple[Array, Array]:
+    """The same of bodies of a scene, (n, 2, 3) and (n,); the radius of other shapes is nan."""
+    kinds, (radius, half, _) = packed.kinds[chosen], packed.params[chosen].T
+    capsule = kinds == ShapeKind.CAPSULE
+    arm = np.where(capsule, half, 0.0)[:, None] * packed.rotation[chosen, :, 2]
+    middle = packed.position[chosen]
+    radius = np.where(capsule | (kinds == ShapeKind.SPHERE), radius, np.nan)
+    return np.stack([middle - arm, middle + arm], axis=1), radius
+
+
+def segment_distance(first: Array, second: Array) -> Array:
+    """Distances of line segments [m], each given by its ends, (..., 2, 3), shape (...).
 
     After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.9.
     """
-    u, v, w = first[1] - first[0], second[1] - second[0], first[0] - second[0]
-    a, b, c, d, e = (float(x @ y) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    u, v = first[..., 1, :] - first[..., 0, :], second[..., 1, :] - second[..., 0, :]
+    w = first[..., 0, :] - second[..., 0, :]
+    a, b, c, d, e = ((x * y).sum(axis=-1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     det = a * c - b * b
-    s = min(1.0, max(0.0, (b * e - c * d) / det)) if det > 1e-12 * a * c else 0.0
-    t = (b * s + e) / c if c > 0 else 0.0
-    if not 0.0 <= t <= 1.0 or c == 0:
-        t = min(1.0, max(0.0, t))
-        s = min(1.0, max(0.0, (b * t - d) / a)) if a > 0 else 0.0
-    return float(np.linalg.norm(w + s * u - t * v))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = np.where(det > 1e-12 * a * c, np.clip((b * e - c * d) / det, 0.0, 1.0), 0.0)
+        t = np.where(c > 0, (b * s + e) / c, 0.0)
+        over = (t < 0.0) | (t > 1.0) | (c == 0)
+        t = np.clip(t, 0.0, 1.0)
+        s = np.where(over, np.where(a > 0, np.clip((b * t - d) / a, 0.0, 1.0), 0.0), s)
+    return np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
 
 
 def _surface_points(body: Body) -> Array:

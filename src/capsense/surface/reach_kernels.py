@@ -156,20 +156,30 @@ def _within_reach(cut, span, index, functions, of, rows):
     first, last = span
     width = rows.shape[1]
     more, out = np.zeros((last - first, width)), np.empty((of.shape[0], width))
+    changed = np.zeros(last - first, np.bool_)  # else a line of ``more`` is zero
     for a in range(last - 1, first - 1, -1):
-        if cut.kids[a, 0] >= 0:
-            line, own, share = more[a - first], rows[index[a - first]], _moved(cut, a)
-            x, y = more[cut.kids[a, 0] - first], more[cut.kids[a, 1] - first]
-            p, q = cut.parts[a, 0], cut.parts[a, 1]
+        if cut.kids[a, 0] < 0:
+            continue
+        line, own, share = more[a - first], rows[index[a - first]], _moved(cut, a)
+        if abs(share) > _SAME:
+            changed[a - first] = True
             for i in range(width):
-                line[i] = share * own[i] + (p * x[i] + q * y[i])
+                line[i] = share * own[i]
+        for c in range(2):
+            part = cut.kids[a, c] - first
+            if changed[part]:
+                changed[a - first] = True
+                for i in range(width):
+                    line[i] += cut.parts[a, c] * more[part, i]
     for f in range(of.shape[0]):
         a = functions.cluster[of[f]]
-        if a < 0:
-            for i in range(width):
-                out[f, i] = rows[0, i] + more[-1 - a - first, i]
-        else:
-            x, y = more[cut.kids[a, 0] - first], more[cut.kids[a, 1] - first]
-            for i in range(width):
-                out[f, i] = rows[index[a - first], i] + (x[i] - y[i])
+        own = rows[index[a - first] if a >= 0 else 0]
+        for i in range(width):
+            out[f, i] = own[i]
+        for c in range(2 if a >= 0 else 1):
+            part = (cut.kids[a, c] if a >= 0 else -1 - a) - first
+            sign = 1.0 - 2.0 * c
+            if changed[part]:
+                for i in range(width):
+                    out[f, i] += sign * more[part, i]
     return out
