@@ -111,7 +111,7 @@ class Matter:
             return self
         low, high = packed.bounds[chosen, 0] - 0.5 * _TOUCH, packed.bounds[chosen, 1] + 0.5 * _TOUCH
         near = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2)
-        near &= self.conducting & (self.free[:, None] | self.free)
+        near &= self.conducting[:, None] & self.conducting & (self.free[:, None] | self.free)
         first, second = np.nonzero(np.triu(near, 1))
         ends, radius = _axes(packed, chosen)
         apart = segment_distance(ends[first], ends[second]) - radius[first] - radius[second]
