@@ -110,13 +110,14 @@ def bound_images(leaves, rows, pairs, green):
         return
     points, image = leaves.points, np.empty((4, 3))
     for j in range(points.shape[0]):
-        inverse = 0.0
+        inverse, lowest = 0.0, points[j, 0, 2]
         for q in range(4):
+            lowest = min(lowest, points[j, q, 2])
             inverse += 0.25 / max(points[j, q, 2] - green.box[1, 2], 1e-9)
             image[q, 0], image[q, 1] = points[j, q, 0], points[j, q, 1]
             image[q, 2] = 2.0 * green.floor - points[j, q, 2]
         side = math.sqrt(12.0 * _arm(points[j][0], points[j][1]) * _arm(points[j][0], points[j][2]))
-        if inverse * side < _WIDE or points[j, :, 2].min() < green.box[1, 2]:
+        if inverse * side < _WIDE or lowest < green.box[1, 2]:
             continue
         met = mean_inverse(points[j], image, 0.0)
         for k in range(green.lead, rows.shape[1]):

@@ -55,7 +55,9 @@ def reached(cut, leaves):
         a = cut.leaves[j]
         if whole[a] > 0.0:
             leaf[a], at[i] = i, a
-            points[i], true[i] = leaves.points[j], leaves.true[j]
+            for q in range(4):
+                for k in range(3):  # copies of whole arrays would bring in code for texts of errors
+                    points[i, q, k], true[i, q, k] = leaves.points[j, q, k], leaves.true[j, q, k]
             extent[i], soft[i], beyond[i] = leaves.extent[j], leaves.soft[j], leaves.beyond[j]
             owner[i], within[i] = leaves.owner[j], leaves.within[j]
             i += 1

@@ -117,8 +117,8 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
                 matrix[e, f] = value
             else:
                 rest[f - solved, e] = value
-    add_own(bodies, cut, functions, False, matrix, rest, own)
-    add_own(bodies, cut, functions, True, matrix, rest, own)
+    for inside in (False, True):
+        add_own(bodies, cut, functions, inside, matrix, rest, own)
     _add_matter(bodies, functions, matrix, own)
     for f in range(solved):
         own[f] = matrix[f, f]
