@@ -30,7 +30,7 @@ from capsense.scene.shapes import as_points
 if TYPE_CHECKING:
     from capsense.masked import MeshSensor
     from capsense.mesh import TetMesh
-    from capsense.readout.readout import Readout
+    from capsense.readout import Readout
 
 Array = NDArray[np.float64]
 Method = Literal["surface", "fem_masked"]
@@ -158,7 +158,7 @@ class Simulator:
         self.use_readout(readout)
 
     def _on_mesh(self, mesh: TetMesh | MeshSensor) -> MeshSensor:
-        from capsense.masked.mesh_sensor import mesh_sensor
+        from capsense.masked import mesh_sensor
 
         if self.method != "fem_masked":
             raise ValueError(f'method {self.method!r} takes a design, not a mesh; use "fem_masked"')
@@ -167,7 +167,7 @@ class Simulator:
     def _make_solver(self) -> tuple[_Solver, Array]:
         """The solver, and the matrix of all terminals in the empty domain [F]."""
         if self.method == "fem_masked":
-            from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor
+            from capsense.masked import MaskedScenes, lattice_sensor
 
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)

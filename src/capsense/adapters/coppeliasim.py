@@ -11,7 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import DepthSensor, make_simulator
+from capsense.adapters import DepthSensor, make_simulator
 from capsense.adapters.coppeliasim_remote import (
     Remote,
     Seen,
@@ -36,8 +36,8 @@ from capsense.adapters.rules import (
 )
 from capsense.design.model import Design
 from capsense.errors import AdapterError, SceneError
+from capsense.readout import Readout
 from capsense.readout.config import make_readout
-from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
 from capsense.scene.materials import Grounding
@@ -139,7 +139,7 @@ def attach(
             origin at the centre of the electrode plane, z out of the sensor. A vision sensor of
             the scene's own is itself the sensor frame.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`.
         options: What is seen and what it is made of: ``materials``, ``exclude`` and the others of
             :class:`~capsense.adapters.rules.SeenOptions`; ``size``, ``resolution`` and ``back`` of
             :class:`~capsense.adapters.rules.ImageOptions`.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import (
+from capsense.adapters import (
     GeometrySensor,
     make_simulator,
     refuse_missing,
@@ -22,7 +22,7 @@ from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, require_package
-from capsense.readout.readout import Readout
+from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.scene.contact import listed
 from capsense.simulator import Simulator
@@ -108,7 +108,7 @@ def attach(
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, the image of a
             camera.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`.
         options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
             the others of :class:`MujocoOptions`.
 

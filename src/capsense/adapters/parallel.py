@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.fleet import Fleet, FleetReading
-from capsense.fleet.fleet import Preset
+from capsense.fleet import Fleet, FleetReading, Preset
 from capsense.scene import Body
 
 Fixed = tuple[NDArray[np.integer], NDArray[np.floating]]

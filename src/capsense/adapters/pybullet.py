@@ -9,7 +9,7 @@ from typing import Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import (
+from capsense.adapters import (
     DepthSensor,
     GeometrySensor,
     make_simulator,
@@ -38,7 +38,7 @@ from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, require_package
-from capsense.readout.readout import Readout
+from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
@@ -115,7 +115,7 @@ def attach(
         design: A design, a packaged name, a design file, or a ready simulator.
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, a rendered image.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`.
         options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
             the others of :class:`PybulletOptions`.
 

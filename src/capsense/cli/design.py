@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli.console import (
+from capsense.cli import (
     OK,
     PICTURES,
     BuildProgress,

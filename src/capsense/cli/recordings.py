@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli.console import (
+from capsense.cli import (
     DIFFERS,
     OK,
     PICTURES,
@@ -26,9 +26,9 @@ from capsense.errors import ReadoutError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from capsense.readout import Readout
     from capsense.readout.conversions import Counts
     from capsense.readout.presets import Chip
-    from capsense.readout.readout import Readout
     from capsense.readout.recording import CapacitanceRecord
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from capsense.cli.console import (
+from capsense.cli import (
     INTERRUPTED,
     OK,
     BuildProgress,
@@ -187,7 +187,7 @@ def play_samples(
 
 
 def _write(recorder: RunWriter, summary: dict[str, Any]) -> None:
-    from capsense.plotting.runs import plot_run
+    from capsense.plotting import plot_run
 
     recorder.write_arrays()
     recorder.write_summary(summary)

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli.console import (
+from capsense.cli import (
     OK,
     BuildProgress,
     Command,

@@ -10,7 +10,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from capsense.cli.console import (
+from capsense.cli import (
     OK,
     TARGET_MISSED,
     BuildProgress,

@@ -15,15 +15,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from capsense.adapters.attached import AttachedSensor
+from capsense.adapters import AttachedSensor
 from capsense.codec import design_to_json
 from capsense.errors import ReadoutError, RecordingError, require_package
 from capsense.reading import Reading
+from capsense.readout import Readout
 from capsense.readout.config import file_content, parse_readout
-from capsense.readout.readout import Readout
-from capsense.recording import ros
+from capsense.recording import DESIGN, NAME, SESSION, describe, ros
 from capsense.recording.files import McapFile
-from capsense.recording.session import DESIGN, NAME, SESSION, describe
 from capsense.scenario.model import Scenario
 from capsense.scene import DepthFrame, Scene
 from capsense.simulator import Simulator

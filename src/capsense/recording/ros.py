@@ -19,7 +19,7 @@ from capsense._style import signal_colours
 from capsense.codec import CHANGING, body_fields, shape_fields
 from capsense.errors import RecordingError, require_package
 from capsense.reading import Reading
-from capsense.recording.session import Session, shield_coupling
+from capsense.recording import Session, shield_coupling
 from capsense.scenario.model import read_channels
 from capsense.scene import (
     Body,

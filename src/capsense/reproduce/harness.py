@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import capsense
-from capsense.recording.session import version_of
+from capsense.recording import version_of
 from capsense.recording.tables import replacing
 
 if TYPE_CHECKING:

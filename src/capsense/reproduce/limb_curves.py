@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 
 import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.field.background import BuildSettings
 from capsense.reproduce.harness import Store
 from capsense.scene.materials import Grounding

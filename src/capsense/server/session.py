@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from capsense.codec import design_to_json
 from capsense.errors import CapSenseError, MissingDependencyError, ProtocolError
-from capsense.server import messages
-from capsense.server.frames import PROTOCOL, unpack_depth
+from capsense.server import PROTOCOL, messages, unpack_depth
 from capsense.server.messages import BodiesMessage, PosesMessage
 from capsense.server.sensor import Frame, ServedSensor
 

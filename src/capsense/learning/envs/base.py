@@ -23,9 +23,9 @@ from capsense.errors import SceneError
 from capsense.humans import Build, Limb, arm
 from capsense.learning.envs.signals import LIMIT, Signals
 from capsense.reading import Reading
+from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.presets import chip_of
-from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.simulator import PresetName, Simulator
 from capsense.skin import AnyDesign
