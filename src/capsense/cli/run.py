@@ -273,8 +273,9 @@ def _record(args: argparse.Namespace) -> int:
       capsense record examples/hand_approach.toml -o hand.mcap
       capsense record examples/hand_approach.toml -o hand.mcap --readout fdc1004 --force
     """
+    from capsense.recording import check_name, make_readout
     from capsense.recording.files import check_target
-    from capsense.recording.recorder import Recorder, check_name, make_readout
+    from capsense.recording.recorder import Recorder
     from capsense.recording.ros import require
 
     require()

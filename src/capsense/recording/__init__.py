@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,15 +24,9 @@ from capsense.errors import RecordingError
 from capsense.field.background import NUMERICS, BuildSettings, MeshSettings
 from capsense.reading import Reading, StepStats
 from capsense.readout import Readout
-from capsense.readout.config import parse_readout
-from capsense.scenario.model import (
-    FORMER_METHODS,
-    METHODS,
-    Channel,
-    Excitation,
-    Scenario,
-    channels_of,
-)
+from capsense.readout.config import file_content, parse_readout
+from capsense.scenario import FORMER_METHODS, METHODS, Channel, Excitation, Scenario
+from capsense.scenario.model import channels_of
 from capsense.simulator import Method, PresetName, Simulator
 
 Array = NDArray[np.float64]
@@ -151,6 +146,35 @@ class Session:
             "versions": self.versions,
         }  # fmt: skip
         return json.dumps(content, indent=1)
+
+
+def check_name(name: str) -> None:
+    """Refuse what cannot be the name of a sensor.
+
+    Raises:
+        RecordingError: It is none.
+    """
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise RecordingError(f"name is {name!r}; give letters, digits and underscores")
+
+
+def make_readout(
+    readout: Readout | str | Path | None, electrodes: Sequence[str], empty: Reading | None = None
+) -> tuple[Readout | None, Mapping[str, Any] | None]:
+    """A readout, and the content of its file where it has one or could have.
+
+    Args:
+        readout: A chip's name, the path of a readout file, a readout, or None.
+        electrodes: Electrode names in matrix order.
+        empty: The reading of an empty scene, which a named chip is set up for.
+
+    Raises:
+        ReadoutError: There is no such chip or file, or anything in it is wrong.
+    """
+    if readout is None or isinstance(readout, Readout):
+        return readout, None
+    config = file_content(readout, electrodes, empty)
+    return parse_readout(config, electrodes, source=str(readout)), config
 
 
 def describe(
