@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import read_only
 from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design
@@ -150,9 +151,8 @@ class Simulator:
         self._names = self.design.electrode_names
         self._terminals = Terminals(self.design, rest)
         n = self._terminals.electrodes
-        self.baseline: Array = self._terminals.empty[:n, :n].copy()
+        self.baseline: Array = read_only(self._terminals.empty[:n, :n].copy())
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
-        self.baseline.setflags(write=False)
         self.readout: Readout | None = None
         """The chip that turns capacitances into counts, if any."""
         self.use_readout(readout)

@@ -41,6 +41,7 @@ from capsense.readout.config import make_readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
 from capsense.scene.materials import Grounding
+from capsense.scene.pose import checked_pose
 from capsense.simulator import Simulator
 
 __all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]
@@ -151,8 +152,7 @@ def attach(
         DesignError: The design is wrong.
         ReadoutError: There is no such chip.
     """
-    if pose_in_object is not None and not isinstance(pose_in_object, Pose):
-        raise SceneError(f"pose_in_object is {pose_in_object!r}; give a Pose(position, quaternion)")
+    pose = Pose() if pose_in_object is None else checked_pose(pose_in_object, "pose_in_object")
     remote = Remote(sim)
     handle = remote.find(object)
     vision_sensor = find_vision_sensor(remote, handle)
@@ -167,9 +167,7 @@ def attach(
     if vision_sensor is None:  # all is checked: only now the scene is changed
         paint = Paint(remote, rules, carrier(remote, handle) if rules.exclude_own else None)
         far = float(simulator.design.domain.upper[2])
-        vision_sensor = make_vision_sensor(
-            remote, handle, pose_in_object or Pose(), image, far, paint.collection
-        )
+        vision_sensor = make_vision_sensor(remote, handle, pose, image, far, paint.collection)
         material = None  # the colours say it
     sensor = CoppeliaSensor(
         remote, vision_sensor, simulator, rules.default_grounding, image.back, paint, material

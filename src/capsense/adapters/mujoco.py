@@ -21,10 +21,10 @@ from capsense.adapters.rules import AttachOptions, Image, check_perception, spli
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
-from capsense.errors import SceneError, require_package
+from capsense.errors import SceneError, listed, require_package
 from capsense.readout import Readout
 from capsense.scene import Pose
-from capsense.scene.contact import listed
+from capsense.scene.pose import checked_pose
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 
@@ -347,8 +347,7 @@ def add_sensor(
             f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, such as "
             "mujoco.MjSpec.from_file(path)"
         )
-    if not isinstance(pose, Pose):
-        raise SceneError(f"pose is {pose!r}; give a Pose(position, quaternion)")
+    checked_pose(pose)
     if not isinstance(name, str) or not name:
         raise SceneError(f"name is {name!r}; give the new site a name, like 'pad'")
     carrier = spec.body(body) if isinstance(body, str) else None

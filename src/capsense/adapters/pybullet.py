@@ -42,6 +42,7 @@ from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
+from capsense.scene.pose import checked_pose
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 
@@ -130,10 +131,9 @@ def attach(
     check_perception(perception, options, _ONLY)
     rules, other = split_rules(options, PybulletOptions)
     shapes = _checked_shapes(other.pop("shapes", "collision"))
-    if not isinstance(pose_in_link, Pose):
-        raise SceneError(f"pose_in_link is {pose_in_link!r}; give a Pose(position, quaternion)")
+    pose = checked_pose(pose_in_link, "pose_in_link")
     number = _client_number(client)
-    mount = Mount(body, _find_link(number, body, link), pose_in_link)
+    mount = Mount(body, _find_link(number, body, link), pose)
     simulator = make_simulator(design)
     sensor: PybulletSensor | PybulletDepthSensor
     if perception == "depth_camera":
