@@ -21,15 +21,7 @@ from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
-from capsense.adapters.placement import (
-    FAR,
-    blind,
-    buried,
-    far_off,
-    felt,
-    placement,
-    turned_round,
-)
+from capsense.adapters.placement import FAR, blind, buried, far_off, felt, placement, turned_round
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
 from capsense.design.model import Design

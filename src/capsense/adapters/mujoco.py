@@ -10,11 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters import (
-    GeometrySensor,
-    make_simulator,
-    refuse_missing,
-)
+from capsense.adapters import GeometrySensor, make_simulator, refuse_missing
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
 from capsense.adapters.rules import AttachOptions, Image, check_perception, split_rules

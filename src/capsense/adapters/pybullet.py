@@ -9,12 +9,7 @@ from typing import Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters import (
-    DepthSensor,
-    GeometrySensor,
-    make_simulator,
-    refuse_missing,
-)
+from capsense.adapters import DepthSensor, GeometrySensor, make_simulator, refuse_missing
 from capsense.adapters.pybullet_bodies import (
     BodyWatch,
     Link,

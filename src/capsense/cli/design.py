@@ -117,13 +117,7 @@ def describe(design: Design) -> str:
     ]
     if design.layers:
         rows = [
-            (
-                k.name,
-                k.material,
-                f"{k.eps_r:g}",
-                *_spans(k.surface),
-                str(len(k.surface.facets)),
-            )
+            (k.name, k.material, f"{k.eps_r:g}", *_spans(k.surface), str(len(k.surface.facets)))
             for k in design.layers
         ]
         blocks.append(table(("layer", "material", "eps_r", *_SPANS, "faces"), rows))

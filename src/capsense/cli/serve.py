@@ -13,14 +13,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli import (
-    OK,
-    BuildProgress,
-    Command,
-    progress_shown,
-    sample_rate,
-    say,
-)
+from capsense.cli import OK, BuildProgress, Command, progress_shown, sample_rate, say
 from capsense.cli.run import build_simulator, chosen_scenario
 
 if TYPE_CHECKING:

@@ -28,15 +28,7 @@ from capsense.design.geometry import (
     in_plane_of,
     read_placement,
 )
-from capsense.design.model import (
-    Conductor,
-    Design,
-    Domain,
-    Electrode,
-    Layer,
-    Role,
-    check_design,
-)
+from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role, check_design
 from capsense.design.shapes import (
     SHAPES,
     bend_sheet,

@@ -65,11 +65,7 @@ RETREAT = (0.20, 0.20, 0.15)
 ACROSS = (0.0, float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)))
 """Turns a capsule's axis from z to x."""
 
-FITS = {
-    "board": (0.9966, 6.714),
-    "first holder": (0.7825, 7.513),
-    "second holder": (0.8438, 4.681),
-}
+FITS = {"board": (0.9966, 6.714), "first holder": (0.7825, 7.513), "second holder": (0.8438, 4.681)}
 """(k, b) of readings k/d − b, d in metres, fitted to a sensor on a PR2 above a person's forearm.
 
 From the source code published with Z. Erickson et al., "Tracking Human Pose During Robot-Assisted

@@ -24,13 +24,7 @@ from capsense.scenario.model import (
     Trajectory,
     play,
 )
-from capsense.scene import (
-    Body,
-    Material,
-    Pose,
-    Shape,
-    TriMesh,
-)
+from capsense.scene import Body, Material, Pose, Shape, TriMesh
 from capsense.scene.materials import Grounding
 from capsense.scene.surface import read_triangles
 

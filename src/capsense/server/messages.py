@@ -19,13 +19,7 @@ from capsense.errors import (
     SceneError,
     SolveError,
 )
-from capsense.scenario import (
-    ScenarioTable,
-    read_bodies,
-    read_grounding,
-    read_material,
-    read_pose,
-)
+from capsense.scenario import ScenarioTable, read_bodies, read_grounding, read_material, read_pose
 from capsense.scene import Body, DepthFrame, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.materials import Grounding
