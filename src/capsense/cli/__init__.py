@@ -1,4 +1,4 @@
-"""The ``capsense`` command, and what its subcommands share; :mod:`~capsense.__main__` lists them.
+"""The ``capsense`` command, and what its subcommands share; ``capsense.__main__`` lists them.
 
 How one is declared, exit codes, signals, progress, tables of text.
 """
