@@ -30,11 +30,11 @@ from capsense.cli import (
 from capsense.errors import CapSenseError, FieldError, SolveError
 
 COMMANDS = (
-    run.RUN, run.RECORD, recordings.REPLAY, recordings.EXPORT, design.DESIGN, recordings.READOUT,
-    studies.DATASET, studies.OPTIMISE, studies.BENCH, studies.REPRODUCE, serve.SERVE, serve.VIEW,
+    run.run, run.record, recordings.replay, recordings.export, design.design, recordings.readout,
+    studies.dataset, studies.optimise, studies.bench, studies.reproduce, serve.serve, serve.view,
 )  # fmt: skip
-"""The subcommands, in the order of ``--help``. A new one is written as a
-:class:`~capsense.cli.Command` and listed here."""
+"""The subcommands, in the order of ``--help``. A new one is a function that
+:func:`~capsense.cli.command` decorates, listed here."""
 
 EXIT_CODES = """\
 exit codes:
@@ -82,7 +82,10 @@ def build_parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        command.add_arguments(sub)
+        for given in command.arguments:
+            into = sub.add_mutually_exclusive_group() if isinstance(given, list) else sub
+            for names, options in given if isinstance(given, list) else [given]:
+                into.add_argument(*names, **options)
         sub.set_defaults(execute=command.execute)
     return parser
 

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,9 @@ PICTURES = (".png", ".svg", ".pdf")
 EVERY = 10.0
 """Seconds between lines that tell of progress where there is no terminal."""
 
+Argument = tuple[list[str], dict[str, Any]]
+"""Names of an argument, and options of ``ArgumentParser.add_argument``."""
+
 
 @dataclass(frozen=True)
 class Command:
@@ -42,22 +46,41 @@ class Command:
     """What is typed after ``capsense``."""
     help: str
     """One line for ``capsense --help``."""
-    add_arguments: Callable[[argparse.ArgumentParser], None]
+    arguments: tuple[Argument | list[Argument], ...]
+    """Of those in a list, one at most may be given."""
     execute: Callable[[argparse.Namespace], int]
     """Does it, and returns the exit code. Its docstring is what ``capsense NAME --help`` says: a
     description, and after the line ``examples:`` commands that work."""
 
 
+def command(
+    name: str, help: str, *arguments: Argument | list[Argument]
+) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
+    """Make a :class:`Command` of the function that follows."""
+    return partial(Command, name, help, arguments)
+
+
+def arg(usage: str, help: str, **options: Any) -> Argument:
+    """An argument of a subcommand.
+
+    Args:
+        usage: Its names and what stands for its value: ``"-o --output DIR"``, or ``"task FILE"``
+            for one that has a place of its own. An option without a value is a switch.
+        help: What ``--help`` says of it.
+        options: Others of ``ArgumentParser.add_argument``.
+    """
+    words = usage.split()
+    names = [word for word in words if word.startswith("-")] or words[:1]
+    if len(words) > len(names):
+        options["metavar"] = words[-1]
+    elif names[0].startswith("-") and "choices" not in options:
+        options["action"] = "store_true"
+    return names, {"help": help, **options}
+
+
 def say(message: str) -> None:
     """One line on stderr."""
     print(f"capsense: {' '.join(message.split())}", file=sys.stderr)
-
-
-def add_quiet(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--quiet``."""
-    parser.add_argument(
-        "-q", "--quiet", action="store_true", help="no progress bar, no summary; errors only"
-    )
 
 
 def progress_shown(quiet: bool) -> bool:
@@ -71,6 +94,11 @@ def sample_rate(text: str) -> float:
     if not 1e-3 <= value <= 1e6:
         raise argparse.ArgumentTypeError(f"{text} Hz; give a number from 0.001 to 1e6")
     return value
+
+
+QUIET = arg("-q --quiet", "no progress bar, no summary; errors only")
+RATE = arg("--rate HZ", "sample rate, instead of the scenario's", type=sample_rate)
+"""Arguments of several subcommands."""
 
 
 def count_of(text: str) -> int:

@@ -31,21 +31,21 @@ from capsense._style import (
     unit_of,
 )
 from capsense._validate import suggest
-from capsense.adapters import AttachedSensor
 from capsense.design.model import Design
 from capsense.errors import CapSenseError
 from capsense.plotting.designs import draw_design, draw_sensor, outline_patch
 from capsense.reading import Reading
-from capsense.recording.export import run_of
-from capsense.recording.reader import Recording
-from capsense.recording.tables import Run
 from capsense.scenario import Excitation
 from capsense.scenario.model import channels_of
 from capsense.scene import Body, Scene
-from capsense.simulator import Simulator
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from capsense.adapters import AttachedSensor
+    from capsense.recording.reader import Recording
+    from capsense.recording.tables import Run
+    from capsense.simulator import Simulator
 
 Array = NDArray[np.float64]
 
@@ -253,6 +253,12 @@ def plot(
         CapSenseError: There is no reading, readings come without their simulator, times or
             scenes are not as many, or an argument is of another kind.
     """
+    from capsense.adapters import AttachedSensor
+    from capsense.recording.export import run_of
+    from capsense.recording.reader import Recording
+    from capsense.recording.tables import Run
+    from capsense.simulator import Simulator
+
     if isinstance(what, Design):
         return cast(Figure, draw_design(what).figure)
     numbered = times is None and not isinstance(what, Recording)
@@ -386,15 +392,10 @@ def _draw_family(family: _Family, times: Array, peak: int, upper: Axes, lower: A
     dress(upper, y="relative to the empty scene")
     upper.tick_params(labelbottom=False)
     dress(lower, y=f"change from the empty scene [{unit}]")
-    if len(times) > 1:
-        _time_strip(lower, times)
-
-
-def _time_strip(axes: Axes, times: Array) -> None:
-    """Colours of time along the bottom, as they are used for the way."""
-    low, high = axes.get_ylim()
-    height = 0.025 * (high - low)
-    place = (times[0], times[-1], low - height, low)
-    colours = np.linspace(0, 1, 256)[None]
-    axes.imshow(colours, cmap=TIME_COLOURS, aspect="auto", extent=place, zorder=0)
-    axes.set_ylim(low - height, high)
+    if len(times) > 1:  # colours of time along the bottom, as they are used for the way
+        low, high = lower.get_ylim()
+        height = 0.025 * (high - low)
+        place = (times[0], times[-1], low - height, low)
+        colours = np.linspace(0, 1, 256)[None]
+        lower.imshow(colours, cmap=TIME_COLOURS, aspect="auto", extent=place, zorder=0)
+        lower.set_ylim(low - height, high)
