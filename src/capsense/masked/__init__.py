@@ -1,8 +1,7 @@
 """The scheme of Schöffmann et al. 2022: masked tetrahedra, solved in full at every step.
 
-Sensors given as tetrahedral meshes, meshes of designs, and the scheme on scenes. The planes of a
-design's mesh follow the edges and faces of its sheets and layers, and spread out with distance from
-them. Tetrahedra whose centroid lies in a body take its material.
+This module has the meshes of sensors. Planes of a design's mesh follow the edges and faces of its
+sheets and layers, and spread out with distance. Tetrahedra take the material at their centroid.
 """
 
 from __future__ import annotations

@@ -349,8 +349,7 @@ def _families(run: Run, values: Array) -> list[_Family]:
 
 def _strongest(values: Array, levels: Array) -> int:
     """The sample with the largest relative change; the middle one where it stays that large."""
-    scale = np.maximum(np.abs(levels), 1e-18)
-    change = (np.abs(values - levels) / scale).max(axis=1)
+    change = (np.abs(values - levels) / np.maximum(np.abs(levels), 1e-18)).max(axis=1)
     first = int(np.argmax(change))
     less = np.flatnonzero(change < 0.995 * change[first])
     ends = np.array([-1, *less, len(change)])

@@ -365,9 +365,8 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
                 )  # fmt: skip
 
     def _move_limb(self, pose: Pose) -> None:
-        x, y, z, w = pose.quaternion
         self.data.mocap_pos[0] = pose.position
-        self.data.mocap_quat[0] = (w, x, y, z)
+        self.data.mocap_quat[0] = (pose.quaternion[3], *pose.quaternion[:3])
 
     def _force(self) -> float:
         """Sum of the normal forces of all contacts [N]."""
