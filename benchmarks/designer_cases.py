@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 
 import capsense as cs
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.field.background import build_background
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
 

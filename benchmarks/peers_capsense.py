@@ -8,8 +8,7 @@ from peers_task import DESIGN, SIZE, Array, bar_corners, design, within
 
 import capsense as cs
 from capsense.field.background import MeshSettings
-from capsense.masked import MeshSensor
-from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor, plan_axes
+from capsense.masked import MaskedScenes, MeshSensor, lattice_sensor, plan_axes
 from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh
 from capsense.simulator import PresetName

@@ -24,7 +24,7 @@ from machine import describe_machine, on_one_core
 
 import capsense as cs
 from capsense._style import COLOURS, LEGEND, dress
-from capsense.learning.envs.tasks import LimbFollow
+from capsense.learning.envs import LimbFollow
 from capsense.learning.envs.vector import LimbFollowVector
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator
 

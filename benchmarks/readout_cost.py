@@ -11,9 +11,9 @@ import time
 
 import numpy as np
 
+from capsense.readout import Readout
 from capsense.readout.imaging import back_projection, landweber, tikhonov
 from capsense.readout.presets import CHIPS
-from capsense.readout.readout import Readout
 
 NAMES = tuple(f"E{k}" for k in range(6))
 STEPS, RATE = 3000, 100.0

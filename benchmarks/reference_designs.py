@@ -32,7 +32,7 @@ from machine import on_one_core
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.design.model import Role
 from capsense.field.boundary import GROUND, Accuracy, BoundarySolution, terminals
 

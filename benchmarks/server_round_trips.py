@@ -27,8 +27,8 @@ from pathlib import Path
 import numpy as np
 
 from capsense.bench import moving_depth
+from capsense.server import ReadingMessage
 from capsense.server.client import Client
-from capsense.server.frames import ReadingMessage
 
 ROOT = Path(__file__).parents[1]
 SKIPPED = 0.1

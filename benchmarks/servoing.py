@@ -27,8 +27,9 @@ import capsense as cs
 from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.field.background import BuildSettings, MeshSettings
 from capsense.learning.envs.base import Randomisation
+from capsense.learning.labels import limb_pose
 from capsense.learning.scenes import load_spec
-from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork, limb_pose
+from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 import capsense as cs
 from capsense.humans import Limb, arm, leg
+from capsense.learning.envs import LOST
 from capsense.learning.envs.base import CONTROL, CapacitiveEnv, Randomisation
 from capsense.learning.envs.signals import UNIT
-from capsense.learning.envs.tasks import LOST
-from capsense.learning.servo import LimbPose, follow, limb_pose
+from capsense.learning.labels import limb_pose
+from capsense.learning.servo import LimbPose, follow
 
 Array = NDArray[np.float64]
 Which = Literal["arm", "leg"]

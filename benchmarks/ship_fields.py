@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from capsense import field
-from capsense.design.loader import available_designs, load_design, parse_design
+from capsense.design import available_designs, load_design, parse_design
 from capsense.errors import FieldError
 from capsense.field.background import BuildSettings, build_background
 from capsense.field.cache import (

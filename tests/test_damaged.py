@@ -24,14 +24,14 @@ from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
 from capsense import errors
-from capsense.cli.main import main
+from capsense import mesh as mesh_io
+from capsense.__main__ import main
 from capsense.design import load_design
 from capsense.design.stl import read_stl
 from capsense.mesh import TetMesh, kuhn_tets, load_mesh, save_mesh
-from capsense.mesh import io as mesh_io
 from capsense.readout import recording as tables
 from capsense.recording import files
-from capsense.server.frames import pack_depth, unpack_depth
+from capsense.server import pack_depth, unpack_depth
 from capsense.server.messages import parse, read_scene
 
 DATA = Path(__file__).parent / "data"

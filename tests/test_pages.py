@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.cli.main import build_parser
+from capsense.__main__ import build_parser
 from capsense.design import parse_design
 from capsense.scenario import parse_scenario
 

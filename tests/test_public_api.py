@@ -38,7 +38,7 @@ def modules_after(statement: str) -> set[str]:
     [
         "import capsense",
         "import capsense; capsense.CapSenseError; dir(capsense); capsense.__all__",
-        "from capsense.cli.main import build_parser; build_parser()",
+        "from capsense.__main__ import build_parser; build_parser()",
     ],
 )
 def test_import_is_light(statement: str) -> None:

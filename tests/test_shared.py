@@ -17,7 +17,7 @@ from tiny_field import SETTINGS, tiny_design
 import capsense as cs
 from capsense.adapters import skin as skin_module
 from capsense.fleet.bodies import BodyTable
-from capsense.masked.mesh_sensor import MaskedScenes
+from capsense.masked import MaskedScenes
 from capsense.readout.conversions import SideBySide
 from capsense.surface.solver import SurfaceSolver
 

@@ -13,7 +13,7 @@ from tiny_field import SETTINGS, tiny_design
 import capsense as cs
 from capsense.errors import BatchError, SceneError, SolveError
 from capsense.field.background import Change
-from capsense.masked.mesh_sensor import MaskedScenes
+from capsense.masked import MaskedScenes
 from capsense.surface import solver
 from capsense.surface.solver import SurfaceSolver, View
 

@@ -23,6 +23,7 @@ _HOMES = {
     for name in node.names
 }
 """The module of each public name."""
+_MODULES = ("humans", "assistive_gym", "coppeliasim", "mujoco", "pybullet")
 __all__ = ["__version__", *_HOMES]
 
 
@@ -35,7 +36,7 @@ def __getattr__(name: str) -> Any:
         value = version("capsense")
     elif name not in _HOMES:
         raise AttributeError(f"module 'capsense' has no attribute {name!r}")
-    elif _HOMES[name] in ("capsense", "capsense.adapters"):
+    elif name in _MODULES:
         value = import_module(f"{_HOMES[name]}.{name}")
     else:
         value = getattr(import_module(_HOMES[name]), name)

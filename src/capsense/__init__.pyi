@@ -1,9 +1,8 @@
 """The public names, and where they are from; see ``docs/conventions.md``."""
 
 from capsense import humans
-from capsense.adapters import assistive_gym, coppeliasim, mujoco, pybullet
-from capsense.adapters.attached import AttachedSensor
-from capsense.design.loader import available_designs, load_design
+from capsense.adapters import AttachedSensor, assistive_gym, coppeliasim, mujoco, pybullet
+from capsense.design import available_designs, load_design
 from capsense.design.model import Design
 from capsense.errors import (
     AdapterError,
@@ -17,14 +16,14 @@ from capsense.errors import (
     SkinError,
     SolveError,
 )
-from capsense.fleet.fleet import Fleet, FleetReading
-from capsense.plotting.runs import plot
+from capsense.fleet import Fleet, FleetReading
+from capsense.plotting import plot
 from capsense.reading import Reading, StepStats
+from capsense.readout import Readout
 from capsense.readout.calibration import calibrate
 from capsense.readout.config import load_readout
 from capsense.readout.conversions import Counts
 from capsense.readout.presets import available_chips
-from capsense.readout.readout import Readout
 from capsense.recording.reader import open_recording, replay
 from capsense.recording.recorder import Recorder, record
 from capsense.scenario import Scenario, load_scenario
@@ -39,7 +38,7 @@ from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from capsense.server.client import Client
 from capsense.simulator import Simulator
 from capsense.skin import Skin
-from capsense.viewer.show import show
+from capsense.viewer import show
 
 __version__: str
 

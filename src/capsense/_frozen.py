@@ -1,11 +1,20 @@
-"""Copies of objects that never change."""
+"""Objects that never change, and their copies."""
 
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+
+_Number = TypeVar("_Number", bound=np.generic)
+
+
+def read_only(array: NDArray[_Number]) -> NDArray[_Number]:
+    """The array itself, which cannot be written to any more."""
+    array.setflags(write=False)
+    return array
 
 
 class Frozen:
@@ -21,5 +30,5 @@ class Frozen:
     def __setstate__(self, state: dict[str, Any]) -> None:
         for value in state.values():
             if isinstance(value, np.ndarray):
-                value.setflags(write=False)
+                read_only(value)
         self.__dict__.update(state)

@@ -35,6 +35,11 @@ def signal_colours(strength: ArrayLike) -> NDArray[np.float64]:
     return np.array(QUIET) + part * np.subtract(LOUD, QUIET)
 
 
+def strength(changes: ArrayLike) -> NDArray[np.float64]:
+    """How strongly electrodes light up, 0 to 1: the logarithm of 1 + change / 0.1 fF, 1 at 1 pF."""
+    return np.clip(np.log10(1.0 + np.abs(changes) / 1e-16) / 4.0, 0.0, 1.0)
+
+
 def bare(axes: Axes) -> None:
     """Take everything off the axes that shows no data."""
     axes.spines[["top", "right"]].set_visible(False)

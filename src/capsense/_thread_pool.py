@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.errors import CapSenseError, SceneError
+from capsense.errors import CapSenseError, SceneError, listed
 
 Array = NDArray[np.float64]
 
@@ -145,14 +145,9 @@ class ThreadPool:
 def some_failed(what: str, failures: Mapping[Key, CapSenseError], count: int) -> str:
     """The message for some of ``count`` readings that failed."""
     first, error = next(iter(failures.items()))
-    others = [repr(key) for key in failures][1:]
-    rest = f" (and so did {_listed(others)})" if others else ""
+    others = list(failures)[1:]
+    rest = f" (and so did {listed(others, 8)})" if others else ""
     return (
         f"{len(failures)} of {count} {what} failed; {first!r}: {error}{rest}; "
         "the others' readings are in this error's readings"
     )
-
-
-def _listed(names: list[str], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
@@ -114,3 +115,9 @@ def require_package(module: str, title: str, extra: str) -> None:
         raise MissingDependencyError(
             f"{title} is not installed; pip install 'capsense[{extra}]'"
         ) from None
+
+
+def listed(names: Sequence[object], most: int) -> str:
+    """The first names in quotes, and how many more there are, for a message."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(repr, names[:most])) + more

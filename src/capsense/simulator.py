@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import read_only
 from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
 from capsense.design import load_design
 from capsense.design.model import Design
@@ -30,7 +31,7 @@ from capsense.scene.shapes import as_points
 if TYPE_CHECKING:
     from capsense.masked import MeshSensor
     from capsense.mesh import TetMesh
-    from capsense.readout.readout import Readout
+    from capsense.readout import Readout
 
 Array = NDArray[np.float64]
 Method = Literal["surface", "fem_masked"]
@@ -150,15 +151,14 @@ class Simulator:
         self._names = self.design.electrode_names
         self._terminals = Terminals(self.design, rest)
         n = self._terminals.electrodes
-        self.baseline: Array = self._terminals.empty[:n, :n].copy()
+        self.baseline: Array = read_only(self._terminals.empty[:n, :n].copy())
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
-        self.baseline.setflags(write=False)
         self.readout: Readout | None = None
         """The chip that turns capacitances into counts, if any."""
         self.use_readout(readout)
 
     def _on_mesh(self, mesh: TetMesh | MeshSensor) -> MeshSensor:
-        from capsense.masked.mesh_sensor import mesh_sensor
+        from capsense.masked import mesh_sensor
 
         if self.method != "fem_masked":
             raise ValueError(f'method {self.method!r} takes a design, not a mesh; use "fem_masked"')
@@ -167,7 +167,7 @@ class Simulator:
     def _make_solver(self) -> tuple[_Solver, Array]:
         """The solver, and the matrix of all terminals in the empty domain [F]."""
         if self.method == "fem_masked":
-            from capsense.masked.mesh_sensor import MaskedScenes, lattice_sensor
+            from capsense.masked import MaskedScenes, lattice_sensor
 
             names = terminals(self.design)
             sensor = self.mesh or lattice_sensor(self.design, names, self.settings.mesh)

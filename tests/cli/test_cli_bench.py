@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from field_cases import delta_reference
 
+from capsense.__main__ import main
 from capsense.bench import BATCH, CHECKS, WORLDS, Times, batch_scenes, check_error
-from capsense.cli.main import main
 from capsense.simulator import Simulator
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import capsense as cs
-from capsense.cli.console import BuildProgress, facts, grouped, seconds, table
-from capsense.cli.main import COMMANDS, build_parser, main
+from capsense.__main__ import COMMANDS, build_parser, main
+from capsense.cli import BuildProgress, facts, grouped, seconds, table
 
 
 def output_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:

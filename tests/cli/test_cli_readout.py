@@ -13,12 +13,12 @@ from ball_scenario import ball_scenario
 from maxwell import random_maxwell
 from relative import near
 
-from capsense.cli.console import BAD_INPUT, OK
-from capsense.cli.main import main
+from capsense.__main__ import main
+from capsense.cli import BAD_INPUT, OK
 from capsense.errors import ReadoutError
+from capsense.readout import Readout
 from capsense.readout.channels import ChannelBank, mutual_patterns, self_patterns
 from capsense.readout.presets import CHIPS
-from capsense.readout.readout import Readout
 from capsense.readout.recording import load_recording
 
 

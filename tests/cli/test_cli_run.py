@@ -16,7 +16,7 @@ import pytest
 from ball_scenario import ball_scenario
 
 import capsense as cs
-from capsense.cli.main import main
+from capsense.__main__ import main
 
 COUNT = 13
 FILES = {"readings.csv", "readings.npz", "summary.json", "plot.png"}

@@ -23,7 +23,7 @@ pytest.importorskip("websockets", reason='needs websockets: pip install "capsens
 
 from raw_websocket import HELLO, raw_websocket
 
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.cli.serve import JsonLines
 from capsense.errors import ProtocolError
 from capsense.server.client import Client
@@ -151,7 +151,7 @@ def test_bad_input(arguments: list[str], words: str, capsys: pytest.CaptureFixtu
 def test_without_websockets() -> None:
     """The message names the install that fixes it."""
     code = (
-        "import sys; sys.modules['websockets'] = None; from capsense.cli.main import main; "
+        "import sys; sys.modules['websockets'] = None; from capsense.__main__ import main; "
         "sys.exit(main(['serve', '--design', 'patch']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

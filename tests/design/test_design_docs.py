@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from capsense.design import parse_design
-from capsense.design.loader import LAYER_EPS_R
+from capsense.design import LAYER_EPS_R, parse_design
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "designs.md").read_text(encoding="utf-8")

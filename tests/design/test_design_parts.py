@@ -12,7 +12,7 @@ import trimesh
 import capsense as cs
 from capsense import codec
 from capsense.cli.design import describe
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.design.solid import (
     crossing,
     cut_lines,

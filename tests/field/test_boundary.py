@@ -21,7 +21,7 @@ from field_cases import (
 
 import capsense as cs
 from capsense.constants import EPS0
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.design.model import Conductor, Design, Layer, Role
 from capsense.errors import FieldError
 from capsense.field import boundary

@@ -21,7 +21,7 @@ import pytest
 import tiny_field
 from tiny_field import SETTINGS, digest, tiny_data, tiny_design
 
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.field import background, cache
 from capsense.field.background import BackgroundField, BuildSettings, MeshSettings
 from capsense.field.boundary import BoundarySolution

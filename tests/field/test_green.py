@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.design.model import Design
 from capsense.errors import FieldError
 from capsense.field.background import BackgroundField

@@ -10,7 +10,7 @@ import pytest
 import capsense as cs
 from capsense import codec
 from capsense.constants import EPS0
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 
 RADIUS = 0.010
 

@@ -13,7 +13,7 @@ from scipy.special import eval_legendre
 
 import capsense as cs
 from capsense.constants import EPS0
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.field.background import build_background
 from capsense.field.boundary import INTERFACE, Accuracy, BoundarySolution, build_model
 from capsense.field.green_points import GreenSettings, Surroundings, reachable_points

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from capsense.design import Design
-from capsense.design.loader import parse_design
+from capsense.design import Design, parse_design
 from capsense.field.background import BackgroundField, BuildSettings, MeshSettings
 from capsense.field.cache import load_or_build
 from capsense.field.green import to_arrays

@@ -10,7 +10,7 @@ import numpy as np
 
 import capsense as cs
 from capsense.errors import ProtocolError, SolveError
-from capsense.recording.session import reading_of
+from capsense.recording import reading_of
 from capsense.scenario.model import Excitation, channels_of
 from capsense.viewer.source import Frame
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.errors import MissingDependencyError
 from capsense.learning.labels import Outline
 from capsense.learning.scenes import COLUMNS, Spec, load_spec

@@ -21,14 +21,17 @@ pytest.importorskip("mujoco")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from capsense.learning.envs import IDS  # noqa: E402
+from capsense.learning.envs import (  # noqa: E402
+    GAP,
+    IDS,
+    across,
+)
 from capsense.learning.envs.base import Randomisation  # noqa: E402
 from capsense.learning.envs.signals import (  # noqa: E402
     KEY,
     CapacitiveObservation,
     write_model,
 )
-from capsense.learning.envs.tasks import GAP, across  # noqa: E402
 
 scripted = SimpleNamespace(
     **runpy.run_path(str(Path(__file__).parents[2] / "examples" / "policies.py"))

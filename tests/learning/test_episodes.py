@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.learning.episodes import Episodes, load_episodes
 from capsense.learning.shards import missing, run
 

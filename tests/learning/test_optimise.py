@@ -12,7 +12,7 @@ import pytest
 import tiny_field
 
 import capsense as cs
-from capsense.cli.main import BAD_INPUT, OK, main
+from capsense.__main__ import BAD_INPUT, OK, main
 from capsense.errors import DesignError, ScenarioError
 from capsense.learning import optimise
 from capsense.learning.optimise import Bound, DesignTask, evaluate, load_task, search, to_toml

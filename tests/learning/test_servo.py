@@ -11,7 +11,8 @@ import pytest
 import capsense as cs
 from capsense.errors import SceneError
 from capsense.humans import arm
-from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork, follow, limb_pose
+from capsense.learning.labels import limb_pose
+from capsense.learning.servo import Belief, LimbPose, PoseEstimator, PoseNetwork, follow
 
 KNOWN = Belief(radius=0.045, radius_spread=0.0)
 POSES = [LimbPose(0.01, 0.05, 0.1, -0.1), LimbPose(-0.02, 0.03, -0.05, 0.2), LimbPose(0, 0.07)]

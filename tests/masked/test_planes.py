@@ -11,7 +11,7 @@ from capsense.design.geometry import Facet, Surface
 from capsense.design.model import Conductor, Design, Electrode, Layer, Role
 from capsense.errors import SceneError
 from capsense.field.background import MeshSettings
-from capsense.masked.mesh_sensor import FREE, WALL, hold_nodes, lattice_sensor, plan_axes
+from capsense.masked import FREE, WALL, hold_nodes, lattice_sensor, plan_axes
 
 DESIGN = patches(
     rectangle((-0.03, 0.0), (0.04, 0.05)), rectangle((0.03, 0.0), (0.03, 0.03)),

@@ -8,6 +8,7 @@ from relative import near
 from scipy import stats
 
 from capsense.errors import ReadoutError
+from capsense.readout import Readout
 from capsense.readout.calibration import (
     CalibrationWarning,
     LinearSensor,
@@ -24,7 +25,6 @@ from capsense.readout.channels import ChannelBank, self_patterns
 from capsense.readout.conversions import Schedule
 from capsense.readout.laws import LinearLaw
 from capsense.readout.noise import Flicker, White
-from capsense.readout.readout import Readout
 
 GAIN, OFFSET, DRIFT = (
     np.array([1.02, 0.95]),

@@ -11,6 +11,7 @@ import pytest
 from relative import near
 
 from capsense.errors import ReadoutError
+from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor, calibrate
 from capsense.readout.checks import phasors, require
 from capsense.readout.config import choose_readout, load_readout, parse_readout
@@ -18,7 +19,6 @@ from capsense.readout.converter import ExponentialTracker, SteppingTracker
 from capsense.readout.laws import ResonanceLaw, ShuntFrontEnd, ShuntLaw
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, RandomWalk, White
 from capsense.readout.presets import CHIPS
-from capsense.readout.readout import Readout
 
 NAMES = ("E1", "E2", "E3")
 FULL = """

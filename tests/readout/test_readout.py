@@ -12,6 +12,7 @@ from maxwell import random_maxwell
 from relative import near
 
 from capsense.errors import ReadoutError
+from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.channels import ChannelBank, Pattern, Wiring, self_patterns
 from capsense.readout.conversions import Counts, Schedule, join
@@ -19,7 +20,6 @@ from capsense.readout.converter import CapDac, Detector, ExponentialTracker, Ste
 from capsense.readout.laws import LinearLaw, ShuntFrontEnd, ShuntLaw
 from capsense.readout.noise import ClimateDrift, Flicker, Mains, Profile, RandomWalk, White
 from capsense.readout.presets import CHIPS
-from capsense.readout.readout import Readout
 
 NAMES = ("A", "B", "C")
 FINE = LinearLaw(1e-21, -(10**12), 10**12)

@@ -25,8 +25,8 @@ from capsense.codec import (
     shape_fields,
 )
 from capsense.errors import RecordingError
+from capsense.recording import describe
 from capsense.recording.ros import PACKAGE, Moment, StepMessages, decode, encode, make
-from capsense.recording.session import describe
 from capsense.scene import RestSurface, SurfaceMesh
 
 Recorded = tuple[Path, list[cs.Reading]]

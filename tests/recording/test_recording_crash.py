@@ -113,7 +113,7 @@ def test_a_full_disk(tmp_path: Path) -> None:
 
 COMMAND = """
 import resource, signal, sys
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.recording import files
 files.FLUSH_EVERY = 0.01  # so that how much is written at once does not depend on the machine
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -10,7 +10,7 @@ import pytest
 import recorded_scenes
 
 import capsense as cs
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.errors import MissingDependencyError, RecordingError
 from capsense.readout.conversions import join
 from capsense.recording.export import export

@@ -11,10 +11,10 @@ import recorded_scenes
 from tiny_field import SETTINGS, tiny_design
 
 import capsense as cs
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.errors import RecordingError
 from capsense.field.background import MeshSettings
-from capsense.recording.session import Session, read_session
+from capsense.recording import Session, read_session
 from capsense.viewer.source import RecordingSource
 
 

@@ -12,7 +12,7 @@ import recorded_scenes
 from ball_scenario import ball_scenario
 
 import capsense as cs
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.errors import RecordingError
 
 COUNT = 13

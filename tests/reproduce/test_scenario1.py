@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.reproduce import scenario1
 from capsense.reproduce.scenario1_setup import (
     load_curves,

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from capsense import reproduce
-from capsense.cli.main import main
+from capsense.__main__ import main
 from capsense.reproduce import STUDIES, load_study
 from capsense.reproduce.harness import (
     MAX_ROWS,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from capsense.errors import ProtocolError
-from capsense.server.frames import (
+from capsense.server import (
     CONVERSION,
     HEADER,
     MAX_SENSOR,

@@ -19,8 +19,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from capsense.errors import ProtocolError, SolveError
+from capsense.server import HEADER, pack_depth
 from capsense.server.client import Client
-from capsense.server.frames import HEADER, pack_depth
 from capsense.server.sensor import ServedSensor
 from capsense.server.server import Limits
 from capsense.server.session import ALL_ALLOWANCES, ALLOWANCE, AT_ONCE, MISTAKE

@@ -14,7 +14,7 @@ from running_server import RunningServer
 
 from capsense.codec import design_from_json
 from capsense.errors import ProtocolError
-from capsense.server.frames import DepthMessage, ReadingMessage
+from capsense.server import DepthMessage, ReadingMessage
 from capsense.server.messages import MessageTable, read_scene
 
 BALL = {"name": "ball", "shape": "sphere", "radius": 0.03, "material": "water"}

@@ -25,8 +25,7 @@ from running_server import RunningServer
 from stopped_clock import StoppedClock
 
 from capsense.errors import ProtocolError
-from capsense.server import session
-from capsense.server.frames import HEADER, pack_depth
+from capsense.server import HEADER, pack_depth, session
 from capsense.server.session import AdmissionControl, RateLimitedConnection
 
 

@@ -19,7 +19,7 @@ pytest.importorskip("viser", reason='needs viser: pip install "capsense[view]"')
 
 from ball_scenario import ball_scenario
 
-from capsense.cli.main import main
+from capsense.__main__ import main
 
 VIEW = [sys.executable, "-m", "capsense", "view", "--port", "0"]
 
@@ -142,7 +142,7 @@ def test_port_that_is_taken(scenario: Path, capsys: pytest.CaptureFixture[str]) 
 def test_without_viser(scenario: Path) -> None:
     """The message names the install that fixes it."""
     code = (
-        "import sys; sys.modules['viser'] = None; from capsense.cli.main import main; "
+        "import sys; sys.modules['viser'] = None; from capsense.__main__ import main; "
         f"sys.exit(main(['view', {str(scenario)!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

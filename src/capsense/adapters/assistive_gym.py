@@ -11,12 +11,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Unpack
 
-from capsense.adapters import pybullet
-from capsense.adapters.attached import AttachedSensor, make_simulator, refuse_missing
+from capsense.adapters import AttachedSensor, make_simulator, pybullet, refuse_missing
 from capsense.adapters.pybullet_bodies import BODY_NAME, LINK_NAME
 from capsense.design.model import Design
 from capsense.errors import SceneError
-from capsense.readout.readout import Readout
+from capsense.readout import Readout
 from capsense.scene import DepthFrame, Pose, Scene
 from capsense.simulator import Simulator
 
@@ -70,7 +69,7 @@ def attach(
         design: A design, a packaged name, a design file, or a ready simulator.
         perception: As for :func:`capsense.adapters.pybullet.attach`.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`.
         options: As for :func:`capsense.adapters.pybullet.attach`: those of
             :class:`~capsense.adapters.pybullet.PybulletOptions`.
 

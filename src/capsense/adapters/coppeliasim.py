@@ -11,7 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import DepthSensor, make_simulator
+from capsense.adapters import DepthSensor, make_simulator
 from capsense.adapters.coppeliasim_remote import (
     Remote,
     Seen,
@@ -36,11 +36,12 @@ from capsense.adapters.rules import (
 )
 from capsense.design.model import Design
 from capsense.errors import AdapterError, SceneError
+from capsense.readout import Readout
 from capsense.readout.config import make_readout
-from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.scene.depth import CONDUCTOR_CODE, DepthFrame, encode_permittivity
 from capsense.scene.materials import Grounding
+from capsense.scene.pose import checked_pose
 from capsense.simulator import Simulator
 
 __all__ = ["CoppeliaOptions", "CoppeliaSensor", "attach", "connect", "running"]
@@ -139,7 +140,7 @@ def attach(
             origin at the centre of the electrode plane, z out of the sensor. A vision sensor of
             the scene's own is itself the sensor frame.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`.
         options: What is seen and what it is made of: ``materials``, ``exclude`` and the others of
             :class:`~capsense.adapters.rules.SeenOptions`; ``size``, ``resolution`` and ``back`` of
             :class:`~capsense.adapters.rules.ImageOptions`.
@@ -151,8 +152,7 @@ def attach(
         DesignError: The design is wrong.
         ReadoutError: There is no such chip.
     """
-    if pose_in_object is not None and not isinstance(pose_in_object, Pose):
-        raise SceneError(f"pose_in_object is {pose_in_object!r}; give a Pose(position, quaternion)")
+    pose = Pose() if pose_in_object is None else checked_pose(pose_in_object, "pose_in_object")
     remote = Remote(sim)
     handle = remote.find(object)
     vision_sensor = find_vision_sensor(remote, handle)
@@ -167,9 +167,7 @@ def attach(
     if vision_sensor is None:  # all is checked: only now the scene is changed
         paint = Paint(remote, rules, carrier(remote, handle) if rules.exclude_own else None)
         far = float(simulator.design.domain.upper[2])
-        vision_sensor = make_vision_sensor(
-            remote, handle, pose_in_object or Pose(), image, far, paint.collection
-        )
+        vision_sensor = make_vision_sensor(remote, handle, pose, image, far, paint.collection)
         material = None  # the colours say it
     sensor = CoppeliaSensor(
         remote, vision_sensor, simulator, rules.default_grounding, image.back, paint, material

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from capsense.adapters.attached import refuse_missing
+from capsense.adapters import refuse_missing
 from capsense.adapters.rules import Image
 from capsense.errors import AdapterError, SceneError, require_package
 from capsense.scene import Pose

@@ -10,21 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import (
-    GeometrySensor,
-    make_simulator,
-    refuse_missing,
-)
+from capsense.adapters import GeometrySensor, make_simulator, refuse_missing
 from capsense.adapters.mujoco_depth import MujocoDepthSensor, check_stepped, find_camera, find_site
 from capsense.adapters.mujoco_model import ModelSource
 from capsense.adapters.rules import AttachOptions, Image, check_perception, split_rules
 from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
-from capsense.errors import SceneError, require_package
-from capsense.readout.readout import Readout
+from capsense.errors import SceneError, listed, require_package
+from capsense.readout import Readout
 from capsense.scene import Pose
-from capsense.scene.contact import listed
+from capsense.scene.pose import checked_pose
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 
@@ -108,7 +104,7 @@ def attach(
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, the image of a
             camera.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`.
         options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
             the others of :class:`MujocoOptions`.
 
@@ -347,8 +343,7 @@ def add_sensor(
             f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, such as "
             "mujoco.MjSpec.from_file(path)"
         )
-    if not isinstance(pose, Pose):
-        raise SceneError(f"pose is {pose!r}; give a Pose(position, quaternion)")
+    checked_pose(pose)
     if not isinstance(name, str) or not name:
         raise SceneError(f"name is {name!r}; give the new site a name, like 'pad'")
     carrier = spec.body(body) if isinstance(body, str) else None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import DepthSensor, refuse_missing
+from capsense.adapters import DepthSensor, refuse_missing
 from capsense.adapters.rules import Rules
 from capsense.errors import SceneError
 from capsense.scene import Pose

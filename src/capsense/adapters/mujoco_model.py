@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import WorldSource
+from capsense.adapters import WorldSource
 from capsense.adapters.meshes import Terrain, height_field, primitive, solid_mesh
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid

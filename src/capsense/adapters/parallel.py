@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
-from capsense.errors import SceneError
-from capsense.fleet import Fleet, FleetReading
-from capsense.fleet.fleet import Preset
+from capsense.errors import SceneError, listed
+from capsense.fleet import Fleet, FleetReading, Preset
 from capsense.scene import Body
 
 Fixed = tuple[NDArray[np.integer], NDArray[np.floating]]
@@ -131,10 +130,7 @@ def _some_body(part: WorldShape) -> Body:
 def warn_left_out(names: Sequence[str], why: str) -> None:
     """Say once which shapes of a model are not seen."""
     if names:
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        warnings.warn(
-            f"sensor: {', '.join(map(repr, names[:_SHOWN]))}{more} not seen: {why}", stacklevel=4
-        )
+        warnings.warn(f"sensor: {listed(names, _SHOWN)} not seen: {why}", stacklevel=4)
 
 
 def matching(known: Sequence[str], patterns: str | Sequence[str], what: str) -> list[int]:

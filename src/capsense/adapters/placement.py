@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
-from capsense.errors import CapSenseError
+from capsense.errors import CapSenseError, listed
 from capsense.scene import Body, Scene, TriMesh
-from capsense.scene.contact import Contacts, distances, find_contacts, listed, points_on
+from capsense.scene.contact import Contacts, distances, find_contacts, points_on
 from capsense.scene.shapes import ShapeKind
 from capsense.simulator import Simulator
 from capsense.surface.solver import PRESETS

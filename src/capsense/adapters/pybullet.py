@@ -9,12 +9,7 @@ from typing import Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import (
-    DepthSensor,
-    GeometrySensor,
-    make_simulator,
-    refuse_missing,
-)
+from capsense.adapters import DepthSensor, GeometrySensor, make_simulator, refuse_missing
 from capsense.adapters.pybullet_bodies import (
     BodyWatch,
     Link,
@@ -38,10 +33,11 @@ from capsense.adapters.skin import AttachedSkin, simulators_of
 from capsense.adapters.world import Frames
 from capsense.design.model import Design
 from capsense.errors import SceneError, require_package
-from capsense.readout.readout import Readout
+from capsense.readout import Readout
 from capsense.scene import Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.depth import DepthFrame
+from capsense.scene.pose import checked_pose
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign
 
@@ -115,7 +111,7 @@ def attach(
         design: A design, a packaged name, a design file, or a ready simulator.
         perception: ``"geometry"``, the shapes themselves, or ``"depth_camera"``, a rendered image.
         readout: A readout whose counts readings are to hold, a chip's name, or a file's; see
-            :meth:`~capsense.adapters.attached.AttachedSensor.read`.
+            :meth:`~capsense.adapters.AttachedSensor.read`.
         options: What is seen and what it is made of: ``materials``, ``grounding``, ``exclude`` and
             the others of :class:`PybulletOptions`.
 
@@ -130,10 +126,9 @@ def attach(
     check_perception(perception, options, _ONLY)
     rules, other = split_rules(options, PybulletOptions)
     shapes = _checked_shapes(other.pop("shapes", "collision"))
-    if not isinstance(pose_in_link, Pose):
-        raise SceneError(f"pose_in_link is {pose_in_link!r}; give a Pose(position, quaternion)")
+    pose = checked_pose(pose_in_link, "pose_in_link")
     number = _client_number(client)
-    mount = Mount(body, _find_link(number, body, link), pose_in_link)
+    mount = Mount(body, _find_link(number, body, link), pose)
     simulator = make_simulator(design)
     sensor: PybulletSensor | PybulletDepthSensor
     if perception == "depth_camera":

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.adapters.attached import WorldSource
+from capsense.adapters import WorldSource
 from capsense.adapters.meshes import (
     UnusableShape,
     is_flat,

@@ -8,13 +8,12 @@ from pathlib import Path
 
 from capsense._thread_pool import OneAtATime, ThreadPool
 from capsense._validate import suggest
-from capsense.adapters.attached import GeometrySensor
+from capsense.adapters import GeometrySensor
 from capsense.adapters.placement import blind
-from capsense.errors import ReadoutError, SceneError
+from capsense.errors import ReadoutError, SceneError, listed
 from capsense.reading import Reading
-from capsense.readout.readout import SEED_STRIDE, Readout
+from capsense.readout import SEED_STRIDE, Readout
 from capsense.scene import Pose
-from capsense.scene.contact import listed
 from capsense.simulator import Simulator
 from capsense.skin import AnyDesign, make_simulators, read_all
 

@@ -7,12 +7,13 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli.console import (
+from capsense.cli import (
     OK,
     PICTURES,
     BuildProgress,
-    Command,
+    arg,
     check_picture,
+    command,
     facts,
     field_figures,
     grouped,
@@ -25,26 +26,20 @@ if TYPE_CHECKING:
     from capsense.simulator import Simulator
 
 
-def _design_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument(
-        "design", metavar="NAME|FILE", nargs="?", help="a packaged design, or a design .toml"
-    )
-    parser.add_argument("--list", action="store_true", help="list the packaged designs")
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="PICTURE",
+@command(
+    "design",
+    "print a sensor design with its field's figures and baseline, or draw it",
+    arg("design NAME|FILE", "a packaged design, or a design .toml", nargs="?"),
+    arg("--list", "list the packaged designs"),
+    arg(
+        "-o --output PICTURE",
+        f"draw the layout to this file ({', '.join(PICTURES)}); without it nothing is drawn",
         type=Path,
-        help=f"draw the layout to this file ({', '.join(PICTURES)}); without it nothing is drawn",
-    )
-    parser.add_argument(
-        "--no-build", action="store_true", help="leave out the field's figures and the baseline"
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
-
-
-def _design(args: argparse.Namespace) -> int:
+    ),
+    arg("--no-build", "leave out the field's figures and the baseline"),
+    arg("-q --quiet", "no progress bar"),
+)
+def design(args: argparse.Namespace) -> int:
     """Print what a sensor design is made of, the figures of its field, and its baseline: the
     capacitance matrix with nothing in front of it. The field is computed at a design's first
     use and kept in the user's cache; --no-build leaves it alone.
@@ -117,13 +112,7 @@ def describe(design: Design) -> str:
     ]
     if design.layers:
         rows = [
-            (
-                k.name,
-                k.material,
-                f"{k.eps_r:g}",
-                *_spans(k.surface),
-                str(len(k.surface.facets)),
-            )
+            (k.name, k.material, f"{k.eps_r:g}", *_spans(k.surface), str(len(k.surface.facets)))
             for k in design.layers
         ]
         blocks.append(table(("layer", "material", "eps_r", *_SPANS, "faces"), rows))
@@ -169,11 +158,3 @@ def describe_field(simulator: Simulator) -> str:
         head = "self, shields driven [pF]"
         text += f"\n\n{table((head, *names), [('', *(f'{c * 1e12:.4f}' for c in guarded))])}"
     return text
-
-
-DESIGN = Command(
-    "design",
-    "print a sensor design with its field's figures and baseline, or draw it",
-    _design_arguments,
-    _design,
-)

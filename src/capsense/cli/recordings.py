@@ -7,14 +7,15 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli.console import (
+from capsense.cli import (
     DIFFERS,
     OK,
     PICTURES,
+    QUIET,
     BuildProgress,
-    Command,
-    add_quiet,
+    arg,
     check_picture,
+    command,
     facts,
     progress_shown,
     say,
@@ -26,28 +27,30 @@ from capsense.errors import ReadoutError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from capsense.readout import Readout
     from capsense.readout.conversions import Counts
     from capsense.readout.presets import Chip
-    from capsense.readout.readout import Readout
     from capsense.readout.recording import CapacitanceRecord
 
 
-def _replay_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument("recording", metavar="FILE.mcap", type=Path, help="the recording")
-    parser.add_argument(
-        "--tolerance", metavar="F", type=float, default=0.0,
-        help="difference of a capacitance that is allowed, in farads; default 0",
-    )  # fmt: skip
-    parser.add_argument(
+@command(
+    "replay",
+    "simulate a recording again and verify that every reading is the same",
+    arg("recording FILE.mcap", "the recording", type=Path),
+    arg(
+        "--tolerance F",
+        "difference of a capacitance that is allowed, in farads; default 0",
+        type=float,
+        default=0.0,
+    ),
+    arg(
         "--method",
+        "simulate with this method instead of the recorded one",
         choices=("surface", "fem_masked"),
-        help="simulate with this method instead of the recorded one",
-    )
-    add_quiet(parser)
-
-
-def _replay_recording(args: argparse.Namespace) -> int:
+    ),
+    QUIET,
+)
+def replay(args: argparse.Namespace) -> int:
     """Simulate a recording again, from the design, settings and bodies in it, and compare every
     reading bit for bit; and the counts of a readout given by a chip's name or a file. The first
     difference is printed.
@@ -91,28 +94,15 @@ def _replay_recording(args: argparse.Namespace) -> int:
     return DIFFERS
 
 
-REPLAY = Command(
-    "replay",
-    "simulate a recording again and verify that every reading is the same",
-    _replay_recording_arguments,
-    _replay_recording,
+@command(
+    "export",
+    "turn a recording into .csv, .npz or .parquet, or make one whole that was cut short",
+    arg("recording FILE.mcap", "the recording", type=Path),
+    arg("-o --output FILE", "what to write", type=Path, required=True),
+    arg("--counts", "the conversions of the readout in place of the readings (.csv, .parquet)"),
+    arg("--force", "replace a file that is there"),
 )
-
-
-def _export_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument("recording", metavar="FILE.mcap", type=Path, help="the recording")
-    parser.add_argument(
-        "-o", "--output", metavar="FILE", type=Path, required=True, help="what to write"
-    )
-    parser.add_argument(
-        "--counts", action="store_true",
-        help="the conversions of the readout in place of the readings (.csv, .parquet)",
-    )  # fmt: skip
-    parser.add_argument("--force", action="store_true", help="replace a file that is there")
-
-
-def _export_recording(args: argparse.Namespace) -> int:
+def export(args: argparse.Namespace) -> int:
     """Turn a recording into another file. The ending chooses the format:
       .csv, .parquet   the columns of readings.csv of capsense run, and the episode
       .npz             the arrays of readings.npz, the episode, and the counts of a readout;
@@ -140,42 +130,28 @@ def _export_recording(args: argparse.Namespace) -> int:
     return OK
 
 
-EXPORT = Command(
-    "export",
-    "turn a recording into .csv, .npz or .parquet, or make one whole that was cut short",
-    _export_recording_arguments,
-    _export_recording,
+@command(
+    "readout",
+    "turn recorded capacitances into what a chip reports",
+    arg("recording REC", "the recording", type=Path, nargs="?"),
+    arg("--list", "list the chips; with --chip, that one's figures"),
+    arg(
+        "--chip NAME", "a chip; may be repeated; 'all' for all of them", action="append", default=[]
+    ),
+    arg("--config FILE.toml", "a readout file", type=Path),
+    arg("--rate HZ", "conversions per second, one of the chip's", type=float),
+    arg("--seed N", "of the noise; default 0", type=int, default=0),
+    arg("--no-noise", "rounding and saturation only"),
+    arg("-o --output DIR", "folder for the tables", type=Path),
+    arg("--force", "replace tables that are there"),
+    arg(
+        "--plot PICTURE",
+        f"draw one channel instead of writing tables ({', '.join(PICTURES)})",
+        type=Path,
+    ),
+    arg("--electrode NAME", "with --plot: the electrode; default the first"),
 )
-
-
-def _read_out_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument("recording", metavar="REC", type=Path, nargs="?", help="the recording")
-    parser.add_argument(
-        "--list", action="store_true", help="list the chips; with --chip, that one's figures"
-    )
-    parser.add_argument(
-        "--chip", metavar="NAME", action="append", default=[],
-        help="a chip; may be repeated; 'all' for all of them",
-    )  # fmt: skip
-    parser.add_argument("--config", metavar="FILE.toml", type=Path, help="a readout file")
-    parser.add_argument(
-        "--rate", metavar="HZ", type=float, help="conversions per second, one of the chip's"
-    )
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the noise; default 0")
-    parser.add_argument("--no-noise", action="store_true", help="rounding and saturation only")
-    parser.add_argument("-o", "--output", metavar="DIR", type=Path, help="folder for the tables")
-    parser.add_argument("--force", action="store_true", help="replace tables that are there")
-    parser.add_argument(
-        "--plot", metavar="PICTURE", type=Path,
-        help=f"draw one channel instead of writing tables ({', '.join(PICTURES)})",
-    )  # fmt: skip
-    parser.add_argument(
-        "--electrode", metavar="NAME", help="with --plot: the electrode; default the first"
-    )
-
-
-def _read_out(args: argparse.Namespace) -> int:
+def readout(args: argparse.Namespace) -> int:
     """Turn the capacitances of a recording into what a chip reports: one channel after another,
     late, noisy, quantised, within its range.
 
@@ -310,8 +286,3 @@ def _figures(chip: Chip) -> str:
 
     rows = [(f.quantity, f.status.value, f.value, f.source) for f in chip.facts]
     return f"{chip.title}\n\n" + table(("figure", "status", "value", "source"), rows)
-
-
-READOUT = Command(
-    "readout", "turn recorded capacitances into what a chip reports", _read_out_arguments, _read_out
-)

@@ -9,18 +9,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from capsense.cli.console import (
+from capsense.cli import (
     INTERRUPTED,
     OK,
+    QUIET,
+    RATE,
     BuildProgress,
-    Command,
     Interrupt,
-    add_quiet,
+    arg,
+    command,
     facts,
     field_figures,
     grouped,
     progress_shown,
-    sample_rate,
     say,
     seconds,
     table,
@@ -34,12 +35,7 @@ if TYPE_CHECKING:
     from capsense.simulator import Simulator
 
 
-def _add_scenario(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenario", metavar="SCENARIO.toml", type=Path, help="the scenario file")
-    parser.add_argument(
-        "--rate", metavar="HZ", type=sample_rate, help="sample rate, instead of the scenario's"
-    )
-    add_quiet(parser)
+SCENARIO = (arg("scenario SCENARIO.toml", "the scenario file", type=Path), RATE, QUIET)
 
 
 def chosen_scenario(args: argparse.Namespace) -> Scenario:
@@ -58,18 +54,14 @@ def _load(args: argparse.Namespace) -> Scenario:
     return scenario
 
 
-def _run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    _add_scenario(parser)
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, required=True, help="folder for the results"
-    )
-    parser.add_argument(
-        "--force", action="store_true", help="replace the results in a folder that is not empty"
-    )
-
-
-def _run(args: argparse.Namespace) -> int:
+@command(
+    "run",
+    "simulate a scenario file and write its readings",
+    *SCENARIO,
+    arg("-o --output DIR", "folder for the results", type=Path, required=True),
+    arg("--force", "replace the results in a folder that is not empty"),
+)
+def run(args: argparse.Namespace) -> int:
     """Simulate a scenario: a sensor, bodies that move in front of it, and how it is sampled.
 
     The output folder receives
@@ -187,7 +179,7 @@ def play_samples(
 
 
 def _write(recorder: RunWriter, summary: dict[str, Any]) -> None:
-    from capsense.plotting.runs import plot_run
+    from capsense.plotting import plot_run
 
     recorder.write_arrays()
     recorder.write_summary(summary)
@@ -241,26 +233,18 @@ def _channel_row(channel: dict[str, Any]) -> list[str]:
     return [channel["name"], *(f"{v * 1e12:.5f}" for v in (level, low, high)), *share]
 
 
-RUN = Command("run", "simulate a scenario file and write its readings", _run_arguments, _run)
-
-
-def _record_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    _add_scenario(parser)
-    parser.add_argument(
-        "-o", "--output", metavar="FILE.mcap", type=Path, required=True, help="the recording"
-    )
-    parser.add_argument("--force", action="store_true", help="replace a file that is there")
-    parser.add_argument(
-        "--readout", metavar="CHIP|FILE.toml",
-        help="record what a chip reports, too: its name, or a readout file",
-    )  # fmt: skip
-    parser.add_argument(
-        "--name", default="sensor", help="of the sensor: its frame, and the beginning of its topics"
-    )
-
-
-def _record(args: argparse.Namespace) -> int:
+@command(
+    "record",
+    "simulate a scenario file and record every step as MCAP, for ROS 2 and Foxglove",
+    *SCENARIO,
+    arg("-o --output FILE.mcap", "the recording", type=Path, required=True),
+    arg("--force", "replace a file that is there"),
+    arg("--readout CHIP|FILE.toml", "record what a chip reports, too: its name, or a readout file"),
+    arg(
+        "--name NAME", "of the sensor: its frame, and the beginning of its topics", default="sensor"
+    ),
+)
+def record(args: argparse.Namespace) -> int:
     """Simulate a scenario, and record every step in an MCAP file of ROS 2 messages: bodies and
     their poses, capacitance matrices, transforms, markers, and the counts of a readout. Foxglove
     and 'ros2 bag' open it; 'capsense replay' simulates it again and compares; 'capsense export'
@@ -273,8 +257,9 @@ def _record(args: argparse.Namespace) -> int:
       capsense record examples/hand_approach.toml -o hand.mcap
       capsense record examples/hand_approach.toml -o hand.mcap --readout fdc1004 --force
     """
+    from capsense.recording import check_name, make_readout
     from capsense.recording.files import check_target
-    from capsense.recording.recorder import Recorder, check_name, make_readout
+    from capsense.recording.recorder import Recorder
     from capsense.recording.ros import require
 
     require()
@@ -319,11 +304,3 @@ def _record_report(scenario: Scenario, recorder: Recorder) -> str:
             ("recording", f"{recorder.path}, {size / 1e6:.2f} MB"),
         ]
     )
-
-
-RECORD = Command(
-    "record",
-    "simulate a scenario file and record every step as MCAP, for ROS 2 and Foxglove",
-    _record_arguments,
-    _record,
-)

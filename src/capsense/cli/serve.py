@@ -13,14 +13,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from capsense.cli.console import (
-    OK,
-    BuildProgress,
-    Command,
-    progress_shown,
-    sample_rate,
-    say,
-)
+from capsense.cli import OK, RATE, BuildProgress, arg, command, progress_shown, say
 from capsense.cli.run import build_simulator, chosen_scenario
 
 if TYPE_CHECKING:
@@ -33,32 +26,6 @@ SWITCH_INTERVAL = 5e-4
 """Time [s] after which Python's threads take turns, so that no client waits long for another."""
 
 
-def _serve_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument(
-        "--design", metavar="NAME|FILE.toml", action="append", required=True,
-        help="what may be opened; may be repeated, the first is the default",
-    )  # fmt: skip
-    parser.add_argument(
-        "--readout", metavar="CHIP|FILE.toml", help="also report what a chip would report"
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address; default this machine only")
-    parser.add_argument("--port", type=int, default=8765, help="default 8765; 0 for any")
-    parser.add_argument(
-        "--token-file", metavar="FILE", type=Path, help="file with the token clients must send"
-    )
-    parser.add_argument(
-        "--origin", metavar="URL", action="append", default=[],
-        help="web page that may connect; may be repeated",
-    )  # fmt: skip
-    parser.add_argument(
-        "--watch", action="store_true", help="let clients watch others' sensors (capsense view)"
-    )
-    for name, what in _LIMITS.items():
-        parser.add_argument(f"--max-{name}", metavar="N", type=int, help=what)
-    parser.add_argument("-q", "--quiet", action="store_true", help="log faults only")
-
-
 _LIMITS = {
     "connections": "clients at once; default 16",
     "sensors": "sensors of one client; default 8",
@@ -67,7 +34,25 @@ _LIMITS = {
 }
 
 
-def _serve(args: argparse.Namespace) -> int:
+@command(
+    "serve",
+    "serve sensors to Unity, browsers and other programs",
+    arg(
+        "--design NAME|FILE.toml",
+        "what may be opened; may be repeated, the first is the default",
+        action="append",
+        required=True,
+    ),
+    arg("--readout CHIP|FILE.toml", "also report what a chip would report"),
+    arg("--host HOST", "address; default this machine only", default="127.0.0.1"),
+    arg("--port PORT", "default 8765; 0 for any", type=int, default=8765),
+    arg("--token-file FILE", "file with the token clients must send", type=Path),
+    arg("--origin URL", "web page that may connect; may be repeated", action="append", default=[]),
+    arg("--watch", "let clients watch others' sensors (capsense view)"),
+    *(arg(f"--max-{name} N", what, type=int) for name, what in _LIMITS.items()),
+    arg("-q --quiet", "log faults only"),
+)
+def serve(args: argparse.Namespace) -> int:
     """Serve sensors over a WebSocket: clients send depth images or bodies, and receive
     capacitances.
 
@@ -160,38 +145,36 @@ def _logger(*, quiet: bool) -> logging.Logger:
     return logger
 
 
-SERVE = Command(
-    "serve", "serve sensors to Unity, browsers and other programs", _serve_arguments, _serve
-)
-
-
 LOOPBACK = ("localhost", "::1")
 
 
-def _view_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument(
-        "scenario", metavar="SCENARIO.toml", type=Path, nargs="?", help="the scenario file"
-    )
-    parser.add_argument("--replay", metavar="FILE.mcap", type=Path, help="show a recording")
-    parser.add_argument("--connect", metavar="URL", help="watch a server, ws://HOST:PORT")
-    parser.add_argument(
-        "--sensor", metavar="CLIENT:SENSOR", type=_address,
-        help="which of the server's, by its log's numbers; default the one opened last",
-    )  # fmt: skip
-    parser.add_argument(
-        "--token-file", metavar="FILE", type=Path, help="file with the token the server asks for"
-    )
-    parser.add_argument(
-        "--rate", metavar="HZ", type=sample_rate, help="sample rate, instead of the scenario's"
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address; default this machine only")
-    parser.add_argument("--port", type=int, default=8080, help="default 8080; 0 for any")
-    parser.add_argument("--paused", action="store_true", help="do not start to play")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print the page's address only")
+def _address(text: str) -> tuple[int, int]:
+    """Parse ``--sensor``."""
+    client, colon, sensor = text.partition(":")
+    if not (colon and client.isdecimal() and sensor.isdecimal()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not CLIENT:SENSOR, such as 3:0")
+    return int(client), int(sensor)
 
 
-def _view(args: argparse.Namespace) -> int:
+@command(
+    "view",
+    "show a sensor at work, live in a web browser",
+    arg("scenario SCENARIO.toml", "the scenario file", type=Path, nargs="?"),
+    arg("--replay FILE.mcap", "show a recording", type=Path),
+    arg("--connect URL", "watch a server, ws://HOST:PORT"),
+    arg(
+        "--sensor CLIENT:SENSOR",
+        "which of the server's, by its log's numbers; default the one opened last",
+        type=_address,
+    ),
+    arg("--token-file FILE", "file with the token the server asks for", type=Path),
+    RATE,
+    arg("--host HOST", "address; default this machine only", default="127.0.0.1"),
+    arg("--port PORT", "default 8080; 0 for any", type=int, default=8080),
+    arg("--paused", "do not start to play"),
+    arg("-q --quiet", "print the page's address only"),
+)
+def view(args: argparse.Namespace) -> int:
     """Show a sensor in a web browser: its electrodes coloured by their signals, the bodies, the
     potential on a plane, charts of the channels, and the matrix. Time can be paused, stepped and
     moved about in.
@@ -228,14 +211,6 @@ def _view(args: argparse.Namespace) -> int:
     finally:
         player.stop()
     return OK
-
-
-def _address(text: str) -> tuple[int, int]:
-    """Parse ``--sensor``."""
-    client, colon, sensor = text.partition(":")
-    if not (colon and client.isdecimal() and sensor.isdecimal()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not CLIENT:SENSOR, such as 3:0")
-    return int(client), int(sensor)
 
 
 def _check_view(args: argparse.Namespace) -> None:
@@ -299,6 +274,3 @@ def _announce(view: LiveView, args: argparse.Namespace) -> None:
     else:
         say("warning: whoever reaches this address sees the page and can move it about")
     print(view.url, flush=True)  # last: whoever waits for it may stop the view at once
-
-
-VIEW = Command("view", "show a sensor at work, live in a web browser", _view_arguments, _view)

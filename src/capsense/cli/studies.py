@@ -6,16 +6,18 @@ import argparse
 import json
 import re
 import sys
+from collections import ChainMap
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from capsense.cli.console import (
+from capsense.cli import (
     OK,
+    QUIET,
     TARGET_MISSED,
     BuildProgress,
-    Command,
-    add_quiet,
+    arg,
+    command,
     count_of,
     facts,
     progress_shown,
@@ -24,31 +26,11 @@ from capsense.cli.console import (
     table,
 )
 from capsense.errors import ScenarioError
+from capsense.reproduce import STUDIES, load_study
 
 if TYPE_CHECKING:
     from capsense.learning.optimise import Bound, DesignTask
     from capsense.reproduce.harness import Study
-
-
-def _dataset_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument("spec", metavar="SPEC.toml", type=Path, help="what the data set holds")
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, required=True, help="folder of the data set"
-    )
-    parser.add_argument(
-        "--shard", metavar="K/N", type=_part, default=(0, 1),
-        help="make every N-th shard only, from shard K on; K from 0 to N - 1",
-    )  # fmt: skip
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "--workers", metavar="N", type=count_of, help="processes; default all processors"
-    )
-    where.add_argument(
-        "--scheduler", metavar="ADDRESS",
-        help="Dask scheduler whose workers make the shards; they see DIR and what SPEC names",
-    )  # fmt: skip
-    add_quiet(parser)
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -58,7 +40,27 @@ def _part(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _dataset(args: argparse.Namespace) -> int:
+@command(
+    "dataset",
+    "make a data set of random scenes or episodes for learning",
+    arg("spec SPEC.toml", "what the data set holds", type=Path),
+    arg("-o --output DIR", "folder of the data set", type=Path, required=True),
+    arg(
+        "--shard K/N",
+        "make every N-th shard only, from shard K on; K from 0 to N - 1",
+        type=_part,
+        default=(0, 1),
+    ),
+    [
+        arg("--workers N", "processes; default all processors", type=count_of),
+        arg(
+            "--scheduler ADDRESS",
+            "Dask scheduler whose workers make the shards; they see DIR and what SPEC names",
+        ),
+    ],
+    QUIET,
+)
+def dataset(args: argparse.Namespace) -> int:
     """Draw random scenes as a file describes them, and write capacitance matrices, the counts of a
     readout and labels as Parquet files with a manifest. A file that names an environment is of
     episodes, which become a LeRobot data set.
@@ -97,22 +99,6 @@ def _dataset(args: argparse.Namespace) -> int:
     return OK
 
 
-DATASET = Command(
-    "dataset",
-    "make a data set of random scenes or episodes for learning",
-    _dataset_arguments,
-    _dataset,
-)
-
-
-def _bench_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument("-o", "--output", metavar="FILE", type=_new_file, help="also write JSON")
-    parser.add_argument(
-        "--steps", metavar="N", type=count_of, default=300, help="timed steps of each world"
-    )
-
-
 def _new_file(text: str) -> Path:
     path = Path(text)
     if not path.parent.is_dir():
@@ -122,7 +108,13 @@ def _new_file(text: str) -> Path:
     return path
 
 
-def _bench(args: argparse.Namespace) -> int:
+@command(
+    "bench",
+    "measure this machine: start, step times, error",
+    arg("-o --output FILE", "also write JSON", type=_new_file),
+    arg("--steps N", "timed steps of each world", type=count_of, default=300),
+)
+def bench(args: argparse.Namespace) -> int:
     """Measure import, start, step times and batches on this machine, with the error of a step
     against a converged reference; within a minute.
 
@@ -177,22 +169,19 @@ def _bench_report(figures: dict[str, Any]) -> str:
     return "\n\n".join([facts(head), table(columns, rows), batch])
 
 
-BENCH = Command("bench", "measure this machine: start, step times, error", _bench_arguments, _bench)
-
-
-def _reproduce_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    from capsense.reproduce import STUDIES
-
-    parser.add_argument("study", choices=[*STUDIES, "all"], help="what to re-run")
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, default=Path("reproduced"),
-        help="folder for the results (default: reproduced); what it holds already is used",
-    )  # fmt: skip
-    parser.add_argument("--reduced", action="store_true", help="fewer cases, less resolution")
-
-
-def _reproduce(args: argparse.Namespace) -> int:
+@command(
+    "reproduce",
+    "re-run the evaluation of Schöffmann et al. 2022",
+    arg("study", "what to re-run", choices=ChainMap({"all": ""}, STUDIES)),
+    arg(
+        "-o --output DIR",
+        "folder for the results (default: reproduced); what it holds already is used",
+        type=Path,
+        default=Path("reproduced"),
+    ),
+    arg("--reduced", "fewer cases, less resolution"),
+)
+def reproduce(args: argparse.Namespace) -> int:
     """Re-run the evaluation of Schöffmann et al. 2022, and what goes beyond it: each study prints a
     table of figures with their targets and verdicts.
 
@@ -210,8 +199,6 @@ def _reproduce(args: argparse.Namespace) -> int:
       capsense reproduce all -o reproduced/
       capsense reproduce all --reduced         a check in little time; coarser
     """
-    from capsense.reproduce import STUDIES, load_study
-
     names = list(STUDIES) if args.study == "all" else [args.study]
     studies = {name: load_study(name) for name in names}
     folders = {name: _prepared(args.output / name) for name in names}
@@ -263,28 +250,16 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:shown])} and {len(names) - shown} more files"
 
 
-REPRODUCE = Command(
-    "reproduce", "re-run the evaluation of Schöffmann et al. 2022", _reproduce_arguments, _reproduce
+@command(
+    "optimise",
+    "choose sizes and gaps of electrodes for a task",
+    arg("task TASK.toml", "what is to be found", type=Path),
+    arg("-o --output DESIGN.toml", "the design that was found", type=Path, required=True),
+    arg("--evaluations N", "candidates to try, instead of the task's", type=int),
+    arg("--no-check", "leave out the check at full accuracy"),
+    QUIET,
 )
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
-    parser.add_argument("task", metavar="TASK.toml", type=Path, help="what is to be found")
-    parser.add_argument(
-        "-o", "--output", metavar="DESIGN.toml", type=Path, required=True,
-        help="the design that was found",
-    )  # fmt: skip
-    parser.add_argument(
-        "--evaluations", metavar="N", type=int, help="candidates to try, instead of the task's"
-    )
-    parser.add_argument(
-        "--no-check", action="store_true", help="leave out the check at full accuracy"
-    )
-    add_quiet(parser)
-
-
-def _execute(args: argparse.Namespace) -> int:
+def optimise(args: argparse.Namespace) -> int:
     """Choose sizes and gaps of electrodes so that they tell the pose of a limb best. TASK.toml
     holds a design whose lengths are expressions of parameters, the parameters' ranges, where
     the limb will be, and the noise of a channel. A candidate is judged by the Cramér-Rao bound
@@ -356,8 +331,3 @@ def _print(task: DesignTask, rows: dict[str, tuple[Any, Bound]], accuracy: str) 
         "vertical [mm]", "pitch [°]", "yaw [°]", "cost",
     ]  # fmt: skip
     print(table(header, lines))
-
-
-OPTIMISE = Command(
-    "optimise", "choose sizes and gaps of electrodes for a task", _arguments, _execute
-)

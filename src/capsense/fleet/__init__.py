@@ -1,6 +1,362 @@
 """Many environments at once: arrays of poses in, arrays of matrices out."""
 
-from capsense.fleet.bodies import FleetCheck, FleetReading
-from capsense.fleet.fleet import Fleet
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capsense._thread_pool import OneAtATime
+from capsense.design import load_design
+from capsense.design.model import Design
+from capsense.errors import MissingDependencyError, ReadoutError, SceneError
+from capsense.field.background import Terminals
+from capsense.field.cache import default_settings, load_or_build
+from capsense.fleet.bodies import BodyTable, FleetCheck, FleetReading, on_device
+from capsense.fleet.cpu import CpuCore
+from capsense.readout import Readout
+from capsense.readout.conversions import SideBySide
+from capsense.scene import Body, Pose, Scene
+from capsense.simulator import Simulator
+from capsense.surface.solver import PRESETS, SurfaceSolver
+
+if TYPE_CHECKING:
+    from capsense.fleet.warp_core import WarpCore
+
+Array = NDArray[np.float64]
 
 __all__ = ["Fleet", "FleetCheck", "FleetReading"]
+
+_QUATERNION = 1e-3
+"""Quaternions may be longer or shorter than 1 by so much; they are made 1 long."""
+
+
+_PANELS = 5
+"""Panels of a shape for each cluster that a body is cut into on Warp."""
+
+Preset = Literal["standard", "learning", "fine"]
+
+
+class Fleet:
+    """Sensors of one design in many environments, with the same places for bodies in each.
+
+    What stands in a place may differ from environment to environment, and change at a reset: see
+    :meth:`change`. Bodies out of a sensor's sight cost nothing on the CPU.
+
+    On the CPU, readings are those of :meth:`Simulator.step` of the same preset; but bodies that
+    touch each other are not joined to one conductor. On Warp every body is cut into as many
+    clusters as ``budget`` says, in single precision: the fewer, the faster and the less exact, see
+    :meth:`check`.
+
+    Args:
+        design: A design, its name, or the path of its file.
+        bodies: What stands in every environment, one body for each place; their poses are not used.
+            Rigid shapes.
+        count: How many environments, e.
+        sensors: How many sensors of the design each has, s.
+        device: ``"cpu"`` for the compiled core on all processors, or a device of Warp:
+            ``"cuda:0"``, or ``"warp:cpu"``, which is for tests.
+        preset: Accuracy on the CPU, as of :class:`Simulator`, whose own default is
+            ``"standard"``.
+        budget: Clusters of each body on Warp: 32, 64 or 128.
+        excitation_frequency: Excitation frequency [Hz].
+
+    Raises:
+        DesignError: The design is wrong.
+        SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have;
+            or a count is not a positive whole number.
+        ValueError: There is no such preset, budget or device.
+        MissingDependencyError: Warp is asked for and not installed.
+    """
+
+    def __init__(
+        self,
+        design: Design | str | Path,
+        bodies: Sequence[Body],
+        count: int,
+        *,
+        sensors: int = 1,
+        device: str = "cpu",
+        preset: Preset = "learning",
+        budget: int = 64,
+        excitation_frequency: float = 250e3,
+    ) -> None:
+        for what, number in (("count", count), ("sensors", sensors)):
+            if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+                raise SceneError(f"{what} is {number!r}; give a whole number from 1")
+        if isinstance(bodies, Body) or not bodies:
+            raise SceneError(f"bodies is {bodies!r}; give a list of at least one Body")
+        for what, chosen, known in (
+            ("preset", preset, tuple(PRESETS)), ("budget", budget, (32, 64, 128)),
+        ):  # fmt: skip
+            if chosen not in known:
+                raise ValueError(f"{what} is {chosen!r}; choose one of {known}")
+        self.design = design if isinstance(design, Design) else load_design(design)
+        self.count, self.sensors, self.places = count, sensors, len(bodies)
+        """How many environments, sensors in each, and places for bodies."""
+        self.device = device
+        field = load_or_build(self.design, default_settings(self.design))
+        chosen_preset = PRESETS[preset]
+        self._finer: Preset = "standard" if preset == "learning" else "fine"
+        if device != "cpu":
+            chosen_preset = replace(chosen_preset, panels=_PANELS * budget)
+        self._solver = SurfaceSolver(
+            field.green, self.design, excitation_frequency=excitation_frequency,
+            preset=chosen_preset,
+        )  # fmt: skip
+        self._terminals = Terminals(self.design, field.capacitance)
+        n = self._terminals.electrodes
+        self.baseline: Array = self._terminals.empty[:n, :n].copy()
+        """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
+        self._table = BodyTable(self._solver, count, len(bodies), sensors)
+        self._chips: Any = None
+        self._one = OneAtATime()
+        self._cpu = CpuCore(self._solver, self._terminals, self._table)
+        self._warp = None if device == "cpu" else self._on_warp(budget)
+        for place, body in enumerate(bodies):
+            self.change(place, body)
+
+    def _on_warp(self, budget: int) -> WarpCore:
+        try:
+            from capsense.fleet.warp_core import WarpCore, known_device
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"device {self.device!r} needs Warp; install it with: pip install 'capsense[warp]'"
+            ) from error
+        return WarpCore(
+            self._solver, self._terminals, (self.count, self.places, self.sensors), budget,
+            known_device(self.device),
+        )  # fmt: skip
+
+    @property
+    def electrode_names(self) -> tuple[str, ...]:
+        """Electrode names in matrix order."""
+        return self.design.electrode_names
+
+    def change(
+        self,
+        place: int,
+        bodies: Body | Sequence[Body | None] | None,
+        environments: ArrayLike | None = None,
+    ) -> None:
+        """Change what stands in a place: shape, size, material, grounding, or nothing at all.
+
+        Sizes of one proportion share what is worked out of a shape; a capsule or box of new
+        proportions takes some ten milliseconds.
+
+        Args:
+            place: Number of the place.
+            bodies: A body or None for all, or one for each of the environments.
+            environments: Which environments, shape (k,); all by default.
+
+        Raises:
+            SceneError: There is no such place or environment, the numbers do not match, or a body
+                is of a shape that is not rigid, or no conductor in a place that is joined.
+        """
+        with self._one:
+            self._table.change(place, bodies, environments)
+            self._take_over()
+
+    def hide(self, sensor: int, places: Sequence[int]) -> None:
+        """Leave places out of what a sensor sees, such as the link that carries it.
+
+        Args:
+            sensor: Number of the sensor.
+            places: Numbers of the places; the sensor sees all others.
+
+        Raises:
+            SceneError: There is no such sensor or place.
+        """
+        self._table.hide(sensor, places)
+        self._take_over()
+
+    def join(self, places: Sequence[int]) -> None:
+        """Make the conductors in some places one, in all environments, as if a wire joined them.
+
+        A fleet does not look for contact. Conductors that are joined share their net charge, and
+        are tied to ground by the sum of their capacitances; with one that is grounded all are.
+        Members out of a sensor's sight, hidden ones too, count for what ties the others to ground.
+
+        Args:
+            places: Numbers of the places; what they are joined with already joins in.
+
+        Raises:
+            SceneError: There is no such place, or something else than a conductor stands there.
+        """
+        self._table.join(places)
+        self._take_over()
+
+    def _take_over(self) -> None:
+        if self._warp is not None:
+            self._warp.take(self._table.bodies, self._table.shapes)
+
+    def use_readout(self, readout: Readout | str | None, *, seed: int = 0) -> None:
+        """Read every sensor through a chip of its own from now on.
+
+        All are switched on together, at 0 s; noise differs from chip to chip.
+
+        Args:
+            readout: A readout for this design's electrodes, the name of a chip, or None.
+            seed: Of all random numbers.
+
+        Raises:
+            ReadoutError: There is no such chip, or the readout is of other electrodes; or it has
+                open electrodes or parts of the user's own, and the fleet is on Warp.
+        """
+        self._chips = None
+        if readout is None:
+            return
+        if isinstance(readout, str):
+            readout = Readout.preset(readout, self.electrode_names)
+        if readout.bank.electrodes != self.electrode_names:
+            raise ReadoutError(
+                f"the readout is of electrodes {readout.bank.electrodes}, the fleet of "
+                f"{self.electrode_names}"
+            )
+        if self._warp is None:
+            self._chips = SideBySide(readout, self.count * self.sensors, seed=seed)
+        else:
+            self._chips = self._warp.chips(readout, self.baseline, seed)
+
+    def step(
+        self,
+        poses: ArrayLike,
+        sensors: ArrayLike | None = None,
+        *,
+        time: Any = None,
+        jacobian: bool = False,
+    ) -> FleetReading:
+        """Return the readings of all environments.
+
+        On Warp, arrays of Warp, PyTorch or JAX that are on the device are taken as they are and
+        not looked at; nothing waits for the device, so that a step can go into a CUDA graph. On the
+        CPU, arrays of others are copied.
+
+        Args:
+            poses: Of the bodies in the world's frame: positions [m], then quaternions (x, y, z, w),
+                shape (e, b, 7).
+            sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
+                frame is the world's.
+            time: Time of the scenes [s], not before that of the last step; a readout needs it. On
+                Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
+                graphs.
+            jacobian: Whether to work out ``reading.jacobian`` as well.
+
+        Raises:
+            SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long.
+            SolveError: Some environments have no solution; the message names the first.
+            ReadoutError: A readout is given no time, or time went back.
+        """
+        if self._chips is not None and time is None:
+            raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
+        with self._one:
+            reading = self.solved(poses, sensors, jacobian=jacobian)
+            if self._chips is None:
+                return reading
+            matrix = reading.capacitance if self._warp is None else reading.delta
+            return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
+
+    def solved(
+        self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
+    ) -> FleetReading:
+        """The same as :meth:`step`, without chips and their time."""
+        if jacobian and self._table.lossy:
+            raise SceneError(
+                "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
+                "them a conductor's or a lossless material"
+            )
+        shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
+        if self._warp is None:
+            if sensors is None:
+                sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), shapes[1])
+            return self._cpu.step(
+                _checked("poses", poses, shapes[0]), _checked("sensors", sensors, shapes[1]),
+                jacobian,
+            )  # fmt: skip
+        where, at = (
+            each if each is None or on_device(each) else _checked(name, each, shape)
+            for name, each, shape in zip(
+                ("poses", "sensors"), (poses, sensors), shapes, strict=True
+            )
+        )
+        core = self._warp
+        core.solve(where, at)
+        return FleetReading(
+            core.capacitance, core.delta, core.error, shield_coupling=core.shields,
+            conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
+        )  # fmt: skip
+
+    def check(
+        self,
+        poses: ArrayLike,
+        sensors: ArrayLike | None = None,
+        *,
+        samples: int = 16,
+        seed: int = 0,
+    ) -> FleetCheck:
+        """Compare some environments with a ``Simulator`` of a finer preset.
+
+        That is ``"standard"``, or ``"fine"`` where the fleet's own is not ``"learning"``.
+
+        Args:
+            poses: As :meth:`step` takes them, on the host.
+            sensors: As :meth:`step` takes them, on the host.
+            samples: How many environments, drawn at random.
+            seed: Of the draw.
+
+        Raises:
+            SceneError: As by :meth:`step`.
+            SolveError: As by :meth:`step`.
+        """
+        e, s, b = self.count, self.sensors, self.places
+        where = _checked("poses", poses, (e, b, 7))
+        at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
+        delta = self.solved(where, at).delta
+        found = delta if self._warp is None else delta.numpy()
+        drawn = np.random.default_rng(seed).permutation(e)[:samples]
+        simulator = Simulator(
+            self.design, excitation_frequency=self._solver.excitation_frequency, preset=self._finer
+        )
+        errors = np.empty((len(drawn), s, *self.baseline.shape))
+        contact = []
+        for row, k in enumerate(drawn.tolist()):
+            for j in range(s):
+                frame = Pose() if at is None else Pose(at[k, j, :3], at[k, j, 3:])
+                hidden = self._table.bodies.hidden[j]
+                scene = Scene(
+                    body.moved(frame.inverse() @ Pose(pose[:3], pose[3:]))
+                    for body, pose, out in zip(self._table.given[k], where[k], hidden, strict=True)
+                    if body is not None and not out
+                )
+                reading = simulator.step(scene)
+                truth = reading.delta
+                if reading.stats.solver_error >= np.abs(reading.capacitance).max():
+                    contact.append((k, j))
+                errors[row, j] = (found[k, j] - truth) / max(np.abs(truth).max(), 1e-18)
+        row, j = np.unravel_index(np.abs(errors).max(axis=(2, 3)).argmax(), errors.shape[:2])
+        return FleetCheck(
+            tuple(drawn.tolist()), float(np.sqrt((errors**2).mean())), float(np.abs(errors).max()),
+            (int(drawn[row]), int(j)), tuple(contact),
+        )  # fmt: skip
+
+
+def _checked(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    poses = np.array(values, float, order="C")
+    if poses.shape != shape:
+        raise SceneError(f"{what} has shape {poses.shape}; give {shape}")
+    if not np.isfinite(poses).all():
+        place = tuple(np.argwhere(~np.isfinite(poses))[0].tolist())
+        raise SceneError(f"{what}{list(place)} is {poses[place]}; poses must be finite")
+    length = np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
+    if (np.abs(length - 1.0) > _QUATERNION).any():
+        place = tuple(np.argwhere(np.abs(length - 1.0) > _QUATERNION)[0].tolist())
+        raise SceneError(
+            f"the quaternion of {what}{list(place[:-1])} is {length[place]:g} long; give (x, y, z, "
+            "w) of length 1"
+        )
+    poses[..., 3:] /= length
+    return poses

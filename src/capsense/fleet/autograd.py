@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from capsense.fleet.fleet import Fleet
+from capsense.fleet import Fleet
 
 
 def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = None) -> torch.Tensor:

@@ -16,9 +16,9 @@ import warp as wp
 from capsense.errors import ReadoutError
 from capsense.fleet import warp_chip_kernels as kernels
 from capsense.fleet.bodies import on_device
+from capsense.readout import Readout
 from capsense.readout.conversions import Held
 from capsense.readout.noise import ClimateDrift, Context, Flicker, Mains, RandomWalk, White
-from capsense.readout.readout import Readout
 
 
 class WarpChips:

@@ -19,7 +19,7 @@ from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
 from capsense.fleet.bodies import Bodies, on_device
 from capsense.fleet.warp_chips import WarpChips
-from capsense.readout.readout import Readout
+from capsense.readout import Readout
 from capsense.surface.solver import SurfaceSolver
 
 Array = NDArray[np.float64]

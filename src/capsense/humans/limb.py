@@ -37,7 +37,7 @@ from capsense._validate import suggest
 from capsense.errors import SceneError
 from capsense.scene import Body, Capsule, Material, Pose
 from capsense.scene.materials import Grounding, checked_grounding
-from capsense.scene.pose import Vec3
+from capsense.scene.pose import Vec3, checked_pose
 
 Sex = Literal["female", "male"]
 Side = Literal["left", "right"]
@@ -254,8 +254,7 @@ class Limb:
         Raises:
             SceneError: A joint, an angle, the material or the grounding is wrong.
         """
-        if not isinstance(pose, Pose):
-            raise SceneError(f"pose is {pose!r}; give a Pose(position, quaternion)")
+        checked_pose(pose)
         tie = checked_grounding(grounding)
         if not isinstance(tie, str):
             tie /= sum(len(s.parts) for s in self.segments)

@@ -22,7 +22,7 @@ from capsense._validate import read_toml
 from capsense.errors import ScenarioError
 from capsense.learning.shards import KEY, DataSet, files_named, write_json, write_table
 from capsense.recording.tables import replacing
-from capsense.scenario.loader import ScenarioTable
+from capsense.scenario import ScenarioTable
 
 Array = NDArray[Any]
 Policy = Callable[[Array], Array]

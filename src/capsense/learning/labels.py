@@ -1,15 +1,18 @@
-"""What is nearest to the electrodes of a sensor: the labels of a data set."""
+"""Labels of what stands before a sensor: what is nearest to its electrodes, where a limb is."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
 from capsense.design import Design
+from capsense.errors import SceneError
 from capsense.scene import Body, Capsule, Cylinder, Scene
 from capsense.scene.contact import distances, points_on
 
@@ -112,3 +115,51 @@ def _on_box(lower: Array, upper: Array) -> Array:
     counts = np.ceil((upper - lower) / _PITCH).astype(int) + 1
     axes = [np.linspace(a, b, n) for a, b, n in zip(lower, upper, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+class LimbPose(NamedTuple):
+    """Where a limb is before a sensor whose x axis is to lie along it, in the sensor frame."""
+
+    lateral: float = 0.0
+    """y of the limb's axis where it crosses the plane x = 0 [m]."""
+    vertical: float = 0.05
+    """z of the axis there, less the limb's radius: the gap to the skin [m]."""
+    pitch: float = 0.0
+    """Angle of the axis to the electrode plane, positive where +x is the farther end [rad]."""
+    yaw: float = 0.0
+    """Angle of the axis to x about the sensor's z, in the electrode plane [rad]."""
+
+    @property
+    def direction(self) -> Array:
+        """Unit vector along the axis, shape (3,)."""
+        p, y = self.pitch, self.yaw
+        return np.array([math.cos(p) * math.cos(y), math.cos(p) * math.sin(y), math.sin(p)])
+
+
+def limb_pose(bodies: Iterable[Body]) -> LimbPose:
+    """The pose of a limb made of capsules, by the one that is thickest where x = 0.
+
+    Args:
+        bodies: Capsules in the sensor frame.
+
+    Raises:
+        SceneError: None of them crosses the plane x = 0, or a body is no capsule.
+    """
+    thickest, found = 0.0, None
+    for body in bodies:
+        if not isinstance(body.shape, Capsule):
+            raise SceneError(f"{body.name}: a limb is made of capsules, not {body.shape!r}")
+        along = body.pose.rotation[:, 2]
+        if abs(along[0]) < 1e-3:
+            continue
+        along = along * math.copysign(1.0, along[0])
+        way = -body.pose.position[0] / along[0]
+        beyond = max(0.0, abs(way) - 0.5 * body.shape.length)
+        radius = math.sqrt(max(0.0, body.shape.radius**2 - beyond**2))
+        if radius > thickest:
+            _, y, z = np.array(body.pose.position) + way * along
+            pitch, yaw = math.asin(along[2]), math.atan2(along[1], along[0])
+            thickest, found = radius, LimbPose(float(y), float(z - radius), pitch, yaw)
+    if found is None:
+        raise SceneError("no capsule crosses the plane x = 0 of the sensor frame; move the limb")
+    return found

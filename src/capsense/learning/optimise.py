@@ -22,12 +22,11 @@ from scipy.optimize import minimize
 from scipy.stats import qmc
 
 from capsense._validate import read_toml, suggest
-from capsense.design import Design
-from capsense.design.loader import parse_design
+from capsense.design import Design, parse_design
 from capsense.errors import DesignError, FieldError, ScenarioError
 from capsense.field.background import BuildSettings, build_background
 from capsense.learning.servo import Belief, LimbPose, PoseEstimator
-from capsense.scenario.loader import ScenarioTable as Table
+from capsense.scenario import ScenarioTable as Table
 from capsense.simulator import PresetName, Simulator
 
 Array = NDArray[np.float64]

@@ -18,10 +18,10 @@ from capsense.humans import Build, arm, leg
 from capsense.learning.labels import Near, Outline
 from capsense.learning.shards import DataSet, files_named
 from capsense.reading import Reading
+from capsense.readout import Readout
 from capsense.readout.config import make_readout
 from capsense.readout.conversions import Held
-from capsense.readout.readout import Readout
-from capsense.scenario.loader import (
+from capsense.scenario import (
     ScenarioTable,
     read_body,
     read_design,

@@ -8,17 +8,16 @@ The task is that of Z. Erickson, H. M. Clever, V. Gangaram, G. Turk, C. K. Liu a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from capsense.errors import SceneError
+from capsense.learning.labels import LimbPose
 from capsense.scene import Body, Capsule, Material, Pose, Scene
 from capsense.scene.materials import Grounding
 from capsense.simulator import Simulator
@@ -39,54 +38,6 @@ LAYERS = (32, 32)
 """Units of the network's hidden layers."""
 DECAY = 1e-4
 """Weight of the squared weights in what its training minimises."""
-
-
-class LimbPose(NamedTuple):
-    """Where a limb is before a sensor whose x axis is to lie along it, in the sensor frame."""
-
-    lateral: float = 0.0
-    """y of the limb's axis where it crosses the plane x = 0 [m]."""
-    vertical: float = 0.05
-    """z of the axis there, less the limb's radius: the gap to the skin [m]."""
-    pitch: float = 0.0
-    """Angle of the axis to the electrode plane, positive where +x is the farther end [rad]."""
-    yaw: float = 0.0
-    """Angle of the axis to x about the sensor's z, in the electrode plane [rad]."""
-
-    @property
-    def direction(self) -> Array:
-        """Unit vector along the axis, shape (3,)."""
-        p, y = self.pitch, self.yaw
-        return np.array([math.cos(p) * math.cos(y), math.cos(p) * math.sin(y), math.sin(p)])
-
-
-def limb_pose(bodies: Iterable[Body]) -> LimbPose:
-    """The pose of a limb made of capsules, by the one that is thickest where x = 0.
-
-    Args:
-        bodies: Capsules in the sensor frame.
-
-    Raises:
-        SceneError: None of them crosses the plane x = 0, or a body is no capsule.
-    """
-    thickest, found = 0.0, None
-    for body in bodies:
-        if not isinstance(body.shape, Capsule):
-            raise SceneError(f"{body.name}: a limb is made of capsules, not {body.shape!r}")
-        along = body.pose.rotation[:, 2]
-        if abs(along[0]) < 1e-3:
-            continue
-        along = along * math.copysign(1.0, along[0])
-        way = -body.pose.position[0] / along[0]
-        beyond = max(0.0, abs(way) - 0.5 * body.shape.length)
-        radius = math.sqrt(max(0.0, body.shape.radius**2 - beyond**2))
-        if radius > thickest:
-            _, y, z = np.array(body.pose.position) + way * along
-            pitch, yaw = math.asin(along[2]), math.atan2(along[1], along[0])
-            thickest, found = radius, LimbPose(float(y), float(z - radius), pitch, yaw)
-    if found is None:
-        raise SceneError("no capsule crosses the plane x = 0 of the sensor frame; move the limb")
-    return found
 
 
 @dataclass(frozen=True)

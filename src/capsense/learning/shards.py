@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 
 from capsense._thread_pool import processors
 from capsense.errors import AdapterError, ScenarioError, require_package
-from capsense.recording.session import versions
+from capsense.recording import versions
 from capsense.recording.tables import replacing
 
 MANIFEST = "manifest.json"

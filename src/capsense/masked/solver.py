@@ -31,7 +31,7 @@ from capsense.errors import FieldError, SolveError
 from capsense.mesh.tetmesh import TetMesh
 
 if TYPE_CHECKING:
-    from capsense.masked.mesh_sensor import MeshSensor
+    from capsense.masked import MeshSensor
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.patches import PathPatch
 
-    from capsense.readout.readout import Readout
+    from capsense.readout import Readout
     from capsense.readout.recording import CapacitanceRecord
 
 
@@ -84,6 +85,36 @@ def add_surface(ax: Axes, surface: Surface, label: str = "", **style: Any) -> No
     """Draw a surface seen from above, in millimetres; ``style`` as ``PathPatch`` takes it."""
     for number, outline in enumerate(outlines(surface)):
         ax.add_patch(outline_patch(outline, label="" if number else label, **style))
+
+
+def draw_sensor(design: Design, colours: Sequence[str], ax: Axes, plane: tuple[int, int]) -> None:
+    """Draw a sensor within its domain as seen along one axis, in millimetres.
+
+    Args:
+        design: Its design.
+        colours: A colour for each electrode.
+        ax: Where it is drawn.
+        plane: The axes to the right and up, (0, 1) from above.
+    """
+    a, b = plane
+    low, high = design.domain.lower * 1e3, design.domain.upper * 1e3
+    walls = shapely.geometry.box(low[a], low[b], high[a], high[b])
+    ax.add_patch(outline_patch(walls, fc="none", ec=FAINT, lw=1.0))
+    for layer in design.layers:
+        for outline in outlines(layer.surface, plane):
+            ax.add_patch(outline_patch(outline, fc=LAYER_COLOUR, ec=FAINT, lw=0.6))
+    electrodes = list(zip(design.electrodes, colours, strict=True))
+    if plane == (0, 1):
+        for conductor in design.conductors:
+            add_surface(ax, conductor.surface, fc="#d5dade", ec="none")
+        for electrode, colour in electrodes:
+            add_surface(ax, electrode.surface, fc=colour, ec="white", lw=0.3, zorder=2)
+        return
+    sheets = [(c.surface, ROLE_COLOURS[c.role], 1.5) for c in design.conductors]
+    for surface, colour, width in sheets + [(e.surface, c, 3.0) for e, c in electrodes]:
+        low, high = surface.bounds * 1e3
+        ends = [low[a], high[a]], [low[b], high[b]]
+        ax.plot(*ends, color=colour, lw=width, solid_capstyle="butt", zorder=2)
 
 
 def _note(ax: Axes, text: str, at: tuple[float, float], **style: Any) -> None:

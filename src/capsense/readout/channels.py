@@ -105,10 +105,7 @@ def self_patterns(
 
 
 def mutual_patterns(
-    electrodes: Sequence[str],
-    pairs: Iterable[tuple[str, str]] = (),
-    *,
-    rest: Rest = "grounded",
+    electrodes: Sequence[str], pairs: Iterable[tuple[str, str]] = (), *, rest: Rest = "grounded"
 ) -> tuple[Pattern, ...]:
     """Pairs (transmitter, receiver); by default every pair once, in the order of the electrodes.
 

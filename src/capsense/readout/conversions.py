@@ -23,7 +23,7 @@ from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Ints, require, require_whole
 
 if TYPE_CHECKING:
-    from capsense.readout.readout import Readout
+    from capsense.readout import Readout
 
 
 @dataclass(frozen=True)
@@ -368,7 +368,7 @@ class SideBySide:
         return self._one.channel_names
 
     def reset(self, *, start: float = 0.0, seed: int | None = None) -> None:
-        """Switch all chips on anew, see :meth:`~capsense.readout.readout.Readout.reset`."""
+        """Switch all chips on anew, see :meth:`~capsense.readout.Readout.reset`."""
         self._many.reset(start=start, seed=seed)
 
     def sample(

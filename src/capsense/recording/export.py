@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from capsense._style import COLOURS
 from capsense.errors import RecordingError, require_package
 from capsense.readout.conversions import Counts, join
+from capsense.recording import Session
 from capsense.recording.reader import Recording, Step
-from capsense.recording.session import Session
 from capsense.recording.tables import (
     Run,
     column_meanings,

@@ -335,9 +335,29 @@ class McapFile:
                 type_name, "ros2msg", text.encode()
             )
         notes = {
-            "offered_qos_profiles": ros.offered_qos(topic),
+            "offered_qos_profiles": offered_qos(topic),
             "topic_type_hash": ros.type_hash(type_name),
         }
         channel = self._writer.register_channel(topic, "cdr", self._schemas[type_name], notes)
         self._channels[topic] = channel
         return channel
+
+
+def offered_qos(topic: str) -> str:
+    """Quality of service of a lasting topic, as rosbag2 writes it down.
+
+    Policies are numbers, which all versions of rosbag2 read. Other topics have none, which it takes
+    for its defaults.
+    """
+    if not ros.lasting(topic):
+        return ""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
+    from rosbags.interfaces import QosTime as Time
+    from rosbags.rosbag2.metadata import dump_qos_v8
+
+    ever = Time(9223372036, 854775807)
+    profile = Qos(
+        QosHistory.KEEP_LAST, ros.lasting(topic), QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL, ever, ever, QosLiveliness.AUTOMATIC, ever, False,
+    )  # fmt: skip
+    return dump_qos_v8([profile])

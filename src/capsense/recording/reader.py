@@ -13,8 +13,7 @@ from capsense.codec import CHANGING, design_from_json, read_body, read_rest, rea
 from capsense.errors import RecordingError, SceneError
 from capsense.reading import Reading, StepStats
 from capsense.readout.conversions import Counts
-from capsense.recording.ros import PACKAGE, decode, require
-from capsense.recording.session import (
+from capsense.recording import (
     DESIGN,
     NAME,
     SESSION,
@@ -24,6 +23,7 @@ from capsense.recording.session import (
     shield_coupling,
     versions,
 )
+from capsense.recording.ros import PACKAGE, decode, require
 from capsense.scene import Body, Pose, RestSurface, Scene, Shape
 from capsense.simulator import Method
 

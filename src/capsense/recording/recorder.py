@@ -6,24 +6,21 @@ import atexit
 import errno
 import logging
 import math
-import re
 import types
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from capsense.adapters.attached import AttachedSensor
+from capsense.adapters import AttachedSensor
 from capsense.codec import design_to_json
 from capsense.errors import ReadoutError, RecordingError, require_package
 from capsense.reading import Reading
-from capsense.readout.config import file_content, parse_readout
-from capsense.readout.readout import Readout
-from capsense.recording import ros
+from capsense.readout import Readout
+from capsense.recording import DESIGN, NAME, SESSION, check_name, describe, make_readout, ros
 from capsense.recording.files import McapFile
-from capsense.recording.session import DESIGN, NAME, SESSION, describe
 from capsense.scenario.model import Scenario
 from capsense.scene import DepthFrame, Scene
 from capsense.simulator import Simulator
@@ -264,35 +261,6 @@ def record(path: str | Path, source: Simulator | AttachedSensor, **options: Any)
     The same as :class:`Recorder`.
     """
     return Recorder(path, source, **options)
-
-
-def check_name(name: str) -> None:
-    """Refuse what cannot be the name of a sensor.
-
-    Raises:
-        RecordingError: It is none.
-    """
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise RecordingError(f"name is {name!r}; give letters, digits and underscores")
-
-
-def make_readout(
-    readout: Readout | str | Path | None, electrodes: Sequence[str], empty: Reading | None = None
-) -> tuple[Readout | None, Mapping[str, Any] | None]:
-    """A readout, and the content of its file where it has one or could have.
-
-    Args:
-        readout: A chip's name, the path of a readout file, a readout, or None.
-        electrodes: Electrode names in matrix order.
-        empty: The reading of an empty scene, which a named chip is set up for.
-
-    Raises:
-        ReadoutError: There is no such chip or file, or anything in it is wrong.
-    """
-    if readout is None or isinstance(readout, Readout):
-        return readout, None
-    config = file_content(readout, electrodes, empty)
-    return parse_readout(config, electrodes, source=str(readout)), config
 
 
 def _scene(world: Scene | DepthFrame) -> Scene:

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._style import signal_colours
+from capsense._style import signal_colours, strength
 from capsense.codec import CHANGING, body_fields, shape_fields
 from capsense.errors import RecordingError, require_package
 from capsense.reading import Reading
-from capsense.recording.session import Session, shield_coupling
+from capsense.recording import Session, shield_coupling
 from capsense.scenario.model import read_channels
 from capsense.scene import (
     Body,
@@ -52,7 +52,6 @@ PLASTIC: Colour = (0.35, 0.6, 0.9, 0.6)
 _CUBE, _SPHERE, _CYLINDER, _TRIANGLES, _DELETE_ALL = 1, 2, 3, 11, 3
 SHADES = 32
 """Colours of an electrode between no signal and the largest."""
-_SMALLEST, _DECADES = 1e-16, 4.0
 
 
 def require() -> None:
@@ -126,26 +125,6 @@ def lasting(topic: str) -> int:
     return _LASTING.get(topic.rpartition("/")[2], 0)
 
 
-def offered_qos(topic: str) -> str:
-    """Quality of service of a lasting topic, as rosbag2 writes it down.
-
-    Policies are numbers, which all versions of rosbag2 read. Other topics have none, which it takes
-    for its defaults.
-    """
-    if not lasting(topic):
-        return ""
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
-    from rosbags.interfaces import QosTime as Time
-    from rosbags.rosbag2.metadata import dump_qos_v8
-
-    ever = Time(9223372036, 854775807)
-    profile = Qos(
-        QosHistory.KEEP_LAST, lasting(topic), QosReliability.RELIABLE,
-        QosDurability.TRANSIENT_LOCAL, ever, ever, QosLiveliness.AUTOMATIC, ever, False,
-    )  # fmt: skip
-    return dump_qos_v8([profile])
-
-
 def make(type_name: str, **fields: Any) -> Any:
     """A message; fields that are not given are zero or empty.
 
@@ -186,11 +165,6 @@ def type_hash(type_name: str) -> str:
 def fields_of(type_name: str) -> list[tuple[str, Any]]:
     """Names of a type's fields, each with its kind as ``rosbags`` describes it."""
     return list(_store().fielddefs[type_name][1])
-
-
-def strength(changes: Any) -> Any:
-    """How strongly electrodes light up, 0 to 1: the logarithm of 1 + change / 0.1 fF, 1 at 1 pF."""
-    return np.clip(np.log10(1.0 + np.abs(changes) / _SMALLEST) / _DECADES, 0.0, 1.0)
 
 
 class Moment(NamedTuple):

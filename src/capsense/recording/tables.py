@@ -19,7 +19,7 @@ from capsense.design.model import Design
 from capsense.errors import ScenarioError
 from capsense.reading import Reading
 from capsense.readout.conversions import Counts
-from capsense.recording.session import versions
+from capsense.recording import versions
 from capsense.scenario import Sample, Scenario
 from capsense.scenario.model import Channel, read_channels
 from capsense.scene import Scene

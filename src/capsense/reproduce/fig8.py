@@ -22,7 +22,7 @@ import capsense as cs
 from capsense._style import COLOURS, INK, LEGEND, dress
 from capsense.bench import moving_bar, reference_bar, time_steps
 from capsense.field.background import BuildSettings
-from capsense.masked.mesh_sensor import plan_axes
+from capsense.masked import plan_axes
 from capsense.reproduce.harness import Cell, Outcome, Report, ReportTable, Row, Store, judged, notes
 from capsense.simulator import Method, PresetName
 

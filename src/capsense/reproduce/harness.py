@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import capsense
-from capsense.recording.session import version_of
+from capsense.recording import version_of
 from capsense.recording.tables import replacing
 
 if TYPE_CHECKING:
@@ -283,8 +283,8 @@ def _plain(value: object) -> Any:
     raise TypeError(f"a part's input is a {type(value).__name__}; give numbers, texts or arrays")
 
 
-ABOVE = ("cli", "plotting", "reproduce", "viewer")
-"""Packages that a part does not depend on, but for the module that computes it."""
+ABOVE = ("__main__.py", "cli", "plotting", "reproduce", "viewer")
+"""What a part does not depend on, but for the module that computes it."""
 
 
 @lru_cache(maxsize=1)

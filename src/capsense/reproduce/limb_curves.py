@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 
 import capsense as cs
 from capsense._style import COLOURS, DASHES, INK, LEGEND, dress
-from capsense.design.loader import parse_design
+from capsense.design import parse_design
 from capsense.field.background import BuildSettings
 from capsense.reproduce.harness import Store
 from capsense.scene.materials import Grounding
@@ -65,11 +65,7 @@ RETREAT = (0.20, 0.20, 0.15)
 ACROSS = (0.0, float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)))
 """Turns a capsule's axis from z to x."""
 
-FITS = {
-    "board": (0.9966, 6.714),
-    "first holder": (0.7825, 7.513),
-    "second holder": (0.8438, 4.681),
-}
+FITS = {"board": (0.9966, 6.714), "first holder": (0.7825, 7.513), "second holder": (0.8438, 4.681)}
 """(k, b) of readings k/d − b, d in metres, fitted to a sensor on a PR2 above a person's forearm.
 
 From the source code published with Z. Erickson et al., "Tracking Human Pose During Robot-Assisted

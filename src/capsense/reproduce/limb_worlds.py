@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.adapters.attached import AttachedSensor
+from capsense.adapters import AttachedSensor
 from capsense.humans import Build, Limb, arm, leg
 from capsense.humans.formats import mjcf_body
 from capsense.scene import Pose

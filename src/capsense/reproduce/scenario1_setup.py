@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense.design import Design, Role, load_design
+from capsense.readout import Readout
 from capsense.readout.calibration import base_capacitance, relative_to
 from capsense.readout.channels import ChannelBank, Wiring, mutual_patterns
 from capsense.readout.conversions import Schedule
 from capsense.readout.laws import ShuntFrontEnd, ShuntLaw
 from capsense.readout.noise import White
-from capsense.readout.readout import Readout
 from capsense.scenario.model import Trajectory
 from capsense.scene import Body, Box, Pose, Scene
 from capsense.simulator import Simulator

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.errors import listed
 from capsense.scene.mesh_shape import TriangleShape
 from capsense.scene.scene import Body, Scene
 from capsense.scene.shapes import ShapeKind
@@ -132,13 +133,6 @@ class Contacts:
     def verb(self, one: str, many: str) -> str:
         """The form of a verb that goes with the electrodes."""
         return one if len(self.met) == 1 else many
-
-
-def listed(names: Sequence[str], most: int) -> str:
-    """The first names in quotes, and how many more there are."""
-    return ", ".join(map(repr, names[:most])) + f" and {len(names) - most} more" * (
-        len(names) > most
-    )
 
 
 def find_contacts(scene: Scene, electrodes: Mapping[str, Array]) -> tuple[Contacts, Contacts]:

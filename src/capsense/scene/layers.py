@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._frozen import read_only
 from capsense.errors import SceneError
 from capsense.scene.shapes import Shape, ShapeKind, as_points
 from capsense.scene.surface import checked_mesh, checked_thickness
@@ -76,11 +77,8 @@ class Layers(Shape):
         slots = sort_slots(f, b, low, high, reach)
         if slots == 0:
             raise SceneError("Layers: no pixel holds an interval; front must be less than back")
-        fields = self.__dict__
-        fields["front"], fields["back"], fields["size"] = low[:slots], high[:slots], wide
-        fields["front"].setflags(write=False)
-        fields["back"].setflags(write=False)
-        fields["_reach"] = reach
+        first, last = read_only(low[:slots]), read_only(high[:slots])
+        self.__dict__.update(front=first, back=last, size=wide, _reach=reach)
 
     @property
     def resolution(self) -> tuple[int, int]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._frozen import Frozen
+from capsense._frozen import Frozen, read_only
 from capsense.errors import SceneError
 from capsense.scene.shapes import Shape, ShapeKind, as_points
 from capsense.scene.surface import (
@@ -138,12 +138,7 @@ class TriMesh(TriangleShape):
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
         v, f, flaw = clean_surface(vertices, faces)
-        v.setflags(write=False)
-        f.setflags(write=False)
-        fields = self.__dict__
-        fields["vertices"] = v
-        fields["faces"] = f
-        fields["_flaw"] = flaw
+        self.__dict__.update(vertices=read_only(v), faces=read_only(f), _flaw=flaw)
 
     @property
     def closed(self) -> bool:
@@ -183,9 +178,7 @@ class TriMesh(TriangleShape):
 
     @cached_property
     def _bounds(self) -> Array:
-        out = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-        out.setflags(write=False)
-        return out
+        return read_only(np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)]))
 
     def _require_inside(self, what: str) -> None:
         flaw = self._flaw
@@ -226,10 +219,8 @@ class RestSurface(Frozen):
     ) -> None:
         number = checked_thickness(thickness)
         v, f = checked_mesh(vertices, faces)
-        f = f.copy()
-        v.setflags(write=False)
-        f.setflags(write=False)
-        self.__dict__.update(vertices=v, faces=f, thickness=number)
+        faces = read_only(f.copy())
+        self.__dict__.update(vertices=read_only(v), faces=faces, thickness=number)
 
     @cached_property
     def closed(self) -> bool:
@@ -269,8 +260,7 @@ class SurfaceMesh(TriangleShape):
                 f"vertices have shape {v.shape}, but the surface was made with "
                 f"{rest.vertices.shape}; make a new one to change its faces"
             )
-        v.setflags(write=False)
-        self.__dict__.update(vertices=v, faces=rest.faces, rest=rest)
+        self.__dict__.update(vertices=read_only(v), faces=rest.faces, rest=rest)
 
     @property
     def closed(self) -> bool:

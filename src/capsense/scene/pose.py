@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._frozen import Frozen
+from capsense._frozen import Frozen, read_only
 from capsense.errors import SceneError
 
 Array = NDArray[np.float64]
@@ -173,15 +173,12 @@ class Pose(Frozen):
     def rotation(self) -> Array:
         """Rotation matrix from the body's frame to the sensor frame, shape (3, 3), read-only."""
         x, y, z, w = self.quaternion
-        r = np.array(
-            (
-                (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-                (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-                (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-            )
+        rows = (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
         )
-        r.setflags(write=False)
-        return r
+        return read_only(np.array(rows))
 
     @property
     def matrix(self) -> Array:
@@ -239,3 +236,14 @@ def _matrix_to_quaternion(r: Array) -> Vec4:
     )
     x, y, z, w = (float(v) for v in rows[largest])
     return x, y, z, w
+
+
+def checked_pose(pose: object, what: str = "pose") -> Pose:
+    """A pose; anything else is refused by the name ``what``.
+
+    Raises:
+        SceneError: It is none.
+    """
+    if not isinstance(pose, Pose):
+        raise SceneError(f"{what} is {pose!r}; give a Pose(position, quaternion)")
+    return pose

@@ -13,7 +13,7 @@ from capsense.errors import SceneError
 from capsense.scene.materials import Grounding, Material, checked_grounding
 from capsense.scene.materials import material as find_material
 from capsense.scene.mesh_shape import SHEET_THICKNESS, RestSurface, SurfaceMesh
-from capsense.scene.pose import Pose
+from capsense.scene.pose import Pose, checked_pose
 from capsense.scene.shapes import Shape
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ class Body:
             raise SceneError(f"body name is {name!r}; give a non-empty string or None")
         fields = self.__dict__
         fields["shape"] = shape
-        fields["pose"] = _checked_pose(pose)
+        fields["pose"] = checked_pose(pose)
         fields["material"] = material if isinstance(material, Material) else find_material(material)
         fields["grounding"] = checked_grounding(grounding)
         fields["name"] = name
@@ -70,14 +70,8 @@ class Body:
         """
         body = object.__new__(Body)
         body.__dict__.update(self.__dict__)
-        body.__dict__["pose"] = _checked_pose(pose)
+        body.__dict__["pose"] = checked_pose(pose)
         return body
-
-
-def _checked_pose(pose: object) -> Pose:
-    if not isinstance(pose, Pose):
-        raise SceneError(f"pose is {pose!r}; give a Pose(position, quaternion)")
-    return pose
 
 
 class DeformableSurface:

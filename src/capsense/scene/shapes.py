@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capsense._frozen import Frozen
+from capsense._frozen import Frozen, read_only
 from capsense.errors import SceneError
 from capsense.scene.pose import Vec3, checked_floats
 
@@ -56,9 +56,7 @@ class Shape(Frozen, ABC):
     @cached_property
     def params(self) -> Array:
         """Sizes [m], see :class:`ShapeKind`, shape (3,), read-only."""
-        half = 0.5 * np.ptp(self.bounds(), axis=0)
-        half.setflags(write=False)
-        return half
+        return read_only(0.5 * np.ptp(self.bounds(), axis=0))
 
     @cached_property
     def packed(self) -> tuple[float, ...]:
@@ -122,9 +120,7 @@ def _sizes(shape: str, name: str, values: object) -> Vec3:
 
 
 def _frozen(*values: float) -> Array:
-    out = np.array(values)
-    out.setflags(write=False)
-    return out
+    return read_only(np.array(values))
 
 
 class _Primitive(Shape):

@@ -19,17 +19,11 @@ from capsense.errors import (
     SceneError,
     SolveError,
 )
-from capsense.scenario.loader import (
-    ScenarioTable,
-    read_bodies,
-    read_grounding,
-    read_material,
-    read_pose,
-)
+from capsense.scenario import ScenarioTable, read_bodies, read_grounding, read_material, read_pose
 from capsense.scene import Body, DepthFrame, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.materials import Grounding
-from capsense.server.frames import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
+from capsense.server import HEADER, MAX_SENSOR, MAX_SEQUENCE, PROTOCOL, DepthMessage
 
 MAX_TEXT = 65536
 """Largest control message [bytes]."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from capsense.errors import ProtocolError, ReadoutError
 from capsense.reading import Reading
+from capsense.readout import Readout
 from capsense.readout.conversions import Counts
-from capsense.readout.readout import Readout
 from capsense.scene import Body, Scene
-from capsense.server.frames import (
+from capsense.server import (
     CONVERSION,
     NO_DETECTOR,
     DepthMessage,

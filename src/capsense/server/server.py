@@ -23,11 +23,11 @@ from capsense._validate import suggest
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import ProtocolError, ServerError
+from capsense.readout import SEED_STRIDE, Readout
 from capsense.readout.config import choose_readout, file_content, parse_readout
-from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene import Body, Pose, Scene, Sphere
 from capsense.scene.depth import DepthFrame
-from capsense.server.frames import HEADER, PROTOCOL
+from capsense.server import HEADER, PROTOCOL
 from capsense.server.messages import MAX_TEXT, Open, Watch
 from capsense.server.sensor import ServedSensor
 from capsense.server.session import (

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from capsense.codec import design_to_json
 from capsense.errors import CapSenseError, MissingDependencyError, ProtocolError
-from capsense.server import messages
-from capsense.server.frames import PROTOCOL, unpack_depth
+from capsense.server import PROTOCOL, messages, unpack_depth
 from capsense.server.messages import BodiesMessage, PosesMessage
 from capsense.server.sensor import Frame, ServedSensor
 
@@ -229,7 +228,7 @@ class ClientSession:
 
     async def dismiss(self, code: str, text: str, close_code: int = POLICY) -> None:
         """Say what is wrong, and close the connection."""
-        self._server.log("dismissed", client=self.number, code=code, message=text[:200])
+        self._log("dismissed", code=code, message=text[:200])
         with suppress(ConnectionClosed):
             await self._send(json.dumps(messages.error_message(code, text)))
             await self._connection.close(close_code, code)
@@ -254,7 +253,7 @@ class ClientSession:
         hello = messages.read_hello(messages.parse(message))
         if not self._server.options.admits(hello.token):
             raise ProtocolError("the token is missing or wrong", "token")
-        self._server.log("hello", client=self.number, name=hello.client)
+        self._log("hello", name=hello.client)
         told = ("sensors", "pixels", "bodies", "message")
         await self._tell(
             "welcome", protocol=PROTOCOL, server=f"capsense {self._server.version}",
@@ -299,9 +298,7 @@ class ClientSession:
         sensor = await self._server.work(lambda: self._server.make_sensor(wanted))
         self.sensors[wanted.sensor] = sensor
         simulator, readout = sensor.simulator, sensor.readout
-        self._server.log(
-            "opened", client=self.number, sensor=wanted.sensor, design=simulator.design.name
-        )
+        self._log("opened", sensor=wanted.sensor, design=simulator.design.name)
         domain = simulator.design.domain
         await self._tell(
             "opened", sensor=wanted.sensor, design=simulator.design.name,
@@ -317,7 +314,7 @@ class ClientSession:
             sensor.drop()
             del self.sensors[number]
         sensor.leave()
-        self._server.log("closed", client=self.number, sensor=number)
+        self._log("closed", sensor=number)
         await self._tell(
             "closed", sensor=number, frames=sensor.frames, readings=sensor.readings,
             dropped=sensor.dropped,
@@ -334,9 +331,7 @@ class ClientSession:
             "watching", client=client, sensor=sensor.options.sensor, open=sensor.options.table,
             design=json.loads(design), baseline=sensor.simulator.baseline.tolist(),
         )  # fmt: skip
-        self._server.log(
-            "watches", client=self.number, watched=client, sensor=sensor.options.sensor
-        )
+        self._log("watches", watched=client, sensor=sensor.options.sensor)
         self._watched = sensor
         sensor.watchers.add(self)
         if sensor.left:  # meanwhile
@@ -404,14 +399,15 @@ class ClientSession:
         """Answer an error; one that nobody foresaw is logged in full."""
         if isinstance(error, CapSenseError):
             code, text = messages.code_of(error), str(error)
-            self._server.log(
-                "refused", client=self.number, code=code, message=text[:200], **address
-            )
+            self._log("refused", code=code, message=text[:200], **address)
         else:
             code, text = "internal", "a fault of the server; its log says more"
             self._server.fault("internal error", client=self.number, **address)
         await self._send(json.dumps(messages.error_message(code, text, **address)))
         await self._pace(MISTAKE)
+
+    def _log(self, event: str, **fields: Any) -> None:
+        self._server.log(event, client=self.number, **fields)
 
     async def _tell(self, kind: str, **content: Any) -> None:
         await self._send(json.dumps({"type": kind, **content}))
@@ -426,5 +422,5 @@ class ClientSession:
             async with asyncio.timeout(self._limits.send_timeout):
                 await self._connection.send(message)
         except TimeoutError:
-            self._server.log("too slow", client=self.number)
+            self._log("too slow")
             self._connection.transport.abort()

@@ -16,12 +16,12 @@ from capsense.codec import design_from_json
 from capsense.errors import ProtocolError, RecordingError, ServerError
 from capsense.field.background import Charges
 from capsense.reading import Reading, StepStats
-from capsense.recording.session import GONE, reading_of
+from capsense.recording import GONE, reading_of
 from capsense.scenario import Channel, Scenario
 from capsense.scenario.model import Excitation, channels_of
 from capsense.scene import Body, Pose, Scene, Shape
+from capsense.server import DepthMessage, ReadingMessage
 from capsense.server.client import Client
-from capsense.server.frames import DepthMessage, ReadingMessage
 from capsense.server.messages import MessageTable, Open, read_open, read_scene
 from capsense.simulator import Simulator
 

@@ -6,6 +6,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,9 +24,9 @@ from capsense.errors import SceneError
 from capsense.humans import Build, Limb, arm
 from capsense.learning.envs.signals import LIMIT, Signals
 from capsense.reading import Reading
+from capsense.readout import Readout
 from capsense.readout.calibration import LinearSensor
 from capsense.readout.presets import chip_of
-from capsense.readout.readout import Readout
 from capsense.scene import Material, Pose
 from capsense.simulator import PresetName, Simulator
 from capsense.skin import AnyDesign
@@ -299,10 +300,10 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
 
     def observe(self, now: Mapping[str, Reading]) -> Observation:
         """The observation, from what the sensors read now."""
-        joints = self.model.actuator_trnid[:, 0]
-        own = [self.data.qpos[self.model.jnt_qposadr[joints]],
-               self.data.qvel[self.model.jnt_dofadr[joints]], self.also()]  # fmt: skip
-        rest = np.clip(np.concatenate(own), -LIMIT, LIMIT).astype(np.float32)
+        m, joints = self.model, self.model.actuator_trnid[:, 0]
+        places, rates = self.data.qpos[m.jnt_qposadr[joints]], self.data.qvel[m.jnt_dofadr[joints]]
+        own = np.concatenate([places, rates, self.also()])
+        rest = np.clip(own, -LIMIT, LIMIT).astype(np.float32)
         return np.concatenate([self.signals.read(self.data.time, now), rest])
 
     @property
@@ -364,9 +365,8 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
                 )  # fmt: skip
 
     def _move_limb(self, pose: Pose) -> None:
-        x, y, z, w = pose.quaternion
         self.data.mocap_pos[0] = pose.position
-        self.data.mocap_quat[0] = (w, x, y, z)
+        self.data.mocap_quat[0] = (pose.quaternion[3], *pose.quaternion[:3])
 
     def _force(self) -> float:
         """Sum of the normal forces of all contacts [N]."""
@@ -380,15 +380,11 @@ class CapacitiveEnv(gymnasium.Env[Observation, NDArray[np.float32]], ABC):
 
     def clearance(self) -> float:
         """Distance between the robot and the person [m], at most 0.5."""
-        limb = self.model.body("limb").id
-        body = self.model.geom_bodyid
-        person = [g for g in range(self.model.ngeom) if body[g] == limb]
-        robot = [g for g in range(self.model.ngeom)
-                 if self.model.geom_conaffinity[g] and body[g] != limb]  # fmt: skip
-        return min(
-            mujoco.mj_geomDistance(self.model, self.data, a, b, 0.5, None)
-            for a in robot for b in person
-        )  # fmt: skip
+        m = self.model
+        person = m.geom_bodyid == m.body("limb").id
+        robot = np.flatnonzero(~person & (m.geom_conaffinity != 0))
+        pairs = product(robot.tolist(), np.flatnonzero(person).tolist())
+        return min(mujoco.mj_geomDistance(m, self.data, a, b, 0.5, None) for a, b in pairs)
 
     def site_frame(self, site: str) -> tuple[Array, Array]:
         """Position [m] and rotation matrix of a site in the world."""

@@ -20,8 +20,8 @@ from capsense.adapters import mujoco as adapter
 from capsense.errors import SceneError
 from capsense.learning.scenes import settled, settling
 from capsense.reading import Reading
+from capsense.readout import SEED_STRIDE, Readout
 from capsense.readout.config import make_readout
-from capsense.readout.readout import SEED_STRIDE, Readout
 from capsense.scene import Pose
 from capsense.skin import AnyDesign
 

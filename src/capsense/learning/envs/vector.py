@@ -17,8 +17,8 @@ from capsense.adapters.rules import Rules
 from capsense.adapters.world import Solid
 from capsense.errors import SceneError
 from capsense.fleet import Fleet
+from capsense.learning.envs import ApproachStop, Dressing, LimbFollow
 from capsense.learning.envs.base import CapacitiveEnv
-from capsense.learning.envs.tasks import ApproachStop, Dressing, LimbFollow
 from capsense.reading import Reading, StepStats
 from capsense.scene import Body, Pose, Shape
 
@@ -255,19 +255,19 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
 
 
 class LimbFollowVector(CapacitiveVectorEnv):
-    """Many of :class:`~capsense.learning.envs.tasks.LimbFollow`."""
+    """Many of :class:`~capsense.learning.envs.LimbFollow`."""
 
     world = LimbFollow
 
 
 class DressingVector(CapacitiveVectorEnv):
-    """Many of :class:`~capsense.learning.envs.tasks.Dressing`."""
+    """Many of :class:`~capsense.learning.envs.Dressing`."""
 
     world = Dressing
 
 
 class ApproachStopVector(CapacitiveVectorEnv):
-    """Many of :class:`~capsense.learning.envs.tasks.ApproachStop`."""
+    """Many of :class:`~capsense.learning.envs.ApproachStop`."""
 
     world = ApproachStop
 
