@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # threads of several processes wait for one another
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import interpreted
 import pytest
