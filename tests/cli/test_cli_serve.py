@@ -109,15 +109,18 @@ def test_quiet() -> None:
         port = free.getsockname()[1]
     command = [*SERVE[:-1], str(port), "--quiet"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        until = time.monotonic() + WAIT
-        while time.monotonic() < until:
-            try:
-                Client(f"ws://127.0.0.1:{port}", timeout=WAIT).close()
-                break
-            except OSError:
-                time.sleep(0.1)
-        process.send_signal(signal.SIGTERM)
-        _, logged = process.communicate(timeout=WAIT)
+        try:
+            until = time.monotonic() + WAIT
+            while time.monotonic() < until:
+                try:
+                    Client(f"ws://127.0.0.1:{port}", timeout=WAIT).close()
+                    break
+                except OSError:
+                    time.sleep(0.1)
+            process.send_signal(signal.SIGTERM)
+            _, logged = process.communicate(timeout=WAIT)
+        finally:
+            process.kill()
     assert (process.returncode, logged) == (0, "")
 
 
