@@ -55,7 +55,10 @@ class Solution(NamedTuple):
 
 
 @pasted
-def _prepared(bodies, green, threshold, width):
+def _prepared(
+    bodies: NDArray[np.void], green: Green, threshold: float, width: float
+) -> tuple[Cut, Leaves, Functions, System]:
+    """:func:`prepared`, for kernels; Python would compile it anew in each process."""
     cut = chosen(bodies, green, threshold, width)
     cut, leaves = reached(cut, placed(bodies, cut, green, INSIDE))
     rows = leaf_rows(leaves.points, leaves.beyond, green)
