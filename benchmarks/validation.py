@@ -13,6 +13,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -214,10 +215,10 @@ def categories() -> str:
     return table(("category", *HEAD), lines)
 
 
-def designs() -> str:
-    """Errors over guarded pads and a pair of pads."""
+def designs(only: str = "") -> str:
+    """Errors over guarded pads and a pair of pads, of cases with ``only`` in their names."""
     lines = []
-    for case in reference_designs.compared("surface"):
+    for case in reference_designs.compared("surface", only):
         cells = [
             "–" if np.isnan(t) else f"{t:.2f} fF, {100 * (g / t - 1):+.2f} %"
             for t, g in case["pairs"]
@@ -227,11 +228,11 @@ def designs() -> str:
     return table(head, lines)
 
 
-def limited(part: str, *columns: str) -> str:
-    """A table of ``limits.py``, in per cent."""
-    found = getattr(limits, part)(cs.Simulator(limits.DESIGN))
-    lines = [(name, *(f"{100 * e:.1f}" for e in errors)) for name, errors in found]
-    return table(("", *columns), lines)
+def limited(part: str, *columns: str, lines: int | None = None) -> str:
+    """A table of ``limits.py``, in per cent; its first lines only where a number is given."""
+    found = islice(getattr(limits, part)(cs.Simulator(limits.DESIGN)), lines)
+    cells = [(name, *(f"{100 * e:.1f}" for e in errors)) for name, errors in found]
+    return table(("", *columns), cells)
 
 
 def machine() -> str:

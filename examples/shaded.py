@@ -49,7 +49,7 @@ class Camera:
         return float(0.5 * self.size[0] / np.tan(0.5 * self.field))
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _fill(p, normals, number, near, owner, normal):  # type: ignore[no-untyped-def]
     """Draw triangles: columns, rows and nearness of corners (m, 3, 3), their normals (m, 3, 3)."""
     rows, columns = near.shape

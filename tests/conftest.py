@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # threads of several processes wait for one another
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import interpreted
 import pytest
@@ -25,8 +29,11 @@ Simulators = Callable[..., "cs.Simulator"]
 def field_cache(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where tests keep built fields: beside pytest's own cache, by the sources that build them.
 
-    A field built by other sources is never read, and is removed.
+    A field built by other sources is never read, and is removed. ``CAPSENSE_TEST_FIELDS`` names
+    another folder, whose fields these sources have built: ``.ci/run`` has one.
     """
+    if "CAPSENSE_TEST_FIELDS" in os.environ:
+        return Path(os.environ["CAPSENSE_TEST_FIELDS"])
     package = Path(cs.__file__).parent
     digest = hashlib.sha256()
     for part in ("field", "design"):

@@ -138,3 +138,36 @@ def test_processes_that_start_together_compile_each_kernel_once(tmp_path: Path) 
     assert len({value for value, _ in found}) == 1
     assert len(list(folder.rglob("*.nbc"))) == 2
     assert not list(folder.rglob("*.lock"))
+
+
+SOLVED = """
+import sys
+from numba.core import event
+import capsense as cs
+
+class Compiled(event.Listener):
+    names = []
+
+    def on_start(self, started):
+        self.names.append(started.data["dispatcher"].__name__)
+
+    def on_end(self, ended):
+        pass
+
+event.register("numba:compile", Compiled())
+sim = cs.Simulator("patch")
+for material in ("steel", "human", cs.Material("gel", 5.0, 2e-4)):
+    ball = cs.Body(cs.Sphere(0.02), cs.Pose((0, 0, 0.05)), material, grounding=1e-10)
+    sim.step(cs.Scene([ball]))
+print(*Compiled.names)
+"""
+
+
+def test_nothing_is_compiled_in_a_second_process() -> None:
+    """Regression: scenes with losses compiled a part of their step in every process, for 5 s."""
+    for _ in range(2):
+        run = [sys.executable, "-c", SOLVED]
+        env = {**os.environ, "PYTHONPATH": _path()}
+        done = subprocess.run(run, env=env, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

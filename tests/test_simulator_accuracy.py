@@ -27,6 +27,7 @@ from field_cases import (
 import capsense as cs
 from capsense.constants import EPS0
 from capsense.design.model import Domain
+from capsense.field.background import BuildSettings
 
 Array = np.ndarray
 
@@ -157,7 +158,8 @@ def test_patches_far_from_the_floor(simulators, case):
     design = cs.load_design("six_patch")
     middle = dataclasses.replace(design, domain=Domain((0.5, 0.5, 0.5), 0.25))
     diagonal = 0.03 if case.startswith("bar") and case != "bar_200" else 0.05
-    check(simulators(middle), "six_patch_midcube", case, diagonal, 0.05)
+    sim = simulators(middle, settings=BuildSettings(panel_scale=2.0))
+    check(sim, "six_patch_midcube", case, diagonal, 0.05)
 
 
 @pytest.mark.parametrize(

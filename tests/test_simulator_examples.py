@@ -33,13 +33,13 @@ def test_forearm(
     pytest.importorskip(simulator, reason=f"{simulator} is not installed")
     monkeypatch.delenv("DISPLAY", raising=False)
     module = example(f"{simulator}_forearm", monkeypatch)
-    monkeypatch.setattr("forearm_story.FRAMES", 4)
+    monkeypatch.setattr("forearm_story.FRAMES", 2)
     record = module.main(tmp_path, **options)
     assert (tmp_path / "forearm.png").stat().st_size > 10_000
     from PIL import Image
 
     with Image.open(tmp_path / "forearm.webp") as animation:
-        assert getattr(animation, "n_frames", 1) == 4
+        assert getattr(animation, "n_frames", 1) == 2
     table = (tmp_path / "forearm.csv").read_text(encoding="utf-8").splitlines()
     assert len(table) == 1 + len(record.time)
     last = [float(v) for v in table[-1].split(",")]
@@ -64,7 +64,7 @@ def test_skin_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     module = example("skin_stops", monkeypatch)
     monkeypatch.setattr(module, "RATE", 10.0)
-    monkeypatch.setattr(module, "FRAMES", 4)
+    monkeypatch.setattr(module, "FRAMES", 2)
     record = module.main(tmp_path)
     assert record.signal[0].shape == (16,)
     for name in ("skin_stops.png", "skin_stops.webp"):

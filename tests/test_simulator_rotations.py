@@ -38,7 +38,7 @@ def test_turning_the_scene_over_a_disc(
     shape: cs.Box, pose: cs.Pose, bound: float, simulators: Simulators
 ) -> None:
     """Measured: 0.2, 0.3, 1.5 and 4 % at most of the mean, over sixteen angles."""
-    sim = simulators(patches(shapely.Point(0, 0).buffer(0.03, 64), backplane=0.01))
+    sim = simulators(patches(shapely.Point(0, 0).buffer(0.03, quad_segs=48), backplane=0.005))
     angles = np.random.default_rng(0).uniform(0.0, 2 * math.pi, 16)
     read = []
     for angle in angles:

@@ -63,10 +63,10 @@ def test_interrupt_while_a_field_is_built(tmp_path: Path, number: signal.Signals
         [*COMMAND, "design", str(path)], env={**os.environ, "CAPSENSE_CACHE_DIR": str(cache)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while not list(cache.glob("*.lock")):
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline, "no build within a minute"
+        assert time.monotonic() < deadline, "no build within five minutes"
         time.sleep(0.01)
     process.send_signal(number)
     _, errors = process.communicate(timeout=120)

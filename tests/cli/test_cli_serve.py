@@ -28,6 +28,8 @@ from capsense.cli.serve import JsonLines
 from capsense.errors import ProtocolError
 from capsense.server.client import Client
 
+WAIT = 120.0
+"""Longest wait for a process [s]; only a failure takes so long."""
 SERVE = [sys.executable, "-m", "capsense", "serve", "--design", "patch", "--port", "0"]
 
 
@@ -54,10 +56,10 @@ def test_serves_until_a_signal(number: signal.Signals, tmp_path: Path) -> None:
             sensor = client.open()
             assert sensor.channel_names
             sensor.step(np.full((16, 16), 0.1))
-            with urllib.request.urlopen(f"http{url[2:]}/health", timeout=5) as answer:
+            with urllib.request.urlopen(f"http{url[2:]}/health", timeout=WAIT) as answer:
                 assert json.loads(answer.read())["readings"] == 1
             process.send_signal(number)
-            assert process.wait(10) == 0
+            assert process.wait(WAIT) == 0
             with pytest.raises(ProtocolError, match="1001"):
                 sensor.step(np.full((16, 16), 0.1))
         assert process.stderr is not None
@@ -75,7 +77,7 @@ def test_a_second_signal_stops_at_once(number: signal.Signals, code: int) -> Non
         while json.loads(process.stderr.readline())["event"] != "stopping":
             pass
         process.send_signal(number)
-        assert process.wait(10) == code
+        assert process.wait(WAIT) == code
         assert '"stopped"' not in process.stderr.read()
 
 
@@ -107,14 +109,18 @@ def test_quiet() -> None:
         port = free.getsockname()[1]
     command = [*SERVE[:-1], str(port), "--quiet"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        for _ in range(200):
-            try:
-                Client(f"ws://127.0.0.1:{port}", timeout=1).close()
-                break
-            except OSError:
-                time.sleep(0.1)
-        process.send_signal(signal.SIGTERM)
-        _, logged = process.communicate(timeout=10)
+        try:
+            until = time.monotonic() + WAIT
+            while time.monotonic() < until:
+                try:
+                    Client(f"ws://127.0.0.1:{port}", timeout=WAIT).close()
+                    break
+                except OSError:
+                    time.sleep(0.1)
+            process.send_signal(signal.SIGTERM)
+            _, logged = process.communicate(timeout=WAIT)
+        finally:
+            process.kill()
     assert (process.returncode, logged) == (0, "")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -35,11 +34,9 @@ def test_names() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_loads_fast_and_the_same_again(name: str) -> None:
-    """Loading takes well under 0.2 s and gives the same content."""
-    start = time.perf_counter()
+def test_loads_the_same_again(name: str) -> None:
+    """Loading twice gives the same content."""
     first = load_design(name)
-    assert time.perf_counter() - start < 0.2
     assert load_design(name).content_hash() == first.content_hash()
     assert first.domain.size == (0.5, 0.5, 0.5)
     assert first.description

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny_field import SETTINGS, arrays, digest, tiny_design
+from tiny_field import SETTINGS, arrays, digest, few_sources, tiny_design
 
 from capsense.field import background
 from capsense.field.background import BuildSettings, MeshSettings, build_background
 from capsense.field.boundary import Accuracy, BoundarySolution
+
+
+@pytest.fixture(scope="module", autouse=True)
+def rough() -> Iterator[None]:
+    """How well charges are answered does not matter here, so that fields are built quickly."""
+    with few_sources():
+        yield
 
 
 def test_a_field_is_that_of_its_boundary_elements() -> None:

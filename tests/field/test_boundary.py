@@ -45,7 +45,7 @@ NACL = 1.7475646
 charges that a point charge q there draws to the walls is −NACL q / (4π eps0 L)."""
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.5])
+@pytest.mark.parametrize("scale", [1.0, pytest.param(0.5, marks=pytest.mark.slow)])
 @pytest.mark.e2e
 def test_unit_square_plate(scale):
     """Analytic: a square plate's 0.366787 · 4π eps0 a, in series with the grounded cube's images.

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_field
-from tiny_field import SETTINGS, digest, tiny_data, tiny_design
+from tiny_field import FIT, SETTINGS, digest, few_sources, tiny_data, tiny_design
 
 from capsense.design import parse_design
 from capsense.field import background, cache
@@ -36,8 +36,14 @@ from capsense.field.cache import (
 )
 
 DENSE = "boundary elements: factorising"
-FIT = "response to charges: fit"
 KEY = cache_key(tiny_design(), SETTINGS)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def rough() -> Iterator[None]:
+    """What is in a field does not matter here, so that it is built quickly."""
+    with few_sources():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -299,7 +305,7 @@ def _wait_for(log: Path, text: str, count: int = 1, limit: float = 120.0) -> Non
 
 def test_two_processes_build_once(tmp_path: Path, reference: str) -> None:
     log = tmp_path / "log"
-    processes = [_start(tmp_path / "cache", log, 0.05) for _ in range(2)]
+    processes = [_start(tmp_path / "cache", log, 1.0) for _ in range(2)]
     for process in processes:
         out, err = process.communicate(timeout=120)
         assert process.returncode == 0, err
@@ -310,7 +316,7 @@ def test_two_processes_build_once(tmp_path: Path, reference: str) -> None:
 
 def test_a_killed_builder_frees_the_lock(tmp_path: Path, reference: str) -> None:
     log = tmp_path / "log"
-    builder = _start(tmp_path, log, 0.3)
+    builder = _start(tmp_path, log, 60.0)
     _wait_for(log, f"{builder.pid} {FIT}")
     builder.send_signal(signal.SIGSTOP)  # on a busy machine it would end before the other begins
     waiter = _start(tmp_path, log, 0.0)
@@ -328,12 +334,11 @@ def test_a_killed_builder_frees_the_lock(tmp_path: Path, reference: str) -> None
 def test_ctrl_c_ends_a_build_at_once(tmp_path: Path) -> None:
     log = tmp_path / "log"
     folder = tmp_path / "cache"
-    builder = _start(folder, log, 1.0)
+    builder = _start(folder, log, 60.0)
     _wait_for(log, FIT)
-    start = time.monotonic()
     builder.send_signal(signal.SIGINT)
-    _, err = builder.communicate(timeout=60)
-    assert time.monotonic() - start < 5.0
+    _, err = builder.communicate(timeout=120)
+    assert log.read_text().splitlines()[-1].endswith(FIT)
     assert builder.returncode != 0
     assert "KeyboardInterrupt" in err
     assert files(folder) == []
@@ -456,7 +461,7 @@ def test_a_folder_that_cannot_be_written(
 
 @pytest.mark.parametrize(
     ("options", "error"),
-    [("size=32k", "No space left on device"), ("ro", "Read-only file system")],
+    [("size=8k", "No space left on device"), ("ro", "Read-only file system")],
 )
 def test_a_real_file_system_that_is_full_or_read_only(
     options: str, error: str, tmp_path: Path, reference: str

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_field import few_sources
 
 import capsense as cs
 from capsense import codec
 from capsense.constants import EPS0
 from capsense.design import parse_design
+from capsense.field.background import build_background
 
 RADIUS = 0.010
 
@@ -26,13 +29,13 @@ def disc(**domain: object) -> cs.Design:
 
 
 @pytest.fixture(scope="module")
-def sim() -> cs.Simulator:
-    return cs.Simulator(disc(open=True))
+def sim(field_cache: Path) -> cs.Simulator:
+    return cs.Simulator(disc(open=True), cache_dir=field_cache)
 
 
 @pytest.fixture(scope="module")
-def boxed() -> cs.Simulator:
-    return cs.Simulator(disc())
+def boxed(field_cache: Path) -> cs.Simulator:
+    return cs.Simulator(disc(), cache_dir=field_cache)
 
 
 def test_disc_alone_has_the_capacitance_of_the_textbook(sim, boxed):
@@ -97,6 +100,7 @@ def test_matrix_is_physical_with_a_layer_at_the_end_of_the_box():
             "layer": [layer],
         }
     )
-    bare, more = (cs.Simulator(d).baseline[0, 0] for d in (design, covered))
+    with few_sources():  # capacitances come from the boundary elements alone
+        bare, more = (build_background(d).capacitance[0, 0] for d in (design, covered))
     assert 1.05 < more / bare < 2.0
     assert np.isfinite(more)

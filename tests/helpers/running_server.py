@@ -13,7 +13,7 @@ from typing import Any
 from capsense.server.client import Client
 from capsense.server.server import Server, ServerOptions
 
-WAIT = 20.0
+WAIT = 120.0
 """Longest wait for a server to start or stop [s]."""
 
 
@@ -71,7 +71,7 @@ class RunningServer:
     def get(self, path: str) -> tuple[int, dict[str, Any]]:
         """Status and content of a plain HTTP request."""
         try:
-            with urllib.request.urlopen(f"http{self.url[2:]}{path}", timeout=5) as answer:
+            with urllib.request.urlopen(f"http{self.url[2:]}{path}", timeout=WAIT) as answer:
                 return answer.status, json.loads(answer.read())
         except urllib.error.HTTPError as answer:
             return answer.code, {}

@@ -21,6 +21,8 @@ from ball_scenario import ball_scenario
 
 from capsense.__main__ import main
 
+WAIT = 120.0
+"""Longest wait for a process [s]; only a failure takes so long."""
 VIEW = [sys.executable, "-m", "capsense", "view", "--port", "0"]
 
 
@@ -49,10 +51,10 @@ def test_shows_until_a_signal(number: signal.Signals, scenario: Path) -> None:
     """The address is printed, and how to reach it; the page is there; a signal ends it with 0."""
     with viewing(str(scenario)) as (process, url):
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+", url)
-        with urllib.request.urlopen(url, timeout=20) as answer:
+        with urllib.request.urlopen(url, timeout=WAIT) as answer:
             assert b"<html" in answer.read()
         process.send_signal(number)
-        out, errors = process.communicate(timeout=20)
+        out, errors = process.communicate(timeout=WAIT)
     assert process.returncode == 0
     assert out == ""
     assert errors.count("\n") == 1
@@ -65,7 +67,7 @@ def test_quiet(scenario: Path) -> None:
     with viewing(str(scenario), "--quiet", "--paused") as (process, url):
         assert url.startswith("http://127.0.0.1:")
         process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=20) == ("", "")
+        assert process.communicate(timeout=WAIT) == ("", "")
     assert process.returncode == 0
 
 
@@ -73,7 +75,7 @@ def test_open_to_others_is_warned_of(scenario: Path) -> None:
     """A page that others can reach is said to be."""
     with viewing(str(scenario), "--host", "0.0.0.0") as (process, _):
         process.send_signal(signal.SIGINT)
-        assert "whoever reaches this address" in process.communicate(timeout=20)[1]
+        assert "whoever reaches this address" in process.communicate(timeout=WAIT)[1]
 
 
 def test_watches_a_server() -> None:
@@ -91,7 +93,7 @@ def test_watches_a_server() -> None:
                 with viewing("--connect", address, "-q") as (process, url):
                     assert url.startswith("http://127.0.0.1:")
                     process.send_signal(signal.SIGINT)
-                    assert process.communicate(timeout=20) == ("", "")
+                    assert process.communicate(timeout=WAIT) == ("", "")
                 assert process.returncode == 0
         finally:
             server.terminate()

@@ -55,6 +55,20 @@ class Solution(NamedTuple):
 
 
 @pasted
+def _prepared(
+    bodies: NDArray[np.void], green: Green, threshold: float, width: float
+) -> tuple[Cut, Leaves, Functions, System]:
+    """:func:`prepared`, for kernels; Python would compile it anew in each process."""
+    cut = chosen(bodies, green, threshold, width)
+    cut, leaves = reached(cut, placed(bodies, cut, green, INSIDE))
+    rows = leaf_rows(leaves.points, leaves.beyond, green)
+    pairs = leaf_pairs(leaves, green.floor)
+    bound_images(leaves, rows, pairs, green)
+    functions = functions_of(bodies, cut, leaves.beyond)
+    return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
+
+
+@compiled
 def prepared(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float
 ) -> tuple[Cut, Leaves, Functions, System]:
@@ -69,13 +83,7 @@ def prepared(
     Returns:
         The cut, its leaves, its functions and their system.
     """
-    cut = chosen(bodies, green, threshold, width)
-    cut, leaves = reached(cut, placed(bodies, cut, green, INSIDE))
-    rows = leaf_rows(leaves.points, leaves.beyond, green)
-    pairs = leaf_pairs(leaves, green.floor)
-    bound_images(leaves, rows, pairs, green)
-    functions = functions_of(bodies, cut, leaves.beyond)
-    return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
+    return _prepared(bodies, green, threshold, width)
 
 
 @compiled
@@ -87,7 +95,7 @@ def solve(
     ``adjoint`` asks for charges that the derivatives of the result follow from; else as
     :func:`prepared`.
     """
-    cut, leaves, functions, system = prepared(bodies, green, threshold, width)
+    cut, leaves, functions, system = _prepared(bodies, green, threshold, width)
     delta, left, coarse, x, shift = reduced(cut, functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
