@@ -77,7 +77,8 @@ def cut_of(
     )
     kids = np.stack([first, second], axis=1)
     parts = (1.0 - whole)[:, None] * np.stack([share, 1.0 - share], axis=1)
-    return Cut(body, node, kids, share, parts, leaf, whole, fade, above, np.array(leaves))
+    there = np.ones(len(node))
+    return Cut(body, node, kids, share, parts, leaf, whole, fade, above, there, np.array(leaves))
 
 
 def _add_barrier(cut: Cut, functions: Functions, system: System, beyond: Array) -> None:
@@ -129,7 +130,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
         cut, leaves, functions, system = prepared(bodies, green)
-        delta, left, coarse, x, shift = reduced(cut, functions, system, True)
+        delta, left, coarse, x, shift = reduced(functions, system, True)
         charge = leaf_charges(cut, functions, x, len(leaves.points))
         m = green.terminals
         return step.Solution(

@@ -25,6 +25,8 @@ GAIN = 1.3
 """What functions that are left out stand for, themselves and all below."""
 BARRIER = 1e5
 """Energy of charge out of reach [1/m]."""
+FULL = 0.1
+"""How far something of a cluster within reach is represented where its functions are whole."""
 COARSE_PANELS = 0.6
 """What panels are too coarse for, over the energy of the functions that end in them."""
 
@@ -204,8 +206,9 @@ class Chosen(NamedTuple):
 
 def within_reach(
     tree: tuple[Array, Array, Array], share: Array, chosen: Chosen, out: Array
-) -> dict[int, tuple[Array, Array]]:
-    """Unit charges on what is within reach of each cluster, on the panels and on the leaves.
+) -> tuple[dict[int, tuple[Array, Array]], dict[int, float]]:
+    """Unit charges on what is within reach of each cluster, on the panels and on the leaves, and
+    how far something of it within reach is represented.
 
     ``out`` is how far each leaf is out of reach. A cluster that is wholly out has none.
     """
@@ -213,6 +216,7 @@ def within_reach(
     amount = [charge[share[:, k] > 0].sum() for k in range(len(kids))]
     leaves, split = chosen.leaves.tolist(), chosen.functions.tolist()
     inside: dict[int, float] = {}
+    there: dict[int, float] = {}
     found: dict[int, tuple[Array, Array]] = {}
     for k in sorted({*leaves, *split}, reverse=True):  # parts stand behind their wholes
         terms, rest = [], 1.0
@@ -220,18 +224,20 @@ def within_reach(
             j = leaves.index(k)
             terms.append((chosen.whole[j] * (1 - out[j]), share[:, k], np.eye(len(leaves))[j]))
             rest -= chosen.whole[j]
+            there[k] = chosen.whole[j] * (out[j] < 1.0)
         if k in split:
             for part in kids[k].tolist():
                 if part in found:
                     weight = rest * amount[part] / amount[k] * inside[part]
                     terms.append((weight, *found[part]))
+                    there[k] = max(there.get(k, 0.0), rest * there[part])
         inside[k] = sum(weight for weight, _, _ in terms)
         if inside[k] > 0.0:
             found[k] = (
                 sum(weight * panels for weight, panels, _ in terms) / inside[k],
                 sum(weight * on for weight, _, on in terms) / inside[k],
             )
-    return found
+    return found, there
 
 
 def reduced(
@@ -249,12 +255,14 @@ def reduced(
     columns, blocks, fade, above, ends = [], [], [], [], []
     for b, (piece, tree, all_of, cut) in enumerate(zip(pieces, trees, share, chosen, strict=True)):
         kids, own = tree[0], found.owner == b
-        units = within_reach(tree, all_of, cut, out[own])
+        units, there = within_reach(tree, all_of, cut, out[own])
         used = [] if piece.neutral or 0 not in units else [units[0]]
+        full = [_smooth(there[0] / FULL)] * len(used)
         net = len(used)
         parted = [x in units and y in units for x, y in kids[cut.functions]]
         for x, y in kids[cut.functions[parted]]:
             used.append((units[x][0] - units[y][0], units[x][1] - units[y][1]))
+            full.append(_smooth(min(there[x], there[y]) / FULL))
         functions = np.array([on for on, _ in used]).reshape(-1, len(piece.panels)).T
         spread = np.zeros((len(found.owner), len(used)))
         spread[own] = np.array([on for _, on in used]).reshape(-1, own.sum()).T
@@ -262,8 +270,8 @@ def reduced(
         block = functions.T @ piece.block @ functions
         block[:net, :net] += piece.tie
         blocks.append(block)
-        fade.append(np.concatenate([[1.0] * net, cut.fade[parted]]))
-        above.append(np.concatenate([[1.0] * net, cut.above[parted]]))
+        fade.append(full * np.concatenate([[1.0] * net, cut.fade[parted]]))
+        above.append(full * np.concatenate([[1.0] * net, cut.above[parted]]))
         panels = (kids[kids[cut.functions[parted]]][..., 0] < 0).mean(axis=1)
         members_out = [
             any(out[own][on != 0.0].max(initial=0.0) > 0.0 for on in (units[x][1], units[y][1]))
@@ -292,7 +300,7 @@ def reduced(
 # ---- scores ----
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
-CROSSED, LARGE = 0.3, (0.08, 0.12)
+CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
 LONG, SHORE = (0.03, 0.06), 5e-3
 
 
@@ -339,15 +347,17 @@ def scores(
                     value = max(value, below) + 0.5 * min(value, below)
                 score[k] = (1 - linear[k]) * value
         score[0] = max(score[0], looks[0].crossing * np.sum(weight * net))
+        seen = np.ones(len(kids))
         for k in range(len(kids)):
             for part in kids[k]:
                 if part >= 0 and kids[part, 0] >= 0:
+                    seen[part] = seen[k] * _smooth((1 - linear.get(k, 1.0)) / SEEN)
                     score[part] += linear.get(part, 1.0) * DECAY * score[k]
         for k in reversed(range(len(kids))):
             if k in looks:
                 large = _smooth((looks[k].size - LARGE[0]) / (LARGE[1] - LARGE[0]))
                 least = max(score[0] * looks[k].size / looks[0].size, CROSSED * large)
-                score[k] = max(score[k], looks[k].crossing * least)
+                score[k] = max(score[k], seen[k] * looks[k].crossing * least)
             score[k] = max([score[k], *(score[p] for p in kids[k] if p >= 0)])
         out.append(score)
     return out
@@ -389,11 +399,12 @@ def _means(
         inside = min((point - room[0]).min(), (room[1] - point).min())
         off = np.linalg.norm(np.maximum(np.maximum(room[0] - point, point - room[1]), 0.0))
         out[k] = (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
-        out[k] *= 1 - _smooth(off / SHORE)
+        within = 1 - _smooth(off / SHORE)
+        out[k] *= within
         crossing = _smooth(2 - 4 * abs(inside) / size)
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
         even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
-        even = _smooth(even) if inside > 0 else 1.0
+        even = 1 - within * (1 - _smooth(even))
         looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, size)
         if kids[k, 0] >= 0 and looks[k].linear < 1:
             wanted += kids[k].tolist()

@@ -278,14 +278,14 @@ def test_charges_on_the_leaves(name: str) -> None:
 @pytest.mark.parametrize("name", [n for n in SOME if n in NAMES or not interpreted.ON])
 def test_charges_are_what_derivatives_follow_from(name: str, threshold: float) -> None:
     """Analytic: as ΔC = φᵀ M φ, it changes by dφᵀ x + xᵀ dφ, what is estimated included."""
-    cut, _, functions, system = prepared(
+    _, _, functions, system = prepared(
         scenes()[name].packed(), packed_green(), threshold, WIDTH
     )  # fmt: skip
     way = np.random.default_rng(3).normal(size=system.phi.shape)
     way *= 0.1 * np.abs(system.phi).max()
 
     def at(step: float) -> Reduced:
-        return reduced(cut, functions, system._replace(phi=system.phi + step * way), True)
+        return reduced(functions, system._replace(phi=system.phi + step * way), True)
 
     x = at(0.0).charge
     wanted = way.T @ x + x.T @ way

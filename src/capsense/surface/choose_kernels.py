@@ -34,8 +34,14 @@ _CROSSED = 0.3
 """Least score of large clusters that cross a wall: so much that functions are fully faded in. Their
 points lie among the sources that stand for the wall, 40 mm behind it, and would attract themselves
 so much that no definite matrix were left."""
+_SEEN = 0.1
+"""Part of a cluster that does not see a linear potential from which on what crosses a wall within
+it counts in full."""
 _WIDE = 0.08, 0.12
 """Clusters come to be large between these extents [m]."""
+_FULL = 0.1
+"""How far something of a cluster within reach has to be represented for its function to be whole:
+what only fine clusters reach comes with them, not at once."""
 _PARTED = 0.1
 """Fade of a function from which on its two clusters are represented by their parts alone."""
 USED, FRONTIER, LEAF = 2, 1, 0
@@ -63,6 +69,8 @@ class Cut(NamedTuple):
     """How far its function is faded in, 0 to 1, shape (k,)."""
     above: NDArray[Any]
     """The same of the cluster above, 1 at the top, shape (k,)."""
+    there: NDArray[Any]
+    """How far something of it within reach is represented, 0 to 1, shape (k,)."""
     leaves: NDArray[Any]
     """The leaves in this list: clusters that are represented by themselves, shape (l,)."""
 
@@ -76,6 +84,10 @@ class Functions(NamedTuple):
     """Its number among the functions of the shape, shape (f,)."""
     body: NDArray[Any]
     """Its body, shape (f,)."""
+    fade: NDArray[Any]
+    """How far it is faded in, 0 to 1, shape (f,)."""
+    above: NDArray[Any]
+    """The same of the function above, 1 at the top, shape (f,)."""
     ends: NDArray[Any]
     """Which part of the two that it splits its cluster into are panels, 0 to 1, shape (f,); 0 where
     something of the cluster is out of reach."""
@@ -168,17 +180,16 @@ def _mean_potentials(body, green, means, met, crossing, linear):
             square += off * off
             room = min(room, x - green.room[0, i], green.room[1, i] - x)
             out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
-        size = body.scale * extent[k]
+        size, share = body.scale * extent[k], 1.0 - smooth(math.sqrt(out) / SHORE)
         crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
             (size - _LONG[0]) / (_LONG[1] - _LONG[0])
         )
         if k >= _COARSE:
             part = size / math.sqrt(square + 1e-12)
-            even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0])) if room > 0.0 else 1.0
-            linear[k] = even * (1.0 - crossing[k])
+            even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
+            linear[k] = (1.0 - share * (1.0 - even)) * (1.0 - crossing[k])
         if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
             lift(points[found : found + 1], least_gap(size, green.cover), green.box)
-        share = 1.0 - smooth(math.sqrt(out) / SHORE)
         for i in range(green.lead):
             means[k, i] = 0.0
         if share > 0.0 and (linear[k] > 0.0 or kids[2 * k] < 0):
@@ -228,17 +239,19 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
         for i in range(weight.shape[0]):
             net += weight[i] * float(mean[0, i]) ** 2
         scores[0] = max(scores[0], crossing[0] * net / (own[0] / body.scale + body.tie))
+    seen = np.ones(count)
     for k in range(count):
         for c in range(2):
             part = kids[2 * k + c]
             if part >= 0 and kids[2 * part] >= 0:
                 share = linear[part] if met[part] else 1.0
                 scores[part] += share * _DECAY * scores[k]
+                seen[part] = seen[k] * smooth((1.0 - linear[k]) / _SEEN)
     whole = scores[0]
     for k in range(count - 1, -1, -1):
         wide = smooth((body.scale * extent[k] - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
         least = max(_CROSSED * wide, whole * extent[k] / extent[0])
-        scores[k] = max(scores[k], crossing[k] * least)
+        scores[k] = max(scores[k], seen[k] * crossing[k] * least)
         if kids[2 * k] >= 0:
             scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
 
@@ -289,7 +302,7 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
     cut = Cut(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),
         np.zeros(count), np.zeros((count, 2)), np.empty(count, np.int64), np.empty(count),
-        np.empty(count), np.empty(count), np.empty(leaves, np.int64),
+        np.empty(count), np.empty(count), np.ones(count), np.empty(leaves, np.int64),
     )  # fmt: skip
     leaf = 0
     for b in range(bodies.shape[0]):
@@ -341,24 +354,29 @@ def functions_of(bodies, cut, beyond):
         np.empty(count, np.int64),
         np.empty(count, np.int64),
     )
-    ends = np.zeros(count)
+    fade, above, ends = np.empty(count), np.empty(count), np.zeros(count)
     f = solved = 0
     for rest in range(2):
         for a in range(cut.node.shape[0]):
             b = cut.body[a]
             if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral and _there(cut, a):
                 cluster[f], number[f], body[f] = -1 - a, 0, b
+                fade[f] = above[f] = smooth(cut.there[a] / _FULL)
                 f += 1
             x, y = cut.kids[a]
             parted = x >= 0 and _there(cut, x) and _there(cut, y)
             if parted and (cut.fade[a] == 0.0) == (rest == 1):
                 # functions are numbered breadth first, as clusters are
                 cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
+                full = smooth(min(cut.there[x], cut.there[y]) / _FULL)
+                fade[f], above[f] = full * cut.fade[a], full * cut.above[a]
                 ends[f] = 0.0 if reaches_out[a] else _panels(bodies[b], cut.node[a])
                 f += 1
         if rest == 0:
             solved = f
-    return Functions(cluster[:f], number[:f], body[:f], ends[:f], solved)
+    return Functions(
+        cluster[:f], number[:f], body[:f], fade[:f], above[:f], ends[:f], solved
+    )  # fmt: skip
 
 
 @compiled

@@ -31,17 +31,21 @@ def reached(cut, leaves):
         out = out or leaves.beyond[j] > 0.0
     if not out:
         return cut, leaves
-    inside = np.zeros(count)
+    inside, there = np.zeros(count), np.zeros(count)
     whole, parts, leaf = np.zeros(count), np.zeros((count, 2)), np.empty(count, np.int64)
     kept = 0
     for a in range(count - 1, -1, -1):
         leaf[a] = -1
         if cut.leaf[a] >= 0:
             whole[a] = cut.whole[a] * (1.0 - leaves.beyond[cut.leaf[a]])
-            kept += whole[a] > 0.0
+            if whole[a] > 0.0:
+                there[a] = cut.whole[a]
+                kept += 1
         for c in range(2):
             if cut.kids[a, c] >= 0:
                 parts[a, c] = cut.parts[a, c] * inside[cut.kids[a, c]]
+                below = (1.0 - cut.whole[a]) * there[cut.kids[a, c]]
+                there[a] = max(there[a], below)
         inside[a] = whole[a] + parts[a, 0] + parts[a, 1]
         if inside[a] > 0.0:
             whole[a] /= inside[a]
@@ -63,7 +67,8 @@ def reached(cut, leaves):
             i += 1
     return (
         Cut(
-            cut.body, cut.node, cut.kids, cut.share, parts, leaf, whole, cut.fade, cut.above, at
+            cut.body, cut.node, cut.kids, cut.share, parts, leaf, whole, cut.fade, cut.above,
+            there, at,
         ),
         Leaves(points, true, extent, soft, beyond, owner, within),
     )  # fmt: skip

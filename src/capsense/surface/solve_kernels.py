@@ -199,7 +199,7 @@ def _add_matter(bodies, functions, matrix, own):
 
 
 @compiled
-def reduced(cut, functions, system, adjoint):
+def reduced(functions, system, adjoint):
     """Solve a system.
 
     Functions that fade in by t are taken as √t A √t with their own energy whole. What they lack,
@@ -209,12 +209,11 @@ def reduced(cut, functions, system, adjoint):
     total, solved, m = functions.cluster.shape[0], functions.solved, phi.shape[1]
     root, lack = np.empty(solved), np.zeros(total)
     for f in range(total):
-        a = functions.cluster[f]
-        fade = 1.0 if a < 0 else cut.fade[a]
+        fade = functions.fade[f]
         if f < solved:
             root[f] = math.sqrt(fade)
         if fade < 1.0:
-            lack[f] = GAIN * (1.0 - fade) * (1.0 - (1.0 - cut.above[a]) ** 4) / own[f]
+            lack[f] = GAIN * (1.0 - fade) * (1.0 - (1.0 - functions.above[f]) ** 4) / own[f]
     factor, x = np.empty((solved, solved)), np.zeros((total, m))
     for f in range(solved):
         for i in range(m):

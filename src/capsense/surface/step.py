@@ -96,7 +96,7 @@ def solve(
     :func:`prepared`.
     """
     cut, leaves, functions, system = _prepared(bodies, green, threshold, width)
-    delta, left, coarse, x, shift = reduced(cut, functions, system, adjoint)
+    delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
     size = functions.solved if shift >= 0.0 else -1
@@ -215,15 +215,14 @@ def solve_lossy(
         others = np.flatnonzero(net & (records["group"][functions.body] == records["group"][b]))
         matrix[np.ix_(root, others)] += ties[b] if np.isfinite(ties[b]) else records["tie"][b]
     diagonal[:n] = np.diag(matrix)
-    clusters = np.where(net, 0, functions.cluster)
-    fade = np.where(net, 1.0, cut.fade[clusters])
+    fade = functions.fade
     root = np.sqrt(fade[:n])
     faded = root[:, None] * matrix[:n] * root
     np.fill_diagonal(faded, np.diag(matrix[:n]))
     solved = (root[:, None] * phi[:n, :m]).astype(complex)
     eliminate(faded, solved)
     solved *= root[:, None]
-    lack = GAIN * (1 - fade) * (1 - (1 - np.where(net, 1.0, cut.above[clusters])) ** 4) / diagonal
+    lack = GAIN * (1 - fade) * (1 - (1 - functions.above) ** 4) / diagonal
     residual = phi[:, :m] - _product(matrix, solved)
     extra = lack[:, None] * residual
     left = _product(residual.T, extra)
