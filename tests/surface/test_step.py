@@ -34,7 +34,7 @@ from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
 from capsense.surface.solve_kernels import Reduced, _add_products, _factorise, _products, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
-from capsense.surface.step import Solution, prepared, solve, solve_lossy
+from capsense.surface.step import Solution, potential_change, prepared, solve, solve_lossy
 
 Array = np.ndarray
 BALL, FINGER, BOX = cs.Sphere(0.03), cs.Capsule(0.008, 0.06), cs.Box((0.1, 0.06, 0.02))
@@ -303,6 +303,22 @@ def test_delta_is_symmetric_and_of_one_sign() -> None:
         delta = scenes()[name].solved(threshold).delta
         assert np.array_equal(delta, delta.T)
         assert np.linalg.eigvalsh(delta).min() > -1e-7 * delta.max()
+
+
+def test_potentials_that_charges_change() -> None:
+    """Differential: 1/r of four points a leaf, bounded, of images, and what the design answers."""
+    found, green = scenes()["three of all kinds"].solved(0.05), exact()
+    leaves = found.points.reshape(-1, 3)
+    image = leaves * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
+    charge = np.repeat(0.25 * found.charge[:, : packed_green().terminals], 4, axis=0)
+    least = np.repeat(0.3 * found.extent, 4)
+    rng = np.random.default_rng(11)
+    points = np.concatenate([leaves, rng.uniform([-0.1, -0.1, 3e-3], [0.1, 0.1, 0.15], (2100, 3))])
+    direct, mirrored = (
+        1 / np.maximum(np.linalg.norm(points[:, None] - q, axis=-1), least) for q in (leaves, image)
+    )
+    wanted = green.psi(points) @ green.psi(leaves).T @ charge - (direct - mirrored) @ charge
+    assert apart(potential_change(green, found, points), wanted) < 1e-6
 
 
 # ---- trees and charge functions ----
