@@ -34,7 +34,15 @@ from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
 from capsense.surface.solve_kernels import Reduced, _add_products, _factorise, _products, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
-from capsense.surface.step import Solution, potential_change, prepared, solve, solve_lossy
+from capsense.surface.step import (
+    Solution,
+    estimate,
+    potential_change,
+    prepared,
+    solve,
+    solve_each,
+    solve_lossy,
+)
 
 Array = np.ndarray
 BALL, FINGER, BOX = cs.Sphere(0.03), cs.Capsule(0.008, 0.06), cs.Box((0.1, 0.06, 0.02))
@@ -303,6 +311,29 @@ def test_delta_is_symmetric_and_of_one_sign() -> None:
         delta = scenes()[name].solved(threshold).delta
         assert np.array_equal(delta, delta.T)
         assert np.linalg.eigvalsh(delta).min() > -1e-7 * delta.max()
+
+
+def test_estimate_of_the_largest_entry() -> None:
+    """Analytic: what is left and what panels are too coarse for; all of it where A was changed."""
+    rng = np.random.default_rng(12)
+    (delta, left), coarse = rng.normal(size=(2, 5, 5)), rng.uniform(size=5)
+    found = scenes()["ball"].solved(0.2)._replace(delta=delta, left=left, coarse=coarse)
+    doubt = np.abs(np.diag(left)) + coarse
+    assert estimate(found._replace(shift=0.0)) == pytest.approx(doubt.max(), rel=1e-14)
+    assert estimate(found._replace(shift=0.03)) == np.abs(np.diag(delta)).max()
+
+
+def test_scenes_one_after_another() -> None:
+    """Invariant: the same as one at a time, to the last bit; nothing of an empty scene."""
+    bodies = scenes()["three of all kinds"].packed()
+    first = np.array([0, 2, 2, 3])
+    delta, error, size = solve_each(bodies, first, packed_green(), 0.2, WIDTH)
+    for k, some in ((0, bodies[:2]), (2, bodies[2:])):
+        wanted = solve(some, packed_green(), 0.2, WIDTH, False)
+        np.testing.assert_array_equal(delta[k], wanted.delta)
+        assert (error[k], size[k]) == (estimate(wanted), wanted.size)
+        assert error[k] > 0
+    assert np.abs(delta[1]).max() == error[1] == size[1] == 0
 
 
 def test_potentials_that_charges_change() -> None:
