@@ -34,7 +34,15 @@ from capsense.surface.leaf_kernels import Leaves, four_points
 from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
 from capsense.surface.solve_kernels import Reduced, _add_products, _factorise, _products, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
-from capsense.surface.step import Solution, prepared, solve, solve_lossy
+from capsense.surface.step import (
+    Solution,
+    estimate,
+    potential_change,
+    prepared,
+    solve,
+    solve_each,
+    solve_lossy,
+)
 
 Array = np.ndarray
 BALL, FINGER, BOX = cs.Sphere(0.03), cs.Capsule(0.008, 0.06), cs.Box((0.1, 0.06, 0.02))
@@ -163,7 +171,9 @@ def scenes() -> dict[str, Scene]:
              body(EGG, (0.0, 0.05, 0.05), tie=NONE),
              body(FINGER, (0.04, 0.0, 0.04), ACROSS, tie=12.0, group=0)]
         ),
-        "box across a wall": Scene([body(BOX, (0.22, 0.0, 0.05), TILTED)]),
+        "ball and box across a wall": Scene(
+            [body(BALL, (0.0, -0.02, 0.05), tie=30.0), body(BOX, (0.22, 0.0, 0.05), TILTED)]
+        ),
         "floating box across two walls": Scene(
             [body(BOX, (0.19, 0.2, 0.04), TILTED, scale=1.5, tie=NONE)]
         ),
@@ -184,20 +194,21 @@ NAMES = (
     "box of eps 5", "finger of eps 80, larger", "ball of eps 2000 with a contact",
     "finger and floating finger", "cylinder of eps 4 before a ball", "three of all kinds",
     "two joined, floating", "two joined on a capacitance, a third alone",
-    "box across a wall", "floating box across two walls", "box of eps 5 across a wall",
+    "ball and box across a wall", "floating box across two walls", "box of eps 5 across a wall",
     "two across a wall, a third inside",
 )  # fmt: skip
 TIED = (
     "ball on a capacitance", "ball of eps 2000 with a contact", "three of all kinds",
     "two joined, floating", "two joined on a capacitance, a third alone",
-    "two across a wall, a third inside",
+    "ball and box across a wall", "two across a wall, a third inside",
 )  # fmt: skip
 """Where net charge has an energy of its own."""
 if interpreted.ON:
     NAMES = (
         "finger at 5 mm", "floating, made smaller", "finger of eps 80, larger",
         "ball of eps 2000 with a contact", "three of all kinds",
-        "two joined on a capacitance, a third alone", "box of eps 5 across a wall",
+        "two joined on a capacitance, a third alone", "ball and box across a wall",
+        "floating box across two walls", "box of eps 5 across a wall",
     )  # fmt: skip
 SOME = ("ball between near and far", "box of eps 5", "three of all kinds")
 
@@ -263,12 +274,13 @@ def test_charges_on_the_leaves(name: str) -> None:
     groups = np.array([-1 - k if p.group is None else p.group for k, p in enumerate(scene.pieces)])
     for group in set(groups.tolist()):
         first = scene.pieces[int(np.argmax(groups == group))]
-        net = found.charge[groups[found.owner] == group, :m].sum(axis=0)
+        own = found.charge[groups[found.owner] == group, :m]
+        net = own.sum(axis=0)
         if first.neutral:
             # those of a group stand apart for an energy of 1e8
             assert np.abs(net).max() < (1e-6 if first.group is None else 1e-5) * most
         else:
-            assert np.abs(net).max() > most
+            assert np.abs(net).max() > np.abs(own).max()
     phi = twin.four_point_mean(found.points, exact(), "phi0")
     phi *= 1.0 - twin.beyond(found.points, packed_green().room)[:, None]
     assert apart(phi.T @ found.charge[:, :m], found.delta) < 3e-5
@@ -299,6 +311,45 @@ def test_delta_is_symmetric_and_of_one_sign() -> None:
         delta = scenes()[name].solved(threshold).delta
         assert np.array_equal(delta, delta.T)
         assert np.linalg.eigvalsh(delta).min() > -1e-7 * delta.max()
+
+
+def test_estimate_of_the_largest_entry() -> None:
+    """Analytic: what is left and what panels are too coarse for; all of it where A was changed."""
+    rng = np.random.default_rng(12)
+    (delta, left), coarse = rng.normal(size=(2, 5, 5)), rng.uniform(size=5)
+    found = scenes()["ball"].solved(0.2)._replace(delta=delta, left=left, coarse=coarse)
+    doubt = np.abs(np.diag(left)) + coarse
+    assert estimate(found._replace(shift=0.0)) == pytest.approx(doubt.max(), rel=1e-14)
+    assert estimate(found._replace(shift=0.03)) == np.abs(np.diag(delta)).max()
+
+
+def test_scenes_one_after_another() -> None:
+    """Invariant: the same as one at a time, to the last bit; nothing of an empty scene."""
+    bodies = scenes()["three of all kinds"].packed()
+    first = np.array([0, 2, 2, 3])
+    delta, error, size = solve_each(bodies, first, packed_green(), 0.2, WIDTH)
+    for k, some in ((0, bodies[:2]), (2, bodies[2:])):
+        wanted = solve(some, packed_green(), 0.2, WIDTH, False)
+        np.testing.assert_array_equal(delta[k], wanted.delta)
+        assert (error[k], size[k]) == (estimate(wanted), wanted.size)
+        assert error[k] > 0
+    assert np.abs(delta[1]).max() == error[1] == size[1] == 0
+
+
+def test_potentials_that_charges_change() -> None:
+    """Differential: 1/r of four points a leaf, bounded, of images, and what the design answers."""
+    found, green = scenes()["three of all kinds"].solved(0.05), exact()
+    leaves = found.points.reshape(-1, 3)
+    image = leaves * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
+    charge = np.repeat(0.25 * found.charge[:, : packed_green().terminals], 4, axis=0)
+    least = np.repeat(0.3 * found.extent, 4)
+    rng = np.random.default_rng(11)
+    points = np.concatenate([leaves, rng.uniform([-0.1, -0.1, 3e-3], [0.1, 0.1, 0.15], (2100, 3))])
+    direct, mirrored = (
+        1 / np.maximum(np.linalg.norm(points[:, None] - q, axis=-1), least) for q in (leaves, image)
+    )
+    wanted = green.psi(points) @ green.psi(leaves).T @ charge - (direct - mirrored) @ charge
+    assert apart(potential_change(green, found, points), wanted) < 1e-6
 
 
 # ---- trees and charge functions ----
@@ -414,6 +465,48 @@ def test_split_cuts_across_what_varies_most() -> None:
     }  # fmt: skip
     for k in (3, 4, 5, 6):
         assert len({int(i) % 2 for i in parts[k]}) == 1
+
+
+def place_of_cut(values: Array, charges: Array, of_normals: bool, last: bool) -> int:
+    """How many of the sorted panels the first part gets: at an edge, or in the middle."""
+    gaps, whole = np.diff(values), values[-1] - values[0]
+    if of_normals and gaps.max() > 0.3 * whole:
+        return int(gaps.argmax()) + 1
+    off = np.abs(values[:-1] + values[1:] - values[0] - values[-1])
+    if of_normals:
+        whole = charges.sum()
+        off = np.abs(2 * np.cumsum(charges)[:-1] - whole)
+    equal = np.flatnonzero((gaps > 0) & (off <= off[gaps > 0].min(initial=math.inf) + 1e-6 * whole))
+    return int(equal[-1 if last else 0]) + 1 if len(equal) else len(values) // 2
+
+
+@pytest.mark.parametrize("kind", ["positions", "normals", "edges", "whole numbers", "equal cuts"])
+def test_split_takes_the_cut_in_the_middle(kind: str) -> None:
+    """Differential: every cluster of a tree against sorted panels; equal cuts take turns."""
+    rng = np.random.default_rng(7)
+    scale = np.ones(6)
+    scale[{"positions": slice(3, 6), "normals": slice(3)}.get(kind, slice(0))] = 0.1
+    for n in (2, 5, 23, 60):
+        features, charges = rng.uniform(size=(n, 6)), rng.uniform(0.1, 1.0, n)
+        features[:2] = [[0.0], [1.0]]  # so that equal cuts are equal in whole grains too
+        if kind == "edges":
+            features[:, 3:] **= 4
+        elif kind == "whole numbers":
+            features[n // 2 :] = features[: n - n // 2]
+            features = np.round(4.0 * features)
+        elif kind == "equal cuts":
+            features, charges = np.round(16.0 * features), np.ones(n)
+        features *= scale
+        clusters = split(features, charges)
+        parts = twin.members(clusters.kids, clusters.panel)
+        for k, (a, _) in enumerate(clusters.kids.tolist()):
+            if a < 0:
+                continue
+            own = parts[k]
+            axis = int(np.ptp(features[own], axis=0).argmax())
+            own = own[np.argsort(features[own, axis], kind="stable")]
+            cut = place_of_cut(features[own, axis], charges[own], axis >= 3, k % 2 == 1)
+            np.testing.assert_array_equal(parts[a], np.sort(own[:cut]))
 
 
 def test_split_of_panels_that_do_not_differ_halves_them() -> None:

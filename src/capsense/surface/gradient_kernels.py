@@ -139,8 +139,6 @@ def _source_sums(points, charge, share, bounds, sources, limits):
                             some[chosen, q, i] = points[j, q, i]
                     chosen += 1
                 j += 1
-            if chosen == 0:
-                continue
             left = _narrowed(left, chosen)
             source_lines(some[:chosen], sources, floor, least, lines)
             for r in range(6):
