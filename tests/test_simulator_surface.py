@@ -410,6 +410,30 @@ def test_a_wall_is_crossed_smoothly_by_parts_of_a_person(simulators):
     assert np.abs(np.diff(values, 2)).max() < 1e-3 * values.min()
 
 
+def test_parts_come_within_reach_without_a_step(simulators):
+    """Invariant: of an upright arm beside the sensor that rises, in ever finer steps."""
+
+    def read(rise):
+        parts = [
+            cs.Body(cs.Capsule(radius, length), cs.Pose((-0.12, 0.0, z + rise)), grounding=1e-11)
+            for radius, length, z in ((0.0486, 0.1817, -0.0987), (0.042, 0.3029, -0.0836))
+        ]
+        return simulators("six_patch").step(cs.Scene(parts)).delta[0, 0]
+
+    rises = np.arange(-0.0115, -0.0045, 2.5e-4)
+    values = [read(rise) for rise in rises]
+    for k in range(len(rises) - 1):
+        (low, high), (first, last) = rises[k : k + 2], values[k : k + 2]
+        for _ in range(12):
+            middle = 0.5 * (low + high)
+            value = read(middle)
+            if abs(value - first) > abs(last - value):
+                high, last = middle, value
+            else:
+                low, first = middle, value
+        assert abs(last - first) < 2e-4 * abs(last), f"a step between {low} and {high} m"
+
+
 # -- Jacobian, potentials ---------------------------------------------------------------------
 
 

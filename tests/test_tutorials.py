@@ -32,7 +32,7 @@ def test_a_page_runs(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Every block, in one namespace, in an empty folder; shown numbers hold to 3 %."""
+    """Every block, in one namespace, in an empty folder; shown numbers hold to 3 % or one in the last digit."""
     monkeypatch.setenv("CAPSENSE_CACHE_DIR", str(field_cache))
     monkeypatch.setenv("MPLBACKEND", "agg")
     code = blocks(page, "python")
@@ -45,7 +45,7 @@ def test_a_page_runs(
         found, shown = capsys.readouterr().out, blocks(page, "text")
         assert NUMBER.sub("#", found).split() == NUMBER.sub("#", shown).split()
         numbers = [[float(n) for n in NUMBER.findall(text)] for text in (found, shown)]
-        assert numbers[0] == pytest.approx(numbers[1], rel=0.03, abs=1e-3)
+        assert numbers[0] == pytest.approx(numbers[1], rel=0.03, abs=0.0101)  # a last digit
 
 
 def files(page: Path) -> dict[str, str]:
