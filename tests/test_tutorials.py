@@ -32,7 +32,7 @@ def test_a_page_runs(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Every block, in one namespace, in an empty folder; shown numbers hold to 3 % or one in the last digit."""
+    """Every block, in one namespace, in an empty folder; shown numbers hold to 3 % or a digit."""
     monkeypatch.setenv("CAPSENSE_CACHE_DIR", str(field_cache))
     monkeypatch.setenv("MPLBACKEND", "agg")
     code = blocks(page, "python")
