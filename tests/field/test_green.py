@@ -161,7 +161,9 @@ def test_a_grounded_ball_changes_c_as_with_boundary_elements(
     assert np.abs(got - exact).max() < (2 if gap < 0.005 else 1) * allowed * np.abs(exact).max()
 
 
-@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize(
+    "name", [n if n == "flat" else pytest.param(n, marks=pytest.mark.e2e) for n in DESIGNS]
+)
 def test_potentials_and_answer_at_points_of_all_kinds(name: str) -> None:
     it = case(name)
     points = somewhere(it)

@@ -87,6 +87,7 @@ def test_open_is_true_or_false():
         disc(open="yes")
 
 
+@pytest.mark.e2e
 def test_matrix_is_physical_with_a_layer_at_the_end_of_the_box():
     """A layer that reaches the box's end has an interface there, since no wall is."""
     layer = {"name": "cover", "eps_r": 3.0, "size": [0.1, 0.1], "z": [0.0, 0.002]}

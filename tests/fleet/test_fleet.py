@@ -145,6 +145,7 @@ def test_environments_do_not_depend_on_each_other(fleet):
     np.testing.assert_array_equal(fleet.step(where).delta, turned)
 
 
+@pytest.mark.e2e
 def test_a_check_is_against_a_finer_preset():
     """Not against the same, of which it would be no check."""
     where = poses(np.random.default_rng(6), 2, 3)
