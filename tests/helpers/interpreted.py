@@ -58,7 +58,8 @@ def _pointer(kind: Any) -> Any:
 
 TWINS = {
     "at": at, "span": span, "put_span": put_span, "splat": splat, "madd": madd, "rsqrt": rsqrt,
-    "vadd": lambda u, v: u + v, "vmadd": lambda u, v, w: u * v + w,
+    "vadd": lambda u, v: u + v, "vsub": lambda u, v: u - v, "vmul": lambda u, v: u * v,
+    "vmadd": lambda u, v, w: u * v + w,
     "muladd": lambda a, b, c: a * b + c, "horizontal_sum": lambda v: v.sum(),
     "where_above": lambda u, v, x, y: np.where(u > v, x, y),
     "singles": _pointer(ctypes.c_float), "doubles": _pointer(ctypes.c_double),

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 import surface_twin as twin
 from interpreted import fewer, limit, thinned
-from numba import njit
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from surface_twin import Piece
 
 import capsense as cs
 from capsense._dense import cholesky, multiply, multiply_simd, substitute
-from capsense._simd import rsqrt
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block
 from capsense.elements.matter import CONDUCTING, UNIT
@@ -608,28 +606,42 @@ def potentials(points: Array, sources: Array, floor: float, least: float) -> Arr
 
 @pytest.mark.parametrize("count", [1, 2, 5, 24, 57])
 def test_potentials_of_sources(count: int) -> None:
-    """Differential: means over four points and single points, to single precision."""
-    rng = np.random.default_rng(count)
-    points = rng.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, 0.2], (count, 4, 3)).astype(np.float32)
-    sources = rng.uniform([-0.1, -0.1, -5e-3], [0.1, 0.1, 0.0], (37, 3)).T.astype(np.float32)
-    sources = np.ascontiguousarray(sources)
-    points[0, 0] = sources[:, 5] + np.float32(1e-5)  # within the bound
-    floor, least = np.float32(-0.01), np.float32(1e-3)
+    """Differential: means over four points, to single precision."""
+    points, sources = random_points(count)
+    out = np.empty((count, 40), np.float32)
+    source_potentials(points, sources, np.float32(-0.01), np.float32(1e-3), out)
     wanted = potentials(points.astype(float), sources, -0.01, 1e-3)
-    out = np.empty((count, 37), np.float32)
-    source_potentials(points, sources, floor, least, out)
     np.testing.assert_allclose(out, wanted.mean(axis=1), rtol=3e-6, atol=3e-6 * out.max())
     assert out[0, 5] == pytest.approx(wanted[0, :, 5].mean(), rel=1e-5)
-    single = np.ascontiguousarray(points[:, 1])
-    point_potentials(single, sources, floor, least, out)
-    np.testing.assert_allclose(out, wanted[:, 1], rtol=3e-6, atol=3e-6 * out.max())
+
+
+@pytest.mark.parametrize("columns", [8, 24])
+@pytest.mark.parametrize("count", [8, 40])
+def test_potentials_at_points(count: int, columns: int) -> None:
+    """Differential: of any number of columns of charges, to single precision."""
+    points, sources = random_points(count)
+    table = np.random.default_rng(columns).normal(size=(40, columns)).astype(np.float32)
+    out = np.full((columns, count), np.float32(math.nan))
+    limits = np.float32(-0.01), np.float32(1e-3)
+    point_potentials(np.ascontiguousarray(points[:, 0].T), sources, table, limits, out)
+    wanted = potentials(points[:, 0].astype(float), sources, -0.01, 1e-3) @ table
+    np.testing.assert_allclose(out.T, wanted, rtol=0, atol=1e-5 * np.abs(wanted).max())
+
+
+def random_points(count: int) -> tuple[Array, Array]:
+    """Points (k, 4, 3), one of which is within the bound of a source, and sources (3, 40)."""
+    rng = np.random.default_rng(count)
+    points = rng.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, 0.2], (count, 4, 3)).astype(np.float32)
+    sources = rng.uniform([-0.1, -0.1, -5e-3], [0.1, 0.1, 0.0], (40, 3)).T.astype(np.float32)
+    points[0, 0] = sources[:, 5] + np.float32(1e-5)
+    return points, np.ascontiguousarray(sources)
 
 
 def test_potential_of_a_source_in_the_floor_is_none() -> None:
     """Analytic: a charge and its image cancel."""
     points = np.random.default_rng(1).uniform(0.02, 0.1, (3, 4, 3)).astype(np.float32)
-    sources = np.array([[0.0], [0.0], [-0.01]], np.float32)
-    out = np.empty((3, 1), np.float32)
+    sources = np.repeat(np.array([[0.0], [0.0], [-0.01]], np.float32), 8, axis=1)
+    out = np.empty((3, 8), np.float32)
     source_potentials(points, sources, np.float32(-0.01), np.float32(1e-3), out)
     np.testing.assert_allclose(out, 0.0, atol=1e-5)
 
@@ -690,20 +702,6 @@ def test_cholesky_finds_out_what_is_not_definite(n: int) -> None:
         for low in (-1.0, 0.0, math.nan):
             diagonal[k, k] = low
             assert not cholesky(diagonal.copy())
-
-
-@njit
-def _roots(values: Array, out: Array) -> None:
-    for k in range(len(values)):
-        out[k] = rsqrt(values[k])
-
-
-def test_inverse_root() -> None:
-    """Analytic: 1/√x from 1e-30 to 1e30, to 3e-7."""
-    values = np.logspace(-30, 30, 20_011).astype(np.float32)
-    out = np.empty_like(values)
-    _roots(values, out)
-    assert np.abs(out * np.sqrt(values.astype(float)) - 1).max() < 3e-7
 
 
 # ---- pairs of clusters ----
@@ -885,13 +883,20 @@ def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold
 
 
 def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
-    """The cut, the scores, and each body's first cluster."""
+    """The cut, the scores with those that are inherited, and each body's first cluster."""
     bodies = scene.packed()
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
     score(bodies, first, green, np.empty(green.terminals), scores)
-    return choose(bodies, first, scores, threshold, WIDTH), scores, first
+    cut = choose(bodies, first, scores.copy(), threshold, WIDTH)
+    for o, (_, shape) in zip(first, scene, strict=False):
+        kids = shape.tree.kids
+        for k in np.flatnonzero(kids[:, 0] >= 0):
+            for part in kids[k]:
+                if scores[o + part] < 0:
+                    scores[o + part] = twin.DECAY * scores[o + k] if kids[part, 0] >= 0 else 0.0
+    return cut, scores, first
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "two joined, floating"])

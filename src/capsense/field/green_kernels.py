@@ -13,8 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._dense import WIDTH
-from capsense._jit import compiled
-from capsense._simd import muladd, rsqrt
+from capsense._jit import compiled, pasted
+from capsense._simd import (
+    SIMD_WIDTH,
+    at,
+    madd,
+    put_span,
+    rsqrt,
+    span,
+    splat,
+    vadd,
+    vmadd,
+    vmul,
+    vsub,
+    where_above,
+)
 from capsense.design.model import Design
 from capsense.field.green import GreenFunction
 
@@ -33,13 +46,18 @@ GAP = 1.5e-4, 7e-4, 0.18, 2e-5
 first, at most the second; less by the thickness of a cover, but not less than the fourth."""
 _FLAT = 1e-4
 """Sheets of a flat design rise by less than this [m]."""
+_AWAY = 1e3
+"""Coordinates of sources without charge [m]."""
 MARGIN = 0.015
 """What lies nearer than this [m] to the ceiling and the side walls is left out: at ground, the
 walls take nearly all of what would meet it."""
 
 
 class Green(NamedTuple):
-    """A design's Green's function, as the kernels take it; single precision."""
+    """A design's Green's function, as the kernels take it; single precision.
+
+    There are a multiple of ``WIDTH`` sources. The last of them, without charge, are far away.
+    """
 
     near: NDArray[Any]
     """Sources for points near the sensor [m], shape (3, s)."""
@@ -84,20 +102,28 @@ def pack_green(green: GreenFunction, design: Design) -> Green:
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
 
+    def sources(positions: NDArray) -> NDArray:
+        out = np.full((3, _padded(len(positions))), _AWAY, np.float32)
+        out[:, : len(positions)] = positions.T
+        return out
+
     def table(phi: NDArray, modes: NDArray) -> NDArray:
-        width = WIDTH * -(-(lead + modes.shape[1]) // WIDTH)
-        out = np.zeros((len(phi), width), np.float32)
-        out[:, :terminals] = phi
-        out[:, lead : lead + modes.shape[1]] = modes
+        out = np.zeros((_padded(len(phi)), _padded(lead + modes.shape[1])), np.float32)
+        out[: len(phi), :terminals] = phi
+        out[: len(phi), lead : lead + modes.shape[1]] = modes
         return out
 
     far = table(green.far_phi, green.far_modes)
     return Green(
-        np.ascontiguousarray(green.near_sources.T), table(green.near_phi, green.near_modes),
-        np.ascontiguousarray(green.far_sources.T), far, np.ascontiguousarray(far[:, :lead]),
+        sources(green.near_sources), table(green.near_phi, green.near_modes),
+        sources(green.far_sources), far, np.ascontiguousarray(far[:, :lead]),
         lead, terminals, float(green.floor), np.asarray(green.box, float),
         np.asarray(green.blend, float), room, cover_of(design),
     )  # fmt: skip
+
+
+def _padded(count: int) -> int:
+    return WIDTH * -(-count // WIDTH)
 
 
 @compiled
@@ -106,44 +132,77 @@ def source_potentials(points, sources, floor, least, out):
 
     Args:
         points: [m], shape (k, 4, 3), single precision, as all that follows.
-        sources: [m], shape (3, s).
+        sources: [m], shape (3, s), s a multiple of 8.
         floor: Height of the floor [m].
         least: No point counts as nearer to a source than this [m]; where bodies reach into the
             sensor, they would meet sources that stand for charges elsewhere.
         out: Filled [1/m], shape (k, s).
     """
-    quarter = np.float32(0.25)
-    two, bound = np.float32(2.0) * floor, least * least
+    width, quarter, zero = sources.shape[1], np.float32(0.25), splat(np.float32(0.0))
     for i in range(points.shape[0]):
-        for q in range(points.shape[1]):
-            x, y, z = points[i, q, 0], points[i, q, 1], points[i, q, 2]
-            for s in range(sources.shape[1]):
-                dx = x - sources[0, s]
-                dy = y - sources[1, s]
-                dz = z - sources[2, s]
-                ez = z + sources[2, s] - two
-                across = muladd(dx, dx, dy * dy)
-                value = rsqrt(max(muladd(dz, dz, across), bound)) - rsqrt(muladd(ez, ez, across))
-                value *= quarter
-                if q == 0:
-                    out[i, s] = value
-                else:
-                    out[i, s] += value
+        for s in range(0, width, SIMD_WIDTH):
+            x, y, up = span(sources, s), span(sources, width + s), span(sources, 2 * width + s)
+            down, value = vsub(splat(np.float32(2.0) * floor), up), zero
+            for q in range(4):
+                o = 12 * i + 3 * q
+                value = vadd(value, _potential(
+                    splat(at(points, o)), splat(at(points, o + 1)), splat(at(points, o + 2)),
+                    x, y, up, down, splat(least * least),
+                ))  # fmt: skip
+            put_span(out, i * width + s, madd(quarter, value, zero))
 
 
 @compiled
-def point_potentials(points, sources, floor, least, out):
-    """The same at single points, shape (k, 3)."""
-    two, bound = np.float32(2.0) * floor, least * least
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        for s in range(sources.shape[1]):
-            dx = x - sources[0, s]
-            dy = y - sources[1, s]
-            dz = z - sources[2, s]
-            ez = z + sources[2, s] - two
-            across = muladd(dx, dx, dy * dy)
-            out[i, s] = rsqrt(max(muladd(dz, dz, across), bound)) - rsqrt(muladd(ez, ez, across))
+def point_potentials(points, sources, table, limits, out):
+    """Potentials of sources and their images at points, for every column of their charges.
+
+    Args:
+        points: [m], shape (3, p), p a multiple of 8.
+        sources: [m], shape (3, s).
+        table: Charges, shape (s, c), c a multiple of 8.
+        limits: Floor and ``least`` [m], as :func:`source_potentials` takes them.
+        out: Filled, shape (c, p).
+    """
+    count, width, columns = points.shape[1], sources.shape[1], table.shape[1]
+    floor, least = limits
+    twice, bound = np.float32(2.0) * floor, splat(least * least)
+    for c in range(0, columns, SIMD_WIDTH):
+        for i in range(0, count, SIMD_WIDTH):
+            x, y, z = span(points, i), span(points, count + i), span(points, 2 * count + i)
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(np.float32(0.0))
+            for s in range(width):
+                up = at(sources, 2 * width + s)
+                value = _potential(
+                    x, y, z, splat(at(sources, s)), splat(at(sources, width + s)), splat(up),
+                    splat(twice - up), bound,
+                )  # fmt: skip
+                o = s * columns + c
+                a0, a1 = madd(at(table, o), value, a0), madd(at(table, o + 1), value, a1)
+                a2, a3 = madd(at(table, o + 2), value, a2), madd(at(table, o + 3), value, a3)
+                a4, a5 = madd(at(table, o + 4), value, a4), madd(at(table, o + 5), value, a5)
+                a6, a7 = madd(at(table, o + 6), value, a6), madd(at(table, o + 7), value, a7)
+            o = c * count + i
+            put_span(out, o, a0)
+            put_span(out, o + count, a1)
+            put_span(out, o + 2 * count, a2)
+            put_span(out, o + 3 * count, a3)
+            put_span(out, o + 4 * count, a4)
+            put_span(out, o + 5 * count, a5)
+            put_span(out, o + 6 * count, a6)
+            put_span(out, o + 7 * count, a7)
+
+
+@pasted
+def _potential(x, y, z, sx, sy, up, down, bound):
+    """Potential at (x, y, z) of a unit charge at height ``up`` and of its image at ``down``.
+
+    ``bound`` is the square of the least distance from the charge.
+    """
+    dx, dy, dz, ez = vsub(x, sx), vsub(y, sy), vsub(z, up), vsub(z, down)
+    across = vmadd(dx, dx, vmul(dy, dy))
+    square = vmadd(dz, dz, across)
+    direct = rsqrt(where_above(square, bound, square, bound))
+    return vsub(direct, rsqrt(vmadd(ez, ez, across)))
 
 
 @compiled

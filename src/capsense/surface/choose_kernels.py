@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._dense import multiply_simd
 from capsense._jit import compiled, pasted
-from capsense._simd import doubles, integers
+from capsense._simd import SIMD_WIDTH, doubles, integers
 from capsense.field.green_kernels import (
     FAR_LEAST,
     NEAR_FACE,
@@ -28,6 +27,8 @@ _COARSE = 31
 """So many clusters, the coarsest of a body, are looked into wherever they are."""
 _DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
+_INHERITED = -1.0
+"""Score of what has :data:`_DECAY` times that of the cluster above."""
 _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 _CROSSED = 0.3
@@ -113,11 +114,11 @@ def score(bodies, first, green, weight, scores):
     Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
     raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. Clusters that
     are small against their distance from the design, and cross no wall, are not looked into: φ⁰ is
-    linear there, and the scores of their parts follow from their own.
+    linear there. Where nothing was looked at the score is :data:`_INHERITED`.
     """
     terminals, lead, total = green.terminals, green.lead, first[-1]
     means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
-    met, crossing, linear = np.zeros(total, np.bool_), np.zeros(total), np.zeros(total)
+    met, crossing, linear = np.zeros(total, np.bool_), np.empty(total), np.empty(total)
     for b in range(bodies.shape[0]):
         body, o = bodies[b], first[b]
         kids, function = integers(body.kids), integers(body.function)
@@ -125,6 +126,8 @@ def score(bodies, first, green, weight, scores):
         span = slice(o, first[b + 1])
         _mean_potentials(body, green, means[span], met[span], crossing[span], linear[span])
         for k in range(2 * body.n - 2, -1, -1):
+            if not met[o + k]:
+                continue
             x, y = kids[2 * k], kids[2 * k + 1]
             if x >= 0 and met[o + x]:
                 p, t = np.float32(charge[x] / charge[k]), np.float32(linear[o + k])
@@ -160,7 +163,7 @@ def _mean_potentials(body, green, means, met, crossing, linear):
     """
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
     most = 2 * body.n - 1
-    places, points = np.empty(most, np.int64), np.empty((most + 3, 3), np.float32)
+    places, points = np.empty(most, np.int64), np.empty((most, 3), np.float32)
     inner = np.empty(most)
     found = 0
     met[0] = True
@@ -180,7 +183,7 @@ def _mean_potentials(body, green, means, met, crossing, linear):
             square += off * off
             room = min(room, x - green.room[0, i], green.room[1, i] - x)
             out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
-        size, share = body.scale * extent[k], 1.0 - smooth(math.sqrt(out) / SHORE)
+        size, share, linear[k] = body.scale * extent[k], 1.0 - smooth(math.sqrt(out) / SHORE), 0.0
         crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
             (size - _LONG[0]) / (_LONG[1] - _LONG[0])
         )
@@ -197,19 +200,16 @@ def _mean_potentials(body, green, means, met, crossing, linear):
             found += 1
         if linear[k] < 1.0 and kids[2 * k] >= 0:
             met[kids[2 * k]] = met[kids[2 * k + 1]] = True
-    rounded = 4 * ((found + 3) // 4)
-    for j in range(found, rounded):
+    columns = np.empty((3, SIMD_WIDTH * ((found + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
+    for j in range(columns.shape[1]):
         for i in range(3):
-            points[j, i] = points[0, i]
-    values = np.empty((rounded, green.far.shape[1]), np.float32)
-    point_potentials(
-        points[:rounded], green.far, np.float32(green.floor), np.float32(FAR_LEAST), values
-    )
-    phi = np.empty((rounded, green.lead), np.float32)
-    multiply_simd(values, green.score_table, phi)
+            columns[i, j] = points[min(j, found - 1), i]
+    phi = np.empty((green.lead, columns.shape[1]), np.float32)
+    limits = np.float32(green.floor), np.float32(FAR_LEAST)
+    point_potentials(columns, green.far, green.score_table, limits, phi)
     for j in range(found):
         for i in range(green.lead):
-            means[places[j], i] = inner[j] * phi[j, i]
+            means[places[j], i] = inner[j] * phi[i, j]
 
 
 @compiled
@@ -223,6 +223,9 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     extent, count = doubles(body.extent), 2 * body.n - 1
     for k in range(count - 1, -1, -1):
+        if not met[k]:
+            scores[k] = _INHERITED
+            continue
         a, scores[k] = kids[2 * k], 0.0
         if a >= 0 and met[a]:
             value = 0.0
@@ -241,14 +244,17 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
         scores[0] = max(scores[0], crossing[0] * net / (own[0] / body.scale + body.tie))
     seen = np.ones(count)
     for k in range(count):
+        if not met[k]:
+            continue
         for c in range(2):
             part = kids[2 * k + c]
-            if part >= 0 and kids[2 * part] >= 0:
-                share = linear[part] if met[part] else 1.0
-                scores[part] += share * _DECAY * scores[k]
+            if part >= 0 and met[part] and kids[2 * part] >= 0:
+                scores[part] += linear[part] * _DECAY * scores[k]
                 seen[part] = seen[k] * smooth((1.0 - linear[k]) / _SEEN)
     whole = scores[0]
     for k in range(count - 1, -1, -1):
+        if not met[k]:
+            continue
         wide = smooth((body.scale * extent[k] - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
         least = max(_CROSSED * wide, whole * extent[k] / extent[0])
         scores[k] = max(scores[k], seen[k] * crossing[k] * least)
@@ -260,13 +266,12 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
 def choose(bodies, first, scores, threshold, width):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
-    A function fades in while its score grows from ``threshold`` to ``width`` times that.
+    A function fades in while its score grows from ``threshold`` to ``width`` times that. Scores
+    that are inherited are written where they are used.
     """
     total = first[-1]
-    state, place = np.empty(total, np.int64), np.empty(total, np.int64)
-    fades, above = np.zeros(total), np.zeros(total)
-    for k in range(total):
-        state[k] = place[k] = -1
+    state, place = np.full(total, np.int8(-1)), np.empty(total, np.int64)
+    fades, above = np.empty(total), np.empty(total)
     count = leaves = np.int64(0)  # not the literal, for which Numba would compile another version
     for b in range(bodies.shape[0]):
         kids = integers(bodies[b].kids)
@@ -277,6 +282,7 @@ def choose(bodies, first, scores, threshold, width):
                 continue
             place[o + k] = count
             count += 1
+            fades[o + k] = 0.0
             if kids[2 * k] < 0:
                 state[o + k] = LEAF
             leaves += _whole(state[o + k], above[o + k]) > 0.0
@@ -286,8 +292,11 @@ def choose(bodies, first, scores, threshold, width):
             fades[o + k] = min(smooth(x), above[o + k])
             state[o + k] = USED if fades[o + k] > 0.0 else FRONTIER
             for c in range(2):
-                state[o + kids[2 * k + c]] = LEAF if state[o + k] == FRONTIER else FRONTIER
-                above[o + kids[2 * k + c]] = fades[o + k]
+                part = o + kids[2 * k + c]
+                state[part] = LEAF if state[o + k] == FRONTIER else FRONTIER
+                above[part] = fades[o + k]
+                if scores[part] == _INHERITED:
+                    scores[part] = _DECAY * scores[o + k]
     return _collect(bodies, first, state, place, fades, above, count, leaves)
 
 
@@ -311,9 +320,9 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
         charge = doubles(bodies[b].charge)
         o = first[b]
         for k in range(nodes):
-            a = place[o + k]
-            if a < 0:
+            if state[o + k] < 0:
                 continue
+            a = place[o + k]
             cut.body[a], cut.node[a] = b, k
             cut.fade[a], cut.above[a] = fades[o + k], above[o + k]
             cut.whole[a] = _whole(state[o + k], above[o + k])

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capsense._dense import WIDTH, multiply, multiply_simd
+from capsense._dense import multiply, multiply_simd
 from capsense._jit import compiled
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, distances, near_share
 from capsense.surface.leaf_kernels import (
@@ -78,9 +78,8 @@ def _add_design(points, charge, bounds, green, work):
     for j in range(n):
         near_part[j] = near_share(distance[j], green.blend)
         far_part[j] = 1.0 - near_part[j]
-    sources, far_sources = _padded(green.near), _padded(green.far)
-    near = _source_sums(points, charge, near_part, bounds, sources, (floor, NEAR_LEAST))
-    far = _source_sums(points, charge, far_part, bounds, far_sources, (floor, FAR_LEAST))
+    near = _source_sums(points, charge, near_part, bounds, green.near, (floor, NEAR_LEAST))
+    far = _source_sums(points, charge, far_part, bounds, green.far, (floor, FAR_LEAST))
     modes = np.zeros((lead, green.near_table.shape[1]), np.float32)
     _add_modes(near, green.near_table, modes)
     _add_modes(far, green.far_table, modes)
@@ -89,19 +88,8 @@ def _add_design(points, charge, bounds, green, work):
         right[i, i] = 1.0
         for k in range(lead, modes.shape[1]):
             right[k, i] = modes[i, k]
-    _add_work(near, sources, green.near_table, right, work)
-    _add_work(far, far_sources, green.far_table, right, work)
-
-
-@compiled
-def _padded(table):
-    """A table and more columns that nothing depends on, up to a multiple of WIDTH."""
-    rows, width = table.shape[0], WIDTH * ((table.shape[1] + WIDTH - 1) // WIDTH)
-    out = np.full((rows, width), np.float32(9.0))
-    for i in range(rows):
-        for j in range(table.shape[1]):
-            out[i, j] = table[i, j]
-    return out
+    _add_work(near, green.near, green.near_table, right, work)
+    _add_work(far, green.far, green.far_table, right, work)
 
 
 @compiled
@@ -185,14 +173,8 @@ def _add_work(sums, sources, table, right, work):
     count, lead, width = sums.shape[0], sums.shape[2], sums.shape[3]
     if count == 0:
         return
-    s, v = table.shape
-    coefficients = np.zeros((width, lead), np.float32)
-    whole = 4 * (s // 4)
-    multiply_simd(table[:whole], right[:v], coefficients[:whole])
-    for k in range(whole, s):
-        for c in range(v):
-            for i in range(lead):
-                coefficients[k, i] += table[k, c] * right[c, i]
+    coefficients = np.empty((width, lead), np.float32)
+    multiply_simd(table, right[: table.shape[1]], coefficients)
     for b in range(count):
         own = sums[b]
         for i in range(lead):
@@ -226,8 +208,8 @@ def _add_pairs(solution, bounds, floor, work):
         for q in range(4):
             image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
-    shapes = _padded(cluster_moments(points, extent))
-    mirrored, width = _padded(cluster_moments(image, extent)), shapes.shape[1]
+    shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
+    width = shapes.shape[1]
     coefficients = np.zeros((width, lead), np.float32)
     for j in range(n):
         for i in range(lead):

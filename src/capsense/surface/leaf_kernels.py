@@ -18,6 +18,7 @@ from capsense._jit import compiled, pasted
 from capsense._simd import (
     SIMD_WIDTH,
     at,
+    dot,
     doubles,
     madd,
     put_span,
@@ -26,6 +27,8 @@ from capsense._simd import (
     splat,
     vadd,
     vmadd,
+    vmul,
+    vsub,
     where_above,
 )
 from capsense.elements.rigid import ROUND, SOFT
@@ -226,28 +229,28 @@ def source_lines(points, sources, floor, least, out):
     """
     width = sources.shape[1]
     layer = out.shape[1] * width
-    zero, minus = splat(np.float32(0.0)), np.float32(-1.0)
+    zero = splat(np.float32(0.0))
     two, bound = splat(np.float32(2.0) * floor), splat(least * least)
     for i in range(points.shape[0]):
         for s in range(0, width, SIMD_WIDTH):
             sx, sy, high = span(sources, s), span(sources, width + s), span(sources, 2 * width + s)
-            low = madd(minus, high, two)
+            low = vsub(two, high)
             value = fx = fy = fz = gx = gy = zero
             for q in range(4):
                 o = 12 * i + 3 * q
-                dx = madd(minus, sx, splat(at(points, o)))
-                dy = madd(minus, sy, splat(at(points, o + 1)))
+                dx = vsub(splat(at(points, o)), sx)
+                dy = vsub(splat(at(points, o + 1)), sy)
                 z = splat(at(points, o + 2))
-                dz, ez = madd(minus, high, z), madd(minus, low, z)
-                across = vmadd(dx, dx, vmadd(dy, dy, zero))
+                dz, ez = vsub(z, high), vsub(z, low)
+                across = vmadd(dx, dx, vmul(dy, dy))
                 square = vmadd(dz, dz, across)
                 a = rsqrt(where_above(square, bound, square, bound))
                 b = rsqrt(vmadd(ez, ez, across))
-                value = vadd(value, madd(minus, b, a))
-                a = vmadd(vmadd(a, a, zero), madd(minus, a, zero), zero)
+                value = vadd(value, vsub(a, b))
+                a = vmul(vmul(a, a), vsub(zero, a))
                 a = where_above(square, bound, a, zero)
-                b = vmadd(vmadd(b, b, zero), b, zero)
-                both, arm = vadd(a, b), vmadd(high, a, vmadd(low, b, zero))
+                b = vmul(vmul(b, b), b)
+                both, arm = vadd(a, b), vmadd(high, a, vmul(low, b))
                 fx, fy = vmadd(dx, both, fx), vmadd(dy, both, fy)
                 fz = vmadd(dz, a, vmadd(ez, b, fz))
                 gx, gy = vmadd(dx, arm, gx), vmadd(dy, arm, gy)
@@ -270,34 +273,34 @@ def _put_six(out, place, layer, six):
 def pair_line(shapes, i, others, weight, out, row):
     """Add force and torque on cluster i by others, by moments, to row ``row`` of ``out``."""
     width = others.shape[1]
-    layer, zero, minus = out.shape[1] * width, splat(np.float32(0.0)), np.float32(-1.0)
+    layer, zero = out.shape[1] * width, splat(np.float32(0.0))
     x, y, z = shapes[0, i], shapes[1, i], shapes[2, i]
     ax, ay, az = shapes[3, i], shapes[4, i], shapes[5, i]
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
     own = splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
     for j in range(0, width, SIMD_WIDTH):
-        dx = madd(minus, span(others, j), splat(x))
-        dy = madd(minus, span(others, width + j), splat(y))
-        dz = madd(minus, span(others, 2 * width + j), splat(z))
+        dx = vsub(splat(x), span(others, j))
+        dy = vsub(splat(y), span(others, width + j))
+        dz = vsub(splat(z), span(others, 2 * width + j))
         cx, cy, cz = (
             span(others, 3 * width + j), span(others, 4 * width + j), span(others, 5 * width + j)
         )  # fmt: skip
         ex, ey, ez = (
             span(others, 6 * width + j), span(others, 7 * width + j), span(others, 8 * width + j)
         )  # fmt: skip
-        inverse = rsqrt(_dot(dx, dy, dz, dx, dy, dz, splat(np.float32(1e-12))))
-        second = vmadd(inverse, inverse, zero)
+        inverse = rsqrt(dot(dx, dy, dz, dx, dy, dz, splat(np.float32(1e-12))))
+        second = vmul(inverse, inverse)
         a = madd(ax, dx, madd(ay, dy, madd(az, dz, zero)))
         b = madd(bx, dx, madd(by, dy, madd(bz, dz, zero)))
-        c, e = _dot(cx, cy, cz, dx, dy, dz, zero), _dot(ex, ey, ez, dx, dy, dz, zero)
-        whole = _dot(cx, cy, cz, cx, cy, cz, _dot(ex, ey, ez, ex, ey, ez, own))
-        along = vmadd(vmadd(a, a, vmadd(b, b, vmadd(c, c, vmadd(e, e, zero)))), second, zero)
-        third = vmadd(vmadd(span(weight, j), inverse, zero), second, zero)
-        fifth = madd(np.float32(3.0), vmadd(third, second, zero), zero)
+        c, e = dot(cx, cy, cz, dx, dy, dz, zero), dot(ex, ey, ez, dx, dy, dz, zero)
+        whole = dot(cx, cy, cz, cx, cy, cz, dot(ex, ey, ez, ex, ey, ez, own))
+        along = vmul(vmadd(a, a, vmadd(b, b, vmadd(c, c, vmul(e, e)))), second)
+        third = vmul(vmul(span(weight, j), inverse), second)
+        fifth = madd(np.float32(3.0), vmul(third, second), zero)
         radial = madd(np.float32(0.5), whole, madd(np.float32(-2.5), along, zero))
-        radial = vmadd(fifth, radial, madd(minus, third, zero))
-        a, b = vmadd(a, fifth, zero), vmadd(b, fifth, zero)
-        c, e = vmadd(c, fifth, zero), vmadd(e, fifth, zero)
+        radial = vmadd(fifth, radial, vsub(zero, third))
+        a, b = vmul(a, fifth), vmul(b, fifth)
+        c, e = vmul(c, fifth), vmul(e, fifth)
         # what turning the arms of i adds to the torque is this times (dx, dy, dz)
         ux = madd(ax, a, madd(bx, b, zero))
         uy = madd(ay, a, madd(by, b, zero))
@@ -317,15 +320,10 @@ def pair_line(shapes, i, others, weight, out, row):
 
 
 @pasted
-def _dot(x, y, z, u, v, w, addend):
-    return vmadd(x, u, vmadd(y, v, vmadd(z, w, addend)))
-
-
-@pasted
 def _cross(x, y, u, v):
     """``x v - y u``."""
     zero = splat(np.float32(0.0))
-    return vmadd(x, v, madd(np.float32(-1.0), vmadd(y, u, zero), zero))
+    return vmadd(x, v, vsub(zero, vmul(y, u)))
 
 
 @compiled
@@ -348,7 +346,7 @@ def near_pairs(points, others, soft, i, own, weight, near, line):
         count += 1
     width = near.shape[1]
     for k in range(0, count, SIMD_WIDTH):
-        zero, minus = splat(np.float32(0.0)), np.float32(-1.0)
+        zero = splat(np.float32(0.0))
         gx = gy = gz = tx = ty = tz = zero
         bound = span(near, 12 * width + k)
         for p in range(4):
@@ -359,14 +357,14 @@ def near_pairs(points, others, soft, i, own, weight, near, line):
             fx = fy = fz = zero
             for q in range(4):
                 o = 3 * q * width + k
-                dx = madd(minus, span(near, o), splat(x))
-                dy = madd(minus, span(near, o + width), splat(y))
-                dz = madd(minus, span(near, o + 2 * width), splat(z))
-                s = _dot(dx, dy, dz, dx, dy, dz, zero)
+                dx = vsub(splat(x), span(near, o))
+                dy = vsub(splat(y), span(near, o + width))
+                dz = vsub(splat(z), span(near, o + 2 * width))
+                s = dot(dx, dy, dz, dx, dy, dz, zero)
                 u = rsqrt(vmadd(s, s, bound))
                 # s / (s s + bound)^(5/4)
-                pull = vmadd(vmadd(u, u, zero), vmadd(u, rsqrt(u), zero), zero)
-                pull = vmadd(s, pull, zero)
+                pull = vmul(vmul(u, u), vmul(u, rsqrt(u)))
+                pull = vmul(s, pull)
                 fx, fy, fz = vmadd(pull, dx, fx), vmadd(pull, dy, fy), vmadd(pull, dz, fz)
             gx, gy, gz = vadd(gx, fx), vadd(gy, fy), vadd(gz, fz)
             tx = madd(y, fz, madd(-z, fy, tx))

@@ -6,8 +6,23 @@ import math
 
 import numpy as np
 
+from capsense._dense import WIDTH
 from capsense._jit import compiled, pasted
-from capsense._simd import muladd, rsqrt
+from capsense._simd import (
+    SIMD_WIDTH,
+    at,
+    dot,
+    madd,
+    put_span,
+    rsqrt,
+    span,
+    splat,
+    vadd,
+    vmadd,
+    vmul,
+    vsub,
+    where_above,
+)
 from capsense.field.green_kernels import smooth
 
 FAR = 0.75
@@ -44,22 +59,22 @@ def leaf_pairs(leaves, floor):
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
     flat, below = _flat(points, soft), _flat(image, soft)
-    line, room = np.empty(n, np.float32), np.empty((15, n), np.float32)
+    line, room = np.empty(shapes.shape[1], np.float32), np.empty((14, shapes.shape[1]), np.float32)
     behind = 0  # clusters of bodies before this one's
     for i in range(n):
         if owner[i] != owner[behind]:
             behind = i
-        _far_means(shapes, i, mirrored, line[: i + 1])
-        _near_means(flat, i, below, line[: i + 1], room)
+        _far_means(shapes, i, mirrored, i + 1, line)
+        _near_means(flat, i, below, i + 1, line, room)
         for j in range(i + 1):
             out[i, j] = -line[j]
         if behind > 0:
-            _far_means(shapes, i, shapes, line[:behind])
-            _near_means(flat, i, flat, line[:behind], room)
+            _far_means(shapes, i, shapes, behind, line)
+            _near_means(flat, i, flat, behind, line, room)
             for j in range(behind):
                 out[i, j] += line[j]
         if leaves.within[i] > 0.0:
-            _far_means(shapes, i, shapes, line[: i + 1])
+            _far_means(shapes, i, shapes, i + 1, line)
             for j in range(behind, i + 1):
                 if line[j] < 0.0 or j == i:
                     line[j] = _near_mean(points[i], points[j], extent[i], extent[j], j == i)
@@ -138,8 +153,11 @@ def _mirror_mean(t):
 
 @compiled
 def cluster_moments(points, extent):
-    """Centre, the two arms and the reach of each cluster, a column each, shape (10, l)."""
-    out = np.empty((10, points.shape[0]), np.float32)
+    """Centre, the two arms and the reach of each cluster, a column each, shape (10, w).
+
+    There are as many columns as :func:`room_for` says; the last are no clusters'.
+    """
+    out = np.zeros((10, room_for(points.shape[0])), np.float32)
     for j in range(points.shape[0]):
         for i in range(3):
             out[i, j] = 0.5 * (points[j, 0, i] + points[j, 3, i])
@@ -150,32 +168,44 @@ def cluster_moments(points, extent):
 
 
 @pasted
-def _dot(x, y, z, u, v, w):
-    return muladd(x, u, muladd(y, v, z * w))
+def room_for(clusters):
+    """Columns of a table of so many clusters."""
+    return WIDTH * ((clusters + WIDTH - 1) // WIDTH)
 
 
 @compiled
-def _far_means(shapes, i, others, out):
-    """Means of 1/r between cluster i and others, by second moments; -1 for those that are near."""
-    half, three, tiny = np.float32(0.5), np.float32(3.0), np.float32(1e-12)
-    x, y, z, reach = shapes[0, i], shapes[1, i], shapes[2, i], shapes[9, i]
+def _far_means(shapes, i, others, count, out):
+    """Means of 1/r between cluster i and the first others, by second moments; -1 for near ones."""
+    width, zero, near = shapes.shape[1], splat(np.float32(0.0)), splat(np.float32(-1.0))
+    x, y, z = splat(at(shapes, i)), splat(at(shapes, width + i)), splat(at(shapes, 2 * width + i))
     ax, ay, az = shapes[3, i], shapes[4, i], shapes[5, i]
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
-    own = _dot(ax, ay, az, ax, ay, az) + _dot(bx, by, bz, bx, by, bz)
-    for j in range(out.shape[0]):
-        dx, dy, dz = x - others[0, j], y - others[1, j], z - others[2, j]
-        cx, cy, cz = others[3, j], others[4, j], others[5, j]
-        ex, ey, ez = others[6, j], others[7, j], others[8, j]
-        square = _dot(dx, dy, dz, dx, dy, dz)
-        inverse = rsqrt(square + tiny)
-        a, b = _dot(ax, ay, az, dx, dy, dz), _dot(bx, by, bz, dx, dy, dz)
-        c, e = _dot(cx, cy, cz, dx, dy, dz), _dot(ex, ey, ez, dx, dy, dz)
-        whole = own + _dot(cx, cy, cz, cx, cy, cz) + _dot(ex, ey, ez, ex, ey, ez)
-        second = inverse * inverse
-        along = three * muladd(a, a, _dot(b, c, e, b, c, e)) * second
-        value = muladd(half * inverse * (along - whole), second, inverse)
-        far = reach + others[9, j]
-        out[j] = value if square > far * far else np.float32(-1.0)
+    own = splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
+    reach = splat(shapes[9, i])
+    for j in range(0, count, SIMD_WIDTH):
+        dx, dy, dz = (
+            vsub(x, span(others, j)),
+            vsub(y, span(others, width + j)),
+            vsub(z, span(others, 2 * width + j)),
+        )
+        cx, cy, cz = (
+            span(others, 3 * width + j), span(others, 4 * width + j), span(others, 5 * width + j)
+        )  # fmt: skip
+        ex, ey, ez = (
+            span(others, 6 * width + j), span(others, 7 * width + j), span(others, 8 * width + j)
+        )  # fmt: skip
+        square = dot(dx, dy, dz, dx, dy, dz, splat(np.float32(1e-12)))
+        inverse = rsqrt(square)
+        second = vmul(inverse, inverse)
+        a = madd(ax, dx, madd(ay, dy, madd(az, dz, zero)))
+        b = madd(bx, dx, madd(by, dy, madd(bz, dz, zero)))
+        c, e = dot(cx, cy, cz, dx, dy, dz, zero), dot(ex, ey, ez, dx, dy, dz, zero)
+        whole = dot(cx, cy, cz, cx, cy, cz, dot(ex, ey, ez, ex, ey, ez, own))
+        along = vmadd(a, a, vmadd(b, b, vmadd(c, c, vmul(e, e))))
+        excess = madd(np.float32(1.5), vmul(along, second), madd(np.float32(-0.5), whole, zero))
+        value = vmadd(vmul(inverse, second), excess, inverse)
+        far = vadd(reach, span(others, 9 * width + j))
+        put_span(out, j, where_above(square, vmul(far, far), value, near))
 
 
 @compiled
@@ -191,31 +221,34 @@ def _flat(points, soft):
 
 
 @compiled
-def _near_means(flat, i, others, out, room):
+def _near_means(flat, i, others, length, out, room):
     """Replace what is negative in a line by :func:`mean_inverse` of cluster i and those others."""
-    count = 0
-    for j in range(out.shape[0]):
-        if out[j] < 0.0:
+    count, n, width = 0, flat.shape[1], room.shape[1]
+    for j in range(length):
+        if at(out, j) < 0.0:
             for k in range(12):
-                room[k, count] = others[k, j]
+                room[k, count] = at(others, k * n + j)
             bound = max(flat[12, i], others[12, j])
-            room[12, count], room[13, count] = (
-                bound * bound * bound * bound + np.float32(1e-24),
-                0.0,
-            )
-            room[14, count] = j
+            room[12, count] = bound * bound * bound * bound + np.float32(1e-24)
+            room[13, count] = j
             count += 1
-    for p in range(4):
-        x, y, z = flat[3 * p, i], flat[3 * p + 1, i], flat[3 * p + 2, i]
+    zero = splat(np.float32(0.0))
+    for k in range(0, count, SIMD_WIDTH):
+        total, bound = zero, span(room, 12 * width + k)
         for q in range(4):
-            for k in range(count):
-                dx, dy = x - room[3 * q, k], y - room[3 * q + 1, k]
-                dz = z - room[3 * q + 2, k]
-                square = _dot(dx, dy, dz, dx, dy, dz)
-                fourth = muladd(square, square, room[12, k])
-                room[13, k] += rsqrt(fourth * rsqrt(fourth))
+            o = 3 * q * width + k
+            ux, uy, uz = span(room, o), span(room, o + width), span(room, o + 2 * width)
+            for p in range(4):
+                o = 3 * p * n + i
+                dx = vsub(splat(at(flat, o)), ux)
+                dy = vsub(splat(at(flat, o + n)), uy)
+                dz = vsub(splat(at(flat, o + 2 * n)), uz)
+                square = dot(dx, dy, dz, dx, dy, dz, zero)
+                fourth = vmadd(square, square, bound)
+                total = vadd(total, rsqrt(vmul(fourth, rsqrt(fourth))))
+        put_span(room, k, madd(np.float32(1.0 / 16.0), total, zero))  # the points are done with
     for k in range(count):
-        out[int(room[14, k])] = room[13, k] * np.float32(1.0 / 16.0)
+        out[int(room[13, k])] = at(room, k)
 
 
 @compiled
