@@ -355,7 +355,7 @@ def functions_of(bodies, cut, beyond):
         if cut.leaf[a] >= 0:
             reaches_out[a] = beyond[cut.leaf[a]] > 0.0
         if cut.kids[a, 0] >= 0:
-            count += _there(cut, cut.kids[a, 0]) and _there(cut, cut.kids[a, 1])
+            count += is_there(cut, cut.kids[a, 0]) and is_there(cut, cut.kids[a, 1])
             for c in range(2):
                 reaches_out[a] = reaches_out[a] or reaches_out[cut.kids[a, c]]
     cluster, number, body = (
@@ -368,12 +368,12 @@ def functions_of(bodies, cut, beyond):
     for rest in range(2):
         for a in range(cut.node.shape[0]):
             b = cut.body[a]
-            if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral and _there(cut, a):
+            if rest == 0 and cut.node[a] == 0 and not bodies[b].neutral and is_there(cut, a):
                 cluster[f], number[f], body[f] = -1 - a, 0, b
                 fade[f] = above[f] = smooth(cut.there[a] / _FULL)
                 f += 1
             x, y = cut.kids[a]
-            parted = x >= 0 and _there(cut, x) and _there(cut, y)
+            parted = x >= 0 and is_there(cut, x) and is_there(cut, y)
             if parted and (cut.fade[a] == 0.0) == (rest == 1):
                 # functions are numbered breadth first, as clusters are
                 cluster[f], number[f], body[f] = a, _function(bodies[b], cut.node[a]), b
@@ -389,7 +389,7 @@ def functions_of(bodies, cut, beyond):
 
 
 @compiled
-def _there(cut, a):
+def is_there(cut, a):
     """Whether anything of a cluster is within reach."""
     return cut.whole[a] + cut.parts[a, 0] + cut.parts[a, 1] > 0.0
 

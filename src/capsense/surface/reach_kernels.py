@@ -15,7 +15,7 @@ import numpy as np
 
 from capsense._jit import compiled
 from capsense._simd import integers, singles
-from capsense.surface.choose_kernels import Cut
+from capsense.surface.choose_kernels import Cut, is_there
 from capsense.surface.leaf_kernels import Leaves
 
 _SAME = 1e-9
@@ -146,7 +146,7 @@ def _own_block(body, table, inside, cut, span, functions, of):
     number, index = np.zeros(clusters + 1, np.int64), np.zeros(clusters, np.int64)
     count = 1  # the net charge comes first
     for a in range(first, last):
-        if cut.kids[a, 0] >= 0:
+        if cut.kids[a, 0] >= 0 and is_there(cut, a):
             number[count], index[a - first] = integers(body.function)[cut.node[a]], count
             count += 1
     rows = np.zeros((count, count))
@@ -165,7 +165,7 @@ def _within_reach(cut, span, index, functions, of, rows):
     more, out = np.zeros((last - first, width)), np.empty((of.shape[0], width))
     changed = np.zeros(last - first, np.bool_)  # else a line of ``more`` is zero
     for a in range(last - 1, first - 1, -1):
-        if cut.kids[a, 0] < 0:
+        if cut.kids[a, 0] < 0 or not is_there(cut, a):
             continue
         line, own, share = more[a - first], rows[index[a - first]], _moved(cut, a)
         if abs(share) > _SAME:

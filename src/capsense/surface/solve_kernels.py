@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capsense._dense import WIDTH, cholesky, multiply_part, substitute
 from capsense._jit import compiled
-from capsense._simd import at, madd, put_span, span
+from capsense._simd import SIMD_WIDTH, at, madd, put_span, span, splat, vsub
 from capsense.surface.reach_kernels import add_own
 
 SHEET = 6.0
@@ -27,6 +27,8 @@ _RAISE = 0.03
 """By what part of itself a diagonal is raised first."""
 _ROWS = 4
 """Rows of a matrix whose products are taken at a time."""
+_CACHED = 100_000
+"""Numbers that stay in a processor's cache: means over clusters are taken for so many at a time."""
 
 
 class System(NamedTuple):
@@ -58,33 +60,36 @@ class Reduced(NamedTuple):
 
 
 @compiled
-def _differences(cut, functions, values, out):
-    """Integrals with the first functions, (f, m), of what has these means on clusters, (k, m)."""
+def _differences(cut, functions, values, out, start):
+    """Integrals with the first functions of what has the means ``values`` (k, m) on clusters.
+
+    They fill m columns of ``out`` from ``start`` on, a row each function; m is a multiple of 8.
+    """
+    width, zero = values.shape[1], splat(np.float32(0.0))
     for f in range(out.shape[0]):
-        a = functions.cluster[f]
-        if a < 0:
-            for i in range(values.shape[1]):
-                out[f, i] = values[-1 - a, i]
-        else:
-            x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
-            for i in range(values.shape[1]):
-                out[f, i] = x[i] - y[i]
+        a, o = functions.cluster[f], f * out.shape[1] + start
+        x, y = (cut.kids[a, 0], cut.kids[a, 1]) if a >= 0 else (-1 - a, np.int64(-1))
+        for i in range(0, width, SIMD_WIDTH):
+            less = span(values, y * width + i) if y >= 0 else zero
+            put_span(out, o + i, vsub(span(values, x * width + i), less))
 
 
 @compiled
 def _climb(cut, values):
-    """Fill the means (k, m) of all clusters of a cut from those of its leaves."""
+    """Fill the means (k, m) of all clusters of a cut from those of its leaves, m as above."""
+    width, zero = values.shape[1], splat(np.float32(0.0))
     for a in range(cut.node.shape[0] - 1, -1, -1):
-        row = values[a]
-        if cut.kids[a, 0] < 0 and cut.leaf[a] < 0:
-            row[:] = np.float32(0.0)
-        elif cut.kids[a, 0] >= 0:
+        o, x, y = a * width, cut.kids[a, 0] * width, cut.kids[a, 1] * width
+        if x < 0 and cut.leaf[a] < 0:
+            for i in range(0, width, SIMD_WIDTH):
+                put_span(values, o + i, zero)
+        elif x >= 0:
             whole = np.float32(cut.whole[a])
             p, q = np.float32(cut.parts[a, 0]), np.float32(cut.parts[a, 1])
-            x, y = values[cut.kids[a, 0]], values[cut.kids[a, 1]]
-            for i in range(values.shape[1]):
-                own = whole * row[i] if whole > 0.0 else np.float32(0.0)
-                row[i] = own + (p * x[i] + q * y[i])
+            for i in range(0, width, SIMD_WIDTH):
+                own = madd(whole, span(values, o + i), zero) if whole > 0.0 else zero
+                own = madd(q, span(values, y + i), own)
+                put_span(values, o + i, madd(p, span(values, x + i), own))
 
 
 @compiled
@@ -127,30 +132,46 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
 
 @compiled
 def _integrals(cut, functions, rows, pairs):
-    """Integrate rows (l, w) with all functions, and pairs (l, l) with all and those solved for."""
+    """Integrate rows (l, w) with all functions, and pairs (l, l) with all and those solved for.
+
+    Pairs are taken some columns at a time, so that the clusters' means stay in the processor's
+    cache. The second result has a few columns too many.
+    """
     clusters, leaves, solved = cut.node.shape[0], cut.leaves.shape[0], functions.solved
     total, width = functions.cluster.shape[0], rows.shape[1]
-    means, met = np.empty((clusters, width), np.float32), np.empty((clusters, leaves), np.float32)
+    means, wide = np.empty((clusters, width), np.float32), np.empty((total, width), np.float32)
     for j in range(leaves):
-        a = cut.leaves[j]
         for i in range(width):
-            means[a, i] = rows[j, i]
-        for i in range(leaves):
-            met[a, i] = pairs[j, i]
+            means[cut.leaves[j], i] = rows[j, i]
     _climb(cut, means)
-    _climb(cut, met)
-    wide, half = np.empty((total, width), np.float32), np.empty((solved, leaves), np.float32)
-    _differences(cut, functions, means, wide)
-    _differences(cut, functions, met, half)
-    columns = np.empty((clusters, solved), np.float32)
-    for j in range(leaves):
-        line = columns[cut.leaves[j]]
-        for e in range(solved):
-            line[e] = half[e, j]
-    _climb(cut, columns)
-    outer = np.empty((total, solved), np.float32)
-    _differences(cut, functions, columns, outer)
+    _differences(cut, functions, means, wide, 0)
+    most = _whole_spans(max(_CACHED // clusters, SIMD_WIDTH * SIMD_WIDTH))
+    many = min(most, _whole_spans(leaves))
+    half = np.empty((solved, many * ((leaves + many - 1) // many)), np.float32)
+    part = np.zeros((clusters, many), np.float32)
+    for start in range(0, leaves, many):
+        for j in range(leaves):
+            line, o = part[cut.leaves[j]], j * leaves + start
+            for i in range(min(many, leaves - start)):
+                line[i] = at(pairs, o + i)
+        _climb(cut, part)
+        _differences(cut, functions, part, half, start)
+    many = min(most, _whole_spans(solved))
+    outer = np.empty((total, many * ((solved + many - 1) // many)), np.float32)
+    part = np.zeros((clusters, many), np.float32)
+    for start in range(0, solved, many):
+        for j in range(leaves):
+            line, o = part[cut.leaves[j]], start * half.shape[1] + j
+            for e in range(min(many, solved - start)):
+                line[e] = at(half, o + e * half.shape[1])
+        _climb(cut, part)
+        _differences(cut, functions, part, outer, start)
     return wide, outer
+
+
+@compiled
+def _whole_spans(columns):
+    return SIMD_WIDTH * max(1, (columns + SIMD_WIDTH - 1) // SIMD_WIDTH)
 
 
 @compiled
