@@ -20,7 +20,7 @@ from capsense.field.green_kernels import (
     smooth,
 )
 
-_LINEAR = 0.45, 0.58
+_LINEAR = 0.6, 0.77
 """Clusters smaller than the first part of their distance from the design see a linear potential,
 those larger than the second do not; in between they come to do."""
 _COARSE = 31
@@ -163,9 +163,8 @@ def _mean_potentials(body, green, means, met, crossing, linear):
     """
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
     most = 2 * body.n - 1
-    places, points = np.empty(most, np.int64), np.empty((most, 3), np.float32)
-    inner = np.empty(most)
-    found = 0
+    places, inner = np.empty(most, np.int64), np.empty(most)
+    points, found = np.empty((most, 3), np.float32), 0
     met[0] = True
     for k in range(most):
         if not met[k]:
@@ -173,11 +172,9 @@ def _mean_potentials(body, green, means, met, crossing, linear):
         square = out = 0.0
         room = 1.0
         for i in range(3):
-            x = body.position[i] + body.scale * (
-                body.rotation[i, 0] * center[3 * k]
-                + body.rotation[i, 1] * center[3 * k + 1]
-                + body.rotation[i, 2] * center[3 * k + 2]
-            )
+            x = body.position[i]
+            for q in range(3):
+                x += body.scale * body.rotation[i, q] * center[3 * k + q]
             points[found, i] = x
             off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
             square += off * off
@@ -331,11 +328,9 @@ def _collect(bodies, first, state, place, fades, above, count, leaves):
                 cut.leaf[a], cut.leaves[leaf] = leaf, a
                 leaf += 1
             if state[o + k] != LEAF:
-                cut.kids[a, 0], cut.kids[a, 1] = (
-                    place[o + kids[2 * k + 0]],
-                    place[o + kids[2 * k + 1]],
-                )
-                cut.share[a] = charge[kids[2 * k + 0]] / charge[k]
+                for c in range(2):
+                    cut.kids[a, c] = place[o + kids[2 * k + c]]
+                cut.share[a] = charge[kids[2 * k]] / charge[k]
                 cut.parts[a, 0] = (1.0 - cut.whole[a]) * cut.share[a]
                 cut.parts[a, 1] = (1.0 - cut.whole[a]) - cut.parts[a, 0]
     return cut
@@ -358,11 +353,8 @@ def functions_of(bodies, cut, beyond):
             count += is_there(cut, cut.kids[a, 0]) and is_there(cut, cut.kids[a, 1])
             for c in range(2):
                 reaches_out[a] = reaches_out[a] or reaches_out[cut.kids[a, c]]
-    cluster, number, body = (
-        np.empty(count, np.int64),
-        np.empty(count, np.int64),
-        np.empty(count, np.int64),
-    )
+    cluster, number = np.empty(count, np.int64), np.empty(count, np.int64)
+    body = np.empty(count, np.int64)
     fade, above, ends = np.empty(count), np.empty(count), np.zeros(count)
     f = solved = 0
     for rest in range(2):
