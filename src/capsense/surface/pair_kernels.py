@@ -314,21 +314,36 @@ def _mean_potential(outer, inner):
         u = v = square = 0.0
         for i in range(3):
             d = outer[q, i] - 0.5 * (inner[0, i] + inner[3, i])
-            u += d * 0.5 * (inner[0, i] - inner[2, i]) / long
-            v += d * 0.5 * (inner[0, i] - inner[1, i]) / short
+            u += d * (inner[0, i] - inner[2, i])
+            v += d * (inner[0, i] - inner[1, i])
             square += d * d
+        u, v = 0.5 * u / long, 0.5 * v / short
         w = math.sqrt(max(square - u * u - v * v, 0.0)) + 1e-9
-        total += (_corner(a - u, b - v, w) - _corner(-a - u, b - v, w)
-                  - _corner(a - u, -b - v, w) + _corner(-a - u, -b - v, w))  # fmt: skip
+        total += _rectangle(a - u, -a - u, b - v, -b - v, w)
     return total / (16.0 * a * b)
 
 
 @compiled
-def _corner(x, y, z):
-    """Antiderivative of 1/r over a rectangle (Wilton et al. 1984), z > 0."""
-    r = math.sqrt(x * x + y * y + z * z)
-    return (x * math.log(y + r + 1e-12) + y * math.log(x + r + 1e-12)
-            - z * math.atan(x * y / (z * r)))  # fmt: skip
+def _rectangle(x, left, y, below, z):
+    """Integral of 1/r over a rectangle with corners (left, below) and (x, y), z > 0.
+
+    (Wilton et al. 1984), with the logarithms, and the angles, of two corners in one.
+    """
+    tiny, xs, ls, ys, bs = 1e-12, x * x, left * left, y * y + z * z, below * below + z * z
+    r, s = math.sqrt(xs + ys), math.sqrt(xs + bs)
+    t, u = math.sqrt(ls + ys), math.sqrt(ls + bs)
+    out = x * math.log((y + r + tiny) / (below + s + tiny))
+    out -= left * math.log((y + t + tiny) / (below + u + tiny))
+    out += y * math.log((x + r + tiny) / (left + t + tiny))
+    out -= below * math.log((x + s + tiny) / (left + u + tiny))
+    return out - z * (_between(x * y, z * r, x * below, z * s)
+                      - _between(left * y, z * t, left * below, z * u))  # fmt: skip
+
+
+@pasted
+def _between(p, q, r, s):
+    """``atan(p / q) - atan(r / s)``, q and s above zero."""
+    return math.atan2(p * s - r * q, q * s + p * r)
 
 
 @compiled
