@@ -20,7 +20,7 @@ from capsense.field.green_kernels import (
     smooth,
 )
 
-_LINEAR = 0.6, 0.77
+_LINEAR = 0.45, 0.58
 """Clusters smaller than the first part of their distance from the design see a linear potential,
 those larger than the second do not; in between they come to do."""
 _COARSE = 31
