@@ -24,6 +24,7 @@ from capsense.surface.solve_kernels import (
     GAIN,
     System,
     assembled,
+    factorise,
     leaf_charges,
     reduced,
 )
@@ -151,8 +152,9 @@ def solve_each(
 def eliminate(matrix: NDArray[np.complex128], sides: NDArray[np.complex128]) -> None:
     """Replace right-hand sides (n, m) by the solution for a symmetric complex matrix (n, n), lost.
 
-    Without pivots, which it needs none of: its real part is positive definite, as energies are, and
-    losses have one sign (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.4).
+    Without pivots, which it needs none of where its real part is positive definite, as energies
+    are, and losses have one sign (Higham, *Accuracy and Stability of Numerical Algorithms*,
+    section 10.4).
     Compiled, as the bits of a BLAS depend on how many threads it has.
     """
     n, m = sides.shape
@@ -218,7 +220,8 @@ def solve_lossy(
     fade = functions.fade
     root = np.sqrt(fade[:n])
     faded = root[:, None] * matrix[:n] * root
-    np.fill_diagonal(faded, np.diag(matrix[:n]))
+    shift = factorise(matrix[:n].real.copy(), root, diagonal.real.copy(), np.empty((n, n)))
+    np.fill_diagonal(faded, diagonal[:n] + max(shift, 0.0) * np.abs(diagonal[:n].real))
     solved = (root[:, None] * phi[:n, :m]).astype(complex)
     eliminate(faded, solved)
     solved *= root[:, None]
@@ -233,7 +236,7 @@ def solve_lossy(
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     return Solution(
         0.5 * (delta + delta.T), np.ascontiguousarray(left.real), coarse, charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, n, 0.0,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, n if shift >= 0.0 else -1, shift,
     )  # fmt: skip
 
 
