@@ -1026,10 +1026,7 @@ def lossily(scene: Scene, threshold: float) -> Solution:
     """Solve with complex energies."""
     ties = np.array([complex(p.tie) for p in scene.pieces])
     soft = np.array([1 / (p.eps_r - 1) if np.isfinite(p.eps_r) else 0.0 for p in scene.pieces])
-    impedances = [s.impedance if np.isfinite(p.eps_r) else None for p, s in scene]
-    return solve_lossy(
-        scene.packed(), ties, soft.astype(complex), impedances, packed_green(), threshold, WIDTH
-    )
+    return solve_lossy(scene.packed(), ties, soft.astype(complex), packed_green(), threshold, WIDTH)
 
 
 @pytest.mark.parametrize(
