@@ -265,13 +265,9 @@ class CpuCore:
             soft, lone = bodies.softness[e, at], records["neutral"][:count] != 0
             ties = np.where(bodies.tie[e, at].imag != 0, bodies.tie[e, at], records["tie"][:count])
             out = solve_lossy(
-                records[:count], np.where(lone, np.inf, ties), soft,
-                [
-                    table.shapes[u].impedance if x != 0 else None
-                    for u, x in zip(bodies.choice[e, at], soft, strict=True)
-                ],
-                solver.green, preset.threshold, preset.width,
+                records[:count], np.where(lone, np.inf, ties), soft, solver.green,
+                preset.threshold, preset.width,
             )  # fmt: skip
             found.delta[e, s], loss[e, s] = out.delta.real, -out.delta.imag
-            found.error[e, s] = (np.abs(np.diag(out.left)) + out.coarse).max()
+            found.error[e, s] = solver.in_farads(out)[1] / UNIT
         return loss

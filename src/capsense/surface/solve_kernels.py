@@ -240,7 +240,7 @@ def reduced(functions, system, adjoint):
         for i in range(m):
             x[f, i] = root[f] * phi[f, i]
     delta, left = np.zeros((m, m)), np.zeros((m, m))
-    shift = _factorise(matrix, root, own, factor)
+    shift = factorise(matrix, root, own, factor)
     if shift < 0.0:
         delta[0, 0] = np.nan
         return Reduced(delta, left, np.zeros(m), x, shift)
@@ -285,7 +285,7 @@ def reduced(functions, system, adjoint):
 
 
 @compiled
-def _factorise(matrix, root, own, factor):
+def factorise(matrix, root, own, factor):
     """Cholesky factor of √t A √t with A's own diagonal.
 
     Where bodies lie within each other or within the sensor, approximate energies may leave no

@@ -263,14 +263,9 @@ class SurfaceSolver:
                 return bodies, None
             matter = bodies.matter
             if matter.lossy:
-                softness = matter.softness
-                impedances = [
-                    s.impedance if soft != 0 and isinstance(s, RigidShape) else None
-                    for s, soft in zip(bodies.shapes, softness, strict=True)
-                ]
                 out = solve_lossy(
-                    bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)), softness,
-                    impedances, self.green, preset.threshold, preset.width,
+                    bodies.records, matter.ties(sizes_of(bodies.records, bodies.shapes)),
+                    matter.softness, self.green, preset.threshold, preset.width,
                 )  # fmt: skip
             else:
                 out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)

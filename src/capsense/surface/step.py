@@ -5,7 +5,6 @@ Compiled in one piece, so that threads do not wait for each other between its st
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,12 +17,13 @@ from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs
-from capsense.surface.reach_kernels import add_own, reached
+from capsense.surface.reach_kernels import reached
 from capsense.surface.solve_kernels import (
     COARSE,
     GAIN,
     System,
     assembled,
+    factorise,
     leaf_charges,
     reduced,
 )
@@ -151,8 +151,9 @@ def solve_each(
 def eliminate(matrix: NDArray[np.complex128], sides: NDArray[np.complex128]) -> None:
     """Replace right-hand sides (n, m) by the solution for a symmetric complex matrix (n, n), lost.
 
-    Without pivots, which it needs none of: its real part is positive definite, as energies are, and
-    losses have one sign (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.4).
+    Without pivots, which it needs none of where its real part is positive definite, as energies
+    are, and losses have one sign (Higham, *Accuracy and Stability of Numerical Algorithms*,
+    section 10.4).
     Compiled, as the bits of a BLAS depend on how many threads it has.
     """
     n, m = sides.shape
@@ -180,7 +181,6 @@ def solve_lossy(
     records: NDArray[np.void],
     ties: NDArray[np.complex128],
     softness: NDArray[np.complex128],
-    impedances: Sequence[NDArray[np.float32] | None],
     green: Green,
     threshold: float,
     width: float,
@@ -189,26 +189,22 @@ def solve_lossy(
 
     Args:
         records: The bodies, whose real softness is not looked at, nor are ties where ``ties`` are
-            finite.
+            finite. Energies are linear in softness.
         ties: Energy of the bodies' net charges [1/m], infinite for floating ones, shape (n,).
         softness: 1 / (eps - 1), shape (n,).
-        impedances: Interior impedance of each body, None for conductors and changing surfaces.
         green, threshold, width: As in :func:`prepared`.
     """
     plain = records.copy()
-    plain["tie"], plain["impedance"] = 0.0, 0
+    plain["tie"], plain["softness"] = 0.0, 0.0
     cut, leaves, functions, system = prepared(plain, green, threshold, width)
+    plain["softness"] = 1.0
+    inside = prepared(plain, green, threshold, width)[3]
     phi, real, below, own = system
     n, m = functions.solved, green.terminals
-    matrix = np.concatenate([real, below]).astype(complex)
-    diagonal = own.astype(complex)
-    plain["impedance"] = [0 if z is None else z.ctypes.data for z in impedances]
-    plain["softness"] = 1.0
-    inside, beside, alone = np.zeros_like(real), np.zeros_like(below), np.zeros_like(own)
-    add_own(plain, cut, functions, True, inside, beside, alone)
     factor = softness[functions.body]
-    matrix += factor[:, None] * np.concatenate([inside, beside])
-    diagonal += factor * alone
+    matrix = np.concatenate([real, below]).astype(complex)
+    matrix += factor[:, None] * np.concatenate([inside.matrix - real, inside.rest - below])
+    diagonal = own + factor * (inside.own - own)
     net = functions.cluster < 0
     for b in range(len(records)):
         root = np.flatnonzero((functions.body == b) & net)
@@ -218,10 +214,11 @@ def solve_lossy(
     fade = functions.fade
     root = np.sqrt(fade[:n])
     faded = root[:, None] * matrix[:n] * root
-    np.fill_diagonal(faded, np.diag(matrix[:n]))
+    shift = factorise(matrix[:n].real.copy(), root, diagonal.real.copy(), np.empty((n, n)))
+    np.fill_diagonal(faded, diagonal[:n] + shift * np.abs(diagonal[:n].real))
     solved = (root[:, None] * phi[:n, :m]).astype(complex)
     eliminate(faded, solved)
-    solved *= root[:, None]
+    solved *= root[:, None] if shift >= 0.0 else np.nan
     lack = GAIN * (1 - fade) * (1 - (1 - functions.above) ** 4) / diagonal
     residual = phi[:, :m] - _product(matrix, solved)
     extra = lack[:, None] * residual
@@ -233,7 +230,7 @@ def solve_lossy(
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     return Solution(
         0.5 * (delta + delta.T), np.ascontiguousarray(left.real), coarse, charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, n, 0.0,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, n if shift >= 0.0 else -1, shift,
     )  # fmt: skip
 
 
