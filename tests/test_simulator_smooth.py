@@ -91,3 +91,12 @@ def test_bar_over_other_designs(simulators, name):
     values = sweep(simulators(name), [bar(0.005 + STEP * k) for k in range(COUNT)])
     assert_no_jump(values)
     assert (np.diff(values) < 0).all()
+
+
+def test_a_wall_lets_a_body_in_smoothly(simulators):
+    """Invariant: the face of a box comes into sight over 5 mm, not at once."""
+    sim = simulators("six_patch")
+    box = cs.Body(cs.Box((0.06, 0.06, 0.06)))
+    values = sweep(sim, [box.moved(cs.Pose((0.271 - STEP * k, 0.0, 0.05))) for k in range(80)])
+    assert values[0] == 0.0
+    assert np.abs(np.diff(values)).max() < 0.1 * values.max()

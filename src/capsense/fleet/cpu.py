@@ -16,7 +16,7 @@ from capsense.elements.matter import SHUT, UNIT
 from capsense.elements.rigid import BODY
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
-from capsense.field.green_kernels import Green
+from capsense.field.green_kernels import SHORE, Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading
 from capsense.surface.gradient_kernels import jacobian
 from capsense.surface.solver import SurfaceSolver
@@ -177,7 +177,7 @@ def _placed(
     turn, own = turns
     _matrix(poses.bodies[e, b], own)
     u, scale = bodies.choice[e, b], bodies.scale[e, b]
-    reach = scale * bodies.radius[u]
+    reach = scale * bodies.radius[u] + SHORE
     record[0] = bodies.shapes[u]
     body = record[0]
     _position(poses, e, b, s, turn, body)

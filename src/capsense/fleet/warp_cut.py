@@ -190,7 +190,7 @@ def choose(
     cut.moved[b, v] = moved
     scale = places.scale[e, b]
     away = _off(wp.transform_get_translation(at), green.room0, green.room1)
-    if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u]:
+    if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u] + _SHORE:
         return
     first = shapes.first[u]
     cut.node[o, v] = first

@@ -19,7 +19,7 @@ from capsense.elements.store import rigid
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
-from capsense.field.green_kernels import pack_green
+from capsense.field.green_kernels import SHORE, pack_green
 from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
 from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
@@ -138,7 +138,8 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain [m], as :func:`windowed` takes them."""
-        self._room = self.green.room[0], self.green.room[1]
+        self._sight = self.green.room + SHORE * np.array([[-1.0], [1.0]])
+        """Corners of the box beyond which no charge is [m], shape (2, 3)."""
         self._last: tuple[View, Solution] | None = None
         self._laid: _Laid | None = None
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
@@ -245,7 +246,7 @@ class SurfaceSolver:
     def look(self, scene: Scene) -> View:
         """Find the bodies of a scene that reach into the domain."""
         packed = scene.pack()
-        met = overlapping(packed.bounds, *self._room)
+        met = overlapping(packed.bounds, *self._sight)
         matter = matter_of([scene[k] for k in met.tolist()], self.excitation_frequency)
         return View(scene, packed, met, matter)
 
@@ -378,8 +379,8 @@ class SurfaceSolver:
         low, high = shape.piece_bounds
         middle = view.packed.position[k] + 0.5 * (low + high) @ rotation.T
         half = 0.5 * (high - low) @ np.abs(rotation.T)
-        room = self.green.room
-        near = ((middle + half > room[0]) & (middle - half < room[1])).all(axis=1)
+        low, high = self._sight
+        near = ((middle + half > low) & (middle - half < high)).all(axis=1)
         return [shape.pieces[i] for i in np.flatnonzero(near).tolist()], _OF_MANY, None
 
     def functions_of(
