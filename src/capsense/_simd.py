@@ -2,9 +2,10 @@
 
 The functions below are one or a few LLVM instructions each, whatever the processor's own width:
 ``splat(s)`` fills all elements, ``vadd(u, v)`` is ``u + v``, ``vsub(u, v)`` is ``u - v``,
-``vmul(u, v)`` is ``u v`` and ``vmadd(u, v, w)`` is ``u v + w``, element by element; ``madd(s, v,
-w)`` is ``s v + w`` with a scalar s, ``horizontal_sum(v)`` adds the elements, ``where_above(u, v, x,
-y)`` is x where u > v, else y, and ``muladd(a, b, c)`` is ``a b + c`` of scalars.
+``vmul(u, v)`` is ``u v``, ``vmadd(u, v, w)`` is ``u v + w`` and ``dot(x, y, z, u, v, w, a)`` is
+``x u + y v + z w + a``, element by element; ``madd(s, v, w)`` is ``s v + w`` with a scalar s,
+``horizontal_sum(v)`` adds the elements, ``where_above(u, v, x, y)`` is x where u > v, else y, and
+``muladd(a, b, c)`` is ``a b + c`` of scalars.
 
 ``at(x, k)`` is element k of a C-ordered array of any shape, ``span`` is the eight from k on, and
 ``put_span`` writes them: unlike ``x[k]``, which counts from the end where k is negative, they do
@@ -25,8 +26,6 @@ from llvmlite import ir
 from numba import types
 from numba.core.cgutils import get_or_insert_function
 from numba.extending import intrinsic, models, register_model
-
-from capsense._jit import pasted
 
 SIMD_WIDTH = 8
 
@@ -165,6 +164,18 @@ def vmadd(typing: Any, left: Any, right: Any, addend: Any) -> Any:
 
 
 @intrinsic
+def dot(typing: Any, x: Any, y: Any, z: Any, u: Any, v: Any, w: Any, addend: Any) -> Any:
+    """``x u + y v + z w + addend``, element by element."""
+
+    def code(builder: Any, x: Any, y: Any, z: Any, u: Any, v: Any, w: Any, addend: Any) -> Any:
+        for left, right in ((z, w), (y, v), (x, u)):
+            addend = multiply_add(builder, left, right, addend)
+        return addend
+
+    return x(x, x, x, x, x, x, x), _emit(code)
+
+
+@intrinsic
 def where_above(typing: Any, left: Any, right: Any, over: Any, other: Any) -> Any:
     """``over`` where ``left`` is above ``right``, else ``other``, element by element."""
 
@@ -244,12 +255,6 @@ def has_guess(target: tuple[str, str, str]) -> bool:
     """Whether a target (triple, processor, features) has AVX's guess of 1 / sqrt(x)."""
     triple, _, features = target
     return triple.startswith("x86_64") and "+avx" in features.split(",")
-
-
-@pasted
-def dot(x: Any, y: Any, z: Any, u: Any, v: Any, w: Any, addend: Any) -> Any:
-    """``x u + y v + z w + addend``, element by element."""
-    return vmadd(x, u, vmadd(y, v, vmadd(z, w, addend)))
 
 
 def _pointer(kind: Any) -> Any:
