@@ -141,6 +141,13 @@ def test_the_scheme_of_the_paper(field_cache: Path, monkeypatch: pytest.MonkeyPa
     assert list(caught.value.readings) == [0, 2]
 
 
+def test_scenes_as_they_come(tiny: cs.Simulator) -> None:
+    """A generator will do; readings are those of the list."""
+    scenes = [cs.Scene([cs.Body(cs.Sphere(0.01), cs.Pose((0, 0, z)))]) for z in (0.03, 0.05)]
+    many, listed = tiny.step_batch(s for s in scenes), tiny.step_batch(scenes)
+    assert [r.delta.tolist() for r in many] == [r.delta.tolist() for r in listed]
+
+
 def test_refused_before_any_work(tiny: cs.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
     """By name, with the fix."""
     monkeypatch.setattr(SurfaceSolver, "look", lambda *_: pytest.fail("worked"))

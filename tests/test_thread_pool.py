@@ -6,6 +6,7 @@ import os
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from capsense._thread_pool import ThreadPool, processors, some_failed
@@ -75,6 +76,11 @@ def test_refused(threads: object) -> None:
     """Not a positive whole number."""
     with pytest.raises(SceneError, match=r"threads is .*give a whole number from 1"):
         ThreadPool(threads)  # type: ignore[arg-type]
+
+
+def test_a_number_of_numpy() -> None:
+    """As computed from other counts."""
+    assert ThreadPool(np.int64(2)).threads == 2
 
 
 def test_processors_where_a_system_does_not_tell(monkeypatch: pytest.MonkeyPatch) -> None:

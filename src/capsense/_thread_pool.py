@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._validate import as_whole
 from capsense.errors import CapSenseError, SceneError, listed
 
 Array = NDArray[np.float64]
@@ -88,9 +89,10 @@ class ThreadPool:
     def __init__(self, threads: int | None = None) -> None:
         if threads is None:
             threads = processors()
-        if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
+        whole = as_whole(threads)
+        if whole is None or whole < 1:
             raise SceneError(f"threads is {threads!r}; give a whole number from 1")
-        self.threads = threads
+        self.threads = whole
         """How many threads read, the calling one included."""
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0

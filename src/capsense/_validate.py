@@ -6,7 +6,7 @@ import difflib
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,6 +28,11 @@ def as_number(value: object) -> float:
         except OverflowError:
             return math.inf
     return math.nan
+
+
+def as_whole(value: object) -> int | None:
+    """A whole number, Python's or NumPy's; None for anything else, booleans too."""
+    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
 
 
 SYNONYMS = (

@@ -314,6 +314,7 @@ class Simulator:
                 ``threads`` is not a positive whole number.
             BatchError: Some scenes failed; it holds the readings of the others.
         """
+        scenes = list(scenes)
         for number, scene in enumerate(scenes):
             _check_view(f"scenes[{number}]: a batch holds", scene)
 

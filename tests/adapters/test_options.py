@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.adapters.rules import AttachOptions, Rules
+from capsense.adapters.rules import AttachOptions, Image, Rules
 
 
 def test_the_rules_are_the_options() -> None:
@@ -39,3 +41,16 @@ def test_unknown_options_are_named(
         world = (model, simulator.MjData(model), "pad")
     with pytest.raises(TypeError, match=message):
         getattr(cs, name).attach(*world, design=tiny_simulator, **options)
+
+
+def test_an_image_of_numpy_numbers() -> None:
+    """They are numbers as any, and words are none."""
+    image = Image(np.float32(0.5), np.int64(32))  # type: ignore[arg-type]
+    assert image == Image(0.5, 32)
+    assert (type(image.size), type(image.resolution)) == (float, int)
+    for wrong in ("0.5", True, math.nan, math.inf, 0.0):
+        with pytest.raises(cs.SceneError, match="give the width of the image in metres"):
+            Image(wrong)  # type: ignore[arg-type]
+    for wrong in (64.0, True, 3, 2001):
+        with pytest.raises(cs.SceneError, match="give a whole number from 4 to 2000"):
+            Image(0.5, wrong)  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_fleet import BODIES, frames
 
+from capsense.errors import SceneError
 from capsense.fleet import Fleet
 
 torch = pytest.importorskip("torch")
@@ -63,3 +64,19 @@ def test_refused():
     poses = torch.tensor([[[0.0, 0.0, 0.06, 0.0, 0.0, 0.0, 1.0]]])
     with pytest.raises(ValueError, match="poses of sensors"):
         change(fleet, poses, poses.clone().requires_grad_())
+
+
+def test_arguments_of_the_other_function():
+    """Each names the function, or the conversion, that takes what was given."""
+    from capsense.fleet.autograd import change
+
+    fleet = Fleet("six_patch", [BODIES[0]], 1)
+    poses = np.array([[[0.0, 0.0, 0.06, 0, 0, 0, 1]]])
+    given = torch.tensor(poses, requires_grad=True)
+    with pytest.raises(SceneError, match=r"poses is a tensor .*autograd\.change\(fleet, poses\)"):
+        fleet.step(given)
+    with pytest.raises(SceneError, match=r"poses is of ndarray; give a tensor"):
+        change(fleet, poses)
+    with pytest.raises(SceneError, match=r"sensors is of ndarray; give a tensor"):
+        change(fleet, given, poses)
+    assert np.array_equal(fleet.step(given.detach()).delta, fleet.step(poses).delta)

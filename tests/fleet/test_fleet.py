@@ -207,3 +207,23 @@ def test_refused(fleet):
         Fleet("six_patch", BODIES, 0)
     with pytest.raises(ValueError, match="preset is 'fast'"):
         Fleet("six_patch", BODIES, 1, preset="fast")
+    with pytest.raises(cs.DesignError, match=r"design is of Simulator; .* such as its design"):
+        Fleet(cs.Simulator("six_patch"), BODIES, 1)
+    for wrong in (3, BODIES[0], [BODIES[0].shape], {"ball": BODIES[0]}, np.array([])):
+        with pytest.raises(SceneError, match=r"bodies is .*; give a list of at least one Body"):
+            Fleet("six_patch", wrong, 1)
+    for wrong in (BODIES[0].shape, [BODIES[0].shape], {"ball": BODIES[0]}):
+        with pytest.raises(SceneError, match=r"bodies is .*; give a Body, None, or a list of them"):
+            fleet.change(0, wrong, [1])
+
+
+def test_numbers_and_lists_of_numpy():
+    """Whole numbers of NumPy are whole numbers, and an array of bodies is a list of them."""
+    bodies = np.empty(2, object)
+    bodies[:] = BODIES[:2]
+    small = Fleet("six_patch", bodies, np.int64(2), sensors=np.int32(1))
+    small.change(np.int64(1), BODIES[2], np.array([1], np.uint8))
+    plain = Fleet("six_patch", BODIES[:2], 2)
+    plain.change(1, BODIES[2], [1])
+    where = poses(np.random.default_rng(7), 2, 2)
+    assert np.array_equal(small.step(where).delta, plain.step(where).delta)

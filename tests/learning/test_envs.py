@@ -278,9 +278,11 @@ def test_side_by_side_refuses() -> None:
     for count in (0, True):
         with pytest.raises(cs.SceneError, match="num_envs is"):
             together(FOLLOW, count)
-    envs = together(FOLLOW, 2)
+    envs = together(FOLLOW, np.int64(2))
     with pytest.raises(cs.SceneError, match="give 2 seeds"):
         envs.reset(seed=[1, 2, 3])
+    first = envs.reset(seed=np.int64(1))[0]
+    assert np.array_equal(first, envs.reset(seed=1)[0])
     envs.reset(seed=1)
     with pytest.raises(cs.SceneError, match=r"actions have shape \(2, 4\); give \(2, 5\)"):
         envs.step(np.zeros((2, 4)))

@@ -93,8 +93,10 @@ def test_refusals(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
         cs.plot(readings, sim, excitation="slf")
     with pytest.raises(cs.CapSenseError, match="no reading"):
         cs.plot([], sim)
-    with pytest.raises(cs.CapSenseError, match="5 readings, times of shape"):
+    with pytest.raises(cs.CapSenseError, match=r"shape \(2,\); give as many"):
         cs.plot(readings, sim, times=[0.0, 1.0])
+    with pytest.raises(cs.CapSenseError, match=r"shape \(5,\) and 4 scenes; give as many"):
+        cs.plot(readings, sim, scenes=scenes[:-1])
 
 
 def test_the_style_sheet_has_the_colours_of_all_pictures() -> None:

@@ -27,6 +27,14 @@ def scene(k: int = 0) -> cs.Scene:
     return recorded_scenes.scene_at(k)
 
 
+@pytest.mark.parametrize("source", [3, "six_patch", cs.load_design("six_patch")])
+def test_what_reads_nothing(path: Path, source: object) -> None:
+    """Neither a simulator nor a sensor; no file is begun."""
+    with pytest.raises(RecordingError, match=r"source is of \w+; give a Simulator, or a sensor"):
+        cs.record(path, source)  # type: ignore[arg-type]
+    assert not path.exists()
+
+
 def test_steps_behind_the_recorders_back(sim: cs.Simulator, path: Path) -> None:
     """They would change the last digits of what follows; a reset puts it right."""
     with cs.record(path, sim) as run:

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import trimesh
 
 from capsense.errors import SceneError
 from capsense.scene import (
@@ -150,3 +151,11 @@ def test_printing_stays_short() -> None:
     assert repr(scene).startswith("<Scene of 100: link0 (TriMesh), link1")
     assert len(repr(scene[0])) < 500
     assert repr(Scene()) == "<Scene of 0: nothing>"
+
+
+def test_a_mesh_of_trimesh() -> None:
+    """The message says how it becomes a shape."""
+    mesh = trimesh.creation.icosphere(radius=0.03)
+    with pytest.raises(SceneError, match=r"give a TriMesh\(mesh\.vertices, mesh\.faces\)"):
+        Body(mesh)
+    assert Body(TriMesh(mesh.vertices, mesh.faces)).shape.volume == pytest.approx(mesh.volume)

@@ -108,3 +108,9 @@ def test_pictures_and_videos() -> None:
         video.seek(5)
         video.load()
         assert video.info["duration"] == 50
+
+
+def test_what_is_on_no_robot() -> None:
+    """A simulator is shown by another command."""
+    with pytest.raises(cs.SceneError, match=r"sensor is of Simulator; .* capsense view"):
+        cs.show(cs.Simulator("six_patch"), port=0)  # type: ignore[arg-type]

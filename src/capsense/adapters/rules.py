@@ -9,7 +9,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from capsense._validate import suggest
+from capsense._validate import as_number, as_whole, suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Body, Material, Pose, Shape, material
@@ -197,10 +197,12 @@ class Image:
 
     def __post_init__(self) -> None:
         size, pixels = self.size, self.resolution
-        if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < np.inf:
+        if not 0 < as_number(size) < np.inf:
             raise SceneError(f"size is {size!r}; give the width of the image in metres")
-        if isinstance(pixels, bool) or not isinstance(pixels, int) or not 4 <= pixels <= 2000:
+        if not 4 <= (as_whole(pixels) or 0) <= 2000:
             raise SceneError(f"resolution is {pixels!r}; give a whole number from 4 to 2000")
+        object.__setattr__(self, "size", float(size))
+        object.__setattr__(self, "resolution", int(pixels))
 
     @classmethod
     def of(cls, options: Mapping[str, Any], design: Design) -> Image:

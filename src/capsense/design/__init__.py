@@ -6,6 +6,7 @@ This module reads design files, and checks them.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -88,6 +89,12 @@ def load_design(name_or_path: str | Path) -> Design:
         DesignError: If there is no such design, or if anything in its file is wrong; the message
             names the file, the item, the value and the fix.
     """
+    if not isinstance(name_or_path, str | os.PathLike):
+        own = ", such as its design" if hasattr(name_or_path, "design") else ""
+        raise DesignError(
+            f"the design is of {type(name_or_path).__name__}; give a packaged name, the path of a "
+            f".toml file, or a Design{own}"
+        )
     text = str(name_or_path)
     if isinstance(name_or_path, str) and not text.endswith(".toml") and not set("/\\") & set(text):
         names = available_designs()

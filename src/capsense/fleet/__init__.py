@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._thread_pool import OneAtATime
+from capsense._validate import as_whole, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
@@ -86,10 +87,12 @@ class Fleet:
         excitation_frequency: float = 250e3,
     ) -> None:
         for what, number in (("count", count), ("sensors", sensors)):
-            if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+            if (as_whole(number) or 0) < 1:
                 raise SceneError(f"{what} is {number!r}; give a whole number from 1")
-        if isinstance(bodies, Body) or not bodies:
-            raise SceneError(f"bodies is {bodies!r}; give a list of at least one Body")
+        count, sensors = int(count), int(sensors)
+        given, bodies = bodies, list(bodies) if isinstance(bodies, Iterable) else []
+        if not bodies or not all(isinstance(body, Body) for body in bodies):
+            raise SceneError(f"bodies is {shorten(given)}; give a list of at least one Body")
         for what, chosen, known in (
             ("preset", preset, tuple(PRESETS)), ("budget", budget, (32, 64, 128)),
         ):  # fmt: skip
@@ -345,6 +348,11 @@ class Fleet:
 
 
 def _checked(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    if getattr(values, "requires_grad", False):
+        raise SceneError(
+            f"{what} is a tensor that requires gradients, which step does not follow; give "
+            f"{what}.detach(), or write capsense.fleet.autograd.change(fleet, poses)"
+        )
     poses = np.array(values, float, order="C")
     if poses.shape != shape:
         raise SceneError(f"{what} has shape {poses.shape}; give {shape}")

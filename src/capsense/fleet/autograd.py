@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from capsense.errors import SceneError
 from capsense.fleet import Fleet
 
 
@@ -29,6 +30,12 @@ def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = Non
         SolveError: As by :meth:`Fleet.step`.
         ValueError: Gradients by the sensors' poses are asked for.
     """
+    for what, values in (("poses", poses), ("sensors", sensors)):
+        if not isinstance(values, torch.Tensor | None):
+            raise SceneError(
+                f"{what} is of {type(values).__name__}; give a tensor, such as "
+                f"torch.tensor({what}, requires_grad=True)"
+            )
     if sensors is not None and sensors.requires_grad:
         raise ValueError("gradients by the poses of sensors are not known; move the bodies instead")
     out: torch.Tensor = _Change.apply(poses, sensors, fleet)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._validate import as_whole, shorten
 from capsense.elements.matter import matter_of
 from capsense.elements.pieces import windowed
 from capsense.elements.rigid import BODY, RigidShape
@@ -125,7 +126,8 @@ class BodyTable:
         environments: ArrayLike | None,
     ) -> None:
         """See :meth:`Fleet.change`."""
-        if isinstance(place, bool) or not isinstance(place, int) or not 0 <= place < self.places:
+        whole = as_whole(place)
+        if whole is None or not 0 <= whole < self.places:
             raise SceneError(f"place is {place!r}; there are places 0 to {self.places - 1}")
         rows = np.arange(self.count) if environments is None else np.asarray(environments).ravel()
         if not rows.size:
@@ -136,7 +138,13 @@ class BodyTable:
             raise SceneError(
                 f"environments is {environments!r}; give numbers from 0 to {self.count - 1}"
             )
-        each = [bodies] * len(rows) if isinstance(bodies, Body) or bodies is None else list(bodies)
+        each: list[Body | None]
+        if isinstance(bodies, Body) or bodies is None:
+            each = [bodies] * len(rows)
+        else:
+            each = list(bodies if isinstance(bodies, Iterable) else [bodies])
+        if not all(body is None or isinstance(body, Body) for body in each):
+            raise SceneError(f"bodies is {shorten(bodies)}; give a Body, None, or a list of them")
         if len(each) != len(rows):
             raise SceneError(f"{len(each)} bodies are given for {len(rows)} environments")
         alike = {id(body): body for body in each}

@@ -284,9 +284,9 @@ def plot(
         moments = np.arange(count) if times is None else np.asarray(times, dtype=float)
         seen = [Scene()] * count if scenes is None else scenes
         if moments.shape != (count,) or len(seen) != count:
+            also = "" if scenes is None else f" and {len(seen)} scenes"
             raise CapSenseError(
-                f"{count} readings, times of shape {moments.shape} and {len(seen)} scenes; give as "
-                "many of each"
+                f"{count} readings, times of shape {moments.shape}{also}; give as many of each"
             )
         channels = channels_of(Excitation(excitation), design.electrode_names)
         run = Run(

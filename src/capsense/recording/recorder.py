@@ -72,6 +72,11 @@ class Recorder:
         self._told = False
         self.count = 0
         """Steps recorded so far."""
+        if not isinstance(source, Simulator | AttachedSensor):
+            raise RecordingError(
+                f"source is of {type(source).__name__}; give a Simulator, or a sensor that attach "
+                "returned"
+            )
         self._sensor = source if isinstance(source, AttachedSensor) else None
         self._simulator = source if isinstance(source, Simulator) else source.simulator
         check_name(name)

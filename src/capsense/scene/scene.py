@@ -50,9 +50,13 @@ class Body:
         name: str | None = None,
     ) -> None:
         if not isinstance(shape, Shape):
-            raise SceneError(
-                f"shape is {shape!r}; give a Box, Sphere, Capsule, Cylinder, Ellipsoid or TriMesh"
+            mesh = hasattr(shape, "vertices") and hasattr(shape, "faces")
+            fix = (
+                "TriMesh(mesh.vertices, mesh.faces)"
+                if mesh
+                else ("Box, Sphere, Capsule, Cylinder, Ellipsoid or TriMesh")
             )
+            raise SceneError(f"shape is {shape!r}; give a {fix}")
         if not (name is None or (isinstance(name, str) and name)):
             raise SceneError(f"body name is {name!r}; give a non-empty string or None")
         fields = self.__dict__

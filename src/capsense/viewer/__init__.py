@@ -44,6 +44,11 @@ class Show:
     """Reads an attached sensor and shows it on a page; see :func:`show`."""
 
     def __init__(self, sensor: AttachedSensor, *, host: str, port: int) -> None:
+        if not isinstance(sensor, AttachedSensor):
+            raise SceneError(
+                f"sensor is of {type(sensor).__name__}; give a sensor that attach returned, or "
+                "watch a scenario or a recording with capsense view"
+            )
         self._sensor, self._count = sensor, 0
         self._stream = SensorStream(sensor)
         self.player = Follower(self._stream)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from capsense._validate import as_whole
 from capsense.adapters.mujoco_depth import find_site
 from capsense.adapters.mujoco_model import ModelReader
 from capsense.adapters.rules import Rules
@@ -155,8 +156,9 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
         device: str = "cpu",
         **options: Any,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+        if (as_whole(num_envs) or 0) < 1:
             raise SceneError(f"num_envs is {num_envs!r}; give a whole number from 1")
+        num_envs = int(num_envs)
         first = self.world(**options)
         shared = {**options, "design": first.simulator}
         self.worlds = [first, *(self.world(**shared) for _ in range(num_envs - 1))]
@@ -188,8 +190,11 @@ class CapacitiveVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], ND
             SceneError: Another number of seeds, or a mask of another shape.
         """
         n = self.num_envs
-        seeds = [None] * n if seed is None else seed
-        seeds = [seeds + k for k in range(n)] if isinstance(seeds, int) else list(seeds)
+        seeds: list[int | None] = [None] * n
+        if (first := as_whole(seed)) is not None:
+            seeds = [first + k for k in range(n)]
+        elif seed is not None:
+            seeds = list(cast("Sequence[int | None]", seed))
         mask = np.asarray((options or {}).get("reset_mask", np.ones(n, np.bool_)))
         if len(seeds) != n or mask.shape != (n,) or mask.dtype != np.bool_:
             raise SceneError(f"reset: give {n} seeds, and a mask of {n} booleans")
