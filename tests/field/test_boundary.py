@@ -60,20 +60,27 @@ def test_unit_square_plate(scale):
     assert got == pytest.approx(expected, rel=2e-3 * scale)
 
 
-def test_disc_over_the_floor():
+ITSELF = pytest.param(1.0, marks=pytest.mark.e2e)
+"""The default: small designs are cut finer than its sizes. Others have a fraction of the panels."""
+
+
+@pytest.mark.parametrize("scale", [2.0, ITSELF])
+def test_disc_over_the_floor(scale):
     """Analytic: Kirchhoff's disc capacitor; the floor's image makes a pair of discs 2h apart.
 
     C = 2 [eps0 π r² / 2h + eps0 r (ln(16π r / 2h) − 1)], right to O(h/r ln²) of the second term.
     """
     r, h = 0.02, 0.001
     disc = shapely.Point(0, 0).buffer(r, quad_segs=48)
-    got = capacitance(patches(disc, backplane=h))[0, 0]
+    got = capacitance(patches(disc, backplane=h), scale)[0, 0]
     edge = EPS0 * r * (math.log(16 * math.pi * r / (2 * h)) - 1)
     expected = 2 * (EPS0 * math.pi * r**2 / (2 * h) + edge)
     assert abs(got / expected - 1) < 0.01
 
 
-@pytest.mark.parametrize("box", [1.0, pytest.param(2.0, marks=pytest.mark.e2e), 5.0])
+@pytest.mark.parametrize(
+    "box", [*(pytest.param(b, marks=pytest.mark.e2e) for b in (1.0, 2.0)), 5.0]
+)
 def test_disc_in_a_large_box(box):
     """Analytic: 8 eps0 a, and the potential that a charge's images in a cube make in its middle,
     which is that of a charge in a cubic lattice of alternating ones, 1.7476 / L.
@@ -146,13 +153,14 @@ def test_walls_are_cut_evenly_whatever_is_inside(size, along):
     np.testing.assert_allclose(walls, [(size / along) ** 2] * (5 * along**2))
 
 
-def test_two_stripes():
-    """Measured against the carried-over figures: 0.1 % on the diagonal, 0.2 % beside it."""
+@pytest.mark.parametrize("scale", [1.5, ITSELF])
+def test_two_stripes(scale):
+    """Measured against the carried-over figures: 0.2 % on the diagonal, 0.3 % beside it."""
     case = figures()["two_stripes"]
     design = patches(
         shapely.box(0.0025, -0.05, 0.0125, 0.05), shapely.box(-0.0125, -0.05, -0.0025, 0.05)
     )
-    got = capacitance(design)
+    got = capacitance(design, scale)
     assert got[0, 0] == pytest.approx(case["C11"] * PICO, rel=0.005)
     assert got[0, 1] == pytest.approx(case["C12"] * PICO, rel=0.01)
     assert_physical(0.5 * (got + got.T))
@@ -181,11 +189,12 @@ def test_matter_that_fills_the_box_scales_everything():
     np.testing.assert_allclose(capacitance(full, 2.0), 3 * capacitance(bare, 2.0), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("scale", "bound"), [(1.0, 0.005), (5.0, 0.03)])
-def test_half_filled_box_takes_the_mean(scale, bound):
+@pytest.mark.parametrize("scale", [5.0, 1.5, ITSELF])
+def test_half_filled_box_takes_the_mean(scale):
     """Analytic: electrodes in the interface in the middle of the box see (e1 + e2) / 2.
 
-    The empty field's symmetry about z = 0 makes it satisfy the interface by itself.
+    The empty field's symmetry about z = 0 makes it satisfy the interface by itself. Measured:
+    0.07 %.
     """
     squares = rectangle((-0.02, 0), (0.03, 0.03)), rectangle((0.02, 0), (0.03, 0.03))
     bare = patches(*squares, size=0.2, backplane=0.1)
@@ -194,7 +203,7 @@ def test_half_filled_box_takes_the_mean(scale, bound):
         layers=(slab(5.0, (-0.1, -0.1, -0.1), (0.1, 0.1, 0.0)),),
     )  # fmt: skip
     got, expected = capacitance(half, scale), 3 * capacitance(bare, scale)
-    np.testing.assert_allclose(got, expected, atol=bound * expected.max())
+    np.testing.assert_allclose(got, expected, atol=2e-3 * expected.max())
 
 
 def test_pads_on_matter_and_in_air_couple_alike():
@@ -214,12 +223,13 @@ def test_pads_on_matter_and_in_air_couple_alike():
     assert_physical(0.5 * (got + got.T))
 
 
-def test_capacitance_scales_with_size():
+@pytest.mark.parametrize("scale", [2.0, ITSELF])
+def test_capacitance_scales_with_size(scale):
     """Analytic: twice the lengths, twice the capacitance; panels scale with the sheets."""
 
     def scaled(k: float) -> Array:
         squares = [rectangle((x * k, 0), (0.03 * k, 0.03 * k)) for x in (-0.02, 0.02)]
-        return capacitance(patches(*squares, size=0.3 * k, backplane=0.01 * k), 1.0)
+        return capacitance(patches(*squares, size=0.3 * k, backplane=0.01 * k), scale)
 
     np.testing.assert_allclose(scaled(2.0), 2 * scaled(1.0), rtol=0.01)
 
@@ -273,10 +283,11 @@ def test_shields_and_floating_conductors_are_terminals():
     assert_physical(0.5 * (matrix + matrix.T), 1e-3)
 
 
-def test_finer_panels_converge_from_below():
+@pytest.mark.parametrize("least", [1.0, pytest.param(0.5, marks=pytest.mark.e2e)])
+def test_finer_panels_converge_from_below(least):
     """Measured: the capacitance of a sheet grows towards its limit as panels shrink."""
     design = patches(rectangle((0, 0), (0.03, 0.03)), size=0.2, backplane=0.01)
-    values = [capacitance(design, s)[0, 0] for s in (2.0, 1.0, 0.5)]
+    values = [capacitance(design, k * least)[0, 0] for k in (4.0, 2.0, 1.0)]
     assert values[0] < values[1] < values[2]
     assert values[2] - values[1] < values[1] - values[0]
     assert values[2] / values[1] - 1 < 0.005

@@ -38,6 +38,8 @@ Array = np.ndarray
 
 FEW = GreenSettings(near_sources=360, near_spacing=2.8e-3, far_sources=160, far_spacing=3.6e-3)
 """Sizes for designs of a few centimetres."""
+FEWER = replace(FEW, training=300, wide=400, far_training=1000)
+"""As many charges, fitted at a third of the points, for designs of many panels."""
 
 
 def square(name: str, x: float, size: float = 0.024) -> dict[str, Any]:
@@ -104,9 +106,10 @@ class Case:
 @cache
 def case(name: str) -> Case:
     design = DESIGNS[name]()
-    solution = BoundarySolution(design, Accuracy(1.6))
+    scale, settings = (1.6, FEW) if name == "flat" else (2.5, FEWER)
+    solution = BoundarySolution(design, Accuracy(scale))
     densities = solution.densities(np.eye(len(terminals(design))))
-    return Case(design, solution, densities, build_green(solution, densities, settings=FEW))
+    return Case(design, solution, densities, build_green(solution, densities, settings=settings))
 
 
 def ball(center: Array, radius: float, n: int = 150) -> Array:

@@ -31,7 +31,11 @@ def simulator():
 
 @pytest.mark.parametrize(
     ("budget", "single", "every", "close"),
-    [(32, 1.6, 4.2, 58), (64, 0.55, 1.0, 82), (128, 0.35, 0.45, 86)],
+    [
+        (32, 1.6, 4.2, 58),
+        (64, 0.55, 1.0, 82),
+        pytest.param(128, 0.35, 0.45, 86, marks=pytest.mark.e2e),
+    ],
 )
 def test_errors_over_the_reference_map(scenes, simulator, budget, single, every, close):
     """Measured: rms of the diagonal [%], of single bodies from 15 mm on, and of all scenes; how
@@ -130,14 +134,23 @@ def test_several_sensors_places_and_matter():
 
 
 def test_arrays_of_others():
-    """Differential: of NumPy, Warp and PyTorch; nothing is left of the last step."""
+    """Differential: of NumPy and Warp; nothing is left of the last step."""
     fleet = Fleet("six_patch", BODIES, 4, device="warp:cpu", budget=32)
     where = poses(np.random.default_rng(12), 4, 3).astype(np.float32)
     truth = fleet.step(where).delta.numpy().copy()
     fleet.step(poses(np.random.default_rng(13), 4, 3))
     found = fleet.step(wp.array(where, device="cpu")).delta
     np.testing.assert_allclose(found.numpy(), truth, rtol=1e-5)
+
+
+@pytest.mark.e2e  # which takes seconds to import
+def test_arrays_of_pytorch():
+    """Differential: to and from it."""
     torch = pytest.importorskip("torch")
+    fleet = Fleet("six_patch", BODIES, 4, device="warp:cpu", budget=32)
+    where = poses(np.random.default_rng(12), 4, 3).astype(np.float32)
+    truth = fleet.step(where).delta.numpy().copy()
+    fleet.step(poses(np.random.default_rng(13), 4, 3))
     found = fleet.step(torch.from_numpy(where)).delta
     np.testing.assert_allclose(torch.from_dlpack(found).numpy(), truth, rtol=1e-5)
 
@@ -274,7 +287,10 @@ def test_functions_that_add_nothing_are_left_out(lossy):
     assert found == pytest.approx(truth, rel=1e-5)
 
 
-MODULES = ["warp_cut", "warp_pairs", "warp_solve", "warp_charges", "warp_chip_kernels"]
+MODULES = [
+    "warp_cut", "warp_solve", "warp_chip_kernels",
+    *(pytest.param(m, marks=pytest.mark.e2e) for m in ("warp_pairs", "warp_charges")),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MODULES)

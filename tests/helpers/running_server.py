@@ -6,25 +6,37 @@ import asyncio
 import json
 import logging
 import threading
+import time
 import urllib.error
 import urllib.request
+from collections.abc import Callable
 from typing import Any
 
 from capsense.server.client import Client
-from capsense.server.server import Server, ServerOptions
+from capsense.server.server import Limits, Server, ServerOptions
 
 WAIT = 120.0
-"""Longest wait for a server to start or stop [s]."""
+"""Longest wait for a server to start or stop, and for whatever else must happen [s]."""
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + WAIT
+    while not condition():
+        assert time.monotonic() < deadline, "it never came about"
+        time.sleep(0.005)
 
 
 class RunningServer:
     """Serves within its ``with`` block.
 
     Args:
-        options: ``port`` is 0, any free one, unless it is given.
+        options: ``port`` is 0, any free one, unless it is given; ``limits`` are those of
+            :meth:`patient`.
     """
 
     def __init__(self, *designs: str, port: int = 0, **options: Any) -> None:
+        options.setdefault("limits", self.patient())
         self.events: list[dict[str, Any]] = []
         """What was logged."""
         logger = logging.Logger("test")
@@ -53,9 +65,14 @@ class RunningServer:
         """Its port."""
         return int(self.url.rpartition(":")[2])
 
+    @staticmethod
+    def patient(**limits: Any) -> Limits:
+        """Limits with which a busy machine dismisses nobody, but for those that are given."""
+        return Limits(**{"hello_timeout": WAIT, "send_timeout": WAIT, **limits})
+
     def client(self, **options: Any) -> Client:
-        """A new client."""
-        return Client(self.url, **options)
+        """A new client, which waits for answers as long as tests do."""
+        return Client(self.url, **{"timeout": WAIT, **options})
 
     def stop(self) -> None:
         """Stop serving, and wait for the end."""

@@ -24,7 +24,7 @@ def first_order(sim: cs.Simulator, z: float, thickness: float, size: float, eps_
 
 @cache  # for sheets of several thicknesses
 def _per_thickness(sim: cs.Simulator, z: float, size: float, eps_r: float, terminal: int) -> float:
-    side = (np.arange(100) + 0.5) / 100 * size - size / 2
+    side = (np.arange(50) + 0.5) / 50 * size - size / 2  # twice as many change it by 2e-5
     x, y = (a.ravel() for a in np.meshgrid(side, side))
     places = np.column_stack([x, y, np.full(x.size, z)])
     field = [

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import threading
-import time
 
 import numpy as np
 import pytest
-from running_server import RunningServer
+from running_server import WAIT, RunningServer, wait_for
 
 import capsense as cs
 from capsense.errors import CapSenseError, ProtocolError, ServerError
@@ -112,7 +111,7 @@ def test_several_sensors_and_clients(served: RunningServer, dome: np.ndarray) ->
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20)
+        thread.join(WAIT)
     assert results == [True] * 30
 
 
@@ -152,7 +151,7 @@ def hold_solves(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threa
 
     def slow(self: ServedSensor, frame: object) -> bytes:
         begun.set()
-        assert go.wait(10)
+        assert go.wait(WAIT)
         return solve(self, frame)  # type: ignore[arg-type]
 
     monkeypatch.setattr(ServedSensor, "solve", slow)
@@ -167,7 +166,7 @@ def test_newest_frame_wins(
     with served.client() as client:
         sensor = client.open()
         sensor.send(dome)
-        assert begun.wait(10)
+        assert begun.wait(WAIT)
         for _ in range(7):
             sensor.send(dome)
         other = client.open()  # handled after those seven
@@ -186,7 +185,7 @@ def test_frames_that_a_reset_or_the_end_overtakes(
     with served.client() as client:
         busy, ended, restarted = client.open(), client.open(), client.open()
         busy.send(dome)
-        assert begun.wait(10)
+        assert begun.wait(WAIT)
         ended.send(dome)
         restarted.send(dome)
         assert ended.close() == {"frames": 1, "readings": 0, "dropped": 1}
@@ -277,9 +276,7 @@ def test_health_and_log(dome: np.ndarray) -> None:
                 sensor.step(dome)
             _, health = server.get("/health")
             assert (health["clients"], health["sensors"], health["readings"]) == (1, 1, 3)
-        deadline = time.monotonic() + 5
-        while not server.logged("disconnected") and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_for(lambda: server.logged("disconnected"))
         assert server.get("/health")[1]["readings"] == 3
         assert server.get("/")[0] == 426
         assert server.get("/else")[0] == 404
@@ -296,17 +293,16 @@ def test_stopping_closes_connections(dome: np.ndarray, monkeypatch: pytest.Monke
     with RunningServer() as server, server.client() as client, server.client():
         sensor = client.open()
         sensor.send(dome)
-        assert begun.wait(10)
+        assert begun.wait(WAIT)
         stopping = threading.Thread(target=server.stop)
         stopping.start()
-        while not server.logged("stopping"):
-            time.sleep(0.005)
+        wait_for(lambda: server.logged("stopping"))
         assert server.get("/health")[0] == 503
         with pytest.raises(ProtocolError, match="503"):
             server.client()
         go.set()
         assert client.reading(sensor.number, 0).sequence == 0
-        stopping.join(10)
+        stopping.join(WAIT)
         with pytest.raises(ProtocolError, match="1001"):
             sensor.step(dome)
         with pytest.raises(OSError, match="refused"):
@@ -363,7 +359,7 @@ def test_the_client_comes_back() -> None:
     """A server that goes and comes finds its client there again, the sensor opened as it was."""
     depth = np.full((8, 8), 0.05, np.float32)
     first = RunningServer().__enter__()
-    with first.client(timeout=5.0) as client:
+    with first.client() as client:
         sensor = client.open(sensor=3, material="steel")
         before = sensor.step(depth)
         first.stop()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from running_server import RunningServer
+from running_server import WAIT, RunningServer
 
 from capsense.server.server import Limits
 
@@ -41,7 +41,7 @@ def test_javascript(served: RunningServer, tmp_path: Path) -> None:
     program = tmp_path / "page.js"
     program.write_text(snippet("javascript", served), encoding="utf-8")
     command = [node, "--experimental-websocket", str(program)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT)
     if "WebSocket is not defined" in done.stderr or "bad option" in done.stderr:
         pytest.skip("needs node, version 20 or later")
     rows = np.array([[float(v) for v in line.split()] for line in done.stdout.splitlines()])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -21,7 +20,7 @@ from raw_websocket import (
     masked,
     raw_websocket,
 )
-from running_server import RunningServer
+from running_server import WAIT, RunningServer, wait_for
 from stopped_clock import StoppedClock
 
 from capsense.errors import ProtocolError
@@ -32,7 +31,7 @@ from capsense.server.session import AdmissionControl, RateLimitedConnection
 @pytest.fixture(autouse=True)
 def witness(served: RunningServer, dome: np.ndarray) -> Iterator[None]:
     """Another client, whose session must go on as if nothing had happened."""
-    with served.client(timeout=5) as client:
+    with served.client() as client:
         sensor = client.open()
         before = sensor.step(dome)
         yield
@@ -97,13 +96,6 @@ def flood(connection: RawWebSocket, frame: bytes) -> None:
         connection.send(frame * 10_000)
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds, for some seconds."""
-    deadline = time.monotonic() + 5
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.005)
-
-
 def test_the_reason_of_the_cut(served: RunningServer) -> None:
     """A client that stops to listen is told."""
     with raw_websocket(served.port, HELLO) as connection:
@@ -134,7 +126,7 @@ def test_only_one_address(served: RunningServer) -> None:
     """By default the server listens on 127.0.0.1 alone, and on none of the machine's others."""
     assert served.url.startswith("ws://127.0.0.1:")
     with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.2", served.port), timeout=2)
+        socket.create_connection(("127.0.0.2", served.port), timeout=WAIT)
 
 
 def test_newcomers_are_let_in_slowly(
