@@ -1,4 +1,5 @@
-"""Strict reading of TOML files: every key, type, unit and number is checked as it is read."""
+"""Strict reading of TOML files: every key, type, unit and number is checked as it is read; and
+what counts as a whole number or a number anywhere."""
 
 from __future__ import annotations
 
