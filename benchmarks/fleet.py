@@ -9,8 +9,8 @@ A solve is one sensor in one environment: ``six_patch_bare`` before one finger (
 pose in every environment and at every step. Errors are of the diagonal of ΔC (over the reference,
 or over 1 % of the scene's largest entry where that is more) in the scenes of
 ``tests/data/reference_map.json`` that hold one primitive from 15 mm on, and in all scenes of
-primitives. On Warp, differences of all entries to ``Simulator.step``, over each scene's largest
-entry, are beside them. Times are of steps with the poses on the device; a host array costs its
+primitives. On Warp, differences of all entries to ``Simulator.step`` with both its presets, over
+each scene's largest entry, are beside them. Times are of steps with the poses on the device; a host array costs its
 copy. Times of the processor are those of all threads of this program, which other programs disturb
 less.
 """
@@ -43,6 +43,8 @@ Array = NDArray[np.float64]
 PRIMITIVES = cs.Box, cs.Sphere, cs.Capsule, cs.Cylinder, cs.Ellipsoid
 FINGER = cs.Body(cs.Capsule(0.008, 0.06), material="human", name="finger")
 STEPS = 9
+PRESETS = "standard", "fine"
+"""Presets of ``Simulator`` that Warp is compared with."""
 
 
 def fingers(count: int, rng: np.random.Generator) -> Array:
@@ -58,18 +60,18 @@ def fingers(count: int, rng: np.random.Generator) -> Array:
 def errors(options: dict[str, Any], scenes: list[ReferenceScene]) -> tuple[Array, Array, Array]:
     """Errors of single bodies from 15 mm on, of all scenes, and differences to ``Simulator`` [%].
 
-    The last are of shape (scenes, 6, 6).
+    The last are of shape (presets, scenes, 6, 6).
     """
     fleet, poses = fleet_of(scenes, **options)
-    simulator = cs.Simulator(DESIGN)
-    truth = np.array([simulator.step(s.scene).delta for s in scenes])
+    simulators = [cs.Simulator(DESIGN, preset=p) for p in PRESETS]
+    truth = np.array([[s.step(one.scene).delta for one in scenes] for s in simulators])
     delta = fleet.step(poses).delta
     delta = (delta if isinstance(delta, np.ndarray) else delta.numpy())[:, 0].astype(float)
     found = np.array(
         [100 * diagonal_errors(d, s.delta) for d, s in zip(delta, scenes, strict=True)]
     )
     single = [len(s.scene) == 1 and s.gap > 0.0149 for s in scenes]
-    apart = 100 * (delta - truth) / np.abs(truth).max(axis=(1, 2), keepdims=True)
+    apart = 100 * (delta - truth) / np.abs(truth).max(axis=(2, 3), keepdims=True)
     return found[single].ravel(), found.ravel(), apart
 
 
@@ -140,11 +142,13 @@ def main() -> int:
         if options.device != "cpu":
             plain, whole = memory(chosen)
             print(f"{value!s:10} {plain:,} bytes a sensor, {whole:,} with gradients")
-            worst = np.abs(apart).max(axis=(1, 2))
-            print(
-                f"{'':10} to Simulator.step: rms {np.sqrt((apart**2).mean()):.2f} %, worst "
-                f"{worst.max():.2f} %, {(worst < 1).sum()} of {len(worst)} scenes within 1 %"
-            )
+            for preset, entries in zip(PRESETS, apart, strict=True):
+                worst = np.abs(entries).max(axis=(1, 2))
+                print(
+                    f"{'':10} to Simulator.step, {preset}: rms {np.sqrt((entries**2).mean()):.2f} %"
+                    f", worst {worst.max():.2f} %, {(worst < 1).sum()} of {len(worst)} scenes "
+                    "within 1 %"
+                )
         for count in options.counts:
             solves, busy = rate(chosen, count)
             print(
