@@ -1,7 +1,8 @@
-"""Surfaces without energies of their own: depth images, cloth, bodies that the box cuts off.
+"""Surfaces without energies of their own: depth images, cloth, and bodies that are wide.
 
-Their clusters are fixed; charge, centres and second moments follow the pieces at every step, and
-clusters meet each other as rectangles of the same moments.
+Clusters of theirs meet each other as rectangles of the same second moments, at every step. Those of
+depth images and cloth are fixed; charge, centres and moments follow the pieces. A wide body has far
+more pieces than energies could be worked out for.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.elements import tree_kernels
-from capsense.elements.rigid import BODY, Clusters, split
+from capsense.elements.panels import SurfacePanels
+from capsense.elements.rigid import BODY, Clusters, panel_features, split
 from capsense.scene import Box, Capsule, Cylinder, Layers, RestSurface, SurfaceMesh
 from capsense.scene.shapes import Shape
 
@@ -250,7 +252,7 @@ class Pieces(Protocol):
 
 
 class ChangingBody:
-    """A surface as the step takes it; ``record`` points to arrays that are held here.
+    """A surface of pieces as the step takes it; ``record`` points to arrays that are held here.
 
     Args:
         tree: Clusters of all pieces.
@@ -296,6 +298,10 @@ class ChangingBody:
         self._extent = extent
         self.capacitance = 0.35 * float(extent[0])
         """About that in free space over 4π eps0 [m]."""
+        self.radius = float(
+            (np.linalg.norm(self._center[single], axis=1) + 0.75 * extent[single]).max()
+        )
+        """Radius of a ball about the origin that holds the surface [m]."""
         self._own = np.empty(n)
         self._own[0] = 0.5 * _OWN / extent[0]
         self._own[self._function[~single]] = _OWN / extent[~single]
@@ -304,6 +310,35 @@ class ChangingBody:
         for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
         self.record = record
+        self.nbytes = sum(a.nbytes for a in self.__dict__.values() if isinstance(a, np.ndarray))
+        """Room that the arrays take up [bytes]."""
+
+
+WIDE = 0.2
+"""Conductors of a second-largest extent above this [m] are solved for on :func:`wide_body`."""
+_PIECE = 4e-3
+"""Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""
+_FEWEST, _DOUBLINGS = 5000, 3
+"""Pieces of wide bodies are so many, doubled at most so often."""
+
+
+def wide_pieces(shape: Shape) -> int:
+    """About how many pieces a wide shape is cut into; 0 where it is not wide."""
+    held = shape.__dict__.get("_pieces")
+    if held is None:
+        low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
+        held = 0
+        if middle > WIDE:
+            wanted = 2 * (low * middle + middle * high + high * low) / _PIECE**2
+            doublings = math.ceil(math.log2(wanted / _FEWEST))
+            held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS)
+        shape.__dict__["_pieces"] = held
+    return held
+
+
+def wide_body(panels: SurfacePanels) -> ChangingBody:
+    """A conductor on many panels, which meet each other without a block of energies."""
+    return ChangingBody(split(panel_features(panels), panels.areas), panels)
 
 
 def _lengths(shape: Shape) -> tuple[float, float, float]:

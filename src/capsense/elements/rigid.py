@@ -116,6 +116,11 @@ class RigidShape(Frozen):
     """Capacitance in free space over 4π eps0 [m]."""
 
     @property
+    def radius(self) -> float:
+        """Radius of a ball about the origin that holds the shape [m]."""
+        return float(np.linalg.norm(self.panels.corners, axis=2).max())
+
+    @property
     def own(self) -> Array:
         """Diagonal of ``energy`` [1/m], shape (n,)."""
         return self._once("_own", lambda: np.diag(self.energy).astype(float))
@@ -260,9 +265,13 @@ def _substitute(factor: Array, x: Array) -> None:
 
 def build_tree(panels: SurfacePanels, charge: Array) -> Tree:
     """Split panels into clusters; ``charge`` (n,) is their equilibrium charge, above zero."""
+    return charged_tree(panels, split(panel_features(panels), charge), charge)
+
+
+def panel_features(panels: SurfacePanels) -> Array:
+    """Centres and scaled normals of panels, as :func:`split` takes them [m], shape (n, 6)."""
     extent = float(np.ptp(panels.centers, axis=0).max())
-    features = np.concatenate([panels.centers, _NORMALS * extent * panels.normals], axis=1)
-    return charged_tree(panels, split(features, charge), charge)
+    return np.concatenate([panels.centers, _NORMALS * extent * panels.normals], axis=1)
 
 
 def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tree:

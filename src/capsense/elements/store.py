@@ -12,12 +12,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capsense.elements.panels import panels_of, polygon_panels
+from capsense.elements.pieces import ChangingBody, wide_body
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
@@ -98,7 +99,9 @@ _MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
 _LOCK = threading.Lock()
-_SHAPES: OrderedDict[Hashable, RigidShape] = OrderedDict()
+_SHAPES: OrderedDict[Hashable, RigidShape | ChangingBody] = OrderedDict()
+
+T = TypeVar("T", bound=RigidShape | ChangingBody)
 
 
 def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
@@ -111,32 +114,50 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
     Raises:
         SceneError: The shape has no surface that can be covered with panels.
     """
-    held = shape.__dict__.get("_rigid")
+    return _kept(shape, count, "_rigid", _rigid_of)
+
+
+def wide(shape: Shape, count: int) -> tuple[ChangingBody, float]:
+    """The same of a wide conductor, of so many pieces without energies of their own."""
+    return _kept(shape, count, "_wide", lambda whole, _, name: wide_body(panels_of(whole, count)))
+
+
+def _rigid_of(whole: Shape, count: int, name: str) -> RigidShape:
+    if isinstance(whole, TriMesh):
+        return _mesh_shape(whole, count, name)
+    return rigid_shape(panels_of(whole, count), apart=True)
+
+
+def _kept(
+    shape: Shape, count: int, slot: str, make: Callable[[Shape, int, str], T]
+) -> tuple[T, float]:
+    """What is made of a shape's form, once, and how many times as large the shape is."""
+    held = shape.__dict__.get(slot)
     if held is not None and held[0] == count:
         return held[1], held[2]
-    size, key, make = _recipe(shape, count)
+    size, form, whole = _form(shape, count)
+    key: Hashable = (slot, *form)
     with _LOCK:
         found = _SHAPES.get(key)
         if found is not None:
             _SHAPES.move_to_end(key)
     if found is None:
-        made = make()
+        made = make(whole, count, str(form[0]))
         with _LOCK:
             found = _SHAPES.setdefault(key, made)
             while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
                 _SHAPES.popitem(last=False)
-    shape.__dict__["_rigid"] = (count, found, size)
-    return found, size
+    shape.__dict__[slot] = (count, found, size)
+    return cast(T, found), size
 
 
-def _recipe(shape: Shape, count: int) -> tuple[float, Hashable, Callable[[], RigidShape]]:
-    """A shape's size [m], what tells its form from others, and how to make it of size 1."""
+def _form(shape: Shape, count: int) -> tuple[float, tuple[Hashable, ...], Shape]:
+    """A shape's size [m], what tells its form from others, and its form, of size 1."""
     if isinstance(shape, TriMesh):
         digest = hashlib.sha256(repr((VERSION, count, shape.vertices.shape)).encode())
         for values in (shape.vertices, shape.faces):
             digest.update(np.ascontiguousarray(values).tobytes())
-        name = digest.hexdigest()[:32]
-        return 1.0, name, lambda: _mesh_shape(shape, count, name)
+        return 1.0, (digest.hexdigest()[:32],), shape
     size = float(shape.params.max())
     first, second, third = (max(round(x, _DIGITS), _LEAST) for x in (shape.params / size).tolist())
     # made from the rounded form, so that bits do not hang on which of its sizes was met first
@@ -154,8 +175,7 @@ def _recipe(shape: Shape, count: int) -> tuple[float, Hashable, Callable[[], Rig
             whole = Ellipsoid((first, second, third))
         case _:
             whole = shape  # has no panels, and is refused as that
-    key = (int(shape.kind), first, second, third, count)
-    return size, key, lambda: rigid_shape(panels_of(whole, count), apart=True)
+    return size, (int(shape.kind), first, second, third, count), whole
 
 
 # -- meshes ---------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -115,7 +115,7 @@ class Fleet:
         n = self._terminals.electrodes
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
-        self._table = BodyTable(self._solver, count, len(bodies), sensors)
+        self._table = BodyTable(self._solver, count, len(bodies), sensors, wide=device == "cpu")
         self._chips: Any = None
         self._one = OneAtATime()
         self._cpu = CpuCore(self._solver, self._terminals, self._table)
@@ -195,7 +195,7 @@ class Fleet:
 
     def _take_over(self) -> None:
         if self._warp is not None:
-            self._warp.take(self._table.bodies, self._table.shapes)
+            self._warp.take(self._table.bodies, cast("list[Any]", self._table.shapes))
 
     def use_readout(self, readout: Readout | str | None, *, seed: int = 0) -> None:
         """Read every sensor through a chip of its own from now on.

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_whole, shorten
 from capsense.elements.matter import matter_of
-from capsense.elements.pieces import windowed
+from capsense.elements.pieces import ChangingBody, windowed
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.errors import SceneError
 from capsense.readout.conversions import Held
-from capsense.scene import Body
+from capsense.scene import Body, Layers, SurfaceMesh
 from capsense.surface.solver import SurfaceSolver
 
 Array = NDArray[np.float64]
@@ -102,12 +102,15 @@ class BodyTable:
     Args:
         solver: Works out what is known of a shape.
         count, places, sensors: How many environments, places in each, and sensors.
+        wide: Whether the kernels take wide bodies as those of ``SurfaceSolver`` do.
     """
 
-    def __init__(self, solver: SurfaceSolver, count: int, places: int, sensors: int) -> None:
-        self._solver = solver
+    def __init__(
+        self, solver: SurfaceSolver, count: int, places: int, sensors: int, *, wide: bool
+    ) -> None:
+        self._solver, self._wide = solver, wide
         self.count, self.places, self.sensors = count, places, sensors
-        self.shapes: list[RigidShape] = []
+        self.shapes: list[RigidShape | ChangingBody] = []
         """Those in the table, in its order; records point to their arrays."""
         self._kinds: dict[tuple[int, bool], int] = {}
         shape = count, places
@@ -189,13 +192,14 @@ class BodyTable:
             return -1, 1.0, 0.0, 0.0, 1, np.zeros(3)
         if not isinstance(body, Body):
             raise SceneError(f"{body!r} is not a Body")
-        matter = matter_of([body], self._solver.excitation_frequency)
-        window, _ = windowed(body.shape, np.zeros(3), self._solver.reach)
-        shape, size = self._solver.functions_of(window)
-        if not isinstance(shape, RigidShape):
+        if isinstance(body.shape, Layers | SurfaceMesh):
             raise SceneError(
                 f"{type(body.shape).__name__} is not rigid; a fleet takes primitives and TriMesh"
             )
+        matter = matter_of([body], self._solver.excitation_frequency)
+        window, _ = windowed(body.shape, np.zeros(3), self._solver.reach)
+        wide = self._wide and bool(matter.conducting[0])
+        shape, size = self._solver.functions_of(window, wide)
         tie = complex(matter.ties(np.array([size * shape.capacitance]))[0])
         neutral = int(np.isinf(tie.real))
         soft = complex(matter.softness[0])
@@ -203,18 +207,17 @@ class BodyTable:
         cut = 0.5 * np.ptp(body.shape.bounds(), axis=0) - 0.5 * np.ptp(window.bounds(), axis=0)
         return number, size, soft, 0.0 if neutral else tie, neutral, cut
 
-    def _number(self, shape: RigidShape, soft: bool) -> int:
+    def _number(self, shape: RigidShape | ChangingBody, soft: bool) -> int:
         """The number of a shape in the table, which it joins if it is new."""
         found = self._kinds.setdefault((id(shape), soft), len(self._kinds))
         if found == len(self.shapes):
             record = np.array([shape.record], BODY)
-            if soft:
+            if soft and isinstance(shape, RigidShape):
                 record["impedance"] = shape.impedance.ctypes.data
-            radius = float(np.linalg.norm(shape.panels.corners, axis=2).max())
             self.shapes.append(shape)
             self.bodies = self.bodies._replace(
                 shapes=np.concatenate([self.bodies.shapes, record]),
-                radius=np.append(self.bodies.radius, radius),
+                radius=np.append(self.bodies.radius, shape.radius),
             )
         return found
 

@@ -13,9 +13,16 @@ from numpy.typing import NDArray
 from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
-from capsense.elements.pieces import ChangingBody, layer_pieces, longer, mesh_pieces, windowed
+from capsense.elements.pieces import (
+    ChangingBody,
+    layer_pieces,
+    longer,
+    mesh_pieces,
+    wide_pieces,
+    windowed,
+)
 from capsense.elements.rigid import BODY, RigidShape
-from capsense.elements.store import rigid
+from capsense.elements.store import rigid, wide
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
@@ -318,12 +325,13 @@ class SurfaceSolver:
         found: list[tuple[RigidShape | ChangingBody, float]] = []
         places: list[int] = []
         offsets: list[tuple[int, Array]] = []
+        conducting = view.matter.conducting.tolist()
         for place in range(len(view.met)):
             parts, share, at = self._parts(view, place)
             if at is not None:
                 offsets.append((len(places), at))
             for part in parts:
-                found.append(self.functions_of(part, share))
+                found.append(self.functions_of(part, conducting[place], share))
                 places.append(place)
         laid = self._laid
         if laid is None or laid.whole is not matter or (laid.places, laid.found) != (places, found):
@@ -384,13 +392,19 @@ class SurfaceSolver:
         return [shape.pieces[i] for i in np.flatnonzero(near).tolist()], _OF_MANY, None
 
     def functions_of(
-        self, shape: Shape, share: float = 1.0
+        self, shape: Shape, conducting: bool, share: float = 1.0
     ) -> tuple[RigidShape | ChangingBody, float]:
-        """Charge functions of a body from a share of the usual panels, and its size."""
+        """Charge functions of a body from a share of the usual panels, and its size.
+
+        Conductors that are so wide that the usual panels would be too coarse for the gap to a
+        sensor get panels of a few millimetres.
+        """
         if isinstance(shape, Layers):
             return ChangingBody(*layer_pieces(shape)), 1.0
         if isinstance(shape, SurfaceMesh):
             sheet = 0.0 if shape.closed else shape.rest.thickness
             return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
+        if conducting and (pieces := wide_pieces(shape)):
+            return wide(shape, pieces)
         edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
         return rigid(shape, round(share * self.preset.panels) * (2 if edged else 1))
