@@ -300,6 +300,12 @@ def scenes() -> list[dict[str, Any]]:
         add("near box", gap, placed(body("box", (0.04, 0.04, 0.02)), gap, 0.001, 0.0255))
         slant = Rotation.from_euler("ZY", (0.4, 0.6))
         add("near finger", gap, placed(body("capsule", [0.008, 0.06], turn=slant), gap, x, y))
+    over = Rotation.from_euler("ZY", (0.3, math.pi / 2))
+    for gap in (5, 10, 20, 50):
+        add("wide box", gap, placed(body("box", (0.3, 0.26, 0.1)), gap, 0.01, -0.005))
+        add("wide ball", gap, placed(body("sphere", [0.15], "floating"), gap, 0.01, -0.005))
+        trunk = body("capsule", [0.11, 0.15], turn=over)
+        add("wide capsule", gap, placed(trunk, gap, 0.01, -0.005))
     return out
 
 

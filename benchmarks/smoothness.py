@@ -3,7 +3,8 @@
     python benchmarks/smoothness.py --method surface --bodies finger ball
 
 Over ``six_patch_bare``, in steps of 0.05 mm (0.05° where the body turns), for a finger, a
-fingertip, a forearm, a ball, a tilted box, and for bodies that overlap: a bent arm and a hand:
+fingertip, a forearm, a ball, a tilted box, wide bodies (a trunk and a table), and for bodies that
+overlap: a bent arm and a hand:
 
 - approach: lowest point from 60 to 8 mm above the electrodes. "2nd diff": the largest second
   difference of log ΔC_ii, of entries that are above 3 % of the scene's largest at all three
@@ -76,6 +77,8 @@ BODIES: dict[str, tuple[list[Part], Angles]] = {
     "forearm": ([Part(cs.Capsule(0.040, 0.250))], (0.4, 1.5, 0.0)),
     "ball": ([Part(cs.Sphere(0.030))], (0.0, 0.0, 0.0)),
     "tilted box": ([Part(cs.Box((0.1, 0.08, 0.05)))], (0.3, 0.25, 0.15)),
+    "trunk": ([Part(cs.Capsule(0.12, 0.30))], (0.4, 1.5, 0.0)),
+    "table": ([Part(cs.Box((0.6, 0.5, 0.04)))], (0.3, 0.1, 0.05)),
     "bent arm": (
         [
             Part(cs.Capsule(0.040, 0.250), (-0.120, 0.0, 0.0), _ACROSS),
