@@ -19,6 +19,7 @@ import capsense as cs
 
 GROUPS = {
     "several bodies": ("two ", "three ", "balls ", " + ", "stacked", "overlapping"),
+    "wide body, 0.2 to 0.4 m": ("wide",),
     "hand before a body": ("hand",),
     "finger": ("finger",),
     "limb": ("limb", "arm"),

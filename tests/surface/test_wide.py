@@ -1,0 +1,140 @@
+"""Wide conductors: panels of a few millimetres, without a block of energies."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+from reference_scenes import DESIGN, MORE, diagonal_errors, reference_scenes
+
+import capsense as cs
+from capsense.elements import store
+from capsense.elements.panels import panels_of
+from capsense.elements.pieces import WIDE, ChangingBody, wide_body, wide_pieces
+from capsense.elements.rigid import BODY, RigidShape
+from capsense.surface.solver import SurfaceSolver
+
+SCENES = [s for s in reference_scenes(MORE) if s.category.startswith("wide")]
+PLATE = cs.Box((0.4, 0.3, 0.02))
+
+
+@pytest.fixture(scope="module")
+def sim() -> cs.Simulator:
+    return cs.Simulator(DESIGN)
+
+
+@pytest.mark.parametrize("reference", SCENES, ids=lambda s: s.name)
+def test_references(sim, reference):
+    """Measured against boundary elements: 2 % from 5 mm on, and no worse than five times what the
+    reading tells."""
+    reading = sim.step(reference.scene)
+    errors = np.abs(diagonal_errors(reading.delta, reference.delta))
+    assert errors.max() < 0.02
+    largest = reference.delta.max()
+    off = np.abs(reading.delta - reference.delta).max()
+    assert off <= 5 * reading.stats.solver_error + reference.error * largest
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-12])
+def test_grounding(sim, grounding):
+    """Differential: the fine preset, which has functions and pieces of its own choice."""
+    pose = cs.Pose.from_euler((0.02, 0.01, 0.045), (0.0, 0.1, 0.3))
+    scene = cs.Scene([cs.Body(PLATE, pose, "steel", grounding)])
+    fine = cs.Simulator(DESIGN, preset="fine").step(scene).delta
+    assert np.abs(sim.step(scene).delta - fine).max() < 0.02 * np.abs(fine).max()
+
+
+def test_a_plate_that_closes_the_sensor_in(sim):
+    """Analytic: far from its edges, a plate a gap d above an electrode of side a >> d takes up at
+    least eps0 a² / d of its charge."""
+    gap = 0.002
+    reading = sim.step(cs.Scene([cs.Body(PLATE, cs.Pose((0, 0, gap + 0.01)))]))
+    low, high = np.inf, 0.0
+    for electrode in sim.design.electrodes:
+        corners = electrode.surface.triangles.reshape(-1, 3)
+        area = np.prod(np.ptp(corners[:, :2], axis=0))
+        low = min(low, cs.constants.EPS0 * area / gap)
+        high = max(high, cs.constants.EPS0 * area / gap)
+    own = np.diag(reading.capacitance)
+    assert own.min() > low
+    assert own.max() < 1.6 * high
+
+
+def test_jacobian(sim):
+    """Differential: central differences."""
+    pose = cs.Pose.from_euler((0.02, 0.01, 0.05), (0.05, 0.05, 0.3))
+    body = cs.Body(PLATE, pose)
+    slope = sim.step(cs.Scene([body]), jacobian=True).jacobian[0]
+    for axis in range(3):
+        ends = []
+        for sign in (1, -1):
+            moved = np.array(pose.position) + sign * 1e-5 * np.eye(3)[axis]
+            ends.append(sim.step(cs.Scene([body.moved(cs.Pose(moved, pose.quaternion))])).delta)
+        wanted = (ends[0] - ends[1]) / 2e-5
+        assert np.abs(slope[..., axis] - wanted).max() < 0.01 * np.abs(slope[..., :3]).max()
+
+
+def test_fleets_read_as_simulators():
+    """Differential: wide bodies and small ones, sizes that differ; a dielectric stays as it was."""
+    finger = cs.Body(cs.Capsule(0.008, 0.06), material="human")
+    others = [cs.Body(PLATE), cs.Body(cs.Box((0.8, 0.6, 0.04))), cs.Body(PLATE, material="wood")]
+    fleet = cs.Fleet("six_patch", [others[0], finger], 3)
+    fleet.change(0, others[1:], environments=[1, 2])
+    where = np.zeros((3, 2, 7))
+    where[..., 6] = 1.0
+    where[:, 0, :3], where[:, 1, :3] = (0.01, 0.0, 0.12), (0.02, 0.0, 0.06)
+    found = fleet.step(where).delta[:, 0]
+    simulator = cs.Simulator("six_patch", preset="learning")
+    for e in range(3):
+        placed = zip((others[e], finger), where[e], strict=True)
+        scene = cs.Scene([body.moved(cs.Pose(at[:3])) for body, at in placed])
+        truth = simulator.step(scene).delta
+        assert np.abs(found[e] - truth).max() < 1e-9 * np.abs(truth).max()
+
+
+@pytest.mark.parametrize(
+    ("shape", "pieces"),
+    [
+        (cs.Box((WIDE, WIDE, 1.0)), 0),
+        (cs.Capsule(0.1, 2.0), 0),  # 0.2 m wide
+        (cs.Box((0.22, 0.22, 0.02)), 10_000),
+        (cs.Sphere(0.15), 40_000),
+        (cs.Box((2.0, 1.5, 0.05)), 40_000),  # and no more
+    ],
+    ids=repr,
+)
+def test_how_many_pieces(shape, pieces):
+    """Unit: two lengths above ``WIDE``; then edges of 4 mm or less, up to a bound."""
+    assert wide_pieces(shape) == pieces
+
+
+def test_what_is_kept_of_a_shape():
+    """Unit: bodies of the same proportions and number of pieces share theirs."""
+    first, size = store.wide(cs.Box((0.4, 0.3, 0.2)), 5000)
+    second, other = store.wide(cs.Box((0.8, 0.6, 0.4)), 5000)
+    assert first is second
+    assert other == pytest.approx(2 * size)
+    assert first.radius * size == pytest.approx(math.hypot(0.2, 0.15, 0.1), rel=0.1)
+    assert first.radius * size >= math.hypot(0.2, 0.15, 0.1)
+    panels = panels_of(cs.Box((0.4, 0.3, 0.2)), 5000)
+    assert wide_body(panels).record["n"] == len(panels) == first.record["n"]
+    assert first.nbytes > 8 * 2 * len(panels)
+
+
+def test_which_bodies_are_wide(sim):
+    """Unit: conductors only, whatever the scene has been read with before."""
+    solver: SurfaceSolver = SurfaceSolver(sim.background.green, sim.design)
+    for conducting, kind in ((True, ChangingBody), (False, RigidShape)):
+        shape, _ = solver.functions_of(PLATE, conducting)
+        assert isinstance(shape, kind)
+        assert shape.record.dtype == BODY
+
+
+def test_copies(sim):
+    """Differential: scenes and simulators survive pickle after use, with the same bits."""
+    scene = cs.Scene([cs.Body(PLATE, cs.Pose((0, 0, 0.05)))])
+    before = sim.step(scene).delta
+    again, other = pickle.loads(pickle.dumps((scene, sim)))
+    np.testing.assert_array_equal(other.step(again).delta, before)
