@@ -10,9 +10,9 @@ pose in every environment and at every step. Errors are of the diagonal of ΔC (
 or over 1 % of the scene's largest entry where that is more) in the scenes of
 ``tests/data/reference_map.json`` that hold one primitive from 15 mm on, and in all scenes of
 primitives. On Warp, differences of all entries to ``Simulator.step`` with both its presets, over
-each scene's largest entry, are beside them. Times are of steps with the poses on the device; a host array costs its
-copy. Times of the processor are those of all threads of this program, which other programs disturb
-less.
+each scene's largest entry, are beside them. Times are of steps with the poses on the device; a host
+array costs its copy. Times of the processor are those of all threads of this program, which other
+programs disturb less.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ def test_fleets_read_as_simulators():
     ("shape", "pieces"),
     [
         (cs.Box((WIDE, WIDE, 1.0)), 0),
-        (cs.Capsule(0.1, 2.0), 0),  # 0.2 m wide
+        (cs.Capsule(0.08, 2.0), 0),  # 0.16 m wide
         (cs.Box((0.22, 0.22, 0.02)), 10_000),
         (cs.Sphere(0.15), 40_000),
         (cs.Box((2.0, 1.5, 0.05)), 40_000),  # and no more

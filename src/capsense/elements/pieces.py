@@ -314,7 +314,7 @@ class ChangingBody:
         """Room that the arrays take up [bytes]."""
 
 
-WIDE = 0.21
+WIDE = 0.16
 """Conductors of a second-largest extent above this [m] are solved for on :func:`wide_body`."""
 _PIECE = 4e-3
 """Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""

@@ -106,7 +106,7 @@ class Fleet:
         chosen_preset = PRESETS[preset]
         self._finer: Preset = "standard" if preset == "learning" else "fine"
         if device != "cpu":
-            chosen_preset = replace(chosen_preset, panels=_PANELS * budget)
+            chosen_preset = replace(chosen_preset, panels=_PANELS * budget, wide=False)
         self._solver = SurfaceSolver(
             field.green, self.design, excitation_frequency=excitation_frequency,
             preset=chosen_preset,
@@ -115,7 +115,7 @@ class Fleet:
         n = self._terminals.electrodes
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
-        self._table = BodyTable(self._solver, count, len(bodies), sensors, wide=device == "cpu")
+        self._table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
         self._one = OneAtATime()
         self._cpu = CpuCore(self._solver, self._terminals, self._table)

@@ -102,13 +102,10 @@ class BodyTable:
     Args:
         solver: Works out what is known of a shape.
         count, places, sensors: How many environments, places in each, and sensors.
-        wide: Whether the kernels take wide bodies as those of ``SurfaceSolver`` do.
     """
 
-    def __init__(
-        self, solver: SurfaceSolver, count: int, places: int, sensors: int, *, wide: bool
-    ) -> None:
-        self._solver, self._wide = solver, wide
+    def __init__(self, solver: SurfaceSolver, count: int, places: int, sensors: int) -> None:
+        self._solver = solver
         self.count, self.places, self.sensors = count, places, sensors
         self.shapes: list[RigidShape | ChangingBody] = []
         """Those in the table, in its order; records point to their arrays."""
@@ -198,8 +195,7 @@ class BodyTable:
             )
         matter = matter_of([body], self._solver.excitation_frequency)
         window, _ = windowed(body.shape, np.zeros(3), self._solver.reach)
-        wide = self._wide and bool(matter.conducting[0])
-        shape, size = self._solver.functions_of(window, wide)
+        shape, size = self._solver.functions_of(window, bool(matter.conducting[0]))
         tie = complex(matter.ties(np.array([size * shape.capacitance]))[0])
         neutral = int(np.isinf(tie.real))
         soft = complex(matter.softness[0])

@@ -54,6 +54,8 @@ class Preset:
     """Charge functions count that take up this part of an electrode's energy alone."""
     width: float = 2.5
     """They fade in up to so many times that."""
+    wide: bool = True
+    """Whether conductors that are wide get panels of a few millimetres."""
 
 
 PRESETS = {
@@ -404,7 +406,7 @@ class SurfaceSolver:
         if isinstance(shape, SurfaceMesh):
             sheet = 0.0 if shape.closed else shape.rest.thickness
             return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
-        if conducting and (pieces := wide_pieces(shape)):
+        if self.preset.wide and conducting and (pieces := wide_pieces(shape)):
             return wide(shape, pieces)
         edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
         return rigid(shape, round(share * self.preset.panels) * (2 if edged else 1))
