@@ -205,8 +205,8 @@ class World:
     name: str
     sample: Callable[[int], View | Callable[[], View]]
     """What is seen at a sample, or what makes it within the timed step."""
-    target: float
-    """Of the standard preset's median [ms]."""
+    target: float | None
+    """Of the standard preset's median [ms], if it has one."""
     exact: Callable[[], cs.Scene] | None = None
     """The bodies of sample 0 as plain shapes; None where these are what is seen anyway."""
     judged: bool = True
@@ -220,12 +220,16 @@ def worlds() -> list[World]:
     ball, near = low(cs.Sphere(0.03), 0.030), low(FINGER, 0.005, (0.012, 0.007), SLANT)
     finger = low(FINGER, 0.015, (0.012, 0.007), SLANT)
     forearm, bar = low(FOREARM, 0.020, turn=LEVEL), low(BAR, 0.020)
+    table = low(cs.Box((0.6, 0.5, 0.04)), 0.020)
+    trunk = low(cs.Capsule(0.12, 0.3), 0.020, turn=LEVEL)
     return [
         World("ball of 30 mm radius at 30 mm", swaying(ball), 0.3, single=True),
         World("finger at 15 mm", swaying(finger), 0.3, single=True),
         World("finger at 5 mm", swaying(near), 0.7, single=True),
         World("forearm at 20 mm", swaying(forearm), 0.3, single=True),
         World("bar 150 x 150 x 20 mm at 20 mm", swaying(bar), 0.3, single=True),
+        World("table 600 x 500 x 40 mm at 20 mm", swaying(table), None),
+        World("trunk of 120 mm radius at 20 mm", swaying(trunk), None),
         World("hand at 20 mm, body behind", swaying(*hand(0.020)), 0.8),
         World("finger at 15 mm, 12 far capsules", swaying(finger, *far_capsules()), 0.6),
         World("12 near capsules", swaying(*near_capsules()), 2.5),
