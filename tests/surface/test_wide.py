@@ -110,6 +110,30 @@ def test_how_many_pieces(shape, pieces):
     assert wide_pieces(shape) == pieces
 
 
+@pytest.mark.parametrize("twice", [False, True], ids=["once", "twice"])
+def test_meshes(sim, twice):
+    """Differential: the primitive. Few triangles are halved; those given twice count once."""
+    box = cs.Box((0.3, 0.25, 0.1)).to_trimesh()
+    faces = np.concatenate([box.faces, box.faces[::-1]]) if twice else box.faces
+    mesh = cs.TriMesh(box.vertices, faces)
+    pose = cs.Pose.from_euler((0.01, 0.0, 0.075), (0.05, 0.0, 0.3))
+    found, truth = (
+        sim.step(cs.Scene([cs.Body(shape, pose)])).delta
+        for shape in (mesh, cs.Box((0.3, 0.25, 0.1)))
+    )
+    assert np.abs(found - truth).max() < 0.02 * np.abs(truth).max()
+
+
+def test_triangles_of_wide_meshes_are_not_merged():
+    """Unit: that takes minutes for some 100,000."""
+    mesh = cs.Ellipsoid((0.2, 0.15, 0.15)).to_trimesh()
+    shape = cs.TriMesh(mesh.vertices, mesh.faces)
+    panels = panels_of(shape, 500, merge=False)
+    assert len(panels) == pytest.approx(500 + len(mesh.faces), rel=0.1)
+    assert panels.areas.sum() == pytest.approx(mesh.area, rel=1e-9)
+    assert panels.closed
+
+
 def test_what_is_kept_of_a_shape():
     """Unit: bodies of the same proportions and number of pieces share theirs."""
     first, size = store.wide(cs.Box((0.4, 0.3, 0.2)), 5000)

@@ -50,7 +50,7 @@ class SurfacePanels:
         )
 
 
-def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
+def panels_of(shape: Shape | ArrayLike, count: int = 600, *, merge: bool = True) -> SurfacePanels:
     """Cover a rigid shape with about ``count`` flat panels.
 
     Panels of boxes and cylinders shrink towards edges. Triangle meshes are reduced, or their
@@ -60,6 +60,7 @@ def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
         shape: A primitive or a mesh, or the corners of triangles [m], shape (m, 3, 3), of an open
             or a closed surface with any winding.
         count: Number of panels to aim at.
+        merge: Whether triangles of a mesh are merged; else there are ``count`` more of them.
 
     Returns:
         Panels in the frame of the shape. The same input always gives the same panels.
@@ -86,7 +87,7 @@ def panels_of(shape: Shape | ArrayLike, count: int = 600) -> SurfacePanels:
             raise SceneError(f"{type(shape).__name__}: this kind of shape has no panels")
         case _:
             triangles = np.asarray(shape, dtype=float)
-    reduced = reduced_triangles(triangles, count)
+    reduced = reduced_triangles(triangles, count, merge=merge)
     corners = reduced.corners[:, [0, 1, 2, 2]]
     return polygon_panels(corners, reduced.parts, reduced.closed)
 

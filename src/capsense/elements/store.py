@@ -119,7 +119,9 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
 
 def wide(shape: Shape, count: int) -> tuple[ChangingBody, float]:
     """The same of a wide conductor, of so many pieces without energies of their own."""
-    return _kept(shape, count, "_wide", lambda whole, _, name: wide_body(panels_of(whole, count)))
+    return _kept(
+        shape, count, "_wide", lambda whole, *_: wide_body(panels_of(whole, count, merge=False))
+    )
 
 
 def _rigid_of(whole: Shape, count: int, name: str) -> RigidShape:

@@ -61,7 +61,7 @@ class Triangles(NamedTuple):
     """Whether the surface bounds a volume; then normals point out of it."""
 
 
-def reduced_triangles(triangles: Array, count: int) -> Triangles:
+def reduced_triangles(triangles: Array, count: int, *, merge: bool = True) -> Triangles:
     """Reduce a mesh, or halve its triangles, until it has about ``count``.
 
     Connected parts are reduced one by one by quadric error (Garland and Heckbert, *Surface
@@ -71,6 +71,8 @@ def reduced_triangles(triangles: Array, count: int) -> Triangles:
     Args:
         triangles: Corners [m], shape (m, 3, 3); any winding, open or closed.
         count: Number of triangles to aim at.
+        merge: Whether triangles are merged, which takes minutes for some 100,000. Else there are
+            ``count`` more than were given.
 
     Raises:
         SceneError: A wrong shape, a number that is not finite, or no triangle with an area.
@@ -85,7 +87,11 @@ def reduced_triangles(triangles: Array, count: int) -> Triangles:
     areas = np.zeros(label.max() + 1)
     np.add.at(areas, label, _areas(vertices[faces]))
     for k, wanted in enumerate(_shares(areas, count)):
-        own = _covered(vertices, faces[label == k], int(wanted))
+        part = faces[label == k]
+        if merge:
+            own = _covered(vertices, part, int(wanted))
+        else:
+            own = _halved(vertices[part], np.zeros(part.shape, bool), len(part) + int(wanted))
         corners.append(own)
         parts.append(np.full(len(own), k))
     out, which = np.concatenate(corners), np.concatenate(parts)
