@@ -30,7 +30,7 @@ from reference_scenes import MORE, diagonal_errors, reference_scenes
 
 import capsense as cs
 from capsense.elements.pieces import ChangingBody
-from capsense.elements.store import wide as wide_functions
+from capsense.elements.store import in_pieces
 from capsense.simulator import PresetName
 from capsense.surface.solver import Preset, SurfaceSolver
 
@@ -57,7 +57,7 @@ class InPieces(SurfaceSolver):
     def functions_of(
         self, shape: cs.Shape, conducting: bool, share: float = 1.0
     ) -> tuple[ChangingBody, float]:
-        return wide_functions(shape, 80_000)
+        return in_pieces(shape, 80_000)
 
 
 def apart(found: np.ndarray, truth: np.ndarray) -> float:

@@ -136,8 +136,8 @@ def test_triangles_of_wide_meshes_are_not_merged():
 
 def test_what_is_kept_of_a_shape():
     """Unit: bodies of the same proportions and number of pieces share theirs."""
-    first, size = store.wide(cs.Box((0.4, 0.3, 0.2)), 5000)
-    second, other = store.wide(cs.Box((0.8, 0.6, 0.4)), 5000)
+    first, size = store.in_pieces(cs.Box((0.4, 0.3, 0.2)), 5000)
+    second, other = store.in_pieces(cs.Box((0.8, 0.6, 0.4)), 5000)
     assert first is second
     assert other == pytest.approx(2 * size)
     assert first.radius * size == pytest.approx(math.hypot(0.2, 0.15, 0.1), rel=0.1)

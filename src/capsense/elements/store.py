@@ -18,11 +18,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.elements.panels import panels_of, polygon_panels
-from capsense.elements.pieces import ChangingBody, wide_body
+from capsense.elements.pieces import (
+    ChangingBody,
+    layer_pieces,
+    mesh_pieces,
+    wide_body,
+    wide_pieces,
+)
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
-from capsense.scene import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere, TriMesh
+from capsense.scene import (
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    Layers,
+    Shape,
+    Sphere,
+    SurfaceMesh,
+    TriMesh,
+)  # fmt: skip
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
@@ -104,6 +120,26 @@ _SHAPES: OrderedDict[Hashable, RigidShape | ChangingBody] = OrderedDict()
 T = TypeVar("T", bound=RigidShape | ChangingBody)
 
 
+def functions_of(
+    shape: Shape, count: int, *, wide: bool
+) -> tuple[RigidShape | ChangingBody, float]:
+    """Charge functions of any shape from about ``count`` panels, and its size [m].
+
+    Args:
+        shape: The shape.
+        count: Panels of a round one; one with edges has twice as many.
+        wide: Whether shapes that are wide get panels of a few millimetres instead.
+    """
+    if isinstance(shape, Layers):
+        return ChangingBody(*layer_pieces(shape)), 1.0
+    if isinstance(shape, SurfaceMesh):
+        sheet = 0.0 if shape.closed else shape.rest.thickness
+        return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
+    if wide and (pieces := wide_pieces(shape)):
+        return in_pieces(shape, pieces)
+    return rigid(shape, count * (2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1))
+
+
 def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
     """Return the charge functions of a shape of some size, and how many times as large it is.
 
@@ -117,7 +153,7 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
     return _kept(shape, count, "_rigid", _rigid_of)
 
 
-def wide(shape: Shape, count: int) -> tuple[ChangingBody, float]:
+def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:
     """The same of a wide conductor, of so many pieces without energies of their own."""
     return _kept(
         shape, count, "_wide", lambda whole, *_: wide_body(panels_of(whole, count, merge=False))

@@ -13,21 +13,14 @@ from numpy.typing import NDArray
 from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
-from capsense.elements.pieces import (
-    ChangingBody,
-    layer_pieces,
-    longer,
-    mesh_pieces,
-    wide_pieces,
-    windowed,
-)
+from capsense.elements.pieces import ChangingBody, longer, windowed
 from capsense.elements.rigid import BODY, RigidShape
-from capsense.elements.store import rigid, wide
+from capsense.elements.store import functions_of
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import SHORE, pack_green
-from capsense.scene import Layers, Scene, SurfaceMesh, TriMesh
+from capsense.scene import Scene, TriMesh
 from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.scene import PackedScene
@@ -396,17 +389,6 @@ class SurfaceSolver:
     def functions_of(
         self, shape: Shape, conducting: bool, share: float = 1.0
     ) -> tuple[RigidShape | ChangingBody, float]:
-        """Charge functions of a body from a share of the usual panels, and its size.
-
-        Conductors that are so wide that the usual panels would be too coarse for the gap to a
-        sensor get panels of a few millimetres.
-        """
-        if isinstance(shape, Layers):
-            return ChangingBody(*layer_pieces(shape)), 1.0
-        if isinstance(shape, SurfaceMesh):
-            sheet = 0.0 if shape.closed else shape.rest.thickness
-            return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
-        if self.preset.wide and conducting and (pieces := wide_pieces(shape)):
-            return wide(shape, pieces)
-        edged = shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER)
-        return rigid(shape, round(share * self.preset.panels) * (2 if edged else 1))
+        """Charge functions of a body from a share of the usual panels, and its size."""
+        panels = round(share * self.preset.panels)
+        return functions_of(shape, panels, wide=conducting and self.preset.wide)
