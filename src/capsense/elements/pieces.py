@@ -298,10 +298,6 @@ class ChangingBody:
         self._extent = extent
         self.capacitance = 0.35 * float(extent[0])
         """About that in free space over 4π eps0 [m]."""
-        self.radius = float(
-            (np.linalg.norm(self._center[single], axis=1) + 0.75 * extent[single]).max()
-        )
-        """Radius of a ball about the origin that holds the surface [m]."""
         self._own = np.empty(n)
         self._own[0] = 0.5 * _OWN / extent[0]
         self._own[self._function[~single]] = _OWN / extent[~single]
@@ -310,8 +306,18 @@ class ChangingBody:
         for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
         self.record = record
-        self.nbytes = sum(a.nbytes for a in self.__dict__.values() if isinstance(a, np.ndarray))
+
+    @property
+    def radius(self) -> float:
+        """Radius of a ball about the origin that holds the surface [m]."""
+        single = self._panel >= 0
+        off = np.linalg.norm(self._center[single], axis=1)
+        return float((off + 0.75 * self._extent[single]).max())
+
+    @property
+    def nbytes(self) -> int:
         """Room that the arrays take up [bytes]."""
+        return sum(a.nbytes for a in self.__dict__.values() if isinstance(a, np.ndarray))
 
 
 WIDE = 0.16
