@@ -125,7 +125,7 @@ def test_meshes(sim, twice):
 
 
 def test_triangles_of_wide_meshes_are_not_merged():
-    """Unit: that takes minutes for some 100,000."""
+    """Unit: that takes half a minute for 80,000."""
     mesh = cs.Ellipsoid((0.2, 0.15, 0.15)).to_trimesh()
     shape = cs.TriMesh(mesh.vertices, mesh.faces)
     panels = panels_of(shape, 500, merge=False)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from capsense.elements import tree_kernels
 from capsense.elements.panels import SurfacePanels
-from capsense.elements.rigid import BODY, Clusters, panel_features, split
+from capsense.elements.rigid import BODY, Clusters, features, split
 from capsense.scene import Box, Capsule, Cylinder, Layers, RestSurface, SurfaceMesh
 from capsense.scene.shapes import Shape
 
@@ -29,8 +29,6 @@ STEP_SLOPE = 3.0
 """Slope of a surface, depth over width, from which a jump between two pixels is a step."""
 _FILLED = 10.0
 """Backs farther than this [m] are not known: the image is filled from the front on."""
-_NORMALS = 0.6
-"""How far apart two opposite normals count, as a share of the surface's extent, in splitting."""
 _PIECES = 500
 """Triangles are cut until no edge is longer than those of so many equal ones."""
 _HALVINGS = 60
@@ -102,9 +100,7 @@ def _cut(rest: RestSurface) -> PieceLayout:
         shares[long, end] = middle
         face, shares = np.concatenate([face, face[long]]), np.concatenate([shares, other])
     first, normals = _pieces(rest.vertices, rest.faces, face, shares)
-    extent = float(np.ptp(first.centers, axis=0).max())
-    features = np.concatenate([first.centers, _NORMALS * extent * normals], axis=1)
-    return PieceLayout(face, shares, split(features, first.areas))
+    return PieceLayout(face, shares, split(features(first.centers, normals), first.areas))
 
 
 def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[PieceArrays, Array]:
@@ -344,7 +340,7 @@ def wide_pieces(shape: Shape) -> int:
 
 def wide_body(panels: SurfacePanels) -> ChangingBody:
     """A conductor on many panels, which meet each other without a block of energies."""
-    return ChangingBody(split(panel_features(panels), panels.areas), panels)
+    return ChangingBody(split(features(panels.centers, panels.normals), panels.areas), panels)
 
 
 def _lengths(shape: Shape) -> tuple[float, float, float]:

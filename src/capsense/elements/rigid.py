@@ -265,13 +265,13 @@ def _substitute(factor: Array, x: Array) -> None:
 
 def build_tree(panels: SurfacePanels, charge: Array) -> Tree:
     """Split panels into clusters; ``charge`` (n,) is their equilibrium charge, above zero."""
-    return charged_tree(panels, split(panel_features(panels), charge), charge)
+    return charged_tree(panels, split(features(panels.centers, panels.normals), charge), charge)
 
 
-def panel_features(panels: SurfacePanels) -> Array:
-    """Centres and scaled normals of panels, as :func:`split` takes them [m], shape (n, 6)."""
-    extent = float(np.ptp(panels.centers, axis=0).max())
-    return np.concatenate([panels.centers, _NORMALS * extent * panels.normals], axis=1)
+def features(centers: Array, normals: Array) -> Array:
+    """Centres and scaled normals (n, 3) of panels, as :func:`split` takes them [m], (n, 6)."""
+    extent = float(np.ptp(centers, axis=0).max())
+    return np.concatenate([centers, _NORMALS * extent * normals], axis=1)
 
 
 def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tree:

@@ -38,7 +38,7 @@ from capsense.scene import (
     Sphere,
     SurfaceMesh,
     TriMesh,
-)  # fmt: skip
+)
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
