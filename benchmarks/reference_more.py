@@ -306,6 +306,13 @@ def scenes() -> list[dict[str, Any]]:
         add("wide ball", gap, placed(body("sphere", [0.15], "floating"), gap, 0.01, -0.005))
         trunk = body("capsule", [0.11, 0.15], turn=over)
         add("wide capsule", gap, placed(trunk, gap, 0.01, -0.005))
+    for eps in (4.0, 40.0):
+        for gap in (5, 10, 20, 50):
+            for name, height in (("slab", 0.03), ("box", 0.12)):
+                item = body("box", (0.3, 0.26, height), "diel", eps=eps)
+                add(f"wide {name} eps {eps:g}", gap, placed(item, gap, 0.01, -0.005))
+            item = body("sphere", [0.15], "diel", eps=eps)
+            add(f"wide ball eps {eps:g}", gap, placed(item, gap, 0.01, -0.005))
     return out
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import capsense as cs
-from capsense.elements.pieces import windowed
+from capsense.elements.panels import windowed
 
 LOW, HIGH = np.array([-0.25, -0.25, -0.01]), np.array([0.25, 0.25, 0.49])
 REACH = float(np.linalg.norm(HIGH - LOW))

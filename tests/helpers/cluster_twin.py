@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.elements.rigid import INSIDE
 from capsense.field.green_kernels import Green
 from capsense.surface import step
 from capsense.surface.choose_kernels import Cut, Functions, functions_of
@@ -111,7 +110,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 
     def prepared(bodies: NDArray[np.void], green: Green, *_: float) -> tuple:
         cut = cut_of(green, bodies, [shape.tree for shape in shapes], count, favoured)
-        leaves = placed(bodies, cut, green, INSIDE)
+        leaves = placed(bodies, cut, green)
         rows = leaf_rows(leaves.points, leaves.beyond, green)
         functions = functions_of(bodies, cut, leaves.beyond)
         inside = leaves._replace(beyond=np.zeros_like(leaves.beyond))

@@ -1,4 +1,4 @@
-"""Wide conductors: panels of a few millimetres, without a block of energies."""
+"""Wide bodies: panels of a few millimetres, without a block of energies."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import pickle
 import numpy as np
 import pytest
 from reference_scenes import DESIGN, MORE, diagonal_errors, reference_scenes
+from scipy.spatial import cKDTree
 
 import capsense as cs
 from capsense.elements import store
+from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import panels_of
-from capsense.elements.pieces import WIDE, ChangingBody, wide_body, wide_pieces
-from capsense.elements.rigid import BODY, RigidShape
+from capsense.elements.pieces import WIDE, WideBody, wide_pieces
+from capsense.elements.rigid import BODY, Clusters, RigidShape, features, split
 from capsense.surface.solver import SurfaceSolver
 
 SCENES = [s for s in reference_scenes(MORE) if s.category.startswith("wide")]
@@ -27,11 +29,11 @@ def sim() -> cs.Simulator:
 
 @pytest.mark.parametrize("reference", SCENES, ids=lambda s: s.name)
 def test_references(sim, reference):
-    """Measured against boundary elements: 2 % from 5 mm on, and no worse than five times what the
-    reading tells."""
+    """Measured against boundary elements: 2 % from 5 mm on, 3 % for dielectrics, and no worse than
+    five times what the reading tells."""
     reading = sim.step(reference.scene)
     errors = np.abs(diagonal_errors(reading.delta, reference.delta))
-    assert errors.max() < 0.02
+    assert errors.max() < (0.03 if "eps" in reference.name else 0.02)
     largest = reference.delta.max()
     off = np.abs(reading.delta - reference.delta).max()
     assert off <= 5 * reading.stats.solver_error + reference.error * largest
@@ -77,7 +79,7 @@ def test_jacobian(sim):
 
 
 def test_fleets_read_as_simulators():
-    """Differential: wide bodies and small ones, sizes that differ; a dielectric stays as it was."""
+    """Differential: wide bodies and small ones, sizes that differ; conductors and a dielectric."""
     finger = cs.Body(cs.Capsule(0.008, 0.06), material="human")
     others = [cs.Body(PLATE), cs.Body(cs.Box((0.8, 0.6, 0.04))), cs.Body(PLATE, material="wood")]
     fleet = cs.Fleet("six_patch", [others[0], finger], 3)
@@ -143,17 +145,96 @@ def test_what_is_kept_of_a_shape():
     assert first.radius * size == pytest.approx(math.hypot(0.2, 0.15, 0.1), rel=0.1)
     assert first.radius * size >= math.hypot(0.2, 0.15, 0.1)
     panels = panels_of(cs.Box((0.4, 0.3, 0.2)), 5000)
-    assert wide_body(panels).record["n"] == len(panels) == first.record["n"]
+    assert WideBody(panels, lambda: panels).record["n"] == len(panels) == first.record["n"]
     assert first.nbytes > 8 * 2 * len(panels)
 
 
 def test_which_bodies_are_wide(sim):
-    """Unit: conductors only, whatever the scene has been read with before."""
+    """Unit: all but dielectrics of several parts, between which no charge may pass."""
     solver: SurfaceSolver = SurfaceSolver(sim.background.green, sim.design)
-    for conducting, kind in ((True, ChangingBody), (False, RigidShape)):
-        shape, _ = solver.functions_of(PLATE, conducting)
-        assert isinstance(shape, kind)
-        assert shape.record.dtype == BODY
+    box = PLATE.to_trimesh()
+    one = cs.TriMesh(box.vertices, box.faces)
+    two = cs.TriMesh(
+        np.concatenate([box.vertices, box.vertices + np.array([0, 0, 0.1])]),
+        np.concatenate([box.faces, box.faces + len(box.vertices)]),
+    )
+    for shape, conducting, kind in (
+        (PLATE, True, WideBody), (PLATE, False, WideBody), (one, False, WideBody),
+        (two, True, WideBody), (two, False, RigidShape), (cs.Sphere(0.05), True, RigidShape),
+    ):  # fmt: skip
+        found, _ = solver.functions_of(shape, conducting)
+        assert isinstance(found, kind)
+        assert found.record.dtype == BODY
+
+
+def _panel_sums(tree: Clusters, areas: np.ndarray, count: int) -> np.ndarray:
+    """The first functions of a tree as charges of its panels, shape (count, n)."""
+    below: list[np.ndarray] = [np.array([])] * len(tree.kids)
+    out = np.zeros((count, len(areas)))
+    for k in range(len(tree.kids) - 1, -1, -1):
+        a, b = tree.kids[k]
+        below[k] = np.array([tree.panel[k]]) if a < 0 else np.concatenate([below[a], below[b]])
+        if a >= 0 and tree.function[k] < count:
+            for part, sign in ((below[a], 1.0), (below[b], -1.0)):
+                out[tree.function[k], part] += sign * areas[part] / areas[part].sum()
+    out[0] = areas / areas.sum()
+    return out
+
+
+@pytest.mark.parametrize(("few", "many"), [(300, 300), (120, 900)], ids=["same", "finer"])
+def test_the_impedance_of_the_inside(few, many):
+    """Differential: Z − 2F of few panels, and each of the many panels on the nearest of them."""
+    shape = cs.Ellipsoid((0.2, 0.15, 0.15))
+    coarse, panels = panels_of(shape, few), panels_of(shape, many)
+    body = WideBody(panels, lambda: coarse)
+    known = len(body.impedance)
+    assert known == min(len(coarse), len(panels))
+    free = free_block(coarse)
+    more = impedance(coarse, free) - 2.0 * free
+    tree = split(features(panels.centers, panels.normals), panels.areas)
+    on = np.zeros((len(panels), len(coarse)))
+    places = cKDTree(features(coarse.centers, coarse.normals))
+    nearest = places.query(features(panels.centers, panels.normals))[1]  # some are as near
+    on[np.arange(len(panels)), nearest] = 1.0
+    charges = _panel_sums(tree, panels.areas, known) @ on
+    truth = charges @ more @ charges.T
+    found = body.impedance
+    np.testing.assert_allclose(found[1:, 1:], truth[1:, 1:], atol=1e-5 * np.abs(truth).max())
+
+
+def test_the_inside_of_an_open_surface_is_twice_its_energy():
+    """Unit: nothing is added to that."""
+    sheet = cs.TriMesh([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0]], [[0, 1, 2]])
+    body, _ = store.in_pieces(sheet, 5000)
+    assert not np.any(body.impedance)
+    assert body.record["inside"] == 2.0
+
+
+@pytest.mark.parametrize("eps", [2.0, 10.0, 1e3, 9.9e3])
+def test_permittivities(sim, eps):
+    """Differential: the fine preset on functions with energies of their own; a box of 0.17 m."""
+    pose = cs.Pose((0.01, 0.0, 0.03 + 0.01))
+    scene = cs.Scene([cs.Body(cs.Box((0.17, 0.165, 0.02)), pose, cs.Material("m", eps_r=eps))])
+    narrow = cs.Scene([cs.Body(cs.Box((0.17, 0.1599, 0.02)), pose, cs.Material("m", eps_r=eps))])
+    ratio = sim.step(scene).delta / cs.Simulator(DESIGN, preset="fine").step(narrow).delta
+    assert np.abs(np.diag(ratio) - 1.0).max() < 0.03
+
+
+def test_losses(sim):
+    """Analytic limits: a wide lossy plate reads as a dielectric where it hardly conducts, and as a
+    conductor where it does."""
+    pose = cs.Pose((0.0, 0.0, 0.04))
+
+    def read(material: cs.Material) -> cs.Reading:
+        return sim.step(cs.Scene([cs.Body(PLATE, pose, material, "floating")]))
+
+    plain = read(cs.Material("plain", eps_r=4.0)).delta
+    low = read(cs.Material("low", eps_r=4.0, sigma=1e-9))
+    np.testing.assert_allclose(low.delta, plain, rtol=1e-3, atol=1e-3 * plain.max())
+    metal = sim.step(cs.Scene([cs.Body(PLATE, pose, "steel", "floating")])).delta
+    high = read(cs.Material("high", eps_r=4.0, sigma=0.1)).delta
+    np.testing.assert_allclose(high, metal, rtol=0.02, atol=0.02 * metal.max())
+    assert np.diag(low.conductance).min() > 0.0
 
 
 def test_copies(sim):

@@ -148,9 +148,11 @@ class Matter:
         records["group"], records["softness"] = self.group, softness.real
         for k in np.flatnonzero(softness).tolist():
             shape = shapes[k]
-            if isinstance(shape, RigidShape):  # `.ctypes` takes much longer
-                records["impedance"][k] = shape.impedance.__array_interface__["data"][0]
-            else:
+            block = shape.impedance
+            if block is not None:  # `.ctypes` takes much longer
+                records["impedance"][k] = block.__array_interface__["data"][0]
+                records["known"][k] = len(block)
+            if isinstance(shape, ChangingBody):
                 records["sheet"][k] = shape.sheet
 
 

@@ -128,3 +128,44 @@ def polygon_panels(
         labels,
         closed,
     )
+
+
+def _lengths(shape: Shape) -> tuple[float, float, float]:
+    """How long a shape is [m] along the axes that it can be cut along, else 0."""
+    if isinstance(shape, Box):
+        return shape.size
+    return (0.0, 0.0, shape.length) if isinstance(shape, Cylinder | Capsule) else (0.0, 0.0, 0.0)
+
+
+def longer(shape: Shape, reach: float) -> bool:
+    """Whether :func:`windowed` cuts a shape."""
+    return max(_lengths(shape)) > reach
+
+
+def windowed(shape: Shape, middle: Array, reach: float) -> tuple[Shape, Array]:
+    """Cut a box, cylinder or capsule to a length that reaches through the domain.
+
+    The part keeps its size while the body moves, so that its charge functions are made once.
+
+    Args:
+        shape: Any shape.
+        middle: Centre of the domain in the shape's frame [m], shape (3,).
+        reach: Diagonal of the domain [m]. What is no longer along any axis stays whole.
+
+    Returns:
+        The part, and its centre in the shape's frame [m], shape (3,).
+    """
+    if not longer(shape, reach):
+        return shape, np.zeros(3)
+    size = np.array(_lengths(shape))
+    part = np.minimum(size, reach)
+    at = np.clip(middle, 0.5 * (part - size), 0.5 * (size - part))
+    held = shape.__dict__.get("_window")
+    if held is None or held[0] != reach:
+        x, y, z = part.tolist()
+        if isinstance(shape, Cylinder | Capsule):
+            held = reach, type(shape)(shape.radius, z)
+        else:
+            held = reach, Box((x, y, z))
+        shape.__dict__["_window"] = held
+    return held[1], at

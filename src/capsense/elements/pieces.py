@@ -8,21 +8,26 @@ more pieces than energies could be worked out for.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from threadpoolctl import threadpool_limits
 
 from capsense.elements import tree_kernels
+from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
-from capsense.elements.rigid import BODY, Clusters, features, split
-from capsense.scene import Box, Capsule, Cylinder, Layers, RestSurface, SurfaceMesh
+from capsense.elements.rigid import BODY, INSIDE, Clusters, features, once, split
+from capsense.scene import Layers, RestSurface, SurfaceMesh
 from capsense.scene.shapes import Shape
 
 Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 STEP_SLOPE = 3.0
@@ -39,11 +44,14 @@ _LEAST_AREA = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PieceArrays:
-    """Pieces of a surface as arrays, see :class:`~capsense.elements.pieces.Pieces`."""
+    """Small flat pieces of a surface, n of them, in the frame of their body."""
 
     centers: Array
+    """[m], shape (n, 3)."""
     areas: Array
+    """[m²], shape (n,)."""
     moments: Array
+    """Second central moments of area over the area [m²], shape (n, 3, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,22 +239,6 @@ _OWN = 4.0
 """Energy of a charge function times the extent of its cluster, as far as scores need it."""
 
 
-class Pieces(Protocol):
-    """Small flat pieces of a surface, n of them, in the frame of their body."""
-
-    @property
-    def centers(self) -> Array:
-        """[m], shape (n, 3)."""
-
-    @property
-    def areas(self) -> Array:
-        """[m²], shape (n,)."""
-
-    @property
-    def moments(self) -> Array:
-        """Second central moments of area over the area [m²], shape (n, 3, 3)."""
-
-
 class ChangingBody:
     """A surface of pieces as the step takes it; ``record`` points to arrays that are held here.
 
@@ -260,7 +252,7 @@ class ChangingBody:
     def __init__(
         self,
         tree: Clusters,
-        surface: Pieces,
+        surface: PieceArrays | SurfacePanels,
         wanted: NDArray[np.bool_] | None = None,
         sheet: float = 0.0,
     ) -> None:
@@ -299,9 +291,15 @@ class ChangingBody:
         self._own[self._function[~single]] = _OWN / extent[~single]
         record = np.zeros(1, BODY)[0]
         record["n"], record["scale"] = n, 1.0
+        record["inside"] = INSIDE if sheet == 0.0 else 0.0
         for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data
         self.record = record
+
+    @property
+    def impedance(self) -> Array32 | None:
+        """What the inside has beyond ``record["inside"]`` times the energy, if that is known."""
+        return None
 
     @property
     def radius(self) -> float:
@@ -317,7 +315,7 @@ class ChangingBody:
 
 
 WIDE = 0.16
-"""Conductors of a second-largest extent above this [m] are solved for on :func:`wide_body`."""
+"""Shapes of a second-largest extent above this [m] are solved for on a :class:`WideBody`."""
 _PIECE = 4e-3
 """Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""
 _FEWEST, _DOUBLINGS = 5000, 3
@@ -338,47 +336,57 @@ def wide_pieces(shape: Shape) -> int:
     return held
 
 
-def wide_body(panels: SurfacePanels) -> ChangingBody:
-    """A conductor on many panels, which meet each other without a block of energies."""
-    return ChangingBody(split(features(panels.centers, panels.normals), panels.areas), panels)
+_HALF_SPACE = 2.0
+"""Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
 
-def _lengths(shape: Shape) -> tuple[float, float, float]:
-    """How long a shape is [m] along the axes that it can be cut along, else 0."""
-    if isinstance(shape, Box):
-        return shape.size
-    return (0.0, 0.0, shape.length) if isinstance(shape, Cylinder | Capsule) else (0.0, 0.0, 0.0)
-
-
-def longer(shape: Shape, reach: float) -> bool:
-    """Whether :func:`windowed` cuts a shape."""
-    return max(_lengths(shape)) > reach
-
-
-def windowed(shape: Shape, middle: Array, reach: float) -> tuple[Shape, Array]:
-    """Cut a box, cylinder or capsule to a length that reaches through the domain.
-
-    The part keeps its size while the body moves, so that its charge functions are made once.
+class WideBody(ChangingBody):
+    """A rigid shape on many panels, which meet each other without a block of energies.
 
     Args:
-        shape: Any shape.
-        middle: Centre of the domain in the shape's frame [m], shape (3,).
-        reach: Diagonal of the domain [m]. What is no longer along any axis stays whole.
-
-    Returns:
-        The part, and its centre in the shape's frame [m], shape (3,).
+        panels: The many panels.
+        coarse: Makes some hundred panels of the same shape, from which the impedance of the inside
+            is found.
     """
-    if not longer(shape, reach):
-        return shape, np.zeros(3)
-    size = np.array(_lengths(shape))
-    part = np.minimum(size, reach)
-    at = np.clip(middle, 0.5 * (part - size), 0.5 * (size - part))
-    held = shape.__dict__.get("_window")
-    if held is None or held[0] != reach:
-        x, y, z = part.tolist()
-        if isinstance(shape, Cylinder | Capsule):
-            held = reach, type(shape)(shape.radius, z)
-        else:
-            held = reach, Box((x, y, z))
-        shape.__dict__["_window"] = held
-    return held[1], at
+
+    def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
+        self._at, self._coarse = features(panels.centers, panels.normals), coarse
+        super().__init__(split(self._at, panels.areas), panels)
+        self.record["inside"] = _HALF_SPACE
+
+    @property
+    def impedance(self) -> Array32:
+        """As in :class:`ChangingBody`, shape (f, f).
+
+        Z − 2F is smooth: charges within a small place that add to zero have none of it. So it is
+        that of a few panels, for the charge functions of clusters as large as these and larger.
+        """
+        return once(self, "_impedance", self._inside)
+
+    def _inside(self) -> Array32:
+        panels = self._coarse()
+        if not panels.closed:
+            return np.zeros((1, 1), np.float32)
+        with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
+            free = free_block(panels)
+            more = impedance(panels, free) - _HALF_SPACE * free
+        top = min(2 * len(panels) - 1, len(self._kids))  # clusters of the tree as far as it is used
+        kids = np.where(self._kids[:top] < top, self._kids[:top], -1)
+        last = kids[:, 0] < 0
+        number = np.where(last, np.cumsum(last) - 1, -1)
+        single = np.flatnonzero(self._panel >= 0)
+        parent = np.zeros(len(self._kids), np.int64)
+        parent[self._kids[self._panel < 0]] = np.flatnonzero(self._panel < 0)[:, None]
+        above = single.copy()
+        while (below := above >= top).any():
+            above[below] = parent[above[below]]
+        on = cKDTree(features(panels.centers, panels.normals)).query(self._at)[1]
+        share = self._charge[single] / self._charge[above]
+        places = number[above], on[self._panel[single]]
+        shares = csr_array((share, places), (last.sum(), len(panels)))
+        block = np.ascontiguousarray(shares @ (shares @ more).T)
+        tree = kids, number, self._charge[:top], self._function[:top]
+        rows, out = np.empty(block.shape), np.empty(block.shape, np.float32)
+        tree_kernels.to_functions(block, *tree, rows)
+        tree_kernels.energies_of_functions(rows, *tree, out)
+        return out

@@ -52,12 +52,14 @@ BODY = np.dtype(
         ("points", np.int64), ("extent", np.int64), ("soft", np.int64), ("own", np.int64),
         ("energy", np.int64),
         ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
+        ("known", np.int64),  # functions that have energies and impedances there, the first ones
         ("spread", np.int64),  # second moments of a changing surface, else 0: it has no energies
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("neutral", np.int64),  # whether it carries no net charge
         ("group", np.int64),  # bodies that touch are one conductor, named by its first body
         ("tie", np.float64),  # energy of a group's net charge beyond that of its field [1/m]
+        ("inside", np.float64),  # impedance of its inside, over its energy; 0 for a sheet
         ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
         ("softness", np.float64),  # 1 / (eps - 1), 0 for a conductor
     ]
@@ -101,6 +103,12 @@ class Tree(Clusters):
         return out
 
 
+def once(shape: object, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+    """An array of a shape that threads that meet here share: records point to it."""
+    found = shape.__dict__.get(name)
+    return shape.__dict__.setdefault(name, make()) if found is None else found
+
+
 @dataclass(frozen=True, eq=False)
 class RigidShape(Frozen):
     """Charge functions of a shape in its own frame; 4π eps0 = 1 in all energies.
@@ -123,13 +131,13 @@ class RigidShape(Frozen):
     @property
     def own(self) -> Array:
         """Diagonal of ``energy`` [1/m], shape (n,)."""
-        return self._once("_own", lambda: np.diag(self.energy).astype(float))
+        return once(self, "_own", lambda: np.diag(self.energy).astype(float))
 
     @cached_property
     def record(self) -> np.void:
         """What the kernels take of a body that its shape tells; points to arrays held here."""
         record = np.zeros(1, BODY)[0]
-        record["n"] = len(self.panels)
+        record["n"] = record["known"] = len(self.panels)
         record["energy"], record["own"] = self.energy.ctypes.data, self.own.ctypes.data
         for name in ("kids", "function", "charge", "center", "points", "extent", "soft"):
             record[name] = getattr(self.tree, name).ctypes.data
@@ -142,12 +150,7 @@ class RigidShape(Frozen):
         A body of permittivity eps adds ``Z / (eps - 1)`` to ``energy``. That of an open surface is
         not known; it is taken for :data:`INSIDE` times ``energy``.
         """
-        return self._once("_impedance", self._inside)
-
-    def _once(self, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-        """An array that threads that meet here share: records point to it."""
-        found = self.__dict__.get(name)
-        return self.__dict__.setdefault(name, make()) if found is None else found
+        return once(self, "_impedance", self._inside)
 
     def _inside(self) -> Array32:
         if not self.panels.closed:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from capsense.elements.panels import panels_of, polygon_panels
 from capsense.elements.pieces import (
     ChangingBody,
+    WideBody,
     layer_pieces,
     mesh_pieces,
-    wide_body,
     wide_pieces,
 )
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
@@ -107,6 +107,8 @@ _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
 _LEAST = 1e-9
 """The least of their lengths, over the largest."""
+_COARSE = 1000
+"""Panels of wide shapes from which the impedance of their inside is found."""
 _TRIANGLES = 1.6
 """So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
 _EACH = 0.2
@@ -154,10 +156,12 @@ def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
 
 
 def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:
-    """The same of a wide conductor, of so many pieces without energies of their own."""
-    return _kept(
-        shape, count, "_wide", lambda whole, *_: wide_body(panels_of(whole, count, merge=False))
-    )
+    """The same of a wide shape, of so many pieces without energies of their own."""
+    return _kept(shape, count, "_wide", _wide_of)
+
+
+def _wide_of(whole: Shape, count: int, _: str) -> WideBody:
+    return WideBody(panels_of(whole, count, merge=False), lambda: panels_of(whole, _COARSE))
 
 
 def _rigid_of(whole: Shape, count: int, name: str) -> RigidShape:

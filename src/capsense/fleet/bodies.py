@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_whole, shorten
 from capsense.elements.matter import matter_of
-from capsense.elements.pieces import ChangingBody, windowed
+from capsense.elements.panels import windowed
+from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.errors import SceneError
 from capsense.readout.conversions import Held
@@ -208,8 +209,8 @@ class BodyTable:
         found = self._kinds.setdefault((id(shape), soft), len(self._kinds))
         if found == len(self.shapes):
             record = np.array([shape.record], BODY)
-            if soft and isinstance(shape, RigidShape):
-                record["impedance"] = shape.impedance.ctypes.data
+            if soft and (block := shape.impedance) is not None:
+                record["impedance"], record["known"] = block.ctypes.data, len(block)
             self.shapes.append(shape)
             self.bodies = self.bodies._replace(
                 shapes=np.concatenate([self.bodies.shapes, record]),

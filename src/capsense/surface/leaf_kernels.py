@@ -65,11 +65,8 @@ class Leaves(NamedTuple):
 
 
 @compiled
-def placed(bodies, cut, green, inside):
-    """Place the leaves of a cut in the sensor frame.
-
-    ``inside`` is the impedance of the inside of surfaces that change, over their energy.
-    """
+def placed(bodies, cut, green):
+    """Place the leaves of a cut in the sensor frame."""
     n = cut.leaves.shape[0]
     points, corners, true = np.empty((n, 4, 3)), np.empty((4, 3)), np.empty((n, 4, 3))
     extent, soft, out = np.empty(n), np.empty(n), np.empty(n)
@@ -80,7 +77,7 @@ def placed(bodies, cut, green, inside):
         body = bodies[cut.body[a]]
         owner[j], k = cut.body[a], cut.node[a]
         if body.spread != 0:
-            within[j] = 1.0 if body.sheet > 0.0 else 1.0 + inside * body.softness
+            within[j] = 1.0 + body.inside * body.softness
             spread, center = doubles(body.spread), doubles(body.center)
             for i in range(3):
                 middle[i] = center[3 * k + i]

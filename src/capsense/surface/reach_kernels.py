@@ -113,14 +113,16 @@ def add_own(bodies, cut, functions, inside, matrix, rest, own):
             if moved:
                 block = _own_block(body, table, inside, cut, (first, last), functions, of[:count])
             for i in range(count):
-                f, line = of[i], functions.number[of[i]] * body.n
+                f, line = of[i], functions.number[of[i]] * body.known
                 for j in range(i + 1):
                     e = of[j]
                     if f != e and e >= solved:
                         continue
                     if moved:
                         value = block[i, j]
-                    elif inside and functions.number[f] * functions.number[e] == 0:
+                    elif max(functions.number[f], functions.number[e]) >= body.known or (
+                        inside and functions.number[f] * functions.number[e] == 0
+                    ):
                         value = 0.0
                     else:
                         value = float(table[line + functions.number[e]])
@@ -152,7 +154,8 @@ def _own_block(body, table, inside, cut, span, functions, of):
     rows = np.zeros((count, count))
     for i in range(1 if inside else 0, count):
         for j in range(1 if inside else 0, count):
-            rows[i, j] = table[number[i] * body.n + number[j]]
+            if number[i] < body.known and number[j] < body.known:
+                rows[i, j] = table[number[i] * body.known + number[j]]
     half = _within_reach(cut, span, index, functions, of, rows)
     return _within_reach(cut, span, index, functions, of, half.T.copy())
 

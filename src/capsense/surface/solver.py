@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from capsense._jit import first_use
 from capsense.design.model import Design
 from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
-from capsense.elements.pieces import ChangingBody, longer, windowed
+from capsense.elements.panels import longer, windowed
+from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.elements.store import functions_of
 from capsense.errors import CapSenseError, SceneError, SolveError
@@ -391,4 +392,5 @@ class SurfaceSolver:
     ) -> tuple[RigidShape | ChangingBody, float]:
         """Charge functions of a body from a share of the usual panels, and its size."""
         panels = round(share * self.preset.panels)
-        return functions_of(shape, panels, wide=conducting and self.preset.wide)
+        whole = conducting or not isinstance(shape, TriMesh) or shape.parts == 1
+        return functions_of(shape, panels, wide=self.preset.wide and whole)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, pasted
-from capsense.elements.rigid import INSIDE
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
@@ -60,7 +59,7 @@ def _prepared(
 ) -> tuple[Cut, Leaves, Functions, System]:
     """:func:`prepared`, for kernels; Python would compile it anew in each process."""
     cut = chosen(bodies, green, threshold, width)
-    cut, leaves = reached(cut, placed(bodies, cut, green, INSIDE))
+    cut, leaves = reached(cut, placed(bodies, cut, green))
     rows = leaf_rows(leaves.points, leaves.beyond, green)
     pairs = leaf_pairs(leaves, green.floor)
     bound_images(leaves, rows, pairs, green)
