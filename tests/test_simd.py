@@ -22,11 +22,14 @@ from capsense._simd import (
     span,
     splat,
     vadd,
+    vdiv,
+    vlog,
     vmadd,
     vmul,
     vsub,
     where_above,
 )
+from capsense.elements.panel_kernels import angle_of
 
 ROOTS = """
 import numpy as np
@@ -172,3 +175,59 @@ def test_spans_begin_anywhere(kind):
     np.testing.assert_array_equal(out[3:35], x[4:36])
     assert not out[:3].any()
     assert not out[35:].any()
+
+
+@njit
+def _quotients(x, y, out):
+    for k in range(0, x.size, SIMD_WIDTH):
+        put_span(out, k, vdiv(span(x, k), span(y, k)))
+
+
+@njit
+def _logarithms(x, out):
+    for k in range(0, x.size, SIMD_WIDTH):
+        put_span(out, k, vlog(span(x, k)))
+
+
+@njit
+def _angles(y, x, out):
+    for k in range(0, x.size, SIMD_WIDTH):
+        put_span(out, k, angle_of(span(x, k), span(y, k)))
+
+
+def test_quotients() -> None:
+    """Differential: numpy's, to the last bit."""
+    x, y = np.random.default_rng(3).normal(size=(2, 4096)).astype(np.float32)
+    out = np.empty_like(x)
+    _quotients(x, y, out)
+    np.testing.assert_array_equal(out, x / y)
+
+
+def test_logarithms() -> None:
+    """Differential: numpy's in double precision, from 1e-37 to 1e38, densely about 1."""
+    rng = np.random.default_rng(4)
+    x = np.concatenate([10.0 ** rng.uniform(-37, 38, 80_000), 1 + rng.uniform(-0.4, 0.6, 80_000)])
+    x = np.append(x, [1.0, 2.0, 0.5, 0.70710677, 0.7071068, 1.4142135, 1.4142137, 1e-37])
+    x = x.astype(np.float32)
+    out = np.empty_like(x)
+    _logarithms(x, out)
+    truth = np.log(x.astype(float))
+    assert (np.abs(out - truth) / np.maximum(np.abs(truth), 1.0)).max() < 1.2e-7
+    near = np.abs(truth) < 1e-2  # there it is the relative error that counts
+    assert (np.abs(out - truth)[near] <= 2e-7 * np.abs(truth)[near]).all()
+
+
+def test_angles() -> None:
+    """Differential: numpy's in double precision, all around, on the axes and at the origin."""
+    rng = np.random.default_rng(5)
+    angle, length = rng.uniform(-np.pi, np.pi, 80_000), 10.0 ** rng.uniform(-30, 30, 80_000)
+    x, y = length * np.cos(angle), length * np.sin(angle)
+    x = np.append(x, [0, 1, 0, 1, 1, 1, 2, 0]).astype(np.float32)
+    y = np.append(y, [0, 0, 1, 1, -1, 0.41421357, 1, -1]).astype(np.float32)
+    out = np.empty_like(x)
+    _angles(y, x, out)
+    truth = np.arctan2(y.astype(float), x.astype(float))
+    assert np.abs(out - truth).max() < 4e-7
+    left = np.empty(8, np.float32)
+    _angles(np.zeros(8, np.float32), np.full(8, -1, np.float32), left)
+    np.testing.assert_allclose(left, np.pi, rtol=1e-7)

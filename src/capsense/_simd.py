@@ -5,7 +5,8 @@ The functions below are one or a few LLVM instructions each, whatever the proces
 ``vmul(u, v)`` is ``u v``, ``vmadd(u, v, w)`` is ``u v + w`` and ``dot(x, y, z, u, v, w, a)`` is
 ``x u + y v + z w + a``, element by element; ``madd(s, v, w)`` is ``s v + w`` with a scalar s,
 ``horizontal_sum(v)`` adds the elements, ``where_above(u, v, x, y)`` is x where u > v, else y, and
-``muladd(a, b, c)`` is ``a b + c`` of scalars.
+``muladd(a, b, c)`` is ``a b + c`` of scalars. ``vdiv(u, v)`` is ``u / v`` and ``vlog(u)`` the
+natural logarithm in single precision.
 
 ``at(x, k)`` is element k of a C-ordered array of any shape, ``span`` is the eight from k on, and
 ``put_span`` writes them: unlike ``x[k]``, which counts from the end where k is negative, they do
@@ -148,6 +149,12 @@ def vmul(typing: Any, left: Any, right: Any) -> Any:
 
 
 @intrinsic
+def vdiv(typing: Any, left: Any, right: Any) -> Any:
+    """``left / right``, element by element."""
+    return left(left, left), _emit(lambda builder, *values: builder.fdiv(*values))
+
+
+@intrinsic
 def madd(typing: Any, scalar: Any, value: Any, addend: Any) -> Any:
     """``scalar * value + addend`` with a scalar in the precision of the vectors."""
 
@@ -249,6 +256,44 @@ def rsqrt(typing: Any, value: Any) -> Any:
         return y
 
     return value(value), code
+
+
+_ROOT_HALF = 0x3F3504F3
+"""Bits of √½ in single precision."""
+_LOG = (
+    0.070376836292, -0.11514610310, 0.11676998740, -0.12420140846, 0.14249322787,
+    -0.16668057665, 0.20000714765, -0.24999993993, 0.33333331174,
+)  # fmt: skip
+"""Of (log(1 + x) - x + x²/2) / x³ between √½ - 1 and √2 - 1; S. Moshier, Cephes (1989), logf."""
+_LOG_TWO = 0.693359375, -2.12194440e-4
+
+
+@intrinsic
+def vlog(typing: Any, value: Any) -> Any:
+    """Natural logarithm of eight normal numbers above zero, to 1e-7 or 1e-7 of it."""
+    if value != _SINGLE:
+        return None
+
+    def code(builder: Any, number: Any) -> Any:
+        whole = ir.VectorType(_INT, SIMD_WIDTH)
+
+        def each(same: float, kind: Any = number.type) -> Any:
+            return ir.Constant(kind, [same] * SIMD_WIDTH)
+
+        bits = builder.bitcast(number, whole)
+        power = builder.ashr(builder.sub(bits, each(_ROOT_HALF, whole)), each(23, whole))
+        bits = builder.sub(bits, builder.shl(power, each(23, whole)))
+        x = builder.fsub(builder.bitcast(bits, number.type), each(1.0))
+        exponent = builder.sitofp(power, number.type)
+        square, y = builder.fmul(x, x), each(_LOG[0])
+        for factor in _LOG[1:]:
+            y = multiply_add(builder, y, x, each(factor))
+        y = builder.fmul(y, builder.fmul(x, square))
+        y = multiply_add(builder, exponent, each(_LOG_TWO[1]), y)
+        y = multiply_add(builder, square, each(-0.5), y)
+        return multiply_add(builder, exponent, each(_LOG_TWO[0]), builder.fadd(x, y))
+
+    return value(value), _emit(code)
 
 
 def has_guess(target: tuple[str, str, str]) -> bool:

@@ -819,7 +819,7 @@ def test_pairs_of_one_surface_near_each_other(center, turned, sides, limit: floa
     assert found[0, 1] == found[1, 0]
 
 
-@pytest.mark.parametrize("distance", [0.0118, 0.0122])  # on both sides of 0.6 (10 mm + 10 mm)
+@pytest.mark.parametrize("distance", [0.0118, 0.0148, 0.0152])  # to both sides of 0.75 × 20 mm
 def test_pairs_of_one_surface_are_the_same_in_any_frame(distance: float) -> None:
     """Invariant: axes change places, and so do rectangles."""
     found = []

@@ -11,13 +11,31 @@ from __future__ import annotations
 
 import math
 
-from capsense._jit import inlined, kernel
+import numpy as np
+
+from capsense._jit import inlined, kernel, pasted
+from capsense._simd import (
+    dot,
+    rsqrt,
+    span,
+    splat,
+    vadd,
+    vdiv,
+    vlog,
+    vmadd,
+    vmul,
+    vsub,
+    where_above,
+)
 
 NEAR = 2.2
 """Pairs nearer than this many sums of their reaches are integrated in closed form."""
 TOUCHING = 1.25
 """Pairs nearer than this many sums of their reaches take the fine points."""
 _TINY = 1e-300
+_ATAN = 0.0805374449538, -0.138776856032, 0.199777106478, -0.333329491539
+"""Of (atan(x) - x) / x³ up to tan(π/8), in powers of x²; S. Moshier, Cephes (1989),
+atanf."""
 
 
 @kernel
@@ -177,3 +195,99 @@ def fill_flux(panels, out):
                     value -= p[3] * solid_angle(frames[k], p[0], p[1], p[2])
                 out[k, j] = value
         out[k, k] = 0.0
+
+
+@pasted
+def rectangle_potential(frames, o, points, p):
+    """Potentials of unit charge spread evenly over eight rectangles, at a point each [1/m].
+
+    The integral of 1/r over a rectangle with corners (left, below) and (x, y), seen from a height
+    z > 0 (Wilton et al. 1984), with the logarithms, and the angles, of two corners in one.
+
+    Args:
+        frames: Table whose columns hold centre, both axes, normal and half sides, one number below
+            the other; single precision.
+        o: Where the first of these stands.
+        points: Table whose columns hold points.
+        p: Where the first coordinate of these stands.
+    """
+    n, w, zero = points.shape[1], frames.shape[1], splat(np.float32(0.0))
+    dx = vsub(span(points, p), span(frames, o))
+    dy = vsub(span(points, p + n), span(frames, o + w))
+    dz = vsub(span(points, p + 2 * n), span(frames, o + 2 * w))
+    u, v, z = (
+        dot(dx, dy, dz, span(frames, o + 3 * w), span(frames, o + 4 * w), span(frames, o + 5 * w),
+            zero),
+        dot(dx, dy, dz, span(frames, o + 6 * w), span(frames, o + 7 * w), span(frames, o + 8 * w),
+            zero),
+        dot(dx, dy, dz, span(frames, o + 9 * w), span(frames, o + 10 * w),
+            span(frames, o + 11 * w), zero),
+    )  # fmt: skip
+    a, b = span(frames, o + 12 * w), span(frames, o + 13 * w)
+    z = vadd(where_above(z, zero, z, vsub(zero, z)), splat(np.float32(1e-9)))
+    x, left, y, below = vsub(a, u), vsub(vsub(zero, a), u), vsub(b, v), vsub(vsub(zero, b), v)
+    zz = vmul(z, z)
+    xs, ls = vmadd(x, x, zz), vmadd(left, left, zz)
+    ys, bs = vmadd(y, y, zz), vmadd(below, below, zz)
+    r, s, t, e = (
+        _root(vmadd(x, x, ys)), _root(vmadd(x, x, bs)),
+        _root(vmadd(left, left, ys)), _root(vmadd(left, left, bs)),
+    )  # fmt: skip
+    out = vmul(x, _side(y, below, r, s, xs))
+    out = vsub(out, vmul(left, _side(y, below, t, e, ls)))
+    out = vmadd(y, _side(x, left, r, t, ys), out)
+    out = vsub(out, vmul(below, _side(x, left, s, e, bs)))
+    angle = vsub(
+        _between(vmul(x, y), vmul(z, r), vmul(x, below), vmul(z, s)),
+        _between(vmul(left, y), vmul(z, t), vmul(left, below), vmul(z, e)),
+    )
+    return vdiv(vsub(out, vmul(z, angle)), vmul(splat(np.float32(4.0)), vmul(a, b)))
+
+
+@pasted
+def _root(square):
+    """Square root of numbers above zero."""
+    return vmul(square, rsqrt(square))
+
+
+@pasted
+def _side(end, start, far, near, square):
+    """``log((end + far) / (start + near))``, far² = end² + square and near² = start² + square.
+
+    Where a sum would be a small difference it is ``square`` over the other one.
+    """
+    zero, one = splat(np.float32(0.0)), splat(np.float32(1.0))
+    last = vadd(far, where_above(end, zero, end, vsub(zero, end)))
+    first = vadd(near, where_above(start, zero, start, vsub(zero, start)))
+    over = vmul(where_above(end, zero, last, square), where_above(start, zero, one, first))
+    under = vmul(where_above(end, zero, one, last), where_above(start, zero, first, square))
+    return vlog(vdiv(over, under))
+
+
+@pasted
+def _between(p, q, r, s):
+    """``atan(p / q) - atan(r / s)``, q and s above zero."""
+    zero = splat(np.float32(0.0))
+    return angle_of(vmadd(q, s, vmul(p, r)), vmadd(p, s, vsub(zero, vmul(r, q))))
+
+
+@pasted
+def angle_of(x, y):
+    """Angle of the points (x, y), from -π to π, to 3e-7; 0 at the origin."""
+    zero, tiny = splat(np.float32(0.0)), splat(np.float32(1e-37))
+    up, right = where_above(y, zero, y, vsub(zero, y)), where_above(x, zero, x, vsub(zero, x))
+    low, high = where_above(up, right, right, up), where_above(up, right, up, right)
+    wide = vsub(low, vmul(splat(np.float32(0.4142135624)), high))
+    above = where_above(wide, zero, vsub(low, high), low)
+    below = where_above(wide, zero, vadd(low, high), high)
+    part = where_above(wide, zero, splat(np.float32(0.25 * math.pi)), zero)
+    t = vdiv(above, where_above(below, tiny, below, tiny))
+    square = vmul(t, t)
+    series = splat(np.float32(_ATAN[0]))
+    series = vmadd(series, square, splat(np.float32(_ATAN[1])))
+    series = vmadd(series, square, splat(np.float32(_ATAN[2])))
+    series = vmadd(series, square, splat(np.float32(_ATAN[3])))
+    angle = vadd(part, vmadd(vmul(series, square), t, t))
+    angle = where_above(up, right, vsub(splat(np.float32(0.5 * math.pi)), angle), angle)
+    angle = where_above(zero, x, vsub(splat(np.float32(math.pi)), angle), angle)
+    return where_above(zero, y, vsub(zero, angle), angle)

@@ -23,12 +23,12 @@ from capsense._simd import (
     vsub,
     where_above,
 )
+from capsense.elements.panel_kernels import rectangle_potential
 from capsense.field.green_kernels import smooth
 
 FAR = 0.75
-"""Clusters farther apart than so many of their joint extents are met by their moments."""
-_CLOSE = 0.6
-"""Rectangles of one surface nearer than so many of their joint extents are met in closed form."""
+"""Clusters farther apart than so many of their joint extents are met by their moments; nearer ones
+point by point, and in closed form if they are of one surface."""
 BARRIER = 1e5
 """Energy of charge that is out of reach [1/m]."""
 LIFTED = 1e-5
@@ -58,8 +58,8 @@ def leaf_pairs(leaves, floor):
             image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
-    flat, below = _flat(points, soft), _flat(image, soft)
-    line, room = np.empty(shapes.shape[1], np.float32), np.empty((14, shapes.shape[1]), np.float32)
+    flat, below, rectangles = _flat(points, soft), _flat(image, soft), _rectangles(points)
+    line, room = np.empty(shapes.shape[1], np.float32), np.empty((28, shapes.shape[1]), np.float32)
     behind = 0  # clusters of bodies before this one's
     for i in range(n):
         if owner[i] != owner[behind]:
@@ -74,10 +74,10 @@ def leaf_pairs(leaves, floor):
             for j in range(behind):
                 out[i, j] += line[j]
         if leaves.within[i] > 0.0:
-            _far_means(shapes, i, shapes, i + 1, line)
+            _far_means(shapes, i, shapes, i, line)
+            _near_rectangles(rectangles, extent, i, behind, line, room)
+            line[i] = _self_mean(_arm(points[i, 0], points[i, 1]), _arm(points[i, 0], points[i, 2]))
             for j in range(behind, i + 1):
-                if line[j] < 0.0 or j == i:
-                    line[j] = _near_mean(points[i], points[j], extent[i], extent[j], j == i)
                 out[i, j] += leaves.within[i] * line[j]
         for j in range(i):
             out[j, i] = out[i, j]
@@ -271,30 +271,6 @@ def mean_inverse(first, second, soft):
 
 
 @compiled
-def _near_mean(first, second, extent, other, same):
-    """Mean of 1/r [1/m] between two rectangles of one surface, given by their four points."""
-    if same:
-        return _self_mean(_arm(first[0], first[1]), _arm(first[0], first[2]))
-    x = 0.5 * (first[0, 0] + first[3, 0] - second[0, 0] - second[3, 0])
-    y = 0.5 * (first[0, 1] + first[3, 1] - second[0, 1] - second[3, 1])
-    z = 0.5 * (first[0, 2] + first[3, 2] - second[0, 2] - second[3, 2])
-    reach = _CLOSE * (extent + other)
-    if x * x + y * y + z * z > reach * reach:
-        return mean_inverse(first, second, 0.0)
-    # points on the smaller one, the larger one in closed form; both ways where they are alike
-    ratio = (extent / other) ** 4
-    share = ratio / (1.0 + ratio)
-    total = 0.0
-    if share < 0.95:
-        total += (1.0 - share) * _mean_potential(first, second)
-    if share > 0.05:
-        total += share * _mean_potential(second, first)
-    return total / (
-        max(0.0, 1.0 - share if share < 0.95 else 0.0) + (share if share > 0.05 else 0.0)
-    )
-
-
-@compiled
 def _arm(first, second):
     """Half the distance [m] between two of the four points."""
     total = 0.0
@@ -304,46 +280,58 @@ def _arm(first, second):
 
 
 @compiled
-def _mean_potential(outer, inner):
-    """Mean over the points of one rectangle of the potential of unit charge on the other [1/m]."""
-    root = math.sqrt(3.0)
-    short, long = _arm(inner[0], inner[1]) + 1e-9, _arm(inner[0], inner[2]) + 1e-9
-    b, a = root * short, root * long
-    total = 0.0
-    for q in range(4):
-        u = v = square = 0.0
+def _rectangles(points):
+    """The four points of clusters and :func:`rectangle_potential`'s frames, columns, (26, l)."""
+    out = np.empty((26, points.shape[0]), np.float32)
+    for j in range(points.shape[0]):
+        long, short = _arm(points[j, 0], points[j, 2]), _arm(points[j, 0], points[j, 1])
         for i in range(3):
-            d = outer[q, i] - 0.5 * (inner[0, i] + inner[3, i])
-            u += d * (inner[0, i] - inner[2, i])
-            v += d * (inner[0, i] - inner[1, i])
-            square += d * d
-        u, v = 0.5 * u / long, 0.5 * v / short
-        w = math.sqrt(max(square - u * u - v * v, 0.0)) + 1e-9
-        total += _rectangle(a - u, -a - u, b - v, -b - v, w)
-    return total / (16.0 * a * b)
+            for q in range(4):
+                out[3 * q + i, j] = points[j, q, i]
+            out[12 + i, j] = 0.5 * (points[j, 0, i] + points[j, 3, i])
+            out[15 + i, j] = 0.5 * (points[j, 0, i] - points[j, 2, i]) / (long + 1e-9)
+            out[18 + i, j] = 0.5 * (points[j, 0, i] - points[j, 1, i]) / (short + 1e-9)
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            out[21 + i, j] = out[15 + a, j] * out[18 + b, j] - out[15 + b, j] * out[18 + a, j]
+        out[24, j], out[25, j] = math.sqrt(3.0) * long + 1e-9, math.sqrt(3.0) * short + 1e-9
+    return out
 
 
 @compiled
-def _rectangle(x, left, y, below, z):
-    """Integral of 1/r over a rectangle with corners (left, below) and (x, y), z > 0.
+def _near_rectangles(table, extent, i, start, out, room):
+    """Replace what is negative in a line by the mean of 1/r between rectangles of one surface.
 
-    (Wilton et al. 1984), with the logarithms, and the angles, of two corners in one.
+    It is that over four points on one of them, the other in closed form, and the other way about:
+    the larger one counts in closed form.
+
+    Args:
+        table: As of :func:`_rectangles`, shape (26, l).
+        extent: Of the clusters [m], shape (l,).
+        i, start: The cluster, and the first of those before it that are looked at.
+        out: The line, shape (w,).
+        room: Room to work in, shape (28, w).
     """
-    tiny, xs, ls, ys, bs = 1e-12, x * x, left * left, y * y + z * z, below * below + z * z
-    r, s = math.sqrt(xs + ys), math.sqrt(xs + bs)
-    t, u = math.sqrt(ls + ys), math.sqrt(ls + bs)
-    out = x * math.log((y + r + tiny) / (below + s + tiny))
-    out -= left * math.log((y + t + tiny) / (below + u + tiny))
-    out += y * math.log((x + r + tiny) / (left + t + tiny))
-    out -= below * math.log((x + s + tiny) / (left + u + tiny))
-    return out - z * (_between(x * y, z * r, x * below, z * s)
-                      - _between(left * y, z * t, left * below, z * u))  # fmt: skip
-
-
-@pasted
-def _between(p, q, r, s):
-    """``atan(p / q) - atan(r / s)``, q and s above zero."""
-    return math.atan2(p * s - r * q, q * s + p * r)
+    count, n, width, own = 0, table.shape[1], room.shape[1], np.empty((26, SIMD_WIDTH), np.float32)
+    for k in range(26):
+        put_span(own, SIMD_WIDTH * k, splat(at(table, k * n + i)))
+    for j in range(start, i):
+        if at(out, j) < 0.0:
+            for k in range(26):
+                room[k, count] = at(table, k * n + j)
+            ratio = (extent[i] / extent[j]) ** 4
+            room[26, count], room[27, count] = ratio / (1.0 + ratio), j
+            count += 1
+    for k in range(0, count, SIMD_WIDTH):
+        mine = theirs = splat(np.float32(0.0))
+        for q in range(4):
+            mine = vadd(mine, rectangle_potential(own, 12 * SIMD_WIDTH, room, 3 * q * width + k))
+            theirs = vadd(
+                theirs, rectangle_potential(room, 12 * width + k, own, 3 * q * SIMD_WIDTH)
+            )
+        put_span(room, k, vmadd(span(room, 26 * width + k), vsub(mine, theirs), theirs))
+    for k in range(count):
+        out[int(room[27, k])] = 0.25 * at(room, k)
 
 
 @compiled
