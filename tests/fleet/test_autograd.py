@@ -80,3 +80,35 @@ def test_arguments_of_the_other_function():
     with pytest.raises(SceneError, match=r"sensors is of ndarray; give a tensor"):
         change(fleet, given, poses)
     assert np.array_equal(fleet.step(given.detach()).delta, fleet.step(poses).delta)
+
+
+def test_second_derivatives_are_refused():
+    """Unit: they would be without the derivative of the Jacobian."""
+    from capsense.fleet.autograd import change
+
+    fleet = Fleet("six_patch", [BODIES[0]], 1)
+    poses = torch.tensor([[[0.0, 0.0, 0.08, 0.0, 0.0, 0.0, 1.0]]], requires_grad=True)
+    value = (1e12 * change(fleet, poses)).square().sum()
+    (slope,) = torch.autograd.grad(value, poses, create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        slope.sum().backward()
+
+
+def test_no_jacobian_where_no_gradient_is_wanted(monkeypatch):
+    """Unit: under ``no_grad`` it would take three times as long."""
+    from capsense.fleet.autograd import change
+
+    fleet, asked = Fleet("six_patch", [BODIES[0]], 1), []
+    solved = fleet.solved
+
+    def spied(*poses, jacobian):
+        asked.append(jacobian)
+        return solved(*poses, jacobian=jacobian)
+
+    monkeypatch.setattr(fleet, "solved", spied)
+    poses = torch.tensor([[[0.0, 0.0, 0.08, 0.0, 0.0, 0.0, 1.0]]], requires_grad=True)
+    with torch.no_grad():
+        before = change(fleet, poses)
+    after = change(fleet, poses)
+    assert asked == [False, True]
+    assert torch.equal(before, after.detach())

@@ -308,3 +308,21 @@ def test_kernels_compile_for_a_gpu(name, tmp_path):
     ]
     assert sum(sizes) <= 48 * 1024
     assert text.count(".entry") >= 2
+
+
+@pytest.mark.parametrize("place", [(0, 2), (0, 4), (1, 0)], ids=["height", "turn", "other"])
+def test_poses_on_the_device_that_are_not_finite(place: tuple[int, int]) -> None:
+    """Unit: the reading of their environment is not finite, nor its error; others are as before."""
+    bodies = [cs.Body(cs.Capsule(0.01, 0.05)), cs.Body(cs.Sphere(0.02))]
+    fleet = cs.Fleet("six_patch", bodies, 3, device="warp:cpu", budget=32)
+    where = np.zeros((3, 2, 7), np.float32)
+    where[..., 6] = 1.0
+    where[:, 0, 2], where[:, 1, :3] = 0.06, (0.05, 0.0, 0.1)
+    good = fleet.step(wp.array(where, dtype=wp.float32)).delta.numpy().copy()
+    where[(1, *place)] = np.nan
+    reading = fleet.step(wp.array(where, dtype=wp.float32))
+    for values in (reading.delta, reading.capacitance, reading.error):
+        found = np.isfinite(values.numpy()).reshape(3, -1)
+        assert found.all(axis=1).tolist() == [True, False, True]
+        assert not found[1].any()
+    np.testing.assert_array_equal(reading.delta.numpy()[[0, 2]], good[[0, 2]])

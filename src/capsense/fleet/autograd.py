@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch.autograd.function import once_differentiable
 
 from capsense.errors import SceneError
 from capsense.fleet import Fleet
@@ -14,8 +15,8 @@ def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = Non
     """Change of the matrices by the bodies, with gradients by the poses of the bodies.
 
     Gradients are those of the solver's own adjoint, not of differences. That by a quaternion is
-    within the unit sphere: a step along it turns the body and nothing else. With a fleet on Warp
-    nothing leaves the device.
+    within the unit sphere: a step along it turns the body and nothing else. There are no second
+    derivatives; PyTorch refuses them. With a fleet on Warp nothing leaves the device.
 
     Args:
         fleet: A fleet.
@@ -38,7 +39,8 @@ def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = Non
             )
     if sensors is not None and sensors.requires_grad:
         raise ValueError("gradients by the poses of sensors are not known; move the bodies instead")
-    out: torch.Tensor = _Change.apply(poses, sensors, fleet)
+    wanted = poses if torch.is_grad_enabled() else poses.detach()
+    out: torch.Tensor = _Change.apply(wanted, sensors, fleet)
     return out
 
 
@@ -64,6 +66,7 @@ class _Change(torch.autograd.Function):
         return kept(reading.delta)
 
     @staticmethod
+    @once_differentiable
     def backward(context: Any, *outer: Any) -> tuple[torch.Tensor, None, None]:
         poses, sensors = context.saved_tensors
         # along and about the axes of each sensor, then of the world

@@ -341,7 +341,9 @@ def change(
                 y[1] = left.residual[f, lead + j, v]
             more += _GAIN * over(times(x, y), own)
     total += more
-    real = wp.min(circuit.unit * total[0], circuit.screened[i, j])
+    real = circuit.unit * total[0]
+    if real > circuit.screened[i, j]:  # the lesser of NaN and a number would be the number
+        real = circuit.screened[i, j]
     whole[i, j, v] = wp.vec2d(
         circuit.rest[i, j] + wp.float64(real), wp.float64(circuit.unit * total[1])
     )
@@ -394,5 +396,6 @@ def report(
     if i == 0:
         largest = float(0.0)
         for t in range(doubt.shape[0]):
-            largest = wp.max(largest, doubt[t, v])
+            if not (doubt[t, v] <= largest):  # NaN counts as the largest
+                largest = doubt[t, v]
         error[e, s] = circuit.unit * largest
