@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import threading
 import time
@@ -9,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from capsense._thread_pool import ThreadPool, processors, some_failed
+from capsense._thread_pool import OneAtATime, ThreadPool, processors, some_failed
 from capsense.errors import SceneError
 
 
@@ -87,3 +88,25 @@ def test_processors_where_a_system_does_not_tell(monkeypatch: pytest.MonkeyPatch
     """macOS and Windows have no affinity: all processors count."""
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     assert processors() == os.cpu_count()
+
+
+def test_a_lock_that_is_held_while_the_process_forks() -> None:
+    """Regression: the thread that holds it is not in the child, which would wait for ever."""
+    one, held, done = OneAtATime(), threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with one:
+            held.set()
+            done.wait()
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    held.wait()
+    child = multiprocessing.get_context("fork").Process(target=one.__enter__)
+    child.start()
+    child.join(20)
+    ended = child.exitcode
+    child.kill()
+    done.set()
+    holder.join()
+    assert ended == 0

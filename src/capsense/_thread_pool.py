@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -57,11 +58,24 @@ def filled(kernel: Callable[..., None], out: Array, *args: Any) -> Array:
     return out
 
 
+def _renew() -> None:
+    for one in list(_LOCKS):
+        one._lock = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew)
+
+
 class OneAtATime:
-    """A lock for what one thread may use at a time; a copy, or a pickled one, is a new lock."""
+    """A lock for what one thread may use at a time; a copy, or a pickled one, is a new lock.
+
+    So is that of a forked process: a thread that held it has not come along.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
+        _LOCKS.add(self)
 
     def __enter__(self) -> None:
         self._lock.acquire()
@@ -71,6 +85,9 @@ class OneAtATime:
 
     def __reduce__(self) -> tuple[type[OneAtATime], tuple[()]]:
         return OneAtATime, ()
+
+
+_LOCKS: weakref.WeakSet[OneAtATime] = weakref.WeakSet()
 
 
 class ThreadPool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._thread_pool import OneAtATime
 from capsense.elements.panels import panels_of, polygon_panels
 from capsense.elements.pieces import (
     ChangingBody,
@@ -116,7 +116,7 @@ _EACH = 0.2
 _MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
-_LOCK = threading.Lock()
+_LOCK = OneAtATime()
 _SHAPES: OrderedDict[Hashable, RigidShape | ChangingBody] = OrderedDict()
 
 T = TypeVar("T", bound=RigidShape | ChangingBody)
