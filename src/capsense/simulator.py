@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._frozen import read_only
 from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
+from capsense._validate import shorten
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError, SceneError
@@ -109,11 +110,11 @@ class Simulator:
         ):  # fmt: skip
             if chosen not in known:
                 raise ValueError(
-                    f"{what} is {chosen!r}; choose one of {', '.join(map(repr, known))}"
+                    f"{what} is {shorten(chosen)}; choose one of {', '.join(map(repr, known))}"
                 )
         if not (np.isfinite(excitation_frequency) and excitation_frequency > 0):
             raise ValueError(
-                f"excitation_frequency is {excitation_frequency!r}; give a positive number"
+                f"excitation_frequency is {shorten(excitation_frequency)}; give a positive number"
             )
         self.method: Method = method
         self.preset: PresetName = preset

@@ -156,6 +156,17 @@ def test_a_check_is_against_a_finer_preset():
     assert 1e-3 < found["standard"] < found["learning"]
 
 
+def test_a_check_needs_a_finer_preset_and_samples(fleet):
+    """Errors name the thing and the fix."""
+    where = poses(np.random.default_rng(6), 2, 3)
+    finest = Fleet("six_patch", BODIES, 2, preset="fine")
+    with pytest.raises(ValueError, match=r'no finer one.* make one with preset="standard"'):
+        finest.check(where)
+    for samples in (0, -1, 1.5, "all"):
+        with pytest.raises(SceneError, match=f"samples is {samples!r}; give a whole number from 1"):
+            fleet.check(poses(np.random.default_rng(6), COUNT, 3), samples=samples)
+
+
 def test_a_fleet_checks_itself(fleet):
     """Measured: at the learning preset some per cent of the largest entry."""
     found = fleet.check(poses(np.random.default_rng(6), COUNT, 3), samples=5)

@@ -9,7 +9,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from capsense._validate import as_number, as_whole, suggest
+from capsense._validate import as_number, as_whole, shorten, suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError
 from capsense.scene import Body, Material, Pose, Shape, material
@@ -233,7 +233,9 @@ def split_rules(options: Mapping[str, Any], known: type) -> tuple[Rules, dict[st
                     f"attach has no option {name!r}, which is the simulator's; give "
                     f"design=cs.Simulator(design, {name}=…)"
                 )
-            raise TypeError(f"attach has no option {name!r}; {suggest(name, ['design', *names])}")
+            raise TypeError(
+                f"attach has no option {shorten(name)}; {suggest(name, ['design', *names])}"
+            )
     ruled = {f.name for f in fields(Rules)}
     rules = Rules(**{name: value for name, value in options.items() if name in ruled})
     return rules, {name: value for name, value in options.items() if name not in ruled}

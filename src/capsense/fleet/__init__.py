@@ -97,14 +97,15 @@ class Fleet:
             ("preset", preset, tuple(PRESETS)), ("budget", budget, (32, 64, 128)),
         ):  # fmt: skip
             if chosen not in known:
-                raise ValueError(f"{what} is {chosen!r}; choose one of {known}")
+                raise ValueError(f"{what} is {shorten(chosen)}; choose one of {known}")
         self.design = design if isinstance(design, Design) else load_design(design)
         self.count, self.sensors, self.places = count, sensors, len(bodies)
         """How many environments, sensors in each, and places for bodies."""
         self.device = device
         field = load_or_build(self.design, default_settings(self.design))
         chosen_preset = PRESETS[preset]
-        self._finer: Preset = "standard" if preset == "learning" else "fine"
+        finer: dict[Preset, Preset] = {"learning": "standard", "standard": "fine"}
+        self._finer = finer.get(preset) if device == "cpu" else "fine"
         if device != "cpu":
             chosen_preset = replace(chosen_preset, panels=_PANELS * budget, wide=False)
         self._solver = SurfaceSolver(
@@ -303,24 +304,33 @@ class Fleet:
     ) -> FleetCheck:
         """Compare some environments with a ``Simulator`` of a finer preset.
 
-        That is ``"standard"``, or ``"fine"`` where the fleet's own is not ``"learning"``.
+        That is ``"fine"``; of a fleet on the CPU with the preset ``"learning"``, ``"standard"``.
 
         Args:
             poses: As :meth:`step` takes them, on the host.
             sensors: As :meth:`step` takes them, on the host.
-            samples: How many environments, drawn at random.
+            samples: How many environments, drawn at random; all, where there are no more.
             seed: Of the draw.
 
         Raises:
-            SceneError: As by :meth:`step`.
+            SceneError: As by :meth:`step`, or ``samples`` is not a whole number from 1.
+            ValueError: The fleet has the preset ``"fine"``, and there is no finer one.
             SolveError: As by :meth:`step`.
         """
+        if self._finer is None:
+            raise ValueError(
+                'the fleet has preset "fine", and there is no finer one to check it against; '
+                'make one with preset="standard"'
+            )
+        whole = as_whole(samples)
+        if whole is None or whole < 1:
+            raise SceneError(f"samples is {shorten(samples)}; give a whole number from 1")
         e, s, b = self.count, self.sensors, self.places
         where = _checked("poses", poses, (e, b, 7))
         at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
         delta = self.solved(where, at).delta
         found = delta if self._warp is None else delta.numpy()
-        drawn = np.random.default_rng(seed).permutation(e)[:samples]
+        drawn = np.random.default_rng(seed).permutation(e)[:whole]
         simulator = Simulator(
             self.design, excitation_frequency=self._solver.excitation_frequency, preset=self._finer
         )
