@@ -19,7 +19,7 @@ from capsense.elements.rigid import BODY, Clusters, RigidShape, features, split
 from capsense.surface.solver import SurfaceSolver
 
 SCENES = [s for s in reference_scenes(MORE) if s.category.startswith("wide")]
-PLATE = cs.Box((0.4, 0.3, 0.02))
+PLATE, BLOCK = cs.Box((0.4, 0.3, 0.02)), cs.Box((0.4, 0.3, 0.1))
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_jacobian(sim):
 def test_fleets_read_as_simulators():
     """Differential: wide bodies and small ones, sizes that differ; conductors and a dielectric."""
     finger = cs.Body(cs.Capsule(0.008, 0.06), material="human")
-    others = [cs.Body(PLATE), cs.Body(cs.Box((0.8, 0.6, 0.04))), cs.Body(PLATE, material="wood")]
+    others = [cs.Body(PLATE), cs.Body(cs.Box((0.8, 0.6, 0.04))), cs.Body(BLOCK, material="wood")]
     fleet = cs.Fleet("six_patch", [others[0], finger], 3)
     fleet.change(0, others[1:], environments=[1, 2])
     where = np.zeros((3, 2, 7))
@@ -109,7 +109,7 @@ def test_fleets_read_as_simulators():
 )
 def test_how_many_pieces(shape, pieces):
     """Unit: two lengths above ``WIDE``; then edges of 4 mm or less, up to a bound."""
-    assert wide_pieces(shape) == pieces
+    assert wide_pieces(shape, True) == pieces
 
 
 @pytest.mark.parametrize("twice", [False, True], ids=["once", "twice"])
@@ -150,16 +150,18 @@ def test_what_is_kept_of_a_shape():
 
 
 def test_which_bodies_are_wide(sim):
-    """Unit: all but dielectrics of several parts, between which no charge may pass."""
+    """Unit: all but dielectrics that are thin, or of several parts, between which no charge may
+    pass."""
     solver: SurfaceSolver = SurfaceSolver(sim.background.green, sim.design)
-    box = PLATE.to_trimesh()
+    box = BLOCK.to_trimesh()
     one = cs.TriMesh(box.vertices, box.faces)
     two = cs.TriMesh(
-        np.concatenate([box.vertices, box.vertices + np.array([0, 0, 0.1])]),
+        np.concatenate([box.vertices, box.vertices + np.array([0, 0, 0.2])]),
         np.concatenate([box.faces, box.faces + len(box.vertices)]),
     )
     for shape, conducting, kind in (
-        (PLATE, True, WideBody), (PLATE, False, WideBody), (one, False, WideBody),
+        (PLATE, True, WideBody), (PLATE, False, RigidShape), (BLOCK, False, WideBody),
+        (one, False, WideBody),
         (two, True, WideBody), (two, False, RigidShape), (cs.Sphere(0.05), True, RigidShape),
     ):  # fmt: skip
         found, _ = solver.functions_of(shape, conducting)
@@ -213,9 +215,9 @@ def test_the_inside_of_an_open_surface_is_twice_its_energy():
 @pytest.mark.parametrize("eps", [2.0, 10.0, 1e3, 9.9e3])
 def test_permittivities(sim, eps):
     """Differential: the fine preset on functions with energies of their own; a box of 0.17 m."""
-    pose = cs.Pose((0.01, 0.0, 0.03 + 0.01))
-    scene = cs.Scene([cs.Body(cs.Box((0.17, 0.165, 0.02)), pose, cs.Material("m", eps_r=eps))])
-    narrow = cs.Scene([cs.Body(cs.Box((0.17, 0.1599, 0.02)), pose, cs.Material("m", eps_r=eps))])
+    pose = cs.Pose((0.01, 0.0, 0.03 + 0.02))
+    scene = cs.Scene([cs.Body(cs.Box((0.17, 0.165, 0.04)), pose, cs.Material("m", eps_r=eps))])
+    narrow = cs.Scene([cs.Body(cs.Box((0.17, 0.1599, 0.04)), pose, cs.Material("m", eps_r=eps))])
     ratio = sim.step(scene).delta / cs.Simulator(DESIGN, preset="fine").step(narrow).delta
     assert np.abs(np.diag(ratio) - 1.0).max() < 0.03
 
@@ -223,15 +225,15 @@ def test_permittivities(sim, eps):
 def test_losses(sim):
     """Analytic limits: a wide lossy plate reads as a dielectric where it hardly conducts, and as a
     conductor where it does."""
-    pose = cs.Pose((0.0, 0.0, 0.04))
+    pose = cs.Pose((0.0, 0.0, 0.08))
 
     def read(material: cs.Material) -> cs.Reading:
-        return sim.step(cs.Scene([cs.Body(PLATE, pose, material, "floating")]))
+        return sim.step(cs.Scene([cs.Body(BLOCK, pose, material, "floating")]))
 
     plain = read(cs.Material("plain", eps_r=4.0)).delta
     low = read(cs.Material("low", eps_r=4.0, sigma=1e-9))
     np.testing.assert_allclose(low.delta, plain, rtol=1e-3, atol=1e-3 * plain.max())
-    metal = sim.step(cs.Scene([cs.Body(PLATE, pose, "steel", "floating")])).delta
+    metal = sim.step(cs.Scene([cs.Body(BLOCK, pose, "steel", "floating")])).delta
     high = read(cs.Material("high", eps_r=4.0, sigma=0.1)).delta
     np.testing.assert_allclose(high, metal, rtol=0.02, atol=0.02 * metal.max())
     assert np.diag(low.conductance).min() > 0.0

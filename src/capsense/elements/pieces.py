@@ -23,7 +23,7 @@ from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
 from capsense.elements.rigid import BODY, INSIDE, Clusters, features, once, split
-from capsense.scene import Layers, RestSurface, SurfaceMesh
+from capsense.scene import Layers, RestSurface, SurfaceMesh, TriMesh
 from capsense.scene.shapes import Shape
 
 Array = NDArray[np.float64]
@@ -322,18 +322,28 @@ _FEWEST, _DOUBLINGS = 5000, 3
 """Pieces of wide bodies are so many, doubled at most so often."""
 
 
-def wide_pieces(shape: Shape) -> int:
-    """About how many pieces a wide shape is cut into; 0 where it is not wide."""
+COARSE, _THICK = 1000, 2.0
+"""Panels from which the impedance of the inside of wide shapes is found, and how many times as
+thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
+
+
+def wide_pieces(shape: Shape, conducting: bool) -> int:
+    """About how many pieces a shape is cut into; 0 where it is not wide.
+
+    Nor are dielectrics that are thin, or meshes of several parts.
+    """
     held = shape.__dict__.get("_pieces")
     if held is None:
         low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
-        held = 0
+        held = 0, False
         if middle > WIDE:
-            wanted = 2 * (low * middle + middle * high + high * low) / _PIECE**2
-            doublings = math.ceil(math.log2(wanted / _FEWEST))
-            held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS)
+            area = 2 * (low * middle + middle * high + high * low)
+            doublings = math.ceil(math.log2(area / _PIECE**2 / _FEWEST))
+            single = not isinstance(shape, TriMesh) or shape.parts == 1
+            thick = low >= _THICK * math.sqrt(area / COARSE)
+            held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS), single and thick
         shape.__dict__["_pieces"] = held
-    return held
+    return held[0] if conducting or held[1] else 0
 
 
 _HALF_SPACE = 2.0

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from capsense._thread_pool import OneAtATime
 from capsense.elements.panels import panels_of, polygon_panels
 from capsense.elements.pieces import (
+    COARSE,
     ChangingBody,
     WideBody,
     layer_pieces,
@@ -107,8 +108,6 @@ _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
 _LEAST = 1e-9
 """The least of their lengths, over the largest."""
-_COARSE = 1000
-"""Panels of wide shapes from which the impedance of their inside is found."""
 _TRIANGLES = 1.6
 """So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
 _EACH = 0.2
@@ -123,13 +122,14 @@ T = TypeVar("T", bound=RigidShape | ChangingBody)
 
 
 def functions_of(
-    shape: Shape, count: int, *, wide: bool
+    shape: Shape, count: int, *, conducting: bool, wide: bool
 ) -> tuple[RigidShape | ChangingBody, float]:
     """Charge functions of any shape from about ``count`` panels, and its size [m].
 
     Args:
         shape: The shape.
         count: Panels of a round one; one with edges has twice as many.
+        conducting: Whether it holds no field inside.
         wide: Whether shapes that are wide get panels of a few millimetres instead.
     """
     if isinstance(shape, Layers):
@@ -137,7 +137,7 @@ def functions_of(
     if isinstance(shape, SurfaceMesh):
         sheet = 0.0 if shape.closed else shape.rest.thickness
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
-    if wide and (pieces := wide_pieces(shape)):
+    if wide and (pieces := wide_pieces(shape, conducting)):
         return in_pieces(shape, pieces)
     return rigid(shape, count * (2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1))
 
@@ -161,7 +161,7 @@ def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:
 
 
 def _wide_of(whole: Shape, count: int, _: str) -> WideBody:
-    return WideBody(panels_of(whole, count, merge=False), lambda: panels_of(whole, _COARSE))
+    return WideBody(panels_of(whole, count, merge=False), lambda: panels_of(whole, COARSE))
 
 
 def _rigid_of(whole: Shape, count: int, name: str) -> RigidShape:

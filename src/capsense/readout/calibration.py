@@ -14,6 +14,9 @@ from capsense.errors import ReadoutError
 from capsense.readout.checks import Array, Bools, Ints, finite, per_channel, require
 from capsense.readout.noise import Context, Flicker, Process
 
+_ALIKE, _FINE, _APART = 4, 30.0, 4.0
+"""So many samples at one end of what was measured were out of range, if the fit has them this many
+steps of the converter apart, and of the noise where that is less than so many times the steps."""
 _EXCESS = 2.0
 """Residuals that are so many times what noise explains are in doubt; of few samples, more."""
 _OF_NORMAL = 1.4826**2
@@ -193,7 +196,8 @@ class Calibration(LinearSensor):
     """``residual`` over what the noise of most samples, or between neighbours, and the floor
     explain, shape (K,): about 1 where the model holds."""
     doubtful: Bools
-    """Whether it is so large that a channel's figures are not to be believed, shape (K,)."""
+    """Whether it is so large, or the sensor so often at an end of its range, that a channel's
+    figures are not to be believed, shape (K,)."""
 
     @property
     def uncertainty(self) -> Array:
@@ -220,7 +224,8 @@ def calibrate(
 
     Where residuals are much larger than neighbouring samples differ, in time or in the order of
     their true values, or than most of them are, the sensor is not linear, or was out of its range,
-    or somewhere else: the channel is ``doubtful``, and a :class:`CalibrationWarning` says so.
+    or somewhere else: the channel is ``doubtful``, and a :class:`CalibrationWarning` says so. So it
+    is where several samples share the largest or smallest value though the fit has them apart.
 
     Args:
         true: Capacitances that the simulator gives at the poses and times of the recording [F],
@@ -249,6 +254,7 @@ def calibrate(
     epoch = float(t.mean())
     figures, covariance = np.zeros((k, 3)), np.zeros((k, 3, 3))
     residuals, excess = np.full((n, k), np.nan), np.zeros(k)
+    clipped = np.zeros(k, np.bool_)
     for channel in range(k):
         used = kept[:, channel]
         at, x, y = (values[used, channel] for values in (t, c, m))
@@ -260,13 +266,16 @@ def calibrate(
         fit = least_squares(columns, y, channel, at, floor)
         figures[channel, :unknowns], covariance[channel, :unknowns, :unknowns] = fit[:2]
         residuals[used, channel] = rest = y - columns @ fit[0]
-        excess[channel] = _excess(rest, x, at, fit[2])
+        noise = _white(rest, x, at)
+        excess[channel] = _excess(rest, noise, fit[2])
+        clipped[channel] = _clipped(y, y - rest, noise)
     samples = kept.sum(axis=0)
     residual = np.sqrt(np.nansum(residuals**2, axis=0) / (samples - unknowns))
     doubtful = (excess > _EXCESS * (1 + 8 / np.sqrt(samples))) & (
         residual > _SMALL * np.nanstd(np.where(kept, m, np.nan), axis=0)
     )
-    _warn(excess, doubtful)
+    doubtful |= clipped
+    _warn(excess, doubtful, clipped)
     return Calibration(
         figures[:, 0], figures[:, 1], figures[:, 2], epoch, covariance, residuals, residual,
         samples, excess, doubtful,
@@ -285,26 +294,46 @@ def _kept(flags: ArrayLike | None, values: Array) -> Bools:
     return given == 0
 
 
-def _excess(residuals: Array, true: Array, time: Array, slow: float) -> float:
-    """Residuals over what noise explains: see :attr:`Calibration.excess`.
-
-    Args:
-        residuals, true, time: Of a channel, shape (n,).
-        slow: Sum of the residuals' squares that the floor explains [F²].
-    """
+def _white(residuals: Array, true: Array, time: Array) -> float:
+    """Variance of the noise of a channel [F²], as most of its samples, shape (n,), show it."""
     orders = np.lexsort((true, time)), np.lexsort((time, true))
     white = [0.5 * float((np.diff(residuals[order]) ** 2).mean()) for order in orders]
     white.append(_OF_NORMAL * float(np.median(np.abs(residuals - np.median(residuals)))) ** 2)
-    explained = min(white) * len(residuals) + slow
+    return min(white)
+
+
+def _excess(residuals: Array, white: float, slow: float) -> float:
+    """Residuals over what noise explains: see :attr:`Calibration.excess`.
+
+    Args:
+        residuals: Of a channel, shape (n,).
+        white: Variance of its noise [F²].
+        slow: Sum of the residuals' squares that the floor explains [F²].
+    """
+    explained = white * len(residuals) + slow
     return math.sqrt(float(residuals @ residuals) / explained) if explained > 0 else 0.0
 
 
-def _warn(excess: Array, doubtful: Bools) -> None:
+def _clipped(measured: Array, fitted: Array, white: float) -> bool:
+    """Whether a channel met an end of its range: samples (n,), and the variance of its noise."""
+    levels = np.unique(measured)
+    if len(levels) < _ALIKE:
+        return False
+    grain, noise = float(np.diff(levels).min()), math.sqrt(white)
+    least = _APART * (grain if _FINE * grain < noise else grain + noise)
+    ends = (fitted[measured == level] for level in (levels[0], levels[-1]))
+    return any(len(end) >= _ALIKE and np.ptp(end) > least for end in ends)
+
+
+def _warn(excess: Array, doubtful: Bools, clipped: Bools) -> None:
     for channel in np.flatnonzero(doubtful).tolist():
+        why = f"residuals are {excess[channel]:.1f} times as large as noise explains"
+        if clipped[channel]:
+            why = "many samples share its largest or smallest value, as at the end of a range"
         warnings.warn(
-            f"channel {channel}: residuals are {excess[channel]:.1f} times as large as noise "
-            "explains, so gain, offset and their uncertainties are not to be believed; leave out "
-            "samples out of range (flags=), check poses and times, or give the flicker's floor",
+            f"channel {channel}: {why}, so gain, offset and their uncertainties are not to be "
+            "believed; leave out samples out of range (flags=), check poses and times, or give the "
+            "flicker's floor",
             CalibrationWarning,
             stacklevel=3,
         )

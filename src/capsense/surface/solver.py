@@ -49,7 +49,7 @@ class Preset:
     width: float = 2.5
     """They fade in up to so many times that."""
     wide: bool = True
-    """Whether conductors that are wide get panels of a few millimetres."""
+    """Whether bodies that are wide get panels of a few millimetres."""
 
 
 PRESETS = {
@@ -392,5 +392,4 @@ class SurfaceSolver:
     ) -> tuple[RigidShape | ChangingBody, float]:
         """Charge functions of a body from a share of the usual panels, and its size."""
         panels = round(share * self.preset.panels)
-        whole = conducting or not isinstance(shape, TriMesh) or shape.parts == 1
-        return functions_of(shape, panels, wide=self.preset.wide and whole)
+        return functions_of(shape, panels, conducting=conducting, wide=self.preset.wide)
