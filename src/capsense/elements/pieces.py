@@ -330,7 +330,7 @@ thick as these are wide a shape must be: what goes on between two near faces tak
 def wide_pieces(shape: Shape, conducting: bool) -> int:
     """About how many pieces a shape is cut into; 0 where it is not wide.
 
-    Nor are dielectrics that are thin, or meshes of several parts.
+    Nor are dielectrics that are thin, or meshes.
     """
     held = shape.__dict__.get("_pieces")
     if held is None:
@@ -339,9 +339,8 @@ def wide_pieces(shape: Shape, conducting: bool) -> int:
         if middle > WIDE:
             area = 2 * (low * middle + middle * high + high * low)
             doublings = math.ceil(math.log2(area / _PIECE**2 / _FEWEST))
-            single = not isinstance(shape, TriMesh) or shape.parts == 1
-            thick = low >= _THICK * math.sqrt(area / COARSE)
-            held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS), single and thick
+            solid = not isinstance(shape, TriMesh) and low >= _THICK * math.sqrt(area / COARSE)
+            held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS), solid
         shape.__dict__["_pieces"] = held
     return held[0] if conducting or held[1] else 0
 
@@ -375,8 +374,6 @@ class WideBody(ChangingBody):
 
     def _inside(self) -> Array32:
         panels = self._coarse()
-        if not panels.closed:
-            return np.zeros((1, 1), np.float32)
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
             free = free_block(panels)
             more = impedance(panels, free) - _HALF_SPACE * free

@@ -396,6 +396,6 @@ def report(
     if i == 0:
         largest = float(0.0)
         for t in range(doubt.shape[0]):
-            if not (doubt[t, v] <= largest):  # NaN counts as the largest
+            if largest == largest and not (doubt[t, v] <= largest):  # NaN is the largest
                 largest = doubt[t, v]
         error[e, s] = circuit.unit * largest
