@@ -58,6 +58,9 @@ def filled(kernel: Callable[..., None], out: Array, *args: Any) -> Array:
     return out
 
 
+_LOCKS: weakref.WeakSet[OneAtATime] = weakref.WeakSet()
+
+
 def _renew() -> None:
     for one in list(_LOCKS):
         one._lock = threading.RLock()
@@ -85,9 +88,6 @@ class OneAtATime:
 
     def __reduce__(self) -> tuple[type[OneAtATime], tuple[()]]:
         return OneAtATime, ()
-
-
-_LOCKS: weakref.WeakSet[OneAtATime] = weakref.WeakSet()
 
 
 class ThreadPool:

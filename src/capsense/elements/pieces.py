@@ -320,11 +320,11 @@ _PIECE = 4e-3
 """Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""
 _FEWEST, _DOUBLINGS = 5000, 3
 """Pieces of wide bodies are so many, doubled at most so often."""
-
-
 COARSE, _THICK = 1000, 2.0
 """Panels from which the impedance of the inside of wide shapes is found, and how many times as
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
+_HALF_SPACE = 2.0
+"""Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
 
 def wide_pieces(shape: Shape, conducting: bool) -> int:
@@ -343,10 +343,6 @@ def wide_pieces(shape: Shape, conducting: bool) -> int:
             held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS), solid
         shape.__dict__["_pieces"] = held
     return held[0] if conducting or held[1] else 0
-
-
-_HALF_SPACE = 2.0
-"""Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
 
 class WideBody(ChangingBody):

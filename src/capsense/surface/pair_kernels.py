@@ -58,7 +58,7 @@ def leaf_pairs(leaves, floor):
             image[j, q, 0], image[j, q, 1] = points[j, q, 0], points[j, q, 1]
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
-    flat, below, rectangles = _flat(points, soft), _flat(image, soft), _rectangles(points)
+    flat, below, rectangles = _flat(points, soft), _flat(image, soft), _rectangles(leaves)
     line, room = np.empty(shapes.shape[1], np.float32), np.empty((28, shapes.shape[1]), np.float32)
     behind = 0  # clusters of bodies before this one's
     for i in range(n):
@@ -280,10 +280,16 @@ def _arm(first, second):
 
 
 @compiled
-def _rectangles(points):
-    """The four points of clusters and :func:`rectangle_potential`'s frames, columns, (26, l)."""
+def _rectangles(leaves):
+    """The four points of clusters and :func:`rectangle_potential`'s frames, columns, (26, l).
+
+    Those of rigid bodies, which nothing asks for, are left as they are.
+    """
+    points = leaves.points
     out = np.empty((26, points.shape[0]), np.float32)
     for j in range(points.shape[0]):
+        if leaves.within[j] == 0.0:
+            continue
         long, short = _arm(points[j, 0], points[j, 2]), _arm(points[j, 0], points[j, 1])
         for i in range(3):
             for q in range(4):
