@@ -56,6 +56,26 @@ def test_gradients(device):
         assert gradient[e, b, k] == pytest.approx(difference, rel=0, abs=bound * scale)
 
 
+@pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
+def test_gradients_by_long_quaternions(device):
+    """Invariant: the longer, the smaller the gradient; the CPU takes those near 1 only."""
+    from capsense.fleet.autograd import change
+
+    if device != "cpu":
+        pytest.importorskip("warp")
+    fleet = Fleet("six_patch", BODIES[:1], 1, device=device, budget=32)
+    pose = np.array([[[0.01, 0.0, 0.06, 0.1, 0.5, 0.2, 0.8]]])
+    pose[..., 3:] /= np.linalg.norm(pose[..., 3:])
+    factor, gradients = 1.0005 if device == "cpu" else 2.0, []
+    for length in (1.0, factor):
+        given = torch.tensor(pose * np.array([1, 1, 1, *[length] * 4]), requires_grad=True)
+        change(fleet, given)[0, 0, 0, 0].backward()
+        gradients.append(given.grad.numpy()[0, 0])
+    wanted = gradients[0] / np.array([1, 1, 1, *[factor] * 4])
+    bound = 1e-9 if device == "cpu" else 1e-4
+    np.testing.assert_allclose(gradients[1], wanted, rtol=0, atol=bound * np.abs(wanted).max())
+
+
 def test_refused():
     """Errors name the thing."""
     from capsense.fleet.autograd import change

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -226,6 +230,72 @@ def test_refused(fleet):
     for wrong in (BODIES[0].shape, [BODIES[0].shape], {"ball": BODIES[0]}):
         with pytest.raises(SceneError, match=r"bodies is .*; give a Body, None, or a list of them"):
             fleet.change(0, wrong, [1])
+
+    with pytest.raises(SceneError, match=r"environments is .*; give .* such as np.flatnonzero"):
+        fleet.change(0, BODIES[0], np.ones(COUNT, bool))
+    with pytest.raises(SceneError, match=r"join: places is 0; give a list of numbers, such as"):
+        fleet.join(0)
+    with pytest.raises(SceneError, match=r"hide: places is 1; give a list of numbers"):
+        fleet.hide(0, 1)
+    with pytest.raises(SceneError, match=r"hide: 2 is none of the sensors 0 to 1"):
+        fleet.hide(2, [0])
+    with pytest.raises(SceneError, match=r"join: 3 is none of the places 0 to 2"):
+        fleet.join([0, 3])
+
+
+STEP_ANOTHER = """
+import pickle, sys
+import numpy as np
+with open(sys.argv[1], "rb") as file:
+    fleet, where = pickle.load(file)
+np.save(sys.argv[2], fleet.step(where).delta)
+"""
+
+
+@pytest.mark.e2e
+def test_a_pickled_fleet_steps_in_another_process(tmp_path):
+    """Differential: to the last bit, a soft body included; it takes new shapes there too."""
+    bodies = [*BODIES[:2], cs.Body(cs.Box((0.04, 0.02, 0.03)), material="wood")]
+    fleet, where = Fleet("six_patch", bodies, 4), poses(np.random.default_rng(20), 4, 3)
+    truth = fleet.step(where).delta
+    (tmp_path / "fleet").write_bytes(pickle.dumps((fleet, where)))
+    command = [sys.executable, "-c", STEP_ANOTHER, tmp_path / "fleet", tmp_path / "delta.npy"]
+    subprocess.run(command, check=True, timeout=120)
+    np.testing.assert_array_equal(np.load(tmp_path / "delta.npy"), truth)
+
+
+def test_a_copy_of_a_fleet_is_its_own():
+    """Invariant: it reads the same after the other has gone, and changes without it."""
+    where = poses(np.random.default_rng(21), 2, 3)
+    fleet = Fleet("six_patch", BODIES, 2)
+    truth = fleet.step(where).delta
+    other = copy.deepcopy(fleet)
+    fleet.change(0, BODIES[2])
+    np.testing.assert_array_equal(other.step(where).delta, truth)
+    other.change(0, BODIES[2])
+    np.testing.assert_array_equal(other.step(where).delta, fleet.step(where).delta)
+
+
+def test_a_check_of_joined_places_is_against_joined_ones():
+    """Invariant: two floating balls that do not touch but are wired; only presets differ."""
+    balls = [cs.Body(cs.Sphere(0.02), grounding="floating")] * 2
+    fleet = Fleet("six_patch", balls, 2, preset="standard")
+    where = np.zeros((2, 2, 7))
+    where[..., 6], where[..., 2], where[:, :, 0] = 1.0, 0.05, [-0.05, 0.05]
+    apart = fleet.step(where).delta
+    fleet.join([0, 1])
+    assert np.abs(fleet.step(where).delta - apart).max() > 0.05 * np.abs(apart).max()
+    assert fleet.check(where).worst < 0.01
+
+
+def test_time_as_an_array_of_others():
+    """A time of one element is taken as the number that it holds."""
+    where = poses(np.random.default_rng(22), 2, 3)
+    one, two = (Fleet("six_patch", BODIES, 2) for _ in range(2))
+    for each in (one, two):
+        each.use_readout("fdc1004", seed=1)
+    found = one.step(where, time=np.array([0.5])).held.code
+    np.testing.assert_array_equal(found, two.step(where, time=0.5).held.code)
 
 
 def test_numbers_and_lists_of_numpy():

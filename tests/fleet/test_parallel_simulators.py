@@ -72,6 +72,36 @@ def test_mujoco_warp(mujoco_worlds, device, bound):
     assert np.ptp(found[:, 0, 0, 0]) > 0
 
 
+PERSON = """<mujoco><worldbody>
+ <geom name="plate" type="box" size=".03 .05 .005" pos=".08 0 .1"/>
+ <body name="arm" pos="-.02 0 .05"><freejoint/>
+  <geom name="upper" type="capsule" size=".02 .05" pos="-.05 0 0" euler="0 90 0"/>
+  <body name="fore" pos=".0 0 0"><joint type="hinge" axis="0 1 0"/>
+   <geom name="lower" type="capsule" size=".018 .05" pos=".05 0 0" euler="0 90 0"/></body></body>
+ <site name="skin"/></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("grounding", ["floating", 20e-12], ids=["floating", "tied"])
+def test_parts_of_one_articulated_body_are_one_conductor(grounding):
+    """Differential: two links that touch, against an attached sensor, which finds their contact."""
+    mujoco, mjw = pytest.importorskip("mujoco"), pytest.importorskip("mujoco_warp")
+    from capsense.adapters.mujoco_warp import CapacitiveSensors
+
+    model = mujoco.MjModel.from_xml_string(PERSON)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    options = {"materials": {"*er": "human"}, "grounding": {"*er": grounding}}
+    sensors = CapacitiveSensors(
+        model, mjw.put_data(model, data, nworld=2), "skin", preset="standard", **options
+    )
+    assert sensors.sites == ("skin",)
+    there = mjw.put_data(model, data, nworld=2)
+    mjw.kinematics(mjw.put_model(model), there)
+    truth = cs.mujoco.attach(model, data, "skin", **options).read().delta
+    found = sensors.read(there).delta[:, 0]
+    assert np.abs(found - truth).max() < 1e-5 * np.abs(truth).max()
+
+
 def test_mujoco_warp_refuses(mujoco_worlds):
     """Errors name the thing."""
     from capsense.adapters.mujoco_warp import CapacitiveSensors
@@ -138,6 +168,38 @@ def test_newton(device, bound):
             assert np.abs(found[w, s] - truth).max() < bound * np.abs(truth).max()
     with pytest.raises(SceneError, match="no site fits 'nose'"):
         SensorCapacitance(model, "nose")
+
+
+def test_newton_links_of_one_robot_are_one_conductor():
+    """Differential: against one whose places are joined by hand; a body of its own is not."""
+    newton = pytest.importorskip("newton")
+    from capsense.adapters.newton import SensorCapacitance
+
+    builder = newton.ModelBuilder()
+    builder.add_site(-1, label="skin")
+    links = [builder.add_link(label=f"link{k}") for k in range(2)]
+    for k, link in enumerate(links):
+        pose = wp.transform((0.04 * k, 0.0, 0.06), wp.quat_identity())
+        builder.add_shape_sphere(link, xform=pose, radius=0.02, label=f"ball{k}")
+    joints = [
+        builder.add_joint_revolute(parent, child) for parent, child in ((-1, links[0]), links)
+    ]
+    builder.add_articulation(joints)
+    alone = builder.add_body(label="alone")
+    pose = wp.transform((-0.05, 0.0, 0.06), wp.quat_identity())
+    builder.add_shape_sphere(alone, xform=pose, radius=0.02, label="ball2")
+    model = builder.finalize(device="cpu")
+    state = model.state()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    sensor = SensorCapacitance(model, "skin", default_grounding="floating")
+    sensor.update(state)
+    ball = cs.Body(cs.Sphere(0.02), grounding="floating")
+    fleet = cs.Fleet("six_patch", [ball] * 3, 1)
+    fleet.join([0, 1])
+    poses = np.array([[[x, 0, 0.06, 0, 0, 0, 1] for x in (0.0, 0.04, -0.05)]])
+    truth = fleet.step(poses).delta
+    assert sensor.names == ("ball0", "ball1", "ball2")
+    np.testing.assert_allclose(sensor.delta, truth, rtol=0, atol=1e-6 * np.abs(truth).max())
 
 
 def fall(model, data):

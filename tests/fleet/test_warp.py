@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
+import pickle
 import re
 
 import numpy as np
@@ -326,3 +328,51 @@ def test_poses_on_the_device_that_are_not_finite(place: tuple[int, int]) -> None
         assert found.all(axis=1).tolist() == [True, False, True]
         assert not found[1].any()
     np.testing.assert_array_equal(reading.delta.numpy()[[0, 2]], good[[0, 2]])
+
+
+def test_quaternions_on_the_device_of_other_lengths() -> None:
+    """Invariant: only their direction counts; one of length 0 has none, and its reading is NaN."""
+    bodies = [cs.Body(cs.Capsule(0.01, 0.05))]
+    fleet = cs.Fleet("six_patch", bodies, 4, device="warp:cpu", budget=32)
+    where = poses(np.random.default_rng(17), 4, 1).astype(np.float32)
+    at = frames(np.random.default_rng(18), 4, 1).astype(np.float32)
+    truth = fleet.step(wp.array(where), wp.array(at)).delta.numpy().copy()
+    where[..., 3:] *= np.array([0.3, 1.002, 20.0, 0.0], np.float32)[:, None, None]
+    at[..., 3:] *= np.array([5.0, 0.998, 0.1, 1.0], np.float32)[:, None, None]
+    found = fleet.step(wp.array(where), wp.array(at)).delta.numpy()
+    np.testing.assert_allclose(found[:3], truth[:3], rtol=0, atol=3e-5 * np.abs(truth).max())
+    assert np.isnan(found[3]).all()
+
+
+def test_a_captured_step_reads_nan_after_a_new_shape() -> None:
+    """Regression: it used memory that was freed. Captured again, it reads what a step reads."""
+    if not hasattr(wp, "capture_save"):
+        pytest.skip("this version of Warp captures on GPUs only")
+    fleet = cs.Fleet("six_patch", [cs.Body(cs.Sphere(0.02))], 2, device="warp:cpu", budget=32)
+    where = wp.array(poses(np.random.default_rng(19), 2, 1), dtype=wp.float32, device="cpu")
+
+    def captured():
+        fleet.step(where)
+        with wp.ScopedCapture("cpu") as capture:
+            reading = fleet.step(where)
+        return capture.graph, reading
+
+    graph, reading = captured()
+    wp.capture_launch(graph)
+    assert np.isfinite(reading.delta.numpy()).all()
+    fleet.change(0, cs.Body(cs.Capsule(0.01, 0.043)), [1])
+    wp.capture_launch(graph)
+    assert np.isnan(reading.delta.numpy()).all()
+    truth = fleet.step(where).delta.numpy().copy()
+    assert np.isfinite(truth).all()
+    again, reading = captured()
+    wp.capture_launch(again)
+    np.testing.assert_array_equal(reading.delta.numpy(), truth)
+
+
+@pytest.mark.parametrize("make", [copy.deepcopy, pickle.dumps])
+def test_a_fleet_on_warp_is_not_copied(make) -> None:
+    """Refused by name: pointers of one process mean nothing in another."""
+    fleet = cs.Fleet("six_patch", [cs.Body(cs.Sphere(0.02))], 1, device="warp:cpu", budget=32)
+    with pytest.raises(TypeError, match=r"a fleet on 'warp:cpu' cannot be pickled or copied"):
+        make(fleet)

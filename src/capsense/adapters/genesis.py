@@ -71,7 +71,7 @@ class GenesisSensors(ParallelSensors):
         parts: list[WorldShape] = []
         poses: list[tuple[float, ...]] = []
         left: list[str] = []
-        for entity in self._solver.entities:
+        for tree, entity in enumerate(self._solver.entities):
             for link in entity.links:
                 for geom in link.geoms:
                     shape = _shape(geom, link.name, rules)
@@ -81,7 +81,8 @@ class GenesisSensors(ParallelSensors):
                     body = rules.body(shape, (link.name,))
                     where = geom.active_envs_mask
                     each = body if where is None else [body if x else None for x in where.tolist()]
-                    parts.append(WorldShape((link.name,), link.idx, each))
+                    tie = rules.tie_of((link.name,))
+                    parts.append(WorldShape((link.name,), link.idx, tree, tie.owner, each))
                     turn = np.asarray(geom.init_quat)[_ORDER]
                     poses.append((*np.asarray(geom.init_pos).tolist(), *turn.tolist()))
         warn_left_out(left, "a fleet sees no planes and terrains")

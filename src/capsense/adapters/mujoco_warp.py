@@ -43,7 +43,7 @@ class CapacitiveSensors(ParallelSensors):
     Args:
         model: The MuJoCo model that was put on the device.
         data: ``mujoco_warp.Data`` of some worlds.
-        sites: Names of the sites.
+        sites: Names of the sites, or that of one.
         design: A design, its name, or the path of its file, for all sites.
         options: What is seen and what it is made of, as for :func:`capsense.mujoco.attach`; and
             ``device``, ``preset``, ``budget``. All are those of :class:`WarpOptions`.
@@ -57,7 +57,7 @@ class CapacitiveSensors(ParallelSensors):
         self,
         model: mujoco.MjModel,
         data: Any,
-        sites: Sequence[str],
+        sites: str | Sequence[str],
         design: Design | str | Path = "six_patch",
         **options: Unpack[WarpOptions],
     ) -> None:
@@ -79,8 +79,11 @@ class CapacitiveSensors(ParallelSensors):
             body = Body(solid.shape, Pose(), solid.material, solid.tie.grounding)
             geoms.append(geom)
             own = int(model.geom_bodyid[geom])
-            parts.append(WorldShape((solid.label,), own if own > 0 else -1, body))
+            root = int(model.body_rootid[own])
+            link, tree = (number if number > 0 else -1 for number in (own, root))
+            parts.append(WorldShape((solid.label,), link, tree, solid.tie.owner, body))
         warn_left_out(flat, "a fleet sees no planes and terrains")
+        sites = [sites] if isinstance(sites, str) else list(sites)
         numbers = [find_site(model, site) for site in sites]
         carriers = [
             (name, int(model.site_bodyid[k])) for name, k in zip(sites, numbers, strict=True)

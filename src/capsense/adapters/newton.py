@@ -9,6 +9,8 @@ from typing import Any, Unpack
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from capsense.adapters.meshes import primitive, solid_mesh
 from capsense.adapters.parallel import (
@@ -63,13 +65,16 @@ class SensorCapacitance(ParallelSensors):
         parts: list[WorldShape] = []
         columns: list[int] = []
         left: list[str] = []
-        carrier = model.shape_body.numpy()
+        carrier, trees = model.shape_body.numpy(), _trees(model)
         for column in np.flatnonzero(~site).tolist():
             if not reader.known(table[0, column]):
                 left.append(labels[column])
                 continue
             bodies = [reader.body(k, labels[column]) for k in table[:, column].tolist()]
-            parts.append(WorldShape((labels[column],), int(carrier[table[0, column]]), bodies))
+            link, label = int(carrier[table[0, column]]), labels[column]
+            tree = int(trees[link]) if link >= 0 else -1
+            owner = rules.tie_of((label,)).owner
+            parts.append(WorldShape((label,), link, tree, owner, bodies))
             columns.append(column)
         warn_left_out(left, "a fleet sees no planes, height fields, cones and Gaussians")
         known = np.flatnonzero(site)
@@ -123,6 +128,17 @@ def _by_world(model: Any) -> NDArray[np.int64]:
                 "shapes in the same order in all worlds, as ModelBuilder.replicate makes them"
             )
     return np.array([np.concatenate([row, shared]) for row in rows], dtype=np.int64)
+
+
+def _trees(model: Any) -> NDArray[np.integer]:
+    """Bodies that hang together by joints have the same number, shape (bodies,)."""
+    parent, child = model.joint_parent.numpy(), model.joint_child.numpy()
+    between = parent >= 0
+    n = model.body_count
+    graph = coo_array((np.ones(between.sum()), (parent[between], child[between])), (n, n))
+    _, number = connected_components(graph, directed=False)
+    found: NDArray[np.integer] = number
+    return found
 
 
 class _Reader:

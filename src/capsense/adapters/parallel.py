@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from capsense.adapters.rules import AttachOptions, Names, Rules
 from capsense.design.model import Design
+from capsense.elements.matter import matter_of
 from capsense.errors import SceneError, listed
 from capsense.fleet import Fleet, FleetReading, Preset
 from capsense.scene import Body
@@ -43,12 +45,19 @@ class WorldShape:
     """The names it answers to."""
     body: int
     """The simulator's body that carries it, in the first world; -1 for the world itself."""
+    tree: int
+    """What hangs together by joints has the same number; -1 for what is fixed to the world."""
+    owner: str
+    """The rule that says what ties it to ground, see :class:`~capsense.adapters.rules.Tie`."""
     bodies: Body | Sequence[Body | None]
     """What it is: one for all worlds, or one for each, None where there is none."""
 
 
 class ParallelSensors:
     """Sensors on several sites of a robot, in all worlds of a simulator.
+
+    Conductors that hang together by joints and float, or have a capacitance to ground, by one rule
+    are one conductor, whether they touch or not. A capacitance is shared out among all of its rule.
 
     Args:
         parts: Shapes of a world.
@@ -88,9 +97,12 @@ class ParallelSensors:
         self.names = tuple(part.names[-1] for part in seen)
         self.sites = tuple(name for name, _ in sites)
         """Names of the shapes that are seen, and of the sites, in order."""
-        for place, part in enumerate(seen):
-            if not isinstance(part.bodies, Body):
-                self.fleet.change(place, part.bodies)
+        shared, groups = _connected(seen, self.fleet.excitation_frequency)
+        for place, bodies in enumerate(shared):
+            if bodies is not first[place]:
+                self.fleet.change(place, bodies)
+        for group in groups:
+            self.fleet.join(group)
         if rules.exclude_own:
             for sensor, (_, own) in enumerate(sites):
                 mine = [k for k, part in enumerate(seen) if part.body == own >= 0]
@@ -118,6 +130,42 @@ class ParallelSensors:
         if self.fleet.device == "cpu":
             poses, frames = poses.numpy(), frames.numpy()
         return self.fleet.step(poses, frames, time=time)
+
+
+def _connected(
+    parts: Sequence[WorldShape], frequency: float
+) -> tuple[list[Body | Sequence[Body | None]], list[list[int]]]:
+    """The bodies of parts with their shares of capacitances, and which parts are one conductor."""
+    free = [k for k, part in enumerate(parts) if _is_free(_some_body(part), frequency)]
+    count = Counter(parts[k].owner for k in free)
+    out = [part.bodies for part in parts]
+    groups: dict[tuple[int, str], list[int]] = defaultdict(list)
+    for k in free:
+        tree, owner = parts[k].tree, parts[k].owner
+        out[k] = _with_share(out[k], count[owner])
+        if tree >= 0:
+            groups[tree, owner].append(k)
+    return out, [group for group in groups.values() if len(group) > 1]
+
+
+def _is_free(body: Body, frequency: float) -> bool:
+    """Whether a body is a conductor that is not simply grounded."""
+    return body.grounding != "grounded" and bool(matter_of([body], frequency).conducting[0])
+
+
+def _with_share(
+    bodies: Body | Sequence[Body | None], count: int
+) -> Body | Sequence[Body | None]:  # fmt: skip
+    """Bodies with one of ``count`` equal shares of their capacitance to ground."""
+    some = [bodies] if isinstance(bodies, Body) else bodies
+    made = {
+        id(b): Body(b.shape, b.pose, b.material, b.grounding / count, b.name)
+        for b in some
+        if b is not None and not isinstance(b.grounding, str)
+    }
+    if isinstance(bodies, Body):
+        return made.get(id(bodies), bodies)
+    return [made.get(id(b), b) for b in bodies]
 
 
 def _some_body(part: WorldShape) -> Body:

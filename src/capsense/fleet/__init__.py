@@ -18,6 +18,7 @@ from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.fleet.bodies import BodyTable, FleetCheck, FleetReading, on_device
+from capsense.fleet.check import checked_poses, compare, require_no_gradient
 from capsense.fleet.cpu import CpuCore
 from capsense.readout import Readout
 from capsense.readout.conversions import SideBySide
@@ -31,10 +32,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 __all__ = ["Fleet", "FleetCheck", "FleetReading"]
-
-_QUATERNION = 1e-3
-"""Quaternions may be longer or shorter than 1 by so much; they are made 1 long."""
-
 
 _PANELS = 5
 """Panels of a shape for each cluster that a body is cut into on Warp."""
@@ -105,7 +102,7 @@ class Fleet:
         field = load_or_build(self.design, default_settings(self.design))
         chosen_preset = PRESETS[preset]
         finer: dict[Preset, Preset] = {"learning": "standard", "standard": "fine"}
-        self._finer = finer.get(preset) if device == "cpu" else "fine"
+        self.finer = finer.get(preset) if device == "cpu" else "fine"
         if device != "cpu":
             chosen_preset = replace(chosen_preset, panels=_PANELS * budget, wide=False)
         self._solver = SurfaceSolver(
@@ -116,13 +113,22 @@ class Fleet:
         n = self._terminals.electrodes
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
-        self._table = BodyTable(self._solver, count, len(bodies), sensors)
+        self.excitation_frequency = excitation_frequency
+        self.table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
         self._one = OneAtATime()
-        self._cpu = CpuCore(self._solver, self._terminals, self._table)
+        self._cpu = CpuCore(self._solver, self._terminals, self.table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
             self.change(place, body)
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._warp is not None:
+            raise TypeError(
+                f"a fleet on {self.device!r} cannot be pickled or copied: its arrays are those of "
+                "one process and device; make another with cs.Fleet(…) where it is needed"
+            )
+        return vars(self)
 
     def _on_warp(self, budget: int) -> WarpCore:
         try:
@@ -162,7 +168,7 @@ class Fleet:
                 is of a shape that is not rigid, or no conductor in a place that is joined.
         """
         with self._one:
-            self._table.change(place, bodies, environments)
+            self.table.change(place, bodies, environments)
             self._take_over()
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
@@ -175,7 +181,7 @@ class Fleet:
         Raises:
             SceneError: There is no such sensor or place.
         """
-        self._table.hide(sensor, places)
+        self.table.hide(sensor, places)
         self._take_over()
 
     def join(self, places: Sequence[int]) -> None:
@@ -191,12 +197,12 @@ class Fleet:
         Raises:
             SceneError: There is no such place, or something else than a conductor stands there.
         """
-        self._table.join(places)
+        self.table.join(places)
         self._take_over()
 
     def _take_over(self) -> None:
         if self._warp is not None:
-            self._warp.take(self._table.bodies, cast("list[Any]", self._table.shapes))
+            self._warp.take(self.table.bodies, cast("list[Any]", self.table.shapes))
 
     def use_readout(self, readout: Readout | str | None, *, seed: int = 0) -> None:
         """Read every sensor through a chip of its own from now on.
@@ -261,14 +267,16 @@ class Fleet:
             reading = self.solved(poses, sensors, jacobian=jacobian)
             if self._chips is None:
                 return reading
-            matrix = reading.capacitance if self._warp is None else reading.delta
+            matrix = reading.delta
+            if self._warp is None:
+                matrix, time = reading.capacitance, np.asarray(time, float).item()
             return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
     def solved(
         self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
     ) -> FleetReading:
         """The same as :meth:`step`, without chips and their time."""
-        if jacobian and self._table.lossy:
+        if jacobian and self.table.lossy:
             raise SceneError(
                 "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
                 "them a conductor's or a lossless material"
@@ -278,11 +286,14 @@ class Fleet:
             if sensors is None:
                 sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), shapes[1])
             return self._cpu.step(
-                _checked("poses", poses, shapes[0]), _checked("sensors", sensors, shapes[1]),
+                checked_poses("poses", poses, shapes[0]),
+                checked_poses("sensors", sensors, shapes[1]),
                 jacobian,
-            )  # fmt: skip
+            )
+        for name, each in (("poses", poses), ("sensors", sensors)):
+            require_no_gradient(name, each)
         where, at = (
-            each if each is None or on_device(each) else _checked(name, each, shape)
+            each if each is None or on_device(each) else checked_poses(name, each, shape)
             for name, each, shape in zip(
                 ("poses", "sensors"), (poses, sensors), shapes, strict=True
             )
@@ -304,11 +315,14 @@ class Fleet:
     ) -> FleetCheck:
         """Compare some environments with a ``Simulator`` of a finer preset.
 
-        That is ``"fine"``; of a fleet on the CPU with the preset ``"learning"``, ``"standard"``.
+        That is ``"fine"``; of a fleet on the CPU with the preset ``"learning"``, ``"standard"``. A
+        simulator joins the conductors that touch each other, and no others. If places are joined,
+        the comparison is with a finer fleet on the CPU, where the same places are. On Warp, the
+        arrays of the last reading are written anew.
 
         Args:
             poses: As :meth:`step` takes them, on the host.
-            sensors: As :meth:`step` takes them, on the host.
+            sensors: The same of the sensors.
             samples: How many environments, drawn at random; all, where there are no more.
             seed: Of the draw.
 
@@ -317,64 +331,4 @@ class Fleet:
             ValueError: The fleet has the preset ``"fine"``, and there is no finer one.
             SolveError: As by :meth:`step`.
         """
-        if self._finer is None:
-            raise ValueError(
-                'the fleet has preset "fine", and there is no finer one to check it against; '
-                'make one with preset="standard"'
-            )
-        whole = as_whole(samples)
-        if whole is None or whole < 1:
-            raise SceneError(f"samples is {shorten(samples)}; give a whole number from 1")
-        e, s, b = self.count, self.sensors, self.places
-        where = _checked("poses", poses, (e, b, 7))
-        at = None if sensors is None else _checked("sensors", sensors, (e, s, 7))
-        delta = self.solved(where, at).delta
-        found = delta if self._warp is None else delta.numpy()
-        drawn = np.random.default_rng(seed).permutation(e)[:whole]
-        simulator = Simulator(
-            self.design, excitation_frequency=self._solver.excitation_frequency, preset=self._finer
-        )
-        errors = np.empty((len(drawn), s, *self.baseline.shape))
-        contact = []
-        for row, k in enumerate(drawn.tolist()):
-            for j in range(s):
-                frame = Pose() if at is None else Pose(at[k, j, :3], at[k, j, 3:])
-                hidden = self._table.bodies.hidden[j]
-                scene = Scene(
-                    body.moved(frame.inverse() @ Pose(pose[:3], pose[3:]))
-                    for body, pose, out in zip(self._table.given[k], where[k], hidden, strict=True)
-                    if body is not None and not out
-                )
-                reading = simulator.step(scene)
-                truth = reading.delta
-                if reading.stats.solver_error >= np.abs(reading.capacitance).max():
-                    contact.append((k, j))
-                errors[row, j] = (found[k, j] - truth) / max(np.abs(truth).max(), 1e-18)
-        row, j = np.unravel_index(np.abs(errors).max(axis=(2, 3)).argmax(), errors.shape[:2])
-        return FleetCheck(
-            tuple(drawn.tolist()), float(np.sqrt((errors**2).mean())), float(np.abs(errors).max()),
-            (int(drawn[row]), int(j)), tuple(contact),
-        )  # fmt: skip
-
-
-def _checked(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    if getattr(values, "requires_grad", False):
-        raise SceneError(
-            f"{what} is a tensor that requires gradients, which step does not follow; give "
-            f"{what}.detach(), or write capsense.fleet.autograd.change(fleet, poses)"
-        )
-    poses = np.array(values, float, order="C")
-    if poses.shape != shape:
-        raise SceneError(f"{what} has shape {poses.shape}; give {shape}")
-    if not np.isfinite(poses).all():
-        place = tuple(np.argwhere(~np.isfinite(poses))[0].tolist())
-        raise SceneError(f"{what}{list(place)} is {poses[place]}; poses must be finite")
-    length = np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
-    if (np.abs(length - 1.0) > _QUATERNION).any():
-        place = tuple(np.argwhere(np.abs(length - 1.0) > _QUATERNION)[0].tolist())
-        raise SceneError(
-            f"the quaternion of {what}{list(place[:-1])} is {length[place]:g} long; give (x, y, z, "
-            "w) of length 1"
-        )
-    poses[..., 3:] /= length
-    return poses
+        return compare(self, poses, sensors, samples, seed)

@@ -14,8 +14,8 @@ from capsense.fleet import Fleet
 def change(fleet: Fleet, poses: torch.Tensor, sensors: torch.Tensor | None = None) -> torch.Tensor:
     """Change of the matrices by the bodies, with gradients by the poses of the bodies.
 
-    Gradients are those of the solver's own adjoint, not of differences. That by a quaternion is
-    within the unit sphere: a step along it turns the body and nothing else. There are no second
+    Gradients are those of the solver's own adjoint, not of differences. Quaternions count by their
+    direction: a step along the gradient turns the body and nothing else. There are no second
     derivatives; PyTorch refuses them. With a fleet on Warp nothing leaves the device.
 
     Args:
@@ -76,13 +76,13 @@ class _Change(torch.autograd.Function):
             turn = _matrices(sensors.to(slope))
             slope = torch.einsum("eskr,esbqr->esbqk", turn, slope)
         along, about = slope.sum(dim=1).unbind(dim=2)
-        quaternion = torch.nn.functional.normalize(poses.detach()[..., 3:], dim=-1)
-        v, w = quaternion[..., :3], quaternion[..., 3:]
+        length = torch.linalg.vector_norm(poses.detach()[..., 3:], dim=-1, keepdim=True)
+        v, w = (poses.detach()[..., 3:] / length).split([3, 1], dim=-1)
         # a turn by a small vector t takes q to q + (t, 0) q / 2
         turned = torch.cat(
             [w * about + torch.linalg.cross(about, v), -(about * v).sum(dim=-1, keepdim=True)], -1
         )
-        return torch.cat([along, 2.0 * turned], dim=-1), None, None
+        return torch.cat([along, 2.0 * turned / length], dim=-1), None, None
 
 
 def _matrices(poses: torch.Tensor) -> torch.Tensor:

@@ -120,6 +120,19 @@ class BodyTable:
         self.given = np.full(shape, None, object)
         """The bodies themselves, shape (e, b)."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is good in one process only: numbers of objects, and pointers to arrays."""
+        soft = [kind[1] for kind in self._kinds]
+        bodies = self.bodies._replace(shapes=np.zeros(0, BODY))
+        return {**vars(self), "_kinds": soft, "bodies": bodies}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        kinds = list(zip(self.shapes, state["_kinds"], strict=True))
+        self._kinds = {(id(shape), soft): k for k, (shape, soft) in enumerate(kinds)}
+        records = [_record(shape, soft) for shape, soft in kinds]
+        self.bodies = self.bodies._replace(shapes=np.concatenate([np.zeros(0, BODY), *records]))
+
     def change(
         self,
         place: int,
@@ -137,7 +150,8 @@ class BodyTable:
             rows.min() >= 0 and rows.max() < self.count
         )):  # fmt: skip
             raise SceneError(
-                f"environments is {environments!r}; give numbers from 0 to {self.count - 1}"
+                f"environments is {shorten(environments)}; give numbers from 0 to {self.count - 1}"
+                + (", such as np.flatnonzero(mask)" if rows.dtype.kind == "b" else "")
             )
         each: list[Body | None]
         if isinstance(bodies, Body) or bodies is None:
@@ -160,23 +174,17 @@ class BodyTable:
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """See :meth:`Fleet.hide`."""
-        for what, known, given in (
-            ("sensors", self.sensors, [sensor]), ("places", self.places, places),
-        ):  # fmt: skip
-            for number in given:
-                if number not in range(known):
-                    raise SceneError(f"hide: {number!r} is none of the {what} 0 to {known - 1}")
-        self.bodies.hidden[sensor] = np.isin(np.arange(self.places), places)
+        _numbers("hide", "sensors", [sensor], self.sensors)
+        known = _numbers("hide", "places", places, self.places)
+        self.bodies.hidden[sensor] = np.isin(np.arange(self.places), known)
 
     def join(self, places: Sequence[int]) -> None:
         """See :meth:`Fleet.join`."""
-        group = self.bodies.group
-        for number in places:
-            if number not in range(self.places):
-                raise SceneError(f"join: {number!r} is none of the places 0 to {self.places - 1}")
+        group, known = self.bodies.group, _numbers("join", "places", places, self.places)
+        for number in known:
             _require_conductors(self.given[:, number].tolist(), self._solver.excitation_frequency)
-        for number in places:
-            group[group == group[number]] = group[places[0]]
+        for number in known:
+            group[group == group[number]] = group[known[0]]
 
     @property
     def lossy(self) -> bool:
@@ -208,15 +216,31 @@ class BodyTable:
         """The number of a shape in the table, which it joins if it is new."""
         found = self._kinds.setdefault((id(shape), soft), len(self._kinds))
         if found == len(self.shapes):
-            record = np.array([shape.record], BODY)
-            if soft and (block := shape.impedance) is not None:
-                record["impedance"], record["known"] = block.ctypes.data, len(block)
             self.shapes.append(shape)
             self.bodies = self.bodies._replace(
-                shapes=np.concatenate([self.bodies.shapes, record]),
+                shapes=np.concatenate([self.bodies.shapes, _record(shape, soft)]),
                 radius=np.append(self.bodies.radius, shape.radius),
             )
         return found
+
+
+def _record(shape: RigidShape | ChangingBody, soft: bool) -> NDArray[Any]:
+    """What the kernels take of a shape, with its inside if it is soft; points to its arrays."""
+    record = np.array([shape.record], BODY)
+    if soft and (block := shape.impedance) is not None:
+        record["impedance"], record["known"] = block.ctypes.data, len(block)
+    return record
+
+
+def _numbers(doing: str, what: str, given: Sequence[int], known: int) -> list[int]:
+    """The numbers that are given, each one of those that are known."""
+    if not isinstance(given, Iterable):
+        raise SceneError(f"{doing}: {what} is {given!r}; give a list of numbers, such as [{given}]")
+    numbers = list(given)
+    for number in numbers:
+        if (whole := as_whole(number)) is None or not 0 <= whole < known:
+            raise SceneError(f"{doing}: {number!r} is none of the {what} 0 to {known - 1}")
+    return numbers
 
 
 def _require_conductors(bodies: Sequence[Body | None], frequency: float) -> None:

@@ -42,6 +42,8 @@ class WarpCore:
     ) -> None:  # fmt: skip
         self.device, self.counts, self._taken = device, counts, 0
         self._slopes: list[Any] | None = None
+        self.shapes: Any = None
+        self._before: list[Any] = []
         self.green, self.circuit = _response(solver, device), _circuit(terminals, device)
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         environments, places, sensors = counts
@@ -92,7 +94,19 @@ class WarpCore:
         return out
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
-        """Take over what stands where, in the memory that there is; new shapes take new memory."""
+        """Take over what stands where, in the memory that there is; new shapes take new memory.
+
+        What was there before stays, for steps that were captured: these read NaN from then on.
+        """
+        if len(bodies.shapes) != self._taken:
+            if self._taken:
+                before = self.shapes, self.places.choice, self.circuit.rest, self.circuit.empty
+                self._before.append(before)
+                self.places.choice = wp.clone(before[1])
+                self.circuit.rest, self.circuit.empty = map(wp.clone, before[2:])
+                for matrix in before[2:]:
+                    matrix.fill_(np.nan)
+            self.shapes, self._taken = _shapes(shapes, bodies, self._array), len(bodies.shapes)
         for name in ("choice", "neutral", "hidden", "group"):
             getattr(self.places, name).assign(getattr(bodies, name).astype(np.int32))
         for name in ("scale", "slack"):
@@ -100,8 +114,6 @@ class WarpCore:
         for name in ("softness", "tie"):
             both = getattr(bodies, name).astype(np.complex64).view(np.float32)
             getattr(self.places, name).assign(both.reshape(*bodies.scale.shape, 2))
-        if len(bodies.shapes) != self._taken:
-            self.shapes, self._taken = _shapes(shapes, bodies, self._array), len(bodies.shapes)
 
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)

@@ -143,6 +143,13 @@ def _off(p: wp.vec3, low: wp.vec3, high: wp.vec3):
 
 
 @wp.func
+def _unit(pose: wp.transform):
+    """The pose with a quaternion of length 1; of length 0, it is not finite, nor is the reading."""
+    q = wp.transform_get_rotation(pose)
+    return wp.transform(wp.transform_get_translation(pose), q / wp.length(q))
+
+
+@wp.func
 def _need(
     shapes: Shapes, green: Response, at: wp.transform, scale: float, first: int, node: int
 ):  # fmt: skip
@@ -181,7 +188,7 @@ def choose(
     cut.ends[o, v] = 0.0
     if u < 0 or places.hidden[s, b] != 0:
         return
-    at = wp.transform_multiply(wp.transform_inverse(sensors[e, s]), bodies[e, b])
+    at = wp.transform_multiply(wp.transform_inverse(_unit(sensors[e, s])), _unit(bodies[e, b]))
     slack = places.slack[e, b]
     off = wp.transform_point(wp.transform_inverse(at), green.middle)
     moved = wp.transform_vector(at, wp.min(wp.max(off, -slack), slack))
