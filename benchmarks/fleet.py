@@ -42,6 +42,12 @@ import capsense as cs
 Array = NDArray[np.float64]
 PRIMITIVES = cs.Box, cs.Sphere, cs.Capsule, cs.Cylinder, cs.Ellipsoid
 FINGER = cs.Body(cs.Capsule(0.008, 0.06), material="human", name="finger")
+AROUND = [
+    cs.Body(cs.Capsule(0.04, 0.25), material="human", name="forearm"),
+    cs.Body(cs.Ellipsoid((0.1, 0.15, 0.07)), material="human", name="chest"),
+    cs.Body(cs.Box((0.4, 0.15, 0.02)), material="steel", name="shelf"),
+]
+"""What else stands in a place of its own in the rows of four bodies, 0.1 to 0.15 m in front."""
 STEPS = 9
 PRESETS = "standard", "fine"
 """Presets of ``Simulator`` that Warp is compared with."""
@@ -55,6 +61,16 @@ def fingers(count: int, rng: np.random.Generator) -> Array:
     place = rng.uniform([-0.08, -0.05, 0.015], [0.08, 0.05, 0.1], (count, 3))
     place[:, 2] += low
     return np.concatenate([place, turn], axis=1)[:, None]
+
+
+def crowds(count: int, rng: np.random.Generator) -> Array:
+    """Poses of the finger and of what stands around it, shape (count, 4, 7)."""
+    others = np.zeros((count, len(AROUND), 7))
+    others[..., 6] = 1.0
+    others[:, 0, 3:] = [0.0, 0.5**0.5, 0.0, 0.5**0.5]
+    others[..., :3] = [[0.0, 0.1, 0.14], [0.0, 0.0, 0.22], [0.0, -0.18, 0.13]]
+    others[..., :3] += rng.uniform(-0.01, 0.01, (count, 1, 3))
+    return np.concatenate([fingers(count, rng), others], axis=1)
 
 
 def errors(options: dict[str, Any], scenes: list[ReferenceScene]) -> tuple[Array, Array, Array]:
@@ -75,11 +91,12 @@ def errors(options: dict[str, Any], scenes: list[ReferenceScene]) -> tuple[Array
     return found[single].ravel(), found.ravel(), apart
 
 
-def rate(options: dict[str, Any], count: int) -> tuple[float, float]:
+def rate(options: dict[str, Any], count: int, crowd: bool) -> tuple[float, float]:
     """Medians of solves a second by the clock, and of the processor's time for one [s]."""
-    fleet = cs.Fleet(DESIGN, [FINGER], count, **options)
+    fleet = cs.Fleet(DESIGN, [FINGER, *AROUND] if crowd else [FINGER], count, **options)
     rng = np.random.default_rng(count)
-    poses: list[Any] = [fingers(count, rng) for _ in range(STEPS)]
+    drawn = crowds if crowd else fingers
+    poses: list[Any] = [drawn(count, rng) for _ in range(STEPS)]
     wait = lambda: None  # noqa: E731
     if options["device"] != "cpu":
         import warp as wp
@@ -98,15 +115,16 @@ def rate(options: dict[str, Any], count: int) -> tuple[float, float]:
     return 1.0 / float(clock), float(busy)
 
 
-def memory(options: dict[str, Any]) -> tuple[int, int]:
-    """Bytes that a sensor with one body takes on Warp, without gradients and with them."""
+def memory(options: dict[str, Any], crowd: bool) -> tuple[int, int]:
+    """Bytes that a sensor takes on Warp, without gradients and with them."""
     from capsense.fleet.warp_cut import WarpCut
     from capsense.fleet.warp_solve import Left
 
     sizes = []
     for count in (8, 16):
-        fleet = cs.Fleet(DESIGN, [FINGER], count, **options)
-        fleet.step(fingers(count, np.random.default_rng(0)), jacobian=True)
+        fleet = cs.Fleet(DESIGN, [FINGER, *AROUND] if crowd else [FINGER], count, **options)
+        drawn = crowds if crowd else fingers
+        fleet.step(drawn(count, np.random.default_rng(0)), jacobian=True)
         core = fleet._warp
         parts = [
             list(vars(core).values()),
@@ -140,8 +158,13 @@ def main() -> int:
             f"{np.sqrt((e**2).mean()):.2f} {np.abs(e).max():.2f}" for e in (single, every)
         )
         if options.device != "cpu":
-            plain, whole = memory(chosen)
-            print(f"{value!s:10} {plain:,} bytes a sensor, {whole:,} with gradients")
+            for crowd in (False, True):
+                plain, whole = memory(chosen, crowd)
+                bodies = 1 + crowd * len(AROUND)
+                print(
+                    f"{value!s:10} bodies: {bodies}, {plain:,} bytes a sensor, {whole:,} with "
+                    "gradients"
+                )
             for preset, entries in zip(PRESETS, apart, strict=True):
                 worst = np.abs(entries).max(axis=(1, 2))
                 print(
@@ -150,10 +173,14 @@ def main() -> int:
                     "within 1 %"
                 )
         for count in options.counts:
-            solves, busy = rate(chosen, count)
+            solves, busy = rate(chosen, count, crowd=False)
             print(
                 f"{value!s:10} {count:12} {solves:10,.0f} {1e6 * busy:10,.0f}   {told}", flush=True
             )
+        solves, busy = rate(chosen, options.counts[0], crowd=True)
+        print(
+            f"{value!s:10} {options.counts[0]:12} {solves:10,.0f} {1e6 * busy:10,.0f}   four bodies"
+        )
     return 0
 
 

@@ -6,6 +6,7 @@ import copy
 import importlib
 import pickle
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -368,6 +369,19 @@ def test_a_captured_step_reads_nan_after_a_new_shape() -> None:
     again, reading = captured()
     wp.capture_launch(again)
     np.testing.assert_array_equal(reading.delta.numpy(), truth)
+
+
+def test_wide_bodies_are_warned_of_once() -> None:
+    """A warning names the place and the fix; on the CPU, which knows wide bodies, there is none."""
+    table = cs.Body(cs.Box((0.5, 0.4, 0.02)))
+    with pytest.warns(UserWarning, match=r'place 1: 0.4 m is wide .*take device="cpu"') as told:
+        fleet = cs.Fleet("six_patch", [BODIES[0], table], 1, device="warp:cpu", budget=32)
+        fleet.change(0, table)
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cs.Fleet("six_patch", [table], 1)
+        cs.Fleet("six_patch", [cs.Body(cs.Capsule(0.04, 0.4))], 1, device="warp:cpu", budget=32)
 
 
 @pytest.mark.parametrize("make", [copy.deepcopy, pickle.dumps])

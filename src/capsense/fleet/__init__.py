@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from capsense._thread_pool import OneAtATime
 from capsense._validate import as_whole, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
+from capsense.elements.pieces import WIDE
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
@@ -116,7 +118,7 @@ class Fleet:
         self.excitation_frequency = excitation_frequency
         self.table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
-        self._one = OneAtATime()
+        self._one, self._warned = OneAtATime(), False
         self._cpu = CpuCore(self._solver, self._terminals, self.table)
         self._warp = None if device == "cpu" else self._on_warp(budget)
         for place, body in enumerate(bodies):
@@ -170,6 +172,21 @@ class Fleet:
         with self._one:
             self.table.change(place, bodies, environments)
             self._take_over()
+        if self._warp is not None and not self._warned:
+            self._warn_of_wide(place)
+
+    def _warn_of_wide(self, place: int) -> None:
+        for body in {id(b): b for b in self.table.given[:, place] if b is not None}.values():
+            middle = float(np.sort(np.ptp(body.shape.bounds(), axis=0))[1])
+            if middle > WIDE:
+                self._warned = True
+                warnings.warn(
+                    f"place {place}: {middle:.2g} m is wide for a body on Warp, which is cut into "
+                    "few clusters: near the sensor readings are tens of per cent off. Compare with "
+                    'fleet.check(poses), or take device="cpu". This is said once',
+                    stacklevel=3,
+                )
+                return
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """Leave places out of what a sensor sees, such as the link that carries it.
