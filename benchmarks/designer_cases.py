@@ -79,6 +79,8 @@ COVERS: dict[str, dict[str, Any]] = {
     "disc": {"shape": "cylinder", "radius": 0.020, "length": 0.004, "z": 0.002},
     "dome": {"shape": "stl", "file": "dome.stl", "unit": "mm"},
 }
+FINER = {"pair": 0.35, "grid": 0.5}
+"""Size of the finer panels over that of the default: what memory allows."""
 ENTRIES = {"pair": [(0, 0), (0, 1)], "grid": [(0, 0), (5, 5), (0, 1), (5, 6), (0, 2), (5, 10)]}
 
 
@@ -92,7 +94,7 @@ def matrix(design: cs.Design, scale: float) -> tuple[np.ndarray, int]:
 def compare(name: str, data: dict[str, Any]) -> None:
     """Default panels beside finer ones."""
     design = parse_design(data)
-    (default, few), (finer, many) = matrix(design, 1.0), matrix(design, 0.5)
+    (default, few), (finer, many) = matrix(design, 1.0), matrix(design, FINER[name])
     print(f"{data['name']}: {few} and {many} panels")
     for i, j in ENTRIES[name]:
         a, b = default[i, j], finer[i, j]

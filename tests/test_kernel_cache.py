@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import capsense
+from capsense import _jit, _kernel_cache
 
 
 def _path() -> str:
@@ -53,6 +54,27 @@ def test_a_container_without_a_writable_place(option: list[str]) -> None:
     folder = Path(found.stdout.strip())
     assert folder.name.startswith("capsense-kernels-")
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_is_said_of_a_first_use(kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only where kernels can be kept is it once."""
+    told: list[str] = []
+
+    class Timer:
+        def __init__(self, _: float, __: object, texts: list[str]) -> None:
+            told.extend(texts)
+
+        def start(self) -> None: ...
+        def cancel(self) -> None: ...
+
+    monkeypatch.setattr(_jit.threading, "Timer", Timer)
+    monkeypatch.setattr(_jit, "_done", False)
+    monkeypatch.setattr(_kernel_cache, "kept", kept)
+    with _jit.first_use():
+        pass
+    assert ("once, and is then kept" in told[0]) == kept
+    assert ("in each process" in told[0]) != kept
 
 
 CODE = """

@@ -20,6 +20,8 @@ from numba import njit
 from numba.core.caching import FunctionCache
 from numba.core.compiler_lock import global_compiler_lock
 
+from capsense import _kernel_cache
+
 _log = logging.getLogger("capsense")
 
 WAIT = 2.0
@@ -100,7 +102,7 @@ pasted = njit(inline="always")
 
 @contextmanager
 def first_use() -> Iterator[None]:
-    """Say, if the first use in a process takes long, that kernels are compiled and then kept.
+    """Say, if the first use in a process takes long, that kernels are compiled.
 
     It is a warning of the logger ``capsense``, which goes to standard error unless told otherwise.
     """
@@ -108,10 +110,9 @@ def first_use() -> Iterator[None]:
     if _done:
         yield
         return
-    timer = threading.Timer(
-        WAIT, _log.warning,
-        ["compiling the solver for this processor; it takes half a minute once, and is then kept"],
-    )  # fmt: skip
+    often = "once, and is then kept" if _kernel_cache.kept else "in each process"
+    told = f"compiling the solver for this processor; it takes half a minute {often}"
+    timer = threading.Timer(WAIT, _log.warning, [told])
     timer.daemon = True
     timer.start()
     try:

@@ -10,6 +10,10 @@ _MEMORY = "/dev/shm"
 """A file system in memory; containers have it where nothing else can be written."""
 
 
+kept = True
+"""Whether what this process compiles is there for the next one."""
+
+
 def ensure_place(package: Path) -> None:
     """Give Numba a folder for this process alone if it could write its files nowhere.
 
@@ -21,6 +25,8 @@ def ensure_place(package: Path) -> None:
     given = os.environ.get("NUMBA_CACHE_DIR")
     if any(map(_writable, [*([Path(given)] if given else []), package, home / "numba"])):
         return
+    global kept
+    kept = False
     import logging
 
     logging.getLogger("capsense").warning(

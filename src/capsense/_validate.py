@@ -4,7 +4,9 @@ what counts as a whole number or a number anywhere."""
 from __future__ import annotations
 
 import difflib
+import errno
 import math
+import stat
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
@@ -89,13 +91,25 @@ def read_toml(
         CapSenseError: An ``error`` that names the path, if it is missing, unreadable or not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_file(path).decode())
     except FileNotFoundError:
         raise error(f"there is no {what} file {path}; check the path{hint}") from None
     except OSError as cause:
         raise error(f"{path} cannot be read: {cause.strerror}; give a .toml file") from None
     except (ValueError, RecursionError) as cause:
         raise error(f"{path} is not valid TOML: {cause}; correct the line it names") from None
+
+
+def read_file(path: Path) -> bytes:
+    """The content of a file, which must have an end.
+
+    Raises:
+        OSError: It cannot be read, or is a device.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+        raise OSError(errno.EINVAL, "it is a device and no file", str(path))
+    return path.read_bytes()
 
 
 class Table:

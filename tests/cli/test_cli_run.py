@@ -361,6 +361,29 @@ def test_interrupted_while_building(
 
 
 @pytest.mark.usefixtures("fake")
+@pytest.mark.usefixtures("fake")
+def test_a_disk_that_fills_up(
+    scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whole rows are left, as many as the message tells."""
+    resource = pytest.importorskip("resource")
+    assert main(["run", str(scenario), "-o", str(tmp_path / "whole")]) == 0
+    whole = (tmp_path / "whole/readings.csv").read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) // 2, limits[1]))
+    try:
+        code = main(["run", str(scenario), "-o", str(tmp_path / "out")])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 1
+    found = (tmp_path / "out/readings.csv").read_bytes()
+    assert whole.startswith(found)
+    assert found.endswith(b"\n")
+    rows = found.count(b"\n") - 1
+    assert 0 < rows < COUNT
+    assert f"stopped at sample {rows} of {COUNT}" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_disk_full(
     scenario: Path,

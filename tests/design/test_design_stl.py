@@ -288,6 +288,21 @@ def test_metres_read_as_millimetres(tmp_path: Path) -> None:
     refused(lambda: stl(tmp_path), 'electrode "E"', "0.03 mm across", 'did you mean unit = "m"')
 
 
+def test_large_parts_in_metres_read_as_millimetres(tmp_path: Path) -> None:
+    """One of a metre comes out as 1 mm, which a part may have: a warning asks."""
+    save(tmp_path, *flat((1.0, 0.6)))
+    with pytest.warns(UserWarning, match=r'1 mm across with unit = "mm"; .* unit = "m"'):
+        stl(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/null").exists(), reason="no devices here")
+def test_devices_are_no_files(tmp_path: Path) -> None:
+    """They may never end, as /dev/zero does."""
+    refused(lambda: stl(tmp_path, file="/dev/null"), "it is a device and no file")
+    with pytest.raises(DesignError, match="it is a device and no file"):
+        load_design("/dev/null")
+
+
 def test_imprints_of_a_box_that_is_off_the_middle(tmp_path: Path) -> None:
     """Invariant: wherever the file has the box, the parts come to the same place."""
     mesh = trimesh.load(PUBLISHED / "stripe_geom.stl")

@@ -231,6 +231,15 @@ def test_missing_and_unreadable_files(mesh, tmp_path, suffix):
         save_mesh(mesh, tmp_path / "absent" / f"mesh.{suffix}")
 
 
+def test_readers_of_damaged_files_print_nothing(tmp_path, capfd):
+    """What is wrong is in the error alone."""
+    path = tmp_path / "mesh.vtu"
+    path.write_text('<VTKFile type="ImageData" version="0.1"></VTKFile>')
+    with pytest.raises(MeshError, match=r"not a readable \.vtu file"):
+        load_mesh(path)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_file_without_tetrahedra(tmp_path):
     triangle = meshio.Mesh(np.eye(3), [("triangle", np.array([[0, 1, 2]]))])
     triangle.write(tmp_path / "flat.vtu")

@@ -363,6 +363,36 @@ def test_a_few_samples_far_off_are_doubted():
     assert fit.excess == pytest.approx(np.sqrt((left**2).mean(axis=0)) / scale)
 
 
+def test_samples_out_of_order_are_doubted():
+    """Statistical: shuffled, nothing follows the truth; weak but followed for long, it is not."""
+    true, seen, time = recording(np.random.default_rng(5), 400, 1e-16)
+    doubted = 0
+    for seed in range(50):
+        order = np.random.default_rng(seed).permutation(len(true))
+        with pytest.warns(CalibrationWarning, match="what it measured does not follow the true"):
+            doubted += calibrate(true, seen[order], time).doubtful.sum()
+    assert doubted >= 98
+    weak = seen + 5e-13 * np.random.default_rng(6).standard_normal(seen.shape)
+    fit = calibrate(true, weak, time)
+    assert not fit.doubtful.any()
+    assert (np.abs(fit.gain - GAIN) < 4 * fit.uncertainty[:, 0]).all()
+
+
+def test_samples_that_are_left_out_may_be_anything():
+    """Invariant: NaN where flags are set changes nothing; elsewhere it is refused."""
+    true, seen, time = recording(np.random.default_rng(7), 60, 1e-16)
+    flags = np.zeros(seen.shape, int)
+    flags[[3, 8], [0, 1]] = 1
+    plain = calibrate(true, seen, time, flags=flags)
+    true[3, 0], seen[3, 0], seen[8, 1] = np.nan, np.inf, np.nan
+    found = calibrate(true, seen, time, flags=flags)
+    np.testing.assert_array_equal(found.gain, plain.gain)
+    np.testing.assert_array_equal(found.covariance, plain.covariance)
+    seen[9, 1] = np.nan
+    with pytest.raises(ReadoutError, match="measured: a number is not finite"):
+        calibrate(true, seen, time, flags=flags)
+
+
 @pytest.mark.parametrize("noise", [1e-16, 5e-14])
 @pytest.mark.parametrize("count", [40, 200])
 @pytest.mark.parametrize("order", ["smooth", "random"])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
+from capsense._validate import read_file
 from capsense.design.geometry import Facet, Surface
 from capsense.errors import DesignError
 
@@ -35,7 +36,7 @@ def read_stl(path: Path) -> Array:
             triangles.
     """
     try:
-        raw = path.read_bytes()
+        raw = read_file(path)
     except OSError as error:
         raise DesignError(
             f"{path} cannot be read: {error.strerror}; give file relative to the design's .toml"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,8 @@ Array = NDArray[np.float64]
 
 SMALLEST = 5e-4
 """What is smaller across [m] is taken for a file in another unit."""
+SMALL = 2e-3
+"""What is smaller than this [m] may be one; a warning asks."""
 SIZE_TOLERANCE = 1e-5
 """By how much [m] an imprinted box may differ from the domain."""
 
@@ -52,6 +55,12 @@ def _read_triangles(table: DesignTable, folder: Path) -> Array:
         raise table.error(
             f'file = "{file}" is {extent * 1e3:g} mm across with unit = "{unit}", smaller than '
             f"{SMALLEST * 1e3:g} mm; {fix}"
+        )
+    if extent < SMALL and unit != "m":
+        warnings.warn(
+            f'file = "{file}" is {extent * 1e3:g} mm across with unit = "{unit}"; if it was '
+            'exported in metres, write unit = "m"',
+            stacklevel=2,
         )
     return triangles
 

@@ -222,11 +222,11 @@ def _load_msh(path: Path, scale: float) -> TetMesh:
 
 def _load_vtu(path: Path, scale: float) -> TetMesh:
     require_package("meshio", "meshio, which .vtu files need,", "mesh")
-    import meshio
+    from meshio import vtu
 
     if b"vtkLZMADataCompressor" in path.read_bytes():
         raise MeshError("it is compressed by LZMA, to a size that nothing tells; save it by zlib")
-    data = meshio.read(path)
+    data = vtu.read(path)  # meshio.read prints what goes wrong, and ends the process
     counts = Counter({block.type: len(block.data) for block in data.cells})
     if others := {kind: n for kind, n in counts.items() if kind in _OTHER_SOLIDS}:
         raise MeshError(f"it holds solids that are not tetrahedra: {others}")

@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capsense.errors import ReadoutError
-from capsense.readout.checks import Array, Bools, Ints, finite, per_channel, require
+from capsense.readout.checks import Array, Bools, Ints, finite, per_channel, real, require
 from capsense.readout.noise import Context, Flicker, Process
 
 _ALIKE, _FINE, _APART = 4, 30.0, 4.0
 """So many samples at one end of what was measured were out of range, if the fit has them this many
 steps of the converter apart, and of the noise where that is less than so many times the steps."""
+_SIGNIFICANT = 3.0
+"""Gains of fewer standard errors are none."""
 _EXCESS = 2.0
 """Residuals that are so many times what noise explains are in doubt; of few samples, more."""
 _OF_NORMAL = 1.4826**2
@@ -225,7 +227,9 @@ def calibrate(
     Where residuals are much larger than neighbouring samples differ, in time or in the order of
     their true values, or than most of them are, the sensor is not linear, or was out of its range,
     or somewhere else: the channel is ``doubtful``, and a :class:`CalibrationWarning` says so. So it
-    is where several samples share the largest or smallest value though the fit has them apart.
+    is where several samples share the largest or smallest value though the fit has them apart, and
+    where the gain is less than three of its standard errors: what was measured does not follow what
+    is true, as where samples are out of order.
 
     Args:
         true: Capacitances that the simulator gives at the poses and times of the recording [F],
@@ -234,7 +238,8 @@ def calibrate(
         time: Times of the samples [s], shape (n,), or (n, K) where channels have instants of their
             own; needed for drift.
         flags: Samples to leave out, such as ``counts.table("flags")[1]``, which tells those that
-            were out of the converter's range: any number but 0, shape (n, K).
+            were out of the converter's range: any number but 0, shape (n, K). Values there may be
+            NaN.
         drift: Whether to fit a drift that is linear in time.
         floor: Allan deviation of the flicker floor [F]; needs times that rise.
 
@@ -242,7 +247,7 @@ def calibrate(
         ReadoutError: Shapes do not fit, numbers are not finite, samples are too few, or the
             recording does not tell the figures apart (a channel that never changes).
     """
-    c, m = finite("true", true), finite("measured", measured)
+    c, m = real("true", true), real("measured", measured)
     if c.ndim != 2 or c.shape != m.shape or not c.shape[1]:
         raise ReadoutError(f"true has shape {c.shape}, measured {m.shape}; give both as (n, K)")
     n, k = c.shape
@@ -251,6 +256,8 @@ def calibrate(
     if floor > 0 and (np.diff(t, axis=0) <= 0).any():
         raise ReadoutError("with a floor, times must rise; sort the samples")
     unknowns, kept = 3 if drift else 2, _kept(flags, c)
+    for what, values in (("true", c), ("measured", m)):
+        finite(what, values[kept])
     epoch = float(t.mean())
     figures, covariance = np.zeros((k, 3)), np.zeros((k, 3, 3))
     residuals, excess = np.full((n, k), np.nan), np.zeros(k)
@@ -274,8 +281,9 @@ def calibrate(
     doubtful = (excess > _EXCESS * (1 + 8 / np.sqrt(samples))) & (
         residual > _SMALL * np.nanstd(np.where(kept, m, np.nan), axis=0)
     )
-    doubtful |= clipped
-    _warn(excess, doubtful, clipped)
+    blind = figures[:, 0] ** 2 < _SIGNIFICANT**2 * covariance[:, 0, 0]
+    _warn(excess, doubtful | clipped | blind, clipped, blind)
+    doubtful |= clipped | blind
     return Calibration(
         figures[:, 0], figures[:, 1], figures[:, 2], epoch, covariance, residuals, residual,
         samples, excess, doubtful,
@@ -325,11 +333,13 @@ def _clipped(measured: Array, fitted: Array, white: float) -> bool:
     return any(len(end) >= _ALIKE and np.ptp(end) > least for end in ends)
 
 
-def _warn(excess: Array, doubtful: Bools, clipped: Bools) -> None:
+def _warn(excess: Array, doubtful: Bools, clipped: Bools, blind: Bools) -> None:
     for channel in np.flatnonzero(doubtful).tolist():
         why = f"residuals are {excess[channel]:.1f} times as large as noise explains"
         if clipped[channel]:
             why = "many samples share its largest or smallest value, as at the end of a range"
+        elif blind[channel]:
+            why = "what it measured does not follow the true capacitances"
         warnings.warn(
             f"channel {channel}: {why}, so gain, offset and their uncertainties are not to be "
             "believed; leave out samples out of range (flags=), check poses and times, or give the "

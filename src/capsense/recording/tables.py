@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import errno
+import io
 import json
 import os
 from collections.abc import Sequence
@@ -210,19 +213,33 @@ class RunWriter:
         self.scenario = scenario
         names = tuple(str(b.body.name) for b in scenario.bodies)
         self.run = Run(scenario.name, scenario.design, scenario.channels, empty, names)
-        self._file = (folder / FILES[0]).open("w", newline="", encoding="utf-8")
-        self._rows = csv.writer(self._file, lineterminator="\n")
-        self._rows.writerow([name for name, _ in column_meanings(scenario.channels)])
-        self._file.flush()
+        self._file = (folder / FILES[0]).open("wb", buffering=0)
+        self._write_row([name for name, _ in column_meanings(scenario.channels)])
+
+    def _write_row(self, row: Sequence[object]) -> None:
+        """Write a whole row or nothing of it."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(row)
+        start, line = self._file.tell(), text.getvalue().encode()
+        try:
+            if self._file.write(line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), self._file.name)
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._file.truncate(start)
+            raise
 
     def add(self, sample: Sample) -> None:
-        """Keep one sample, and write its row."""
+        """Write the row of one sample, and keep the sample.
+
+        Raises:
+            OSError: The row could not be written; neither it nor the sample is there then.
+        """
         run = self.run
+        self._write_row(csv_row(sample.time, np.array(sample.values), run.levels))
         run.times.append(sample.time)
         run.readings.append(sample.reading)
         run.scenes.append(sample.scene)
-        self._rows.writerow(csv_row(sample.time, np.array(sample.values), run.levels))
-        self._file.flush()
 
     @property
     def count(self) -> int:
