@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,18 @@ def tampered(sim: cs.Simulator, tmp_path: Path) -> Path:
                 reading = dataclasses.replace(reading, capacitance=other)
             run.write(0.1 * k, scene, reading)
     return path
+
+
+def test_threads_that_share_a_recorder_take_turns(sim: cs.Simulator, tmp_path: Path) -> None:
+    """Differential: every reading is that of its own scene, and the file replays to the last bit."""
+    scenes = [recorded_scenes.scene_at(k % 8) for k in range(64)]
+    path, truth = tmp_path / "shared.mcap", [sim.step(scene).delta for scene in scenes[:8]]
+    with cs.record(path, sim) as run, ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda scene: run.step(scene, 1.0).delta, scenes))
+    for k, delta in enumerate(found):
+        np.testing.assert_array_equal(delta, truth[k % 8])
+    told = cs.replay(path)
+    assert (told.steps, told.differing) == (64, 0)
 
 
 def test_the_first_difference(tampered: Path) -> None:

@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from capsense._thread_pool import OneAtATime
 from capsense.adapters import AttachedSensor
 from capsense.codec import design_to_json
 from capsense.errors import ReadoutError, RecordingError, require_package
@@ -36,7 +37,7 @@ class Recorder:
     The simulator is reset first, since a reading depends, in its last digits, on the steps before
     it. Everything is on disk up to half a second ago, so a process that is killed loses that much.
     Close it, or use it in a ``with`` block; that also writes the index that makes the file quick
-    to open.
+    to open. Threads may share one: they take turns, and their times must still rise.
 
     Args:
         path: The file, by custom one that ends in ``.mcap``.
@@ -69,7 +70,7 @@ class Recorder:
     ) -> None:
         ros.require()
         self.path = Path(path)
-        self._told = False
+        self._told, self._one = False, OneAtATime()
         self.count = 0
         """Steps recorded so far."""
         if not isinstance(source, Simulator | AttachedSensor):
@@ -114,9 +115,10 @@ class Recorder:
                 last half second is kept until :meth:`close` tries again.
             SceneError, SolveError: As for the simulator.
         """
-        self._check(time)
-        scene = _scene(world)
-        return self._write(time, world, scene, self._simulator.step(scene, time=time))
+        with self._one:
+            self._check(time)
+            scene = _scene(world)
+            return self._write(time, world, scene, self._simulator.step(scene, time=time))
 
     def read(self, time: float | None = None) -> Reading:
         """Read the attached sensor, record, and return the reading.
@@ -131,11 +133,12 @@ class Recorder:
         """
         if self._sensor is None:
             raise RecordingError("a simulator is recorded, not a sensor; write step(world, time)")
-        now = self._sensor.time if time is None else float(time)
-        self._check(now)
-        view = self._sensor.view()
-        scene = _scene(view)
-        return self._write(now, view, scene, self._sensor.read(now, scene))
+        with self._one:
+            now = self._sensor.time if time is None else float(time)
+            self._check(now)
+            view = self._sensor.view()
+            scene = _scene(view)
+            return self._write(now, view, scene, self._sensor.read(now, scene))
 
     def reset(self) -> None:
         """Reset the simulator, or the sensor and its readout. Time may start anew."""
@@ -158,8 +161,9 @@ class Recorder:
             RecordingError: Time is wrong, or other steps went before that were not recorded.
             OSError: The file could not be written, as for :meth:`step`.
         """
-        self._check_file()
-        return self._write(time, world, _scene(world), reading)
+        with self._one:
+            self._check_file()
+            return self._write(time, world, _scene(world), reading)
 
     def _write(
         self, time: float, world: Scene | DepthFrame, scene: Scene, reading: Reading
