@@ -147,6 +147,9 @@ def test_refused(tiny: cs.Simulator) -> None:
     skin = skin_of(tiny)
     with pytest.raises(SceneError, match="give at least one"):
         cs.Skin({})
+    for wrong in (3, [("a", cs.Pose())], "six_patch"):
+        with pytest.raises(SceneError, match=r"sensors is .*; give a dict such as"):
+            cs.Skin(wrong)
     with pytest.raises(SceneError, match=r"sensor 'a' is .*give a pair \(design, Pose"):
         cs.Skin({"a": "six_patch"})  # type: ignore[dict-item]
     with pytest.raises(SceneError, match="threads is 0"):

@@ -33,6 +33,17 @@ def as_number(value: object) -> float:
     return math.nan
 
 
+def checked_frequency(value: object) -> float:
+    """An excitation frequency [Hz].
+
+    Raises:
+        ValueError: It is no positive number.
+    """
+    if not 0 < (number := as_number(value)) < math.inf:
+        raise ValueError(f"excitation_frequency is {shorten(value)}; give a positive number of Hz")
+    return number
+
+
 def as_whole(value: object) -> int | None:
     """A whole number, Python's or NumPy's; None for anything else, booleans too."""
     return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None

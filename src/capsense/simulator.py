@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._frozen import read_only
 from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
-from capsense._validate import shorten
+from capsense._validate import checked_frequency, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError, SceneError
@@ -112,13 +112,9 @@ class Simulator:
                 raise ValueError(
                     f"{what} is {shorten(chosen)}; choose one of {', '.join(map(repr, known))}"
                 )
-        if not (np.isfinite(excitation_frequency) and excitation_frequency > 0):
-            raise ValueError(
-                f"excitation_frequency is {shorten(excitation_frequency)}; give a positive number"
-            )
         self.method: Method = method
         self.preset: PresetName = preset
-        self.excitation_frequency = excitation_frequency
+        self.excitation_frequency = checked_frequency(excitation_frequency)
         if (mesh is None) == (design is None):
             raise ValueError("give either a design or mesh=…, a TetMesh or a MeshSensor")
         self.mesh = None if mesh is None else self._on_mesh(mesh)

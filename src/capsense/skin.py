@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
-from capsense._validate import suggest
+from capsense._validate import shorten, suggest
 from capsense.design.model import Design
 from capsense.errors import SceneError, SkinError
 from capsense.reading import Reading
@@ -41,6 +41,10 @@ class Skin:
         designs: dict[str, AnyDesign] = {}
         self.poses: dict[str, Pose] = {}
         """Where the sensor frames stand in the world."""
+        if not isinstance(sensors, Mapping):
+            raise SceneError(
+                f'sensors is {shorten(sensors)}; give a dict such as {{"wrist": (design, Pose(…))}}'
+            )
         for name, pair in sensors.items():
             if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], Pose)):
                 raise SceneError(f"sensor {name!r} is {pair!r}; give a pair (design, Pose(…))")

@@ -231,6 +231,11 @@ def test_refused(fleet):
         with pytest.raises(SceneError, match=r"bodies is .*; give a Body, None, or a list of them"):
             fleet.change(0, wrong, [1])
 
+    for wrong in ("x", 0, -1.0, np.nan, np.inf, None, True):
+        with pytest.raises(ValueError, match=r"excitation_frequency is .*; give a positive number"):
+            Fleet("six_patch", BODIES, 1, excitation_frequency=wrong)
+        with pytest.raises(ValueError, match=r"excitation_frequency is .*; give a positive number"):
+            cs.Simulator("six_patch", excitation_frequency=wrong)
     with pytest.raises(SceneError, match=r"environments is .*; give .* such as np.flatnonzero"):
         fleet.change(0, BODIES[0], np.ones(COUNT, bool))
     with pytest.raises(SceneError, match=r"join: places is 0; give a list of numbers, such as"):

@@ -43,7 +43,7 @@ def tampered(sim: cs.Simulator, tmp_path: Path) -> Path:
 
 
 def test_threads_that_share_a_recorder_take_turns(sim: cs.Simulator, tmp_path: Path) -> None:
-    """Differential: every reading is that of its own scene, and the file replays to the last bit."""
+    """Differential: every reading is that of its own scene; the file replays to the last bit."""
     scenes = [recorded_scenes.scene_at(k % 8) for k in range(64)]
     path, truth = tmp_path / "shared.mcap", [sim.step(scene).delta for scene in scenes[:8]]
     with cs.record(path, sim) as run, ThreadPoolExecutor(8) as pool:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._thread_pool import OneAtATime
-from capsense._validate import as_whole, shorten
+from capsense._validate import as_whole, checked_frequency, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.elements.pieces import WIDE
@@ -69,7 +69,7 @@ class Fleet:
         DesignError: The design is wrong.
         SceneError: ``bodies`` is empty, holds something else, or bodies that a fleet cannot have;
             or a count is not a positive whole number.
-        ValueError: There is no such preset, budget or device.
+        ValueError: There is no such preset, budget or device, or the frequency is not positive.
         MissingDependencyError: Warp is asked for and not installed.
     """
 
@@ -89,6 +89,7 @@ class Fleet:
             if (as_whole(number) or 0) < 1:
                 raise SceneError(f"{what} is {number!r}; give a whole number from 1")
         count, sensors = int(count), int(sensors)
+        self.excitation_frequency = checked_frequency(excitation_frequency)
         given, bodies = bodies, list(bodies) if isinstance(bodies, Iterable) else []
         if not bodies or not all(isinstance(body, Body) for body in bodies):
             raise SceneError(f"bodies is {shorten(given)}; give a list of at least one Body")
@@ -115,7 +116,6 @@ class Fleet:
         n = self._terminals.electrodes
         self.baseline: Array = self._terminals.empty[:n, :n].copy()
         """Maxwell matrix of the electrodes in the empty domain [F], shape (n, n)."""
-        self.excitation_frequency = excitation_frequency
         self.table = BodyTable(self._solver, count, len(bodies), sensors)
         self._chips: Any = None
         self._one, self._warned = OneAtATime(), False
