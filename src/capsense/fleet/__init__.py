@@ -286,7 +286,8 @@ class Fleet:
                 return reading
             matrix = reading.delta
             if self._warp is None:
-                matrix, time = reading.capacitance, np.asarray(time, float).item()
+                matrix = reading.capacitance
+                time = np.asarray(time).item() if hasattr(time, "__dlpack__") else time
             return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
     def solved(

@@ -44,6 +44,7 @@ class WarpCore:
         self._slopes: list[Any] | None = None
         self.shapes: Any = None
         self._before: list[Any] = []
+        self._captured = False
         self.green, self.circuit = _response(solver, device), _circuit(terminals, device)
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         environments, places, sensors = counts
@@ -96,10 +97,11 @@ class WarpCore:
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
         """Take over what stands where, in the memory that there is; new shapes take new memory.
 
-        What was there before stays, for steps that were captured: these read NaN from then on.
+        Where a step was captured, what was there before stays for it; it reads NaN from then on.
         """
         if len(bodies.shapes) != self._taken:
-            if self._taken:
+            if self._captured:
+                self._captured = False
                 before = self.shapes, self.places.choice, self.circuit.rest, self.circuit.empty
                 self._before.append(before)
                 self.places.choice = wp.clone(before[1])
@@ -128,6 +130,7 @@ class WarpCore:
         Raises:
             SceneError: They are of another shape or precision, or on another device.
         """
+        self._captured |= bool(self.device.is_capturing)
         bodies = as_transforms(bodies, self.poses)
         sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
         n, views = self.cut.number.shape
