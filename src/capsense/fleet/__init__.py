@@ -19,8 +19,15 @@ from capsense.elements.pieces import WIDE
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
-from capsense.fleet.bodies import BodyTable, FleetCheck, FleetReading, on_device
-from capsense.fleet.check import checked_poses, compare, require_no_gradient
+from capsense.fleet.bodies import (
+    BodyTable,
+    FleetCheck,
+    FleetReading,
+    checked_poses,
+    compare,
+    on_device,
+    require_no_gradient,
+)
 from capsense.fleet.cpu import CpuCore
 from capsense.readout import Readout
 from capsense.readout.conversions import SideBySide
