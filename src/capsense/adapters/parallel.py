@@ -153,9 +153,7 @@ def _is_free(body: Body, frequency: float) -> bool:
     return body.grounding != "grounded" and bool(matter_of([body], frequency).conducting[0])
 
 
-def _with_share(
-    bodies: Body | Sequence[Body | None], count: int
-) -> Body | Sequence[Body | None]:  # fmt: skip
+def _with_share(bodies: Body | Sequence[Body | None], count: int) -> Body | Sequence[Body | None]:
     """Bodies with one of ``count`` equal shares of their capacitance to ground."""
     some = [bodies] if isinstance(bodies, Body) else bodies
     made = {

@@ -20,6 +20,7 @@ from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.fleet.bodies import (
+    WORLD,
     BodyTable,
     FleetCheck,
     FleetReading,
@@ -116,7 +117,7 @@ class Fleet:
         if device != "cpu":
             chosen_preset = replace(chosen_preset, panels=_PANELS * budget, wide=False)
         self._solver = SurfaceSolver(
-            field.green, self.design, excitation_frequency=excitation_frequency,
+            field.green, self.design, excitation_frequency=self.excitation_frequency,
             preset=chosen_preset,
         )  # fmt: skip
         self._terminals = Terminals(self.design, field.capacitance)
@@ -309,7 +310,7 @@ class Fleet:
         shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
         if self._warp is None:
             if sensors is None:
-                sensors = np.broadcast_to(np.array([0.0] * 6 + [1.0]), shapes[1])
+                sensors = np.broadcast_to(WORLD, shapes[1])
             return self._cpu.step(
                 checked_poses("poses", poses, shapes[0]),
                 checked_poses("sensors", sensors, shapes[1]),

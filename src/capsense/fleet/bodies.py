@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+WORLD: Array = np.array([0.0] * 6 + [1.0])
+"""The pose of the world's own frame."""
 _QUATERNION = 1e-3
 """Quaternions may be longer or shorter than 1 by so much; they are made 1 long."""
 
@@ -275,7 +277,7 @@ def compare(
         raise SceneError(f"samples is {shorten(samples)}; give a whole number from 1")
     e, s, b = fleet.count, fleet.sensors, fleet.places
     where = checked_poses("poses", poses, (e, b, 7))
-    at = np.broadcast_to(np.array([0.0] * 6 + [1.0]), (e, s, 7))
+    at = np.broadcast_to(WORLD, (e, s, 7))
     if sensors is not None:
         at = checked_poses("sensors", sensors, (e, s, 7))
     delta = fleet.solved(where, at).delta

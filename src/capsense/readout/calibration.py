@@ -282,8 +282,8 @@ def calibrate(
         residual > _SMALL * np.nanstd(np.where(kept, m, np.nan), axis=0)
     )
     blind = figures[:, 0] ** 2 < _SIGNIFICANT**2 * covariance[:, 0, 0]
-    _warn(excess, doubtful | clipped | blind, clipped, blind)
     doubtful |= clipped | blind
+    _warn(excess, doubtful, clipped, blind)
     return Calibration(
         figures[:, 0], figures[:, 1], figures[:, 2], epoch, covariance, residuals, residual,
         samples, excess, doubtful,

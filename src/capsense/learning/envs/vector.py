@@ -63,7 +63,7 @@ class FleetSkin:
         )  # fmt: skip
         for k, carrier in enumerate(own):
             self._fleet.hide(k, [p for p, solid in enumerate(solids) if solid.frame == carrier])
-        tied = {s.tie.owner for s in solids if s.tie.grounding != "grounded"}
+        tied = {s.tie.owner for s in solids if not isinstance(s.tie.grounding, str)}
         for owner in tied:
             self._fleet.join([p for p, solid in enumerate(solids) if solid.tie.owner == owner])
         self._frames = np.array([solid.frame for solid in solids] + own)
