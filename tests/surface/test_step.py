@@ -29,7 +29,7 @@ from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.surface.choose_kernels import Cut, choose, score
 from capsense.surface.leaf_kernels import Leaves, four_points
-from capsense.surface.pair_kernels import leaf_pairs, mean_inverse
+from capsense.surface.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
 from capsense.surface.solve_kernels import Reduced, _add_products, _products, factorise, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import (
@@ -830,6 +830,20 @@ def test_pairs_of_one_surface_are_the_same_in_any_frame(distance: float) -> None
             one = (np.zeros(3), frame, (0.01, 0.01))
             found.append(pairs([one, (center, frame, (0.01, 0.01))], [0, 0], True)[0, 1])
     np.testing.assert_allclose(found, found[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("gap", [1e-4, 1e-3, 1e-2, 3e-2])
+def test_pairs_that_all_but_coincide(gap: float) -> None:
+    """Analytic: unit squares one above the other, and what charge of opposite signs on them costs;
+    that is 2π times the gap where it is small."""
+    one = (np.zeros(3), Rotation.identity(), (1.0, 1.0))
+    other = (np.array([0.0, 0.0, gap]), Rotation.identity(), (1.0, 1.0))
+    found = pairs([one, other], [0, 0], True, -1e9)
+    own = 4 * math.log(1 + math.sqrt(2)) - 4 * (math.sqrt(2) - 1) / 3
+    assert found[0, 0] == pytest.approx(own, rel=1e-5)
+    assert found[0, 1] == pytest.approx(_mirror_mean(gap), rel=3e-3)
+    cost = own - found[0, 1]
+    assert cost == pytest.approx(2 * math.pi * gap, rel=0.15, abs=1e-5)
 
 
 def test_rigid_bodies_have_no_pairs_of_their_own() -> None:

@@ -323,6 +323,8 @@ _FEWEST, _DOUBLINGS = 5000, 3
 COARSE, _THICK = 1000, 2.0
 """Panels from which the impedance of the inside of wide shapes is found, and how many times as
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
+_PLATE = 0.18
+"""Wide bodies thinner than so many edges of their panels are plates."""
 _HALF_SPACE = 2.0
 """Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
@@ -345,6 +347,16 @@ def wide_pieces(shape: Shape, conducting: bool) -> int:
     return held[0] if conducting or held[1] else 0
 
 
+def _is_plate(panels: SurfacePanels) -> bool:
+    """Whether a body is so thin that the four points of its clusters do not tell its faces apart.
+
+    Its clusters then hold both of its faces.
+    """
+    area = float(panels.areas.sum())
+    volume = float(panels.areas @ np.einsum("ij,ij->i", panels.centers, panels.normals)) / 3
+    return panels.closed and 2.0 * volume / area < _PLATE * math.sqrt(area / len(panels))
+
+
 class WideBody(ChangingBody):
     """A rigid shape on many panels, which meet each other without a block of energies.
 
@@ -355,7 +367,8 @@ class WideBody(ChangingBody):
     """
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
-        self._at, self._coarse = features(panels.centers, panels.normals), coarse
+        normals = np.zeros((len(panels), 3)) if _is_plate(panels) else panels.normals
+        self._at, self._coarse = features(panels.centers, normals), coarse
         super().__init__(split(self._at, panels.areas), panels)
         self.record["inside"] = _HALF_SPACE
 

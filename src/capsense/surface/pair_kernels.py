@@ -33,6 +33,8 @@ BARRIER = 1e5
 """Energy of charge that is out of reach [1/m]."""
 LIFTED = 1e-5
 """Clusters that were moved by less than this [m] count as where they are."""
+_UPON = 0.1
+"""Rectangles nearer to each other than so many of their shorter side lie upon each other."""
 _WIDE = 4.0
 """Sides of a cluster, over its distance from a flat design, from which on its images are bounded:
 four points are good to 0.1 % of their mean up to there."""
@@ -337,7 +339,31 @@ def _near_rectangles(table, extent, i, start, out, room):
             )
         put_span(room, k, vmadd(span(room, 26 * width + k), vsub(mine, theirs), theirs))
     for k in range(count):
-        out[int(room[27, k])] = 0.25 * at(room, k)
+        j = int(room[27, k])
+        out[j] = _upon(table, i, j, 0.25 * at(room, k))
+
+
+@compiled
+def _upon(table, i, j, value):
+    """Bound a mean of 1/r between rectangles that all but coincide, as the two faces of a foil.
+
+    Four points find some per cent more than a rectangle has with itself: equal and opposite charge
+    on the two faces would cost less than no energy. Near each other they have what one has with
+    itself, less 2π times their distance over its area.
+    """
+    short = 2.0 * min(table[25, i], table[25, j])
+    gap = 0.0
+    for q in range(3):
+        gap += float(table[12 + q, i] - table[12 + q, j]) ** 2
+    gap = math.sqrt(gap)
+    if gap >= _UPON * short:
+        return value
+    own, area = 1.0, 0.0
+    for x in (i, j):
+        own *= _self_mean(table[24, x] / math.sqrt(3.0), table[25, x] / math.sqrt(3.0))
+        area = max(area, 4.0 * float(table[24, x]) * float(table[25, x]))
+    bound = math.sqrt(own) - 2.0 * math.pi * gap / area
+    return value + smooth(1.0 - gap / (_UPON * short)) * min(0.0, bound - value)
 
 
 @compiled
