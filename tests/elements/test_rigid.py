@@ -37,6 +37,16 @@ def test_conjugate_gradients_solve(n: int) -> None:
         )
 
 
+def test_the_inside_of_an_open_surface() -> None:
+    """Unit: 2.5 times the energies of functions without net charge."""
+    square = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.1, 0.02], [0.0, 0.1, 0.02]])
+    shape = rigid.rigid_shape(panels_of(square[[[0, 1, 2], [0, 2, 3]]], 30))
+    assert not shape.panels.closed
+    np.testing.assert_allclose(shape.impedance[1:, 1:], 2.5 * shape.energy[1:, 1:], rtol=1e-6)
+    assert not shape.impedance[0].any()
+    assert not shape.impedance[:, 0].any()
+
+
 def test_what_does_not_converge_is_told() -> None:
     assert not rigid._conjugate_gradients(np.full((2, 2), np.nan), np.zeros(2))
     with pytest.raises(SolveError, match="the charges of 2 panels do not converge"):

@@ -59,7 +59,7 @@ def _pointer(kind: Any) -> Any:
 TWINS = {
     "at": at, "span": span, "put_span": put_span, "splat": splat, "madd": madd, "rsqrt": rsqrt,
     "vadd": lambda u, v: u + v, "vsub": lambda u, v: u - v, "vmul": lambda u, v: u * v,
-    "vdiv": lambda u, v: u / v,
+    "vdiv": lambda u, v: u / v, "vlog": np.log,
     "vmadd": lambda u, v, w: u * v + w,
     "dot": lambda x, y, z, u, v, w, a: x * u + (y * v + (z * w + a)),
     "muladd": lambda a, b, c: a * b + c, "horizontal_sum": lambda v: v.sum(),

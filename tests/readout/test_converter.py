@@ -69,6 +69,8 @@ def test_zero_code():
 def test_full_scale_codes():
     """Analytic: without headroom, and with amplifiers to spare, all codes but the last are used."""
     assert ReciprocalLaw(1e-6, 1e-6, 3.3, headroom=0.0).high == 1023
+    law = ReciprocalLaw(1e-6, 1e-6, 3.3, headroom=0.7)
+    assert (law.low, law.high) == (218, 806)  # 1024 × 0.7/3.3 and 1024 × 2.6/3.3
     assert ShuntLaw(ShuntFrontEnd(1e6, 1e3, 20.0, 3.0), 2.0).high == 2**15 - 1
 
 

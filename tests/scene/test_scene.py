@@ -88,7 +88,7 @@ def test_pack_follows_the_bodies():
 
 
 @pytest.mark.parametrize(
-    ("sizes", "told"), [((), False), ((90.0,), True), ((90.0, 50.0), True), ((90.0, 0.1), False)]
+    ("sizes", "told"), [((), False), ((90.0,), True), ((90.0, 20.0), True), ((90.0, 0.1), False)]
 )
 def test_scenes_in_millimetres_are_told(sizes, told):
     """Only where every body is far larger than what the sensor sees."""

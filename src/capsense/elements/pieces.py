@@ -323,14 +323,17 @@ _FEWEST, _DOUBLINGS = 5000, 3
 COARSE, _THICK = 1000, 2.0
 """Panels from which the impedance of the inside of wide shapes is found, and how many times as
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
-_PLATE = 0.18
-"""Wide bodies thinner than so many edges of their panels are plates."""
+_FOIL = 5e-5
+"""Shapes thinner than this part of their width have no energies: their faces would be one."""
+_FACES = 12.0
+"""Clusters that are more than twice so many times as wide as a wide body is thick hold both of its
+faces, which four points do not tell apart."""
 _HALF_SPACE = 2.0
 """Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
 
 def wide_pieces(shape: Shape, conducting: bool) -> int:
-    """About how many pieces a shape is cut into; 0 where it is not wide.
+    """About how many pieces a shape is cut into; 0 where it is neither wide nor a foil.
 
     Nor are dielectrics that are thin, or meshes.
     """
@@ -338,7 +341,7 @@ def wide_pieces(shape: Shape, conducting: bool) -> int:
     if held is None:
         low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
         held = 0, False
-        if middle > WIDE:
+        if middle > WIDE or low < _FOIL * middle:
             area = 2 * (low * middle + middle * high + high * low)
             doublings = math.ceil(math.log2(area / _PIECE**2 / _FEWEST))
             solid = not isinstance(shape, TriMesh) and low >= _THICK * math.sqrt(area / COARSE)
@@ -347,14 +350,12 @@ def wide_pieces(shape: Shape, conducting: bool) -> int:
     return held[0] if conducting or held[1] else 0
 
 
-def _is_plate(panels: SurfacePanels) -> bool:
-    """Whether a body is so thin that the four points of its clusters do not tell its faces apart.
-
-    Its clusters then hold both of its faces.
-    """
-    area = float(panels.areas.sum())
+def _thickness(panels: SurfacePanels) -> float:
+    """Twice the volume over the area [m]; infinite where a surface is open."""
+    if not panels.closed:
+        return math.inf
     volume = float(panels.areas @ np.einsum("ij,ij->i", panels.centers, panels.normals)) / 3
-    return panels.closed and 2.0 * volume / area < _PLATE * math.sqrt(area / len(panels))
+    return 2.0 * abs(volume) / float(panels.areas.sum())
 
 
 class WideBody(ChangingBody):
@@ -367,8 +368,8 @@ class WideBody(ChangingBody):
     """
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
-        normals = np.zeros((len(panels), 3)) if _is_plate(panels) else panels.normals
-        self._at, self._coarse = features(panels.centers, normals), coarse
+        most = _FACES * _thickness(panels)
+        self._at, self._coarse = features(panels.centers, panels.normals, most), coarse
         super().__init__(split(self._at, panels.areas), panels)
         self.record["inside"] = _HALF_SPACE
 

@@ -189,7 +189,10 @@ def _equilibrium(free: Array) -> Array:
     """Charges that put all panels at 1 V, by conjugate gradients, free (n, n) -> (n,)."""
     charge = np.zeros(len(free))
     if not _conjugate_gradients(free, charge):
-        raise SolveError(f"the charges of {len(free)} panels do not converge")
+        raise SolveError(
+            f"the charges of {len(free)} panels do not converge; make bodies thicker that are less "
+            "than 1/20,000 as thick as they are wide, or leave out dielectric films"
+        )
     return charge
 
 
@@ -271,10 +274,13 @@ def build_tree(panels: SurfacePanels, charge: Array) -> Tree:
     return charged_tree(panels, split(features(panels.centers, panels.normals), charge), charge)
 
 
-def features(centers: Array, normals: Array) -> Array:
-    """Centres and scaled normals (n, 3) of panels, as :func:`split` takes them [m], (n, 6)."""
+def features(centers: Array, normals: Array, most: float = np.inf) -> Array:
+    """Centres and scaled normals (n, 3) of panels, as :func:`split` takes them [m], (n, 6).
+
+    Opposite normals count as twice ``most`` [m] apart at most.
+    """
     extent = float(np.ptp(centers, axis=0).max())
-    return np.concatenate([centers, _NORMALS * extent * normals], axis=1)
+    return np.concatenate([centers, min(_NORMALS * extent, most) * normals], axis=1)
 
 
 def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tree:
