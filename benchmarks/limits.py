@@ -4,6 +4,7 @@
   against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels do not
   help there.
 - wide boxes in parallel with the sensor, against 80,000 pieces, and what their readings tell of it.
+- a ball, a limb and a box over the narrow electrodes of ``stripe``, against as many.
 - boxes that come down in steps of 0.02 mm: by how much a large entry falls in a step, at most.
 - a person's arm whose hand leaves the domain, against the preset fine.
 - dielectrics in depth images of 128 × 128 pixels with front and back, against the shapes.
@@ -103,6 +104,23 @@ def wide(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         yield f"gap {1e3 * gap:g} mm", table.ravel().tolist()
 
 
+def narrow(_: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Largest error of the diagonal at gaps of 2, 5, 10 and 30 mm, preset standard."""
+    sim = cs.Simulator("stripe")
+    finer = InPieces(sim.background.green, sim.design, preset=FINER)
+    for shape, height, turn in (
+        (cs.Sphere(0.05), 0.05, 0.0), (cs.Capsule(0.04, 0.2), 0.04, np.pi / 2),
+        (cs.Box((0.14, 0.13, 0.1)), 0.05, 0.0),
+    ):  # fmt: skip
+        off = []
+        for gap in (0.002, 0.005, 0.01, 0.03):
+            pose = cs.Pose.from_euler((0.01, 0.0, gap + height), (turn, 0.0, 0.3))
+            scene = cs.Scene([cs.Body(shape, pose)])
+            truth = np.diag(finer.solve(scene).matrix)
+            off.append(float(np.abs(np.diag(sim.step(scene).delta) - truth).max() / truth.max()))
+        yield repr(shape), off
+
+
 def falls(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     """Largest fall in a step from 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, each preset.
 
@@ -181,6 +199,7 @@ def person(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
 PARTS = {
     "contact, presets learning, standard, fine, and 2,800 panels": contact,
     "wide boxes: median and largest error, and median estimate, of each preset": wide,
+    "narrow electrodes: gaps of 2, 5, 10, 30 mm": narrow,
     "falls in a step: 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, of each preset": falls,
     "a person's arm: rms and largest error, presets learning and standard": person,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
