@@ -149,11 +149,14 @@ def test_foils_seen_edge_on(sim):
         (cs.Box((0.22, 0.22, 0.02)), 10_000),
         (cs.Sphere(0.15), 40_000),
         (cs.Box((2.0, 1.5, 0.05)), 40_000),  # and no more
+        (cs.Box((0.1, 0.1, 4e-6)), 5_000),
+        (cs.Box((0.1, 0.1, 6e-6)), 0),
+        (cs.TriMesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]]), 0),
     ],
     ids=repr,
 )
 def test_how_many_pieces(shape, pieces):
-    """Unit: two lengths above ``WIDE``; then edges of 4 mm or less, up to a bound."""
+    """Unit: two lengths above ``WIDE``, or foils; then edges of 4 mm or less, up to a bound."""
     assert wide_pieces(shape, True) == pieces
 
 

@@ -324,7 +324,7 @@ COARSE, _THICK = 1000, 2.0
 """Panels from which the impedance of the inside of wide shapes is found, and how many times as
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
 _FOIL = 5e-5
-"""Shapes thinner than this part of their width have no energies: their faces would be one."""
+"""Primitives thinner than this part of their width have no energies: their faces would be one."""
 _FACES = 12.0
 """Clusters that are more than twice so many times as wide as a wide body is thick hold both of its
 faces, which four points do not tell apart."""
@@ -341,10 +341,11 @@ def wide_pieces(shape: Shape, conducting: bool) -> int:
     if held is None:
         low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
         held = 0, False
-        if middle > WIDE or low < _FOIL * middle:
+        primitive = not isinstance(shape, TriMesh)
+        if middle > WIDE or (primitive and low < _FOIL * middle):
             area = 2 * (low * middle + middle * high + high * low)
             doublings = math.ceil(math.log2(area / _PIECE**2 / _FEWEST))
-            solid = not isinstance(shape, TriMesh) and low >= _THICK * math.sqrt(area / COARSE)
+            solid = primitive and low >= _THICK * math.sqrt(area / COARSE)
             held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS), solid
         shape.__dict__["_pieces"] = held
     return held[0] if conducting or held[1] else 0
