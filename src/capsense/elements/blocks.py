@@ -154,10 +154,7 @@ def _updated(z: Array, potential: Array, flux: Array) -> Array:
 
 def _regions(panels: SurfacePanels) -> NDArray[np.int64]:
     """Number of the volume that each panel bounds: cavities belong to what is round them."""
-    parts = panels.parts
-    volume = np.bincount(
-        parts, panels.areas * np.einsum("ij,ij->i", panels.centers, panels.normals) / 3
-    )
+    parts, volume = panels.parts, panels.volumes
     solid = np.flatnonzero(volume > 0)
     solid = solid[np.argsort(volume[solid], kind="stable")]
     owner = np.arange(len(volume))

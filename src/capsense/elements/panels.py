@@ -39,6 +39,19 @@ class SurfacePanels:
     def __len__(self) -> int:
         return len(self.areas)
 
+    @property
+    def volumes(self) -> Array:
+        """What each part bounds [m³], negative round a cavity, shape (parts,)."""
+        shares = self.areas * np.einsum("ij,ij->i", self.centers, self.normals) / 3
+        return np.bincount(self.parts, shares)
+
+    @property
+    def thickness(self) -> float:
+        """Twice the volume over the area [m]; infinite where the surface is open."""
+        if not self.closed:
+            return np.inf
+        return float(2.0 * abs(self.volumes.sum()) / self.areas.sum())
+
     def scaled(self, factor: float) -> SurfacePanels:
         """The panels of the body made ``factor`` times as large. F and Z go with 1/factor."""
         return replace(

@@ -351,14 +351,6 @@ def wide_pieces(shape: Shape, conducting: bool) -> int:
     return held[0] if conducting or held[1] else 0
 
 
-def _thickness(panels: SurfacePanels) -> float:
-    """Twice the volume over the area [m]; infinite where a surface is open."""
-    if not panels.closed:
-        return math.inf
-    volume = float(panels.areas @ np.einsum("ij,ij->i", panels.centers, panels.normals)) / 3
-    return 2.0 * abs(volume) / float(panels.areas.sum())
-
-
 class WideBody(ChangingBody):
     """A rigid shape on many panels, which meet each other without a block of energies.
 
@@ -369,7 +361,7 @@ class WideBody(ChangingBody):
     """
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
-        most = _FACES * _thickness(panels)
+        most = _FACES * panels.thickness
         self._at, self._coarse = features(panels.centers, panels.normals, most), coarse
         super().__init__(split(self._at, panels.areas), panels)
         self.record["inside"] = _HALF_SPACE
