@@ -43,7 +43,7 @@ class SurfacePanels:
     def volumes(self) -> Array:
         """What each part bounds [m³], negative round a cavity, shape (parts,)."""
         shares = self.areas * np.einsum("ij,ij->i", self.centers, self.normals) / 3
-        return np.bincount(self.parts, shares)
+        return np.asarray(np.bincount(self.parts, shares))
 
     @property
     def thickness(self) -> float:
