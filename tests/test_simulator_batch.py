@@ -103,7 +103,7 @@ def test_scenes_without_a_solution(
     def broken(*args: Any) -> Any:
         delta, error, size = hollow(*args)
         for k in np.flatnonzero(size > 0)[:1]:  # where it is 0, no body was in sight
-            delta[k, 0, 0], size[k] = (np.nan, size[k]) if size[k] % 2 else (1.0, -1)
+            delta[k, 0, 0] = np.nan
         return delta, error, size
 
     monkeypatch.setattr(solver, "solve_each", broken)

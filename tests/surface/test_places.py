@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from surface_scenes import Placed, green_of, pack
 
 import capsense as cs
-from capsense.field.green_kernels import beyond, distances, least_gap, lift
+from capsense.field.green_kernels import beyond, distances, least_gap, lift, pack_green
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import Leaves, placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
@@ -28,6 +29,28 @@ def distance(points: Array) -> Array:
     """From the design and all that is between it and the floor."""
     low = np.array([*BOX[0, :2], -np.inf])
     return np.linalg.norm(points - np.clip(points, low, BOX[1]), axis=1)
+
+
+def test_places_of_many_terminals() -> None:
+    """Unit: potentials of the terminals come first, modes begin at the next multiple of eight."""
+    sim = cs.Simulator("six_patch_bare")
+    green, rng = sim.background.green, np.random.default_rng(3)
+    for terminals in (7, 8, 9, 17):
+        near, far = (
+            rng.uniform(size=(len(phi), terminals)).astype(phi.dtype)
+            for phi in (green.near_phi, green.far_phi)
+        )
+        packed = pack_green(replace(green, near_phi=near, far_phi=far), sim.design)
+        lead = 8 * math.ceil(terminals / 8)
+        assert (packed.terminals, packed.lead) == (terminals, lead)
+        for table, phi, modes in (
+            (packed.near_table, near, green.near_modes), (packed.far_table, far, green.far_modes),
+            (packed.score_table, far, np.empty((0, 0))),
+        ):  # fmt: skip
+            np.testing.assert_array_equal(table[: len(phi), :terminals], phi)
+            assert (table[:, terminals:lead] == 0.0).all()
+            rows, columns = modes.shape
+            np.testing.assert_array_equal(table[:rows, lead : lead + columns], modes)
 
 
 def test_far_points_stay() -> None:

@@ -84,8 +84,8 @@ def _step_rows(
             found.error[e, s] = estimate(out)
             for i in range(m):
                 for j in range(m):
-                    found.delta[e, s, i, j] = out.delta[i, j] if out.size >= 0 else np.nan
-            if slopes and out.size >= 0:
+                    found.delta[e, s, i, j] = out.delta[i, j] if out.shift >= 0.0 else np.nan
+            if slopes and out.shift >= 0.0:
                 _matrix(poses.sensors[e, s], turn)
                 for c in range(count):  # bodies turn about their own origins
                     _position(poses, e, place[c], s, turn, room[c])

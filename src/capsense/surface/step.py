@@ -48,9 +48,10 @@ class Solution(NamedTuple):
     owner: NDArray[Any]
     """Body of each leaf, shape (l,)."""
     size: int
-    """Functions solved for; -1 where there is no solution."""
+    """Functions solved for."""
     shift: float
-    """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes."""
+    """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes, and
+    -1 where there is no solution, and ``delta`` is not finite."""
 
 
 @pasted
@@ -98,10 +99,9 @@ def solve(
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
-    size = functions.solved if shift >= 0.0 else -1
     return Solution(
         delta[:m, :m], left[:m, :m], coarse[:m], charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, size, shift,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
     )  # fmt: skip
 
 
@@ -131,8 +131,8 @@ def solve_each(
         green, threshold, width: As in :func:`prepared`.
 
     Returns:
-        Changes of the Maxwell matrix [m], (k, m, m), their :func:`estimate` [m], (k,), and the
-        functions solved for, -1 where there is no solution, (k,).
+        Changes of the Maxwell matrix [m], (k, m, m), not finite where there is no solution; their
+        :func:`estimate` [m], (k,); and the functions solved for, (k,).
     """
     k, m = first.shape[0] - 1, green.terminals
     delta, error, size = np.zeros((k, m, m)), np.zeros(k), np.zeros(k, np.int64)
@@ -229,7 +229,7 @@ def solve_lossy(
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
     return Solution(
         0.5 * (delta + delta.T), np.ascontiguousarray(left.real), coarse, charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, n if shift >= 0.0 else -1, shift,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, n, shift,
     )  # fmt: skip
 
 
