@@ -105,8 +105,9 @@ def wide(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
 
 
 def narrow(_: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
-    """Largest error of the diagonal at gaps of 2, 5, 10 and 30 mm, preset standard."""
+    """Largest error of the diagonal at gaps of 2, 5, 10 and 30 mm, each preset."""
     sim = cs.Simulator("stripe")
+    sims = [cs.Simulator("stripe", preset=p, background=sim.background) for p in PRESETS]
     finer = InPieces(sim.background.green, sim.design, preset=FINER)
     for shape, height, turn in (
         (cs.Sphere(0.05), 0.05, 0.0), (cs.Capsule(0.04, 0.2), 0.04, np.pi / 2),
@@ -117,8 +118,10 @@ def narrow(_: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
             pose = cs.Pose.from_euler((0.01, 0.0, gap + height), (turn, 0.0, 0.3))
             scene = cs.Scene([cs.Body(shape, pose)])
             truth = np.diag(finer.solve(scene).matrix)
-            off.append(float(np.abs(np.diag(sim.step(scene).delta) - truth).max() / truth.max()))
-        yield repr(shape), off
+            found = [np.diag(each.step(scene).delta) for each in sims]
+            off.append([float(np.abs(f - truth).max() / truth.max()) for f in found])
+        for preset, errors in zip(PRESETS, zip(*off, strict=True), strict=True):
+            yield f"{shape!r}, {preset}", list(errors)
 
 
 def falls(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:

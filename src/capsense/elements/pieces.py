@@ -24,7 +24,7 @@ from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
 from capsense.elements.rigid import BODY, INSIDE, Clusters, features, once, split
 from capsense.scene import Layers, RestSurface, SurfaceMesh, TriMesh
-from capsense.scene.shapes import Shape
+from capsense.scene.shapes import Shape, ShapeKind
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -316,6 +316,13 @@ class ChangingBody:
 
 WIDE = 0.16
 """Shapes of a second-largest extent above this [m] are solved for on a :class:`WideBody`."""
+_ROUND = {
+    ShapeKind.SPHERE: math.pi / 6, ShapeKind.ELLIPSOID: math.pi / 6,
+    ShapeKind.CAPSULE: math.pi / 4, ShapeKind.CYLINDER: math.pi / 4,
+}  # fmt: skip
+"""About how much of the surface of its bounding box that of a shape is."""
+_SLENDER = 4.0
+"""Lengths beyond so many widths do not make panels too wide."""
 _PIECE = 4e-3
 """Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""
 _FEWEST, _DOUBLINGS = 5000, 3
@@ -332,23 +339,31 @@ _HALF_SPACE = 2.0
 """Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
 
-def wide_pieces(shape: Shape, conducting: bool) -> int:
+def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
     """About how many pieces a shape is cut into; 0 where it is neither wide nor a foil.
 
     Nor are dielectrics that are thin, or meshes.
+
+    Args:
+        shape: A primitive or a mesh.
+        conducting: Whether it holds no field inside.
+        largest: Shapes of so much surface or more [m²] are wide too; not all of long ones counts.
     """
     held = shape.__dict__.get("_pieces")
     if held is None:
         low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
-        held = 0, False
-        primitive = not isinstance(shape, TriMesh)
-        if middle > WIDE or (primitive and low < _FOIL * middle):
-            area = 2 * (low * middle + middle * high + high * low)
-            doublings = math.ceil(math.log2(area / _PIECE**2 / _FEWEST))
-            solid = primitive and low >= _THICK * math.sqrt(area / COARSE)
-            held = _FEWEST * 2 ** min(max(0, doublings), _DOUBLINGS), solid
+        mesh = isinstance(shape, TriMesh)
+        part, area = (
+            2 * (low * middle + (low + middle) * length) * _ROUND.get(shape.kind, 1.0)
+            for length in (min(high, _SLENDER * middle), high)
+        )
+        wide = middle > WIDE or (low < _FOIL * middle and not mesh)
+        doublings = math.ceil(math.log2(max(area / _PIECE**2 / _FEWEST, 1.0)))
+        solid = not mesh and low >= _THICK * math.sqrt(area / COARSE)
+        held = math.inf if wide else part, _FEWEST * 2 ** min(doublings, _DOUBLINGS), solid
         shape.__dict__["_pieces"] = held
-    return held[0] if conducting or held[1] else 0
+    surface, pieces, solid = held
+    return pieces if surface >= largest and (conducting or solid) else 0
 
 
 class WideBody(ChangingBody):

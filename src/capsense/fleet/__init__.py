@@ -115,7 +115,7 @@ class Fleet:
         finer: dict[Preset, Preset] = {"learning": "standard", "standard": "fine"}
         self.finer = finer.get(preset) if device == "cpu" else "fine"
         if device != "cpu":
-            chosen_preset = replace(chosen_preset, panels=_PANELS * budget, wide=False)
+            chosen_preset = replace(chosen_preset, panels=_PANELS * budget, coarsest=None)
         self._solver = SurfaceSolver(
             field.green, self.design, excitation_frequency=self.excitation_frequency,
             preset=chosen_preset,

@@ -36,6 +36,8 @@ _OF_MANY = 0.4
 _NO_SOLUTION = "the charges of the bodies cannot be told apart; look for bodies that coincide"
 _LARGE = 0.4
 """Meshes that are longer than this [m] are solved for part by part."""
+_NARROW = 8e-3
+"""Electrodes count as at least so wide [m]: fields of narrower ones reach bodies as a mean."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,14 @@ class Preset:
     """Charge functions count that take up this part of an electrode's energy alone."""
     width: float = 2.5
     """They fade in up to so many times that."""
-    wide: bool = True
-    """Whether bodies that are wide get panels of a few millimetres."""
+    coarsest: float | None = 0.8
+    """Bodies get panels of a few millimetres where these would be wider on average than so much of
+    the electrodes' width, and where they are wide themselves; None for never."""
 
 
 PRESETS = {
     "standard": Preset(),
-    "learning": Preset(panels=300, threshold=0.08),
+    "learning": Preset(panels=300, threshold=0.08, coarsest=1.5),
     "fine": Preset(panels=1400, threshold=0.004),
 }
 """Presets by name."""
@@ -113,6 +116,16 @@ def _laid_out(
     return _Laid(whole, places, found, records, matter, shapes)
 
 
+def _electrode_width(design: Design) -> float:
+    """Width of the narrowest electrode [m]: twice its area over the length of its rims."""
+    widths = [
+        2 * surface.area / float(np.linalg.norm(np.diff(surface.rims, axis=1), axis=2).sum())
+        for surface in (e.surface for e in design.electrodes)
+        if len(surface.rims)
+    ]
+    return max(min(widths, default=math.inf), _NARROW)
+
+
 class SurfaceSolver:
     """Solves scenes, each by itself.
 
@@ -146,6 +159,7 @@ class SurfaceSolver:
         self._last: tuple[View, Solution] | None = None
         self._laid: _Laid | None = None
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
+        self._widest = self.preset.coarsest and self.preset.coarsest * _electrode_width(design)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
@@ -200,7 +214,7 @@ class SurfaceSolver:
                     records, np.cumsum(counts), self.green, self.preset.threshold, self.preset.width
                 )
             delta, doubt = UNIT * delta, UNIT * doubt
-            sound = (size >= 0) & np.isfinite(delta).all(axis=(1, 2))
+            sound = np.isfinite(delta).all(axis=(1, 2))
             for i, (k, view, _) in enumerate(plain):
                 if sound[i]:
                     out[k] = self._change(view, delta[i], float(doubt[i]), int(size[i]), None)
@@ -273,7 +287,7 @@ class SurfaceSolver:
                 )  # fmt: skip
             else:
                 out = solve(bodies.records, self.green, preset.threshold, preset.width, jacobian)
-        if out.size < 0 or not np.isfinite(out.delta).all():
+        if not np.isfinite(out.delta).all():
             raise SolveError(_NO_SOLUTION)
         return bodies, out
 
@@ -392,4 +406,4 @@ class SurfaceSolver:
     ) -> tuple[RigidShape | ChangingBody, float]:
         """Charge functions of a body from a share of the usual panels, and its size."""
         panels = round(share * self.preset.panels)
-        return functions_of(shape, panels, conducting=conducting, wide=self.preset.wide)
+        return functions_of(shape, panels, conducting=conducting, widest=self._widest)
