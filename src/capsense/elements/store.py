@@ -122,7 +122,7 @@ T = TypeVar("T", bound=RigidShape | ChangingBody)
 
 
 def functions_of(
-    shape: Shape, count: int, *, conducting: bool, widest: float | None = None
+    shape: Shape, count: int, *, conducting: bool, largest: float | None = None
 ) -> tuple[RigidShape | ChangingBody, float]:
     """Charge functions of any shape from about ``count`` panels, and its size [m].
 
@@ -130,15 +130,15 @@ def functions_of(
         shape: The shape.
         count: Panels of a round one; one with edges has twice as many.
         conducting: Whether it holds no field inside.
-        widest: Shapes whose panels would be wider than this on average [m], or that are wide
-            themselves, get panels of a few millimetres instead; None for none of them.
+        largest: Shapes of so much surface or more [m²], or that are wide, get panels of a few
+            millimetres instead; None for none of them.
     """
     if isinstance(shape, Layers):
         return ChangingBody(*layer_pieces(shape)), 1.0
     if isinstance(shape, SurfaceMesh):
         sheet = 0.0 if shape.closed else shape.rest.thickness
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
-    if widest is not None and (pieces := wide_pieces(shape, conducting, count * widest**2)):
+    if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
     return rigid(shape, count * (2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1))
 

@@ -159,7 +159,9 @@ class SurfaceSolver:
         self._last: tuple[View, Solution] | None = None
         self._laid: _Laid | None = None
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
-        self._widest = self.preset.coarsest and self.preset.coarsest * _electrode_width(design)
+        coarsest = self.preset.coarsest
+        self._largest = coarsest and self.preset.panels * (coarsest * _electrode_width(design)) ** 2
+        """Bodies of so much surface or more [m²] get panels of a few millimetres; None for none."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
@@ -406,4 +408,4 @@ class SurfaceSolver:
     ) -> tuple[RigidShape | ChangingBody, float]:
         """Charge functions of a body from a share of the usual panels, and its size."""
         panels = round(share * self.preset.panels)
-        return functions_of(shape, panels, conducting=conducting, widest=self._widest)
+        return functions_of(shape, panels, conducting=conducting, largest=self._largest)
