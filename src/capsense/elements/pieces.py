@@ -332,9 +332,11 @@ COARSE, _THICK = 1000, 2.0
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
 _FOIL = 5e-5
 """Primitives thinner than this part of their width have no energies: their faces would be one."""
-_FACES = 12.0
-"""Clusters that are more than twice so many times as wide as a wide body is thick hold both of its
-faces, which four points do not tell apart."""
+_FACES, _ROUNDED, _FLAT = 12.0, 0.5, 0.5
+"""Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
+of its faces: the first of a plate, of which four points do not tell the faces apart there; the
+second of others, whose limbs are told apart first. A plate is thicker than the third of its least
+extent."""
 _HALF_SPACE = 2.0
 """Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
@@ -366,6 +368,14 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
     return pieces if surface >= largest and (conducting or solid) else 0
 
 
+def faces_apart(panels: SurfacePanels) -> float:
+    """How far apart opposite normals count at most, see :data:`_FACES` [m]."""
+    arms = panels.centers - panels.centers.mean(axis=0)
+    low = float(np.ptp(arms @ np.linalg.eigh(arms.T @ arms)[1], axis=0).min())
+    thickness = panels.thickness if panels.closed else low / 3  # as of a ball
+    return thickness * (_FACES if thickness > _FLAT * low else _ROUNDED)
+
+
 class WideBody(ChangingBody):
     """A rigid shape on many panels, which meet each other without a block of energies.
 
@@ -376,8 +386,8 @@ class WideBody(ChangingBody):
     """
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
-        most = _FACES * panels.thickness
-        self._at, self._coarse = features(panels.centers, panels.normals, most), coarse
+        self._most, self._coarse = faces_apart(panels), coarse
+        self._at = features(panels.centers, panels.normals, self._most)
         super().__init__(split(self._at, panels.areas), panels)
         self.record["inside"] = _HALF_SPACE
 
@@ -405,7 +415,7 @@ class WideBody(ChangingBody):
         above = single.copy()
         while (below := above >= top).any():
             above[below] = parent[above[below]]
-        on = cKDTree(features(panels.centers, panels.normals)).query(self._at)[1]
+        on = cKDTree(features(panels.centers, panels.normals, self._most)).query(self._at)[1]
         share = self._charge[single] / self._charge[above]
         places = number[above], on[self._panel[single]]
         shares = csr_array((share, places), (last.sum(), len(panels)))

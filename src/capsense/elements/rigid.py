@@ -35,8 +35,9 @@ SOFT, ROUND = 0.15, 0.82
 """1/r from the four points of a cluster is bounded below a distance whose square is that of its
 extent times the first, squared, and its least second moment times the second. Two flat squares, or
 two balls, that coincide then have no more energy between them than each has alone."""
-_NORMALS = 0.6
-"""How far apart two opposite normals count, as a share of the shape's extent, in splitting."""
+_NORMALS, _ACROSS = 0.6, 1.25
+"""How far apart opposite normals count in splitting, twice the smaller one of: the first times the
+shape's extent, the second times its second-largest one. So limbs are cut across first."""
 _GRAIN = 1e-9
 """Coordinates closer than this part of the extent are the same: cuts do not hang on rounding."""
 _EXTRA = 0.0, 1e-3, 1e-2, 0.1
@@ -279,8 +280,9 @@ def features(centers: Array, normals: Array, most: float = np.inf) -> Array:
 
     Opposite normals count as twice ``most`` [m] apart at most.
     """
-    extent = float(np.ptp(centers, axis=0).max())
-    return np.concatenate([centers, min(_NORMALS * extent, most) * normals], axis=1)
+    _, width, extent = np.sort(np.ptp(centers, axis=0)).tolist()
+    apart = min(_NORMALS * extent, _ACROSS * width, most)
+    return np.concatenate([centers, apart * normals], axis=1)
 
 
 def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tree:
