@@ -903,13 +903,13 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
-    score(bodies, first, green, np.empty(green.terminals), scores)
-    cut = choose(bodies, first, scores.copy(), threshold, WIDTH)
+    seen = score(bodies, first, green, np.empty(green.terminals), scores)
+    cut = choose(bodies, first, seen, scores.copy(), threshold, WIDTH)
     for o, (_, shape) in zip(first, scene, strict=False):
         kids = shape.tree.kids
         for k in np.flatnonzero(kids[:, 0] >= 0):
             for part in kids[k]:
-                if scores[o + part] < 0:
+                if not scores[o + part] >= 0:
                     scores[o + part] = twin.DECAY * scores[o + k] if kids[part, 0] >= 0 else 0.0
     return cut, scores, first
 

@@ -103,8 +103,8 @@ def chosen(bodies, green, threshold, width):
     for b in range(bodies.shape[0]):
         first[b + 1] = first[b] + 2 * bodies[b].n - 1
     weight, scores = np.empty(green.terminals), np.empty(first[-1])
-    score(bodies, first, green, weight, scores)
-    return choose(bodies, first, scores, threshold, width)
+    seen = score(bodies, first, green, weight, scores)
+    return choose(bodies, first, seen, scores, threshold, width)
 
 
 @compiled
@@ -115,17 +115,24 @@ def score(bodies, first, green, weight, scores):
     raised by those of its parts; ``first`` (b + 1,) has each body's first cluster. Clusters that
     are small against their distance from the design, and cross no wall, are not looked into: φ⁰ is
     linear there. Where nothing was looked at the score is :data:`_INHERITED`.
+
+    Returns:
+        How many of a body's first clusters hold all that were looked at, shape (b,); scores of
+        others, which are inherited too, are not written.
     """
     terminals, lead, total = green.terminals, green.lead, first[-1]
     means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
     met, crossing, linear = np.zeros(total, np.bool_), np.empty(total), np.empty(total)
+    seen = np.empty(bodies.shape[0], np.int64)
     for b in range(bodies.shape[0]):
         body, o = bodies[b], first[b]
         kids, function = integers(body.kids), integers(body.function)
         charge, own = doubles(body.charge), doubles(body.own)
         span = slice(o, first[b + 1])
-        _mean_potentials(body, green, means[span], met[span], crossing[span], linear[span])
-        for k in range(2 * body.n - 2, -1, -1):
+        seen[b] = _mean_potentials(
+            body, green, means[span], met[span], crossing[span], linear[span]
+        )
+        for k in range(seen[b] - 1, -1, -1):
             if not met[o + k]:
                 continue
             x, y = kids[2 * k], kids[2 * k + 1]
@@ -148,10 +155,11 @@ def score(bodies, first, green, weight, scores):
     for i in range(terminals):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
     for b in range(bodies.shape[0]):
-        span = slice(first[b], first[b + 1])
+        span = slice(first[b], first[b] + seen[b])
         _raise_scores(
             bodies[b], means[span], met[span], linear[span], crossing[span], weight, scores[span]
         )
+    return seen
 
 
 @compiled
@@ -159,14 +167,16 @@ def _mean_potentials(body, green, means, met, crossing, linear):
     """φ⁰ in the middle of clusters that see it as linear or have no parts, from the far sources.
 
     ``crossing`` is filled with how much each cluster crosses a wall, 0 to 1, ``linear`` with how
-    linear φ⁰ is there, and ``met`` with which clusters were looked at.
+    linear φ⁰ is there, and ``met`` with which clusters were looked at: none behind as many as are
+    returned.
     """
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
     most = 2 * body.n - 1
     places, inner = np.empty(most, np.int64), np.empty(most)
     points, found = np.empty((most, 3), np.float32), 0
-    met[0] = True
-    for k in range(most):
+    met[0], k, seen = True, -1, 1
+    while k + 1 < seen:
+        k += 1
         if not met[k]:
             continue
         square = out = 0.0
@@ -197,6 +207,7 @@ def _mean_potentials(body, green, means, met, crossing, linear):
             found += 1
         if linear[k] < 1.0 and kids[2 * k] >= 0:
             met[kids[2 * k]] = met[kids[2 * k + 1]] = True
+            seen = max(seen, kids[2 * k + 1] + 1)
     columns = np.empty((3, SIMD_WIDTH * ((found + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
     for j in range(columns.shape[1]):
         for i in range(3):
@@ -207,24 +218,25 @@ def _mean_potentials(body, green, means, met, crossing, linear):
     for j in range(found):
         for i in range(green.lead):
             means[places[j], i] = inner[j] * phi[i, j]
+    return seen
 
 
 @compiled
 def _raise_scores(body, mean, met, linear, crossing, weight, scores):
-    """Score a body's clusters from the mean potentials of those that were met.
+    """Score a body's first clusters from the mean potentials of those that were met.
 
     No charge is beyond a wall. A part that crosses one can carry charge where it is inside only if
     it is split too, which its own score does not tell. So that is at least the score of the body,
     times the part's share of its length.
     """
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
-    extent, count = doubles(body.extent), 2 * body.n - 1
+    extent, count = doubles(body.extent), met.shape[0]
     for k in range(count - 1, -1, -1):
         if not met[k]:
             scores[k] = _INHERITED
             continue
         a, scores[k] = kids[2 * k], 0.0
-        if a >= 0 and met[a]:
+        if 0 <= a < count and met[a]:
             value = 0.0
             for i in range(weight.shape[0]):
                 d = float(mean[a, i] - mean[kids[2 * k + 1], i])
@@ -245,7 +257,7 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
             continue
         for c in range(2):
             part = kids[2 * k + c]
-            if part >= 0 and met[part] and kids[2 * part] >= 0:
+            if 0 <= part < count and met[part] and kids[2 * part] >= 0:
                 scores[part] += linear[part] * _DECAY * scores[k]
                 seen[part] = seen[k] * smooth((1.0 - linear[k]) / _SEEN)
     whole = scores[0]
@@ -255,12 +267,12 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
         wide = smooth((body.scale * extent[k] - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
         least = max(_CROSSED * wide, whole * extent[k] / extent[0])
         scores[k] = max(scores[k], seen[k] * crossing[k] * least)
-        if kids[2 * k] >= 0:
+        if 0 <= kids[2 * k] < count:
             scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
 
 
 @compiled
-def choose(bodies, first, scores, threshold, width):
+def choose(bodies, first, seen, scores, threshold, width):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
     A function fades in while its score grows from ``threshold`` to ``width`` times that. Scores
@@ -268,16 +280,17 @@ def choose(bodies, first, scores, threshold, width):
     """
     total = first[-1]
     state, place = np.full(total, np.int8(-1)), np.empty(total, np.int64)
-    fades, above = np.empty(total), np.empty(total)
+    fades, above, met = np.empty(total), np.empty(total), np.empty(total, np.int64)
     count = leaves = np.int64(0)  # not the literal, for which Numba would compile another version
     for b in range(bodies.shape[0]):
         kids = integers(bodies[b].kids)
-        o = first[b]
+        o, k, last = first[b], -1, 0
         state[o], above[o] = FRONTIER, 1.0
-        for k in range(2 * bodies[b].n - 1):
+        while k < last:
+            k += 1
             if state[o + k] < 0:
                 continue
-            place[o + k] = count
+            place[o + k], met[count] = count, o + k
             count += 1
             fades[o + k] = 0.0
             if kids[2 * k] < 0:
@@ -292,9 +305,10 @@ def choose(bodies, first, scores, threshold, width):
                 part = o + kids[2 * k + c]
                 state[part] = LEAF if state[o + k] == FRONTIER else FRONTIER
                 above[part] = fades[o + k]
-                if scores[part] == _INHERITED:
+                if part - o >= seen[b] or scores[part] == _INHERITED:
                     scores[part] = _DECAY * scores[o + k]
-    return _collect(bodies, first, state, place, fades, above, count, leaves)
+                last = max(last, part - o)
+    return _collect(bodies, first, state, place, fades, above, met[:count], leaves)
 
 
 @compiled
@@ -304,35 +318,32 @@ def _whole(state, above):
 
 
 @compiled
-def _collect(bodies, first, state, place, fades, above, count, leaves):
+def _collect(bodies, first, state, place, fades, above, met, leaves):
+    count = met.shape[0]
     cut = Cut(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),
         np.zeros(count), np.zeros((count, 2)), np.empty(count, np.int64), np.empty(count),
         np.empty(count), np.empty(count), np.ones(count), np.empty(leaves, np.int64),
     )  # fmt: skip
-    leaf = 0
-    for b in range(bodies.shape[0]):
-        nodes = 2 * bodies[b].n - 1
-        kids = integers(bodies[b].kids)
-        charge = doubles(bodies[b].charge)
-        o = first[b]
-        for k in range(nodes):
-            if state[o + k] < 0:
-                continue
-            a = place[o + k]
-            cut.body[a], cut.node[a] = b, k
-            cut.fade[a], cut.above[a] = fades[o + k], above[o + k]
-            cut.whole[a] = _whole(state[o + k], above[o + k])
-            cut.leaf[a] = cut.kids[a, 0] = cut.kids[a, 1] = -1
-            if cut.whole[a] > 0.0:
-                cut.leaf[a], cut.leaves[leaf] = leaf, a
-                leaf += 1
-            if state[o + k] != LEAF:
-                for c in range(2):
-                    cut.kids[a, c] = place[o + kids[2 * k + c]]
-                cut.share[a] = charge[kids[2 * k]] / charge[k]
-                cut.parts[a, 0] = (1.0 - cut.whole[a]) * cut.share[a]
-                cut.parts[a, 1] = (1.0 - cut.whole[a]) - cut.parts[a, 0]
+    leaf = b = 0
+    for a in range(count):
+        at = met[a]
+        while at >= first[b + 1]:
+            b += 1
+        k, kids, charge = at - first[b], integers(bodies[b].kids), doubles(bodies[b].charge)
+        cut.body[a], cut.node[a] = b, k
+        cut.fade[a], cut.above[a] = fades[at], above[at]
+        cut.whole[a] = _whole(state[at], above[at])
+        cut.leaf[a] = cut.kids[a, 0] = cut.kids[a, 1] = -1
+        if cut.whole[a] > 0.0:
+            cut.leaf[a], cut.leaves[leaf] = leaf, a
+            leaf += 1
+        if state[at] != LEAF:
+            for c in range(2):
+                cut.kids[a, c] = place[first[b] + kids[2 * k + c]]
+            cut.share[a] = charge[kids[2 * k]] / charge[k]
+            cut.parts[a, 0] = (1.0 - cut.whole[a]) * cut.share[a]
+            cut.parts[a, 1] = (1.0 - cut.whole[a]) - cut.parts[a, 0]
     return cut
 
 
