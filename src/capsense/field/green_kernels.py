@@ -73,6 +73,8 @@ class Green(NamedTuple):
     """Columns of φ⁰, padded."""
     terminals: int
     """How many of them are terminals."""
+    electrodes: int
+    """How many of these are electrodes, which come first."""
     floor: float
     """Height of the floor [m]."""
     box: NDArray[Any]
@@ -117,7 +119,7 @@ def pack_green(green: GreenFunction, design: Design) -> Green:
     return Green(
         sources(green.near_sources), table(green.near_phi, green.near_modes),
         sources(green.far_sources), far, np.ascontiguousarray(far[:, :lead]),
-        lead, terminals, float(green.floor), np.asarray(green.box, float),
+        lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
         np.asarray(green.blend, float), room, cover_of(design),
     )  # fmt: skip
 

@@ -81,7 +81,7 @@ def _step_rows(
             if count == 0 or found.lossy[e, s]:
                 continue
             out = solve(room[:count], green, sensor.threshold, sensor.width, slopes)
-            found.error[e, s] = estimate(out)
+            found.error[e, s] = estimate(out, green.electrodes)
             for i in range(m):
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.shift >= 0.0 else np.nan

@@ -395,7 +395,7 @@ def report(
     shields[e, s, i] = total
     if i == 0:
         largest = float(0.0)
-        for t in range(doubt.shape[0]):
+        for t in range(circuit.electrodes):
             if largest == largest and not (doubt[t, v] <= largest):  # NaN is the largest
                 largest = doubt[t, v]
         error[e, s] = circuit.unit * largest

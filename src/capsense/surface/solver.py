@@ -26,7 +26,14 @@ from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
-from capsense.surface.step import Solution, potential_change, solve, solve_each, solve_lossy
+from capsense.surface.step import (
+    Solution,
+    estimate,
+    potential_change,
+    solve,
+    solve_each,
+    solve_lossy,
+)
 
 Array = NDArray[np.float64]
 
@@ -298,13 +305,10 @@ class SurfaceSolver:
 
         It is complex, C' - jC'', where matter has losses.
 
-        The error is an estimate of that of the largest entry [F]; where bodies lie within each
-        other or within the sensor so that the matrix had to be changed, it is all of that entry.
+        The error is the :func:`~capsense.surface.step.estimate` [F].
         """
-        doubt = np.abs(solution.left.diagonal()) + solution.coarse
-        if solution.shift > 0.0:
-            doubt = np.abs(solution.delta.diagonal().real)
-        return UNIT * solution.delta, UNIT * float(doubt.max())
+        alone = solution._replace(delta=np.ascontiguousarray(solution.delta.real))
+        return UNIT * solution.delta, UNIT * estimate(alone, self.green.electrodes)
 
     def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
         """How the matrix of all terminals changes with the poses of a scene's bodies.

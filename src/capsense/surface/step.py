@@ -106,16 +106,21 @@ def solve(
 
 
 @compiled
-def estimate(solution: Solution) -> float:
-    """Estimated error of the largest entry [m], of a scene without losses.
+def estimate(solution: Solution, electrodes: int) -> float:
+    """Estimated error of the largest entry of the electrodes' rows [m], of a scene without losses.
 
-    Where bodies lie within each other or within the sensor so that the matrix had to be changed, it
-    is all of that entry.
+    Their columns for shields and floating conductors of the design count, the rows of these do not:
+    a shield changes by far more than what it couples to. Where bodies lie within each other or
+    within the sensor so that the matrix had to be changed, it is all of the largest diagonal.
     """
     out = 0.0
-    for i in range(solution.coarse.shape[0]):
-        doubt = abs(solution.left[i, i]) + solution.coarse[i]
-        out = max(out, abs(solution.delta[i, i]) if solution.shift > 0.0 else doubt)
+    for i in range(electrodes):
+        if solution.shift > 0.0:
+            out = max(out, abs(solution.delta[i, i]))
+            continue
+        out = max(out, abs(solution.left[i, i]) + solution.coarse[i])
+        for j in range(electrodes, solution.left.shape[0]):
+            out = max(out, abs(solution.left[i, j]))
     return out
 
 
@@ -139,7 +144,7 @@ def solve_each(
     for scene in range(k):
         if first[scene] < first[scene + 1]:
             found = solve(bodies[first[scene] : first[scene + 1]], green, threshold, width, False)
-            size[scene], error[scene] = found.size, estimate(found)
+            size[scene], error[scene] = found.size, estimate(found, green.electrodes)
             for i in range(m):
                 for j in range(m):
                     delta[scene, i, j] = found.delta[i, j]
