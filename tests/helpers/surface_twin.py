@@ -299,7 +299,7 @@ def reduced(
 
 # ---- scores ----
 
-COARSE, LINEAR, DECAY, LEAST = 31, (0.6, 0.77), 0.35, 3e-3
+COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
 LONG, SHORE = (0.03, 0.06), 5e-3
 

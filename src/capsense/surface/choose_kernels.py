@@ -20,10 +20,9 @@ from capsense.field.green_kernels import (
     smooth,
 )
 
-_LINEAR, _LINEAR_PIECES = (0.6, 0.77), (0.45, 0.58)
+_LINEAR = 0.45, 0.58
 """Clusters smaller than the first part of their distance from the design see a linear potential,
-those larger than the second do not; in between they come to do. The second pair is for bodies
-without energies of their own."""
+those larger than the second do not; in between they come to do."""
 _COARSE = 31
 """So many clusters, the coarsest of a body, are looked into wherever they are."""
 _DECAY = 0.35
@@ -175,7 +174,6 @@ def _mean_potentials(body, green, means, met, crossing, linear):
     most = 2 * body.n - 1
     places, inner = np.empty(most, np.int64), np.empty(most)
     points, found = np.empty((most, 3), np.float32), 0
-    first, last = _LINEAR if body.spread == 0 else _LINEAR_PIECES
     met[0], k, seen = True, -1, 1
     while k + 1 < seen:
         k += 1
@@ -198,7 +196,7 @@ def _mean_potentials(body, green, means, met, crossing, linear):
         )
         if k >= _COARSE:
             part = size / math.sqrt(square + 1e-12)
-            even = smooth((last - part) / (last - first))
+            even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
             linear[k] = (1.0 - share * (1.0 - even)) * (1.0 - crossing[k])
         if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
             lift(points[found : found + 1], least_gap(size, green.cover), green.box)
