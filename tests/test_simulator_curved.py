@@ -87,3 +87,19 @@ def test_the_driven_housing_takes_no_part_in_self_mode(simulators):
     assert (np.diag(reading.capacitance) > 3.5e-12).all()
     assert (reading.self_capacitance < 1.0e-12).all()
     assert (reading.self_capacitance > 0.3e-12).all()
+
+
+def test_a_link_behind_the_housing_is_no_doubt_of_the_electrodes(simulators):
+    """Measured: the housing alone changes by picofarads; told of the electrodes was all of that
+    error, a hundred times their change."""
+    link = cs.Body(
+        cs.Cylinder(0.048, 0.09), cs.Pose.from_euler((0, 0.1, -0.048), (np.pi / 2, 0, 0))
+    )
+    sim, fine = simulators("arm_segment"), simulators("arm_segment", preset="fine")
+    reading, finer = sim.step(cs.Scene([link])), fine.step(cs.Scene([link]))
+    off = max(
+        np.abs(reading.delta - finer.delta).max(),
+        np.abs(reading.self_capacitance - finer.self_capacitance).max(),
+    )
+    assert off / 5 < reading.stats.solver_error < 5 * off
+    assert reading.stats.solver_error < 0.5 * reading.delta.max()

@@ -135,6 +135,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         return step.Solution(
             delta[:m, :m], left[:m, :m], coarse[:m], charge,
             leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
+            step.estimate(delta, left, coarse[:m], shift, green.electrodes),
         )  # fmt: skip
 
     with (

@@ -20,7 +20,7 @@ from capsense.field.green_kernels import SHORE, Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading
 from capsense.surface.gradient_kernels import jacobian
 from capsense.surface.solver import SurfaceSolver
-from capsense.surface.step import estimate, solve, solve_lossy
+from capsense.surface.step import solve, solve_lossy
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def _step_rows(
             if count == 0 or found.lossy[e, s]:
                 continue
             out = solve(room[:count], green, sensor.threshold, sensor.width, slopes)
-            found.error[e, s] = estimate(out, green.electrodes)
+            found.error[e, s] = out.error
             for i in range(m):
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.shift >= 0.0 else np.nan
@@ -269,5 +269,5 @@ class CpuCore:
                 preset.threshold, preset.width,
             )  # fmt: skip
             found.delta[e, s], loss[e, s] = out.delta.real, -out.delta.imag
-            found.error[e, s] = solver.in_farads(out)[1] / UNIT
+            found.error[e, s] = out.error
         return loss

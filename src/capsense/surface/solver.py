@@ -26,14 +26,7 @@ from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
-from capsense.surface.step import (
-    Solution,
-    estimate,
-    potential_change,
-    solve,
-    solve_each,
-    solve_lossy,
-)
+from capsense.surface.step import Solution, potential_change, solve, solve_each, solve_lossy
 
 Array = NDArray[np.float64]
 
@@ -188,7 +181,8 @@ class SurfaceSolver:
         if solution is None:
             return self._change(view, np.zeros((self.green.terminals,) * 2), 0.0, 0, slope)
         self._last = view, solution
-        return self._change(view, *self.in_farads(solution), solution.size, slope)
+        matrix, error = UNIT * solution.delta, UNIT * solution.error
+        return self._change(view, matrix, error, solution.size, slope)
 
     def _change(
         self, view: View, matrix: NDArray[Any], error: float, size: int, slope: Array | None
@@ -299,16 +293,6 @@ class SurfaceSolver:
         if not np.isfinite(out.delta).all():
             raise SolveError(_NO_SOLUTION)
         return bodies, out
-
-    def in_farads(self, solution: Solution) -> tuple[NDArray[Any], float]:
-        """Change of the Maxwell matrix of all terminals [F], (terminals, terminals), and its error.
-
-        It is complex, C' - jC'', where matter has losses.
-
-        The error is the :func:`~capsense.surface.step.estimate` [F].
-        """
-        alone = solution._replace(delta=np.ascontiguousarray(solution.delta.real))
-        return UNIT * solution.delta, UNIT * estimate(alone, self.green.electrodes)
 
     def jacobian(self, view: View, bodies: PackedBodies, solution: Solution | None) -> Array:
         """How the matrix of all terminals changes with the poses of a scene's bodies.

@@ -52,6 +52,8 @@ class Solution(NamedTuple):
     shift: float
     """What was added to the diagonal to make the matrix definite, relative; 0 in good scenes, and
     -1 where there is no solution, and ``delta`` is not finite."""
+    error: float
+    """See :func:`estimate` [m]."""
 
 
 @pasted
@@ -87,6 +89,31 @@ def prepared(
 
 
 @compiled
+def estimate(
+    delta: NDArray[Any], left: NDArray[Any], coarse: NDArray[Any], shift: float, electrodes: int
+) -> float:
+    """Estimated error of the largest entry of the electrodes' rows [m].
+
+    Their columns for shields and floating conductors of the design count, the rows of these do not:
+    a shield changes by far more than what it couples to. Where bodies lie within each other or
+    within the sensor so that the matrix had to be changed, it is all of the largest diagonal.
+
+    Args:
+        delta, left, coarse, shift: As in :class:`Solution`; real.
+        electrodes: How many of the terminals are electrodes, the first ones.
+    """
+    out = 0.0
+    for i in range(electrodes):
+        if shift > 0.0:
+            out = max(out, abs(delta[i, i]))
+            continue
+        out = max(out, abs(left[i, i]) + coarse[i])
+        for j in range(electrodes, coarse.shape[0]):
+            out = max(out, abs(left[i, j]))
+    return out
+
+
+@compiled
 def solve(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
 ) -> Solution:
@@ -99,29 +126,11 @@ def solve(
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
+    error = estimate(delta, left, coarse[:m], shift, green.electrodes)
     return Solution(
         delta[:m, :m], left[:m, :m], coarse[:m], charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift, error,
     )  # fmt: skip
-
-
-@compiled
-def estimate(solution: Solution, electrodes: int) -> float:
-    """Estimated error of the largest entry of the electrodes' rows [m], of a scene without losses.
-
-    Their columns for shields and floating conductors of the design count, the rows of these do not:
-    a shield changes by far more than what it couples to. Where bodies lie within each other or
-    within the sensor so that the matrix had to be changed, it is all of the largest diagonal.
-    """
-    out = 0.0
-    for i in range(electrodes):
-        if solution.shift > 0.0:
-            out = max(out, abs(solution.delta[i, i]))
-            continue
-        out = max(out, abs(solution.left[i, i]) + solution.coarse[i])
-        for j in range(electrodes, solution.left.shape[0]):
-            out = max(out, abs(solution.left[i, j]))
-    return out
 
 
 @compiled
@@ -144,7 +153,7 @@ def solve_each(
     for scene in range(k):
         if first[scene] < first[scene + 1]:
             found = solve(bodies[first[scene] : first[scene + 1]], green, threshold, width, False)
-            size[scene], error[scene] = found.size, estimate(found, green.electrodes)
+            size[scene], error[scene] = found.size, found.error
             for i in range(m):
                 for j in range(m):
                     delta[scene, i, j] = found.delta[i, j]
@@ -232,9 +241,11 @@ def solve_lossy(
     delta = _product(phi[:n, :m].T, solved) + left
     coarse = COARSE * (functions.ends[:n] * np.abs(diagonal[:n])) @ np.abs(solved) ** 2
     charge = leaf_charges(cut, functions, np.ascontiguousarray(x.real), len(leaves.points))
+    delta, left = 0.5 * (delta + delta.T), np.ascontiguousarray(left.real)
+    error = estimate(np.ascontiguousarray(delta.real), left, coarse, shift, green.electrodes)
     return Solution(
-        0.5 * (delta + delta.T), np.ascontiguousarray(left.real), coarse, charge,
-        leaves.points, leaves.extent, leaves.soft, leaves.owner, n, shift,
+        delta, left, coarse, charge,
+        leaves.points, leaves.extent, leaves.soft, leaves.owner, n, shift, error,
     )  # fmt: skip
 
 
