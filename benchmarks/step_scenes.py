@@ -236,7 +236,7 @@ def worlds() -> list[World]:
         World("depth frame 64 x 64, forearm", seen(forearm), 2.5, lambda: swaying(forearm)(0)),
         World("depth frame 64 x 64, bar", seen(bar), 2.5, lambda: swaying(bar)(0)),
         World("deforming sheet, 400 quads", waving(), 4.0, judged=False),
-        World("person, mesh", swaying(person()), 2.0, lambda: cs.Scene(person_parts())),
+        World("person, mesh", swaying(person()), 2.0),
     ]  # fmt: skip
 
 
