@@ -50,7 +50,7 @@ def test_the_inside_of_an_open_surface() -> None:
 def test_what_does_not_converge_is_told() -> None:
     assert not rigid._conjugate_gradients(np.full((2, 2), np.nan), np.zeros(2))
     with pytest.raises(SolveError, match="the charges of 2 panels do not converge"):
-        rigid._equilibrium(np.full((2, 2), np.nan))
+        rigid.equilibrium(np.full((2, 2), np.nan))
 
 
 @pytest.mark.parametrize(

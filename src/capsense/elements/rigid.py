@@ -44,7 +44,7 @@ _EXTRA = 0.0, 1e-3, 1e-2, 0.1
 """What is added to the panels' own energies, relative, where some nearly coincide."""
 _LEFT, _MOST_STEPS = 1e-8, 1000
 """Conjugate gradients end when so little of the residual is left, or after so many steps."""
-_LEAST_CHARGE = 1e-6
+LEAST_CHARGE = 1e-6
 """Smallest charge of a panel, as a part of the largest: those within a cavity have none."""
 BODY = np.dtype(
     [
@@ -181,12 +181,12 @@ def rigid_shape(panels: SurfacePanels, *, apart: bool = False) -> RigidShape:
         SolveError: The panels lie within each other, so that their block is not definite.
     """
     free = free_block(panels)
-    charge = _equilibrium(free) if apart else _made_definite(free)
-    tree = build_tree(panels, np.maximum(charge, _LEAST_CHARGE * charge.max()))
+    charge = equilibrium(free) if apart else _made_definite(free)
+    tree = build_tree(panels, np.maximum(charge, LEAST_CHARGE * charge.max()))
     return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
 
 
-def _equilibrium(free: Array) -> Array:
+def equilibrium(free: Array) -> Array:
     """Charges that put all panels at 1 V, by conjugate gradients, free (n, n) -> (n,)."""
     charge = np.zeros(len(free))
     if not _conjugate_gradients(free, charge):
