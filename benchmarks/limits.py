@@ -7,6 +7,7 @@
 - a ball, a limb and a box over the narrow electrodes of ``stripe``, against as many.
 - boxes that come down in steps of 0.02 mm: by how much a large entry falls in a step, at most.
 - a person's arm whose hand leaves the domain, against the preset fine.
+- a figure as one mesh of one skin, against 5,600 panels with their energies.
 - dielectrics in depth images of 128 × 128 pixels with front and back, against the shapes.
 - sheets of a dielectric as deforming surfaces of 800 triangles, against boxes as thick.
 - bodies that reach into the sensor: error estimates over the largest entry.
@@ -27,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
 from field_cases import arm_scenes, bar, delta_reference
 from layered_views import view
+from one_skin import person as one_skin
 from reference_scenes import MORE, diagonal_errors, reference_scenes
 
 import capsense as cs
@@ -199,12 +201,26 @@ def person(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         yield f"gap {1e3 * gap:g} mm", np.stack([rms, worst], axis=1).ravel().tolist()
 
 
+def skin(_: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Largest difference from many panels, each preset; the fingertips' gap."""
+    sim = cs.Simulator("six_patch")
+    many = Preset(panels=3500, threshold=1e-3, coarsest=None)
+    truth = SurfaceSolver(sim.background.green, sim.design, preset=many)
+    sims = [cs.Simulator("six_patch", preset=p, background=sim.background) for p in PRESETS]
+    for height in (-0.012, 0.0, 0.02, 0.05, 0.1):
+        scene = one_skin(at=(0.005, 0.003, height))
+        wanted = truth.solve(scene).matrix
+        off = [np.abs(s.step(scene).delta - wanted).max() / wanted.max() for s in sims]
+        yield f"gap {21 + 1e3 * height:g} mm", list(map(float, off))
+
+
 PARTS = {
     "contact, presets learning, standard, fine, and 2,800 panels": contact,
     "wide boxes: median and largest error, and median estimate, of each preset": wide,
     "narrow electrodes: gaps of 2, 5, 10, 30 mm": narrow,
     "falls in a step: 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, of each preset": falls,
     "a person's arm: rms and largest error, presets learning and standard": person,
+    "a figure of one skin: presets learning, standard, fine": skin,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,
     "deforming sheets of dielectrics, gaps of 5, 10, 20, 50 mm": cloth,
     "in the sensor: error estimate with lowest points at 1, 0, -1, -5 mm": inside,

@@ -296,6 +296,7 @@ def main() -> None:
         contact=limited("contact", *PRESETS, "2,800 panels"),
         wide=limited("wide", *(f"{p}: {x}" for p in PRESETS for x in ("median", "worst", "told"))),
         images=limited("images", *GAPS), cloth=limited("cloth", *GAPS),
+        skin=limited("skin", *PRESETS),
         inside=limited("inside", "1 mm", "0 mm", "−1 mm", "−5 mm"),
         studies=studies(reproduced), foretold=foretold(),
     )  # fmt: skip

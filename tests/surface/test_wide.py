@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
+from one_skin import person
 from reference_scenes import DESIGN, MORE, diagonal_errors, reference_scenes
 from scipy.spatial import cKDTree
 
@@ -395,45 +395,8 @@ def test_copies(sim):
     np.testing.assert_array_equal(other.step(again).delta, before)
 
 
-def figure() -> cs.TriMesh:
-    """A figure of one connected skin: a trunk, an arm to the side, one that reaches down with three
-    fingers, two legs. Its corners are at least 20 mm above the sensor."""
-    boxes = np.array([
-        [[-8, -10, 22], [-1, 10, 60]],  # lower and upper corners, in steps
-        [[-8, 9, 45], [-4, 26, 50]],
-        [[-4, -2, 5], [0, 2, 24]], [[-4, -3, 4], [0, 3, 9]],
-        [[-3, -3, 1], [-2, -2, 5]], [[-3, -1, 1], [-2, 0, 5]], [[-3, 1, 1], [-2, 2, 5]],
-        [[-8, -6, 58], [-5, -2, 90]], [[-8, 2, 58], [-5, 6, 90]],
-    ])  # fmt: skip
-    low = boxes.min(axis=(0, 1)) - 1
-    solid = np.zeros(boxes.max(axis=(0, 1)) - low + 1, bool)
-    for a, b in boxes - low:
-        solid[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = True
-    squares = []
-    for axis in range(3):
-        u, v = np.roll(np.eye(3), -1 - axis, axis=0)[:2]
-        for way in (0, 1):
-            corner = np.argwhere(solid & ~np.roll(solid, 1 - 2 * way, axis=axis)).astype(float)
-            corner[:, axis] += way
-            ring = corner, corner + u, corner + u + v, corner + v
-            squares.append(np.stack(ring if way else ring[::-1], axis=1))
-    corners = np.concatenate(squares)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
-    vertices, faces = np.unique(corners, axis=0, return_inverse=True)
-    mesh = trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
-    trimesh.smoothing.filter_laplacian(mesh, iterations=4)
-    return cs.TriMesh(0.008 * (mesh.vertices + low + [0, 0, 2]), mesh.faces)
-
-
 SKINS = {False: (19.003, 15.213, 11.086), True: (19.003, 15.213, 11.086)}
 """C_11, C_55 and C_15 beside a closed and an open figure of one skin, from 8,800 panels [fF]."""
-
-
-def person(open_skin: bool) -> cs.Scene:
-    mesh = figure()
-    if open_skin:
-        mesh = cs.TriMesh(mesh.vertices, mesh.faces[mesh.vertices[mesh.faces, 2].min(axis=1) < 0.6])
-    assert (mesh.parts, mesh.closed) == (1, not open_skin)
-    return cs.Scene([cs.Body(mesh, cs.Pose(), "human", 100e-12)])
 
 
 def of_skin(matrix: np.ndarray) -> list[float]:
@@ -461,9 +424,8 @@ def test_a_person_of_one_skin(simulators, preset, open_skin, most):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("open_skin", [False, True], ids=["closed", "open"])
-def test_the_reference_of_one_skin(simulators, monkeypatch, open_skin):
+def test_the_reference_of_one_skin(simulators, open_skin):
     """Differential: many panels that have energies of their own."""
-    monkeypatch.setattr(store, "_MOST", 1.6)
     sim, many = simulators("six_patch"), Preset(panels=5500, threshold=5e-4, coarsest=None)
     truth = SurfaceSolver(sim.background.green, sim.design, preset=many).solve(person(open_skin))
     assert of_skin(truth.matrix) == pytest.approx(SKINS[open_skin], rel=1e-3)

@@ -347,8 +347,8 @@ _FOIL = 5e-5
 _FACES, _ROUNDED, _FLAT = 12.0, 0.1, 0.5
 """Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
 of its faces: the first of a plate, of which four points do not tell the faces apart there; the
-second of others, whose limbs are told apart first. A plate is thicker than this part of its
-least extent. Its functions are weighted with the area, others with the charges of an equilibrium."""
+second of others, whose limbs are told apart first. A plate is thicker than this part of its least
+extent. Its functions are weighted with the area, others with charges in equilibrium."""
 _CLUSTERS, _SQUARE = 1000, 2.97
 """Clusters from which the charges of wide bodies are found, and the mean of 1/r in a square, times
 its side."""
