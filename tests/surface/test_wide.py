@@ -16,8 +16,8 @@ import capsense as cs
 from capsense.elements import store
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import panels_of
-from capsense.elements.pieces import WIDE, WideBody, wide_pieces
 from capsense.elements.rigid import BODY, Clusters, RigidShape, features, split
+from capsense.elements.wide import WIDE, WideBody, wide_pieces
 from capsense.surface.solver import PRESETS, Preset, SurfaceSolver
 
 SCENES = [s for s in reference_scenes(MORE) if s.category.startswith("wide")]

@@ -1,40 +1,29 @@
-"""Surfaces without energies of their own: depth images, cloth, and bodies that are wide.
+"""Surfaces without energies of their own, such as depth images and cloth.
 
-Clusters of theirs meet each other as rectangles of the same second moments, at every step. Those of
-depth images and cloth are fixed; charge, centres and moments follow the pieces. A wide body has far
-more pieces than energies could be worked out for.
+Clusters of theirs meet each other as rectangles of the same second moments, at every step. The
+clusters are fixed; charge, centres and moments follow the pieces.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
-from threadpoolctl import threadpool_limits
 
 from capsense.elements import tree_kernels
-from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
 from capsense.elements.rigid import (
     BODY,
     INSIDE,
-    LEAST_CHARGE,
     Clusters,
-    equilibrium,
     features,
-    once,
     split,
 )
-from capsense.errors import SolveError
-from capsense.scene import Layers, RestSurface, SurfaceMesh, TriMesh
-from capsense.scene.shapes import Shape, ShapeKind
+from capsense.scene import Layers, RestSurface, SurfaceMesh
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -324,158 +313,3 @@ class ChangingBody:
     def nbytes(self) -> int:
         """Room that the arrays take up [bytes]."""
         return sum(a.nbytes for a in self.__dict__.values() if isinstance(a, np.ndarray))
-
-
-WIDE = 0.16
-"""Shapes of a second-largest extent above this [m] are solved for on a :class:`WideBody`."""
-_ROUND = {
-    ShapeKind.SPHERE: math.pi / 6, ShapeKind.ELLIPSOID: math.pi / 6,
-    ShapeKind.CAPSULE: math.pi / 4, ShapeKind.CYLINDER: math.pi / 4,
-}  # fmt: skip
-"""About how much of the surface of its bounding box that of a shape is."""
-_SLENDER = 4.0
-"""Lengths beyond so many widths do not make panels too wide."""
-_PIECE = 4e-3
-"""Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""
-_FEWEST, _DOUBLINGS = 5000, 3
-"""Pieces of wide bodies are so many, doubled at most so often."""
-COARSE, _THICK = 1000, 2.0
-"""Panels from which the impedance of the inside of wide shapes is found, and how many times as
-thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
-_FOIL = 5e-5
-"""Primitives thinner than this part of their width have no energies: their faces would be one."""
-_FACES, _ROUNDED, _FLAT = 12.0, 0.1, 0.5
-"""Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
-of its faces: the first of a plate, of which four points do not tell the faces apart there; the
-second of others, whose limbs are told apart first. A plate is thicker than this part of its least
-extent. Its functions are weighted with the area, others with charges in equilibrium."""
-_CLUSTERS, _SQUARE = 1000, 2.97
-"""Clusters from which the charges of wide bodies are found, and the mean of 1/r in a square, times
-its side."""
-_HALF_SPACE = 2.0
-"""Impedance of the inside over the energy in free space where a surface is flat and thick."""
-
-
-def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
-    """About how many pieces a shape is cut into; 0 where it is neither wide nor a foil.
-
-    Nor are dielectrics that are thin, or meshes.
-
-    Args:
-        shape: A primitive or a mesh.
-        conducting: Whether it holds no field inside.
-        largest: Shapes of so much surface or more [m²] are wide too; not all of long ones counts.
-    """
-    held = shape.__dict__.get("_pieces")
-    if held is None:
-        low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
-        mesh = isinstance(shape, TriMesh)
-        part, area = (
-            2 * (low * middle + (low + middle) * length) * _ROUND.get(shape.kind, 1.0)
-            for length in (min(high, _SLENDER * middle), high)
-        )
-        wide = middle > WIDE or (low < _FOIL * middle and not mesh)
-        doublings = math.ceil(math.log2(max(area / _PIECE**2 / _FEWEST, 1.0)))
-        solid = not mesh and low >= _THICK * math.sqrt(area / COARSE)
-        held = math.inf if wide else part, _FEWEST * 2 ** min(doublings, _DOUBLINGS), solid
-        shape.__dict__["_pieces"] = held
-    surface, pieces, solid = held
-    return pieces if surface >= largest and (conducting or solid) else 0
-
-
-def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
-    """Thickness of a wide body [m], and whether it is a plate."""
-    arms = panels.centers - panels.centers.mean(axis=0)
-    low = float(np.ptp(arms @ np.linalg.eigh(arms.T @ arms)[1], axis=0).min())
-    thickness = panels.thickness if panels.closed else low / 3  # as of a ball
-    return thickness, thickness > _FLAT * low
-
-
-def _coarsest(kids: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
-    """The first clusters of a tree, as far as ``count`` of them are not split among them.
-
-    Returns:
-        Parts of these clusters, -1 where they are not split, shape (t, 2); numbers of those that
-        are not, shape (t,); and the one that each cluster of a single panel is in, shape (n,).
-    """
-    top = min(2 * count - 1, len(kids))
-    first = np.where(kids[:top] < top, kids[:top], -1)
-    last = first[:, 0] < 0
-    parent = np.zeros(len(kids), np.int64)
-    parent[kids[panel < 0]] = np.flatnonzero(panel < 0)[:, None]
-    above = np.flatnonzero(panel >= 0)
-    while (below := above >= top).any():
-        above[below] = parent[above[below]]
-    return first, np.where(last, np.cumsum(last) - 1, -1), above
-
-
-def _equilibrium(tree: Clusters, panels: SurfacePanels) -> Array:
-    """About the charges that put all panels at one potential, from some clusters of them, (n,).
-
-    Limbs and edges carry more than their share of the surface. What is wrong here, functions of
-    smaller clusters make right.
-    """
-    _, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)
-    cluster = np.empty(len(panels), np.int64)
-    cluster[tree.panel[tree.panel >= 0]] = number[above]
-    area = np.bincount(cluster, panels.areas)
-    center = np.stack([np.bincount(cluster, panels.areas * x) / area for x in panels.centers.T])
-    square = ((center[:, :, None] - center[:, None]) ** 2).sum(axis=0)
-    soft = np.maximum.outer(area, area) / _SQUARE**2
-    try:
-        charge = equilibrium((square**2 + soft**2) ** -0.25)
-    except SolveError:  # of faces that coincide
-        return panels.areas
-    return (
-        np.asarray(np.maximum(charge, LEAST_CHARGE * charge.max()) / area)[cluster] * panels.areas
-    )
-
-
-class WideBody(ChangingBody):
-    """A rigid shape on many panels, which meet each other without a block of energies.
-
-    Args:
-        panels: The many panels.
-        coarse: Makes some hundred panels of the same shape, from which the impedance of the inside
-            is found.
-
-    Attributes:
-        most: How far apart opposite normals count, see :func:`features` [m].
-        weights: Charges of the panels that functions are weighted with, shape (n,).
-    """
-
-    def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
-        thickness, plate = _thickness(panels)
-        self.most, self._coarse = thickness * (_FACES if plate else _ROUNDED), coarse
-        self._at = features(panels.centers, panels.normals, self.most)
-        tree = split(self._at, panels.areas)
-        self.weights = panels.areas if plate else _equilibrium(tree, panels)
-        super().__init__(tree, panels, charge=self.weights)
-        self.record["inside"] = _HALF_SPACE
-
-    @property
-    def impedance(self) -> Array32:
-        """As in :class:`ChangingBody`, shape (f, f).
-
-        Z − 2F is smooth: charges within a small place that add to zero have none of it. So it is
-        that of a few panels, for the charge functions of clusters as large as these and larger.
-        """
-        return once(self, "_impedance", self._inside)
-
-    def _inside(self) -> Array32:
-        panels = self._coarse()
-        with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
-            free = free_block(panels)
-            more = impedance(panels, free) - _HALF_SPACE * free
-        kids, number, above = _coarsest(self._kids, self._panel, len(panels))
-        single = np.flatnonzero(self._panel >= 0)
-        on = cKDTree(features(panels.centers, panels.normals, self.most)).query(self._at)[1]
-        share = self._charge[single] / self._charge[above]
-        places = number[above], on[self._panel[single]]
-        shares = csr_array((share, places), (number.max() + 1, len(panels)))
-        block = np.ascontiguousarray(shares @ (shares @ more).T)
-        tree = kids, number, self._charge[: len(kids)], self._function[: len(kids)]
-        rows, out = np.empty(block.shape), np.empty(block.shape, np.float32)
-        tree_kernels.to_functions(block, *tree, rows)
-        tree_kernels.energies_of_functions(rows, *tree, out)
-        return out

@@ -18,15 +18,9 @@ from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense.elements.panels import panels_of, polygon_panels
-from capsense.elements.pieces import (
-    COARSE,
-    ChangingBody,
-    WideBody,
-    layer_pieces,
-    mesh_pieces,
-    wide_pieces,
-)
+from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
+from capsense.elements.wide import COARSE, WideBody, wide_pieces
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
 from capsense.scene import (

@@ -15,7 +15,7 @@ from capsense._thread_pool import OneAtATime
 from capsense._validate import as_whole, checked_frequency, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.elements.pieces import WIDE
+from capsense.elements.wide import WIDE
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
