@@ -16,7 +16,14 @@ import capsense as cs
 from capsense.elements import store
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import panels_of
-from capsense.elements.rigid import BODY, Clusters, RigidShape, features, split
+from capsense.elements.rigid import (
+    BODY,
+    Clusters,
+    RigidShape,
+    equilibrium,
+    features,
+    split,
+)
 from capsense.elements.wide import WIDE, WideBody, wide_pieces
 from capsense.surface.solver import PRESETS, Preset, SurfaceSolver
 
@@ -429,3 +436,20 @@ def test_the_reference_of_one_skin(simulators, open_skin):
     sim, many = simulators("six_patch"), Preset(panels=5500, threshold=5e-4, coarsest=None)
     truth = SurfaceSolver(sim.background.green, sim.design, preset=many).solve(person(open_skin))
     assert of_skin(truth.matrix) == pytest.approx(SKINS[open_skin], rel=1e-3)
+
+
+def test_weights_of_functions():
+    """Analytic: even on a ball. Differential: on a limb, those of panels with energies. Of a plate
+    they are the areas."""
+    for shape, bound in ((cs.Sphere(0.1), 0.08), (cs.Capsule(0.09, 0.5), 0.12)):
+        panels = panels_of(shape, 5000, merge=False)
+        body = WideBody(panels, panels_of)
+        density = body.weights / panels.areas
+        few = panels_of(shape, 600)
+        wanted = equilibrium(free_block(few)) / few.areas
+        near = cKDTree(few.centers).query(panels.centers)[1]
+        ratio = density / wanted[near]
+        ratio /= np.average(ratio, weights=panels.areas)
+        assert np.sqrt(np.average((ratio - 1) ** 2, weights=panels.areas)) < bound
+    panels = panels_of(PLATE, 5000)
+    assert WideBody(panels, panels_of).weights is panels.areas
