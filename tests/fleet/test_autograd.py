@@ -14,14 +14,14 @@ torch = pytest.importorskip("torch")
 
 @pytest.mark.parametrize("device", ["cpu", "warp:cpu"])
 def test_gradients(device):
-    """Differential: a random sum of all entries, by every pose; to 1 and 0.1 % of the largest."""
+    """Differential: a random sum of all entries, by every pose; to 0.5 and 0.1 % of the largest."""
     from capsense.fleet.autograd import change
 
     if device != "cpu":
         pytest.importorskip("warp")
     fleet = Fleet(
-        "six_patch", [BODIES[0], BODIES[2]], 2, sensors=2, preset="standard",
-        device=device, budget=64,
+        "six_patch", [BODIES[0], BODIES[2]], 2, sensors=2, device=device, budget=64,
+        preset="fine" if device == "cpu" else "standard",
     )  # fmt: skip
 
     def delta(poses):
@@ -52,7 +52,7 @@ def test_gradients(device):
             moved[e, b, 3:] /= np.linalg.norm(moved[e, b, 3:])
             ends.append((delta(moved) * weights).sum())
         difference = (ends[0] - ends[1]) / (2 * step)
-        bound = 1e-2 if device == "cpu" else 1e-3
+        bound = 5e-3 if device == "cpu" else 1e-3
         assert gradient[e, b, k] == pytest.approx(difference, rel=0, abs=bound * scale)
 
 
