@@ -67,7 +67,7 @@ def test_slopes(sim: cs.Simulator, matrix: bool) -> None:
         down[k] -= step
         (a, _), (b, _) = (estimator.model(LimbPose(*x[:4]), math.exp(x[4])) for x in (up, down))
         difference = (a - b) / (2 * step)
-        # measured, of the largest: 1.5 %, by a turn 4 %; the own of the radius is one-sided
+        # measured, of the largest: 1.5 %, by a turn 4 %; that by the radius is one-sided
         bound = 0.1 if k == 4 else 0.05 if k == 3 else 0.03
         assert slopes[:, k] == pytest.approx(difference, abs=bound * np.abs(difference).max())
     assert values.min() > 0 or matrix

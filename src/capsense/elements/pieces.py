@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 
 from capsense.elements import tree_kernels
 from capsense.elements.panels import SurfacePanels
-from capsense.elements.rigid import (
-    BODY,
-    INSIDE,
-    Clusters,
-    features,
-    split,
-)
+from capsense.elements.rigid import BODY, INSIDE, Clusters, features, split
 from capsense.scene import Layers, RestSurface, SurfaceMesh
 
 Array = NDArray[np.float64]
