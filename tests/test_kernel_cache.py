@@ -132,7 +132,7 @@ class Slow(event.Listener):
     count = 0
 
     def on_start(self, started):
-        self.count += started.data["dispatcher"] in (kept_kernels.inner, kept_kernels.outer)
+        self.count += started.data["dispatcher"].__name__ in ("inner", "outer")
         time.sleep(0.5)
 
     def on_end(self, ended):
@@ -160,6 +160,47 @@ def test_processes_that_start_together_compile_each_kernel_once(tmp_path: Path) 
     assert len({value for value, _ in found}) == 1
     assert len(list(folder.rglob("*.nbc"))) == 2
     assert not list(folder.rglob("*.lock"))
+
+
+OTHER = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from numba.core import event
+import kept_kernels
+from capsense._jit import compiled
+
+class Compiled(event.Listener):
+    names = []
+
+    def on_start(self, started):
+        if started.data["dispatcher"].__module__ in ("kept_kernels", "__main__"):
+            self.names.append(started.data["dispatcher"].__name__)
+
+    def on_end(self, ended):
+        pass
+
+@compiled
+def other(n):
+    return kept_kernels.inner(n) - kept_kernels.outer(n)
+
+event.register("numba:compile", Compiled())
+value = other(3.0)
+print(*Compiled.names)
+assert abs(value - (kept_kernels.inner(3.0) - kept_kernels.outer(3.0))) == 0.0
+"""
+
+
+def test_what_kernels_call_is_kept_for_new_callers(tmp_path: Path) -> None:
+    """It is read from its file; what only Python had called is compiled for the new caller."""
+    (tmp_path / "kept_kernels.py").write_text(KERNELS)
+    (tmp_path / "other_kernels.py").write_text(OTHER)
+    env = {**os.environ, "PYTHONPATH": _path(), "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    first = [sys.executable, "-c", CODE, str(tmp_path)]
+    subprocess.run(first, env=env, check=True, capture_output=True, timeout=120)
+    run = [sys.executable, str(tmp_path / "other_kernels.py"), str(tmp_path)]
+    done = subprocess.run(run, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["other", "outer"]
 
 
 SOLVED = """

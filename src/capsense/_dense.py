@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capsense._jit import compiled, pasted
+from capsense._jit import compiled
 from capsense._simd import at, horizontal_sum, madd, muladd, put_span, span, splat, vmadd
 
 WIDTH = 32
@@ -63,7 +63,7 @@ def multiply_part(left, table, depth, width, out):
             _put(out, i * w + j, a0, a1, a2, a3)
 
 
-@pasted
+@compiled
 def _put(out, place, a, b, c, d):
     put_span(out, place, a)
     put_span(out, place + 8, b)

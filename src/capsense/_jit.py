@@ -8,17 +8,21 @@ last bits, and a recording would not replay. What is worth doing eight at a time
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
-from numba import njit
+from numba import config, types, version_info
 from numba.core.caching import FunctionCache
+from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
 
 from capsense import _kernel_cache
 
@@ -65,23 +69,85 @@ class _Cache(FunctionCache):
                 lock.release()
 
 
+class _PartCache(_Cache):
+    """For what only kernels call, beside what Python calls of the same name."""
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return super()._index_key(sig, codegen), "part"
+
+
+class _Part(CPUDispatcher):
+    """Compiles a function for the kernels that call it; Python cannot call it."""
+
+    _kept: type[_Cache] = _PartCache
+
+    def __init__(self, py_func: Any, targetoptions: Any, compiler: Any) -> None:
+        super().__init__(py_func, targetoptions=targetoptions, pipeline_class=compiler)
+        self._cache = self._kept(py_func)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile for types, unless another process has, or does."""
+        # Numba's lock comes first: a thread must not wait for it with a file locked
+        with global_compiler_lock, self._cache.alone(sig, self.targetctx), _nothing_collected():
+            return super().compile(sig)
+
+
+class _Kernel(_Part):
+    """Compiles a function for Python; kernels that call it find its :class:`_Part`."""
+
+    _kept = _Cache
+
+    def __init__(self, py_func: Any, targetoptions: Any) -> None:
+        whole, part = _compilers()
+        super().__init__(py_func, targetoptions, whole)
+        options = {**targetoptions, "no_cpython_wrapper": True}
+        self._part = _Part(py_func, options, part) if part else self
+
+    @property
+    def _numba_type_(self) -> Any:
+        return types.Dispatcher(self._part)
+
+
+_PARTS = (0, 64), (0, 68)
+"""Versions of Numba that :mod:`capsense._parts` was tried with, the first and the last."""
+
+
+@lru_cache(maxsize=1)
+def _compilers() -> tuple[Any, Any]:
+    """What compiles what Python calls, and what kernels call, None for the same.
+
+    With a version that is not known it is all Numba's own, and a first reading takes longer.
+    """
+    if not _PARTS[0] <= version_info.short <= _PARTS[1]:
+        return Compiler, None
+    from capsense import _parts
+
+    return _parts.KernelCompiler, _parts.PartCompiler
+
+
+@contextmanager
+def _nothing_collected() -> Iterator[None]:
+    """Without garbage collection: it takes a sixth of a compiler's time, and finds little."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
+
+
+_OFF = bool(config.DISABLE_JIT)  # type: ignore[attr-defined]
+"""``NUMBA_DISABLE_JIT=1``: Python runs kernels itself."""
+
+
 def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """A decorator for functions that Python calls, or other kernels, or both."""
+    options |= {"nopython": True, "nogil": True, "error_model": "numpy"}
     options["no_cfunc_wrapper"] = True  # nothing calls kernels by address
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
-        if dispatcher is function:  # NUMBA_DISABLE_JIT=1
-            return function
-        dispatcher._cache = cache = _Cache(function)
-        compile_any = dispatcher.compile
-
-        def compile_once(sig: Any) -> Any:
-            # Numba's lock comes first: a thread must not wait for it with a file locked
-            with global_compiler_lock, cache.alone(sig, dispatcher.targetctx):
-                return compile_any(sig)
-
-        dispatcher.compile = compile_once
-        return dispatcher
+        return function if _OFF else _Kernel(function, targetoptions=options)
 
     return decorate
 
@@ -94,10 +160,6 @@ kernel = _jit(_nrt=False)
 Numba counts references to every array that is passed on or sliced, by atomic operations; they took
 more than half of the time of a scan. Room that a kernel needs is therefore handed to it.
 """
-inlined = _jit(_nrt=False, inline="always")
-"""The same, for what is written into the kernel that calls it."""
-pasted = njit(inline="always")
-"""What is written into the kernel that calls it, and may allocate."""
 
 
 @contextmanager
@@ -111,7 +173,7 @@ def first_use() -> Iterator[None]:
         yield
         return
     often = "once, and is then kept" if _kernel_cache.kept else "in each process"
-    told = f"compiling the solver for this processor; it takes half a minute {often}"
+    told = f"compiling the solver for this processor; it takes about 15 seconds {often}"
     timer = threading.Timer(WAIT, _log.warning, [told])
     timer.daemon = True
     timer.start()

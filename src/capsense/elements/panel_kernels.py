@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from capsense._jit import inlined, kernel, pasted
+from capsense._jit import compiled, kernel
 from capsense._simd import (
     dot,
     rsqrt,
@@ -73,7 +73,7 @@ def polygon_potential(frame, x, y, z):
     return total - 2.0 * w * math.atan2(s * q + t * p, p * q - s * t)
 
 
-@inlined
+@compiled
 def _edge(x, y, ex, ey, length, ends):
     """Distance of an edge in the plane times ∫ dl / r along it; (x, y) is its start."""
     return (x * ey - y * ex) * math.log((ends + length + _TINY) / (abs(ends - length) + _TINY))
@@ -197,7 +197,7 @@ def fill_flux(panels, out):
         out[k, k] = 0.0
 
 
-@pasted
+@compiled
 def rectangle_potential(frames, o, points, p):
     """Potentials of unit charge spread evenly over eight rectangles, at a point each [1/m].
 
@@ -244,13 +244,13 @@ def rectangle_potential(frames, o, points, p):
     return vdiv(vsub(out, vmul(z, angle)), vmul(splat(np.float32(4.0)), vmul(a, b)))
 
 
-@pasted
+@compiled
 def _root(square):
     """Square root of numbers above zero."""
     return vmul(square, rsqrt(square))
 
 
-@pasted
+@compiled
 def _side(end, start, far, near, square):
     """``log((end + far) / (start + near))``, far² = end² + square and near² = start² + square.
 
@@ -264,14 +264,14 @@ def _side(end, start, far, near, square):
     return vlog(vdiv(over, under))
 
 
-@pasted
+@compiled
 def _between(p, q, r, s):
     """``atan(p / q) - atan(r / s)``, q and s above zero."""
     zero = splat(np.float32(0.0))
     return angle_of(vmadd(q, s, vmul(p, r)), vmadd(p, s, vsub(zero, vmul(r, q))))
 
 
-@pasted
+@compiled
 def angle_of(x, y):
     """Angle of the points (x, y), from -π to π, to 3e-7; 0 at the origin."""
     zero, tiny = splat(np.float32(0.0)), splat(np.float32(1e-37))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._dense import WIDTH
-from capsense._jit import compiled, pasted
+from capsense._jit import compiled
 from capsense._simd import (
     SIMD_WIDTH,
     at,
@@ -194,7 +194,7 @@ def point_potentials(points, sources, table, limits, out):
             put_span(out, o + 7 * count, a7)
 
 
-@pasted
+@compiled
 def _potential(x, y, z, sx, sy, up, down, bound):
     """Potential at (x, y, z) of a unit charge at height ``up`` and of its image at ``down``.
 

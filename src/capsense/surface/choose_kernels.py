@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled, pasted
+from capsense._jit import compiled
 from capsense._simd import SIMD_WIDTH, doubles, integers
 from capsense.field.green_kernels import (
     FAR_LEAST,
@@ -96,7 +96,7 @@ class Functions(NamedTuple):
     """How many are solved for."""
 
 
-@pasted
+@compiled
 def chosen(bodies, green, threshold, width):
     """Return the cut of a scene: see :func:`score` and :func:`choose`."""
     first = np.zeros(bodies.shape[0] + 1, np.int64)

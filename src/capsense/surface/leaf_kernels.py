@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._dense import multiply
-from capsense._jit import compiled, pasted
+from capsense._jit import compiled
 from capsense._simd import (
     SIMD_WIDTH,
     at,
@@ -316,7 +316,7 @@ def pair_line(shapes, i, others, weight, out, row):
         ))  # fmt: skip
 
 
-@pasted
+@compiled
 def _cross(x, y, u, v):
     """``x v - y u``."""
     zero = splat(np.float32(0.0))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from capsense._dense import WIDTH
-from capsense._jit import compiled, pasted
+from capsense._jit import compiled
 from capsense._simd import (
     SIMD_WIDTH,
     at,
@@ -169,7 +169,7 @@ def cluster_moments(points, extent):
     return out
 
 
-@pasted
+@compiled
 def room_for(clusters):
     """Columns of a table of so many clusters."""
     return WIDTH * ((clusters + WIDTH - 1) // WIDTH)

@@ -144,7 +144,7 @@ def _integrals(cut, functions, rows, pairs):
         for i in range(width):
             means[cut.leaves[j], i] = rows[j, i]
     _climb(cut, means)
-    _differences(cut, functions, means, wide, 0)
+    _differences(cut, functions, means, wide, np.int64(0))
     most = _whole_spans(max(_CACHED // clusters, SIMD_WIDTH * SIMD_WIDTH))
     many = min(most, _whole_spans(leaves))
     half = np.empty((solved, many * ((leaves + many - 1) // many)), np.float32)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled, pasted
+from capsense._jit import compiled
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
@@ -56,20 +56,6 @@ class Solution(NamedTuple):
     """See :func:`estimate` [m]."""
 
 
-@pasted
-def _prepared(
-    bodies: NDArray[np.void], green: Green, threshold: float, width: float
-) -> tuple[Cut, Leaves, Functions, System]:
-    """:func:`prepared`, for kernels; Python would compile it anew in each process."""
-    cut = chosen(bodies, green, threshold, width)
-    cut, leaves = reached(cut, placed(bodies, cut, green))
-    rows = leaf_rows(leaves.points, leaves.beyond, green)
-    pairs = leaf_pairs(leaves, green.floor)
-    bound_images(leaves, rows, pairs, green)
-    functions = functions_of(bodies, cut, leaves.beyond)
-    return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
-
-
 @compiled
 def prepared(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float
@@ -85,7 +71,13 @@ def prepared(
     Returns:
         The cut, its leaves, its functions and their system.
     """
-    return _prepared(bodies, green, threshold, width)
+    cut = chosen(bodies, green, threshold, width)
+    cut, leaves = reached(cut, placed(bodies, cut, green))
+    rows = leaf_rows(leaves.points, leaves.beyond, green)
+    pairs = leaf_pairs(leaves, green.floor)
+    bound_images(leaves, rows, pairs, green)
+    functions = functions_of(bodies, cut, leaves.beyond)
+    return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
 
 
 @compiled
@@ -122,7 +114,7 @@ def solve(
     ``adjoint`` asks for charges that the derivatives of the result follow from; else as
     :func:`prepared`.
     """
-    cut, leaves, functions, system = _prepared(bodies, green, threshold, width)
+    cut, leaves, functions, system = prepared(bodies, green, threshold, width)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     m = green.terminals
