@@ -58,7 +58,7 @@ class Preset:
 PRESETS = {
     "standard": Preset(),
     "learning": Preset(panels=300, threshold=0.08, coarsest=1.5),
-    "fine": Preset(panels=1400, threshold=0.004),
+    "fine": Preset(panels=1400, threshold=0.004, coarsest=0.35),
 }
 """Presets by name."""
 
