@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from capsense.elements.mean_kernels import FAR
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, Green
-from capsense.surface.pair_kernels import FAR
 from capsense.surface.step import Solution
 
 Array = np.ndarray

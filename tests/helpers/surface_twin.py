@@ -319,7 +319,10 @@ def scores(
         means, looks = _means(piece, kids, share, green, room)
         linear = {k: look.linear for k, look in looks.items()}
         net = 0.0
-        own = np.zeros(len(kids))
+        own, told = np.zeros(len(kids)), np.ones(len(kids))
+        for k in sorted(means):
+            if kids[k, 0] >= 0:
+                told[kids[k]] = told[k] * (1 - linear[k])
         for k, value in means.items():
             x, y = kids[k]
             if x >= 0 and x in means:
@@ -329,7 +332,7 @@ def scores(
                 below = p * means[x] + (1 - p) * means[y]
                 means[k] = linear[k] * value + (1 - linear[k]) * below
                 value = means[x] - means[y]
-                energy += (1 - linear[k]) * value**2 / own[k]
+                energy += told[k] * (1 - linear[k]) * value**2 / own[k]
         if not piece.neutral:
             net = means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.tie)
             energy += net
@@ -347,12 +350,14 @@ def scores(
                     value = max(value, below) + 0.5 * min(value, below)
                 score[k] = (1 - linear[k]) * value
         score[0] = max(score[0], looks[0].crossing * np.sum(weight * net))
-        seen = np.ones(len(kids))
+        seen, told = np.ones(len(kids)), np.ones(len(kids))
         for k in range(len(kids)):
             for part in kids[k]:
                 if part >= 0 and kids[part, 0] >= 0:
                     seen[part] = seen[k] * _smooth((1 - linear.get(k, 1.0)) / SEEN)
-                    score[part] += linear.get(part, 1.0) * DECAY * score[k]
+                    told[part] = told[k] * (1 - linear.get(k, 1.0))
+                    rest = 1 - told[part] * (1 - linear.get(part, 1.0))
+                    score[part] = told[part] * score[part] + rest * DECAY * score[k]
         for k in reversed(range(len(kids))):
             if k in looks:
                 large = _smooth((looks[k].size - LARGE[0]) / (LARGE[1] - LARGE[0]))

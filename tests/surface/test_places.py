@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plain_leaves import plain_leaves
 from surface_scenes import Placed, green_of, pack
 
 import capsense as cs
 from capsense.field.green_kernels import beyond, distances, least_gap, lift, pack_green
 from capsense.surface.choose_kernels import chosen
-from capsense.surface.leaf_kernels import Leaves, placed
+from capsense.surface.leaf_kernels import placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
 
 Array = np.ndarray
@@ -160,7 +161,8 @@ def test_lifted_clusters_of_a_body_meet_where_they_are() -> None:
     points[1:3, :, 2] += 2e-3
     size, owner, none = np.full(5, 4e-3), np.array([0, 0, 0, 0, 1]), np.zeros(5)
     before, after = (
-        leaf_pairs(Leaves(points, t, size, size, none, owner, none), -1e5) for t in (points, true)
+        leaf_pairs(plain_leaves(points, t, size, size, none, owner, none), -1e5)
+        for t in (points, true)
     )
     wanted = np.zeros((5, 5))
     for i in range(4):
@@ -177,7 +179,8 @@ def test_charge_out_of_reach_has_a_large_energy() -> None:
     none, owner = np.zeros(3), np.zeros(3, int)
     reach, size = np.array([0.0, 0.5, 1.0]), np.full(3, 4e-3)
     first, second = (
-        leaf_pairs(Leaves(points, points, size, size, r, owner, none), -1e5) for r in (none, reach)
+        leaf_pairs(plain_leaves(points, points, size, size, r, owner, none), -1e5)
+        for r in (none, reach)
     )
     np.testing.assert_allclose(second - first, np.diag(1e5 * reach**3), rtol=1e-6, atol=0.01)
 
@@ -190,7 +193,7 @@ def test_no_image_attracts_more_than_a_mirror(height: float) -> None:
     points = np.array([[[x, y, height] for x in (arm, -arm) for y in (arm, -arm)]])
     points[..., 2] += green.box[1, 2]
     one, none = np.ones(1), np.zeros(1)
-    leaves = Leaves(points, points, side * one, one, none, np.zeros(1, int), none)
+    leaves = plain_leaves(points, points, side * one, one, none, np.zeros(1, int), none)
     rows = np.zeros((1, green.lead + 8), np.float32)
     rows[0, green.lead] = 30.0  # the square of it is what the design answers [1/m]
     pairs = np.zeros((1, 1), np.float32)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import surface_twin as twin
 from interpreted import fewer, limit, thinned
+from plain_leaves import plain_leaves
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from surface_twin import Piece
@@ -28,7 +29,7 @@ from capsense.elements.rigid import BODY, Clusters, RigidShape, rigid_shape, spl
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.surface.choose_kernels import Cut, choose, score
-from capsense.surface.leaf_kernels import Leaves, four_points
+from capsense.surface.leaf_kernels import four_points
 from capsense.surface.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
 from capsense.surface.solve_kernels import Reduced, _add_products, _products, factorise, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
@@ -68,7 +69,7 @@ def exact() -> GreenFunction:
 
 
 def coarse_solver() -> SurfaceSolver:
-    return SurfaceSolver(exact(), simulator().design, preset=Preset(panels=150))
+    return SurfaceSolver(exact(), simulator().design, preset=Preset(panels=150, coarsest=None))
 
 
 @cache
@@ -734,7 +735,7 @@ def pairs(shapes: list, owner: list[int], changing: bool, floor: float = DEEP) -
     extent = np.array([flat(*s)[1] for s in shapes])
     within = np.full(len(shapes), float(changing))
     none = np.zeros(len(shapes))
-    leaves = Leaves(points, points, extent, 0.15 * extent, none, np.array(owner), within)
+    leaves = plain_leaves(points, points, extent, 0.15 * extent, none, np.array(owner), within)
     return leaf_pairs(leaves, floor)
 
 
@@ -863,7 +864,7 @@ def test_pairs_of_bodies_near_each_other() -> None:
     extent, owner = rng.uniform(0.04, 0.12, count), np.repeat([0, 1, 2], [5, 20, 12])
     none = np.zeros(count)
     soft = rng.uniform(0.2, 0.4, count) * extent
-    found = leaf_pairs(Leaves(points, points, extent, soft, none, owner, none), DEEP)
+    found = leaf_pairs(plain_leaves(points, points, extent, soft, none, owner, none), DEEP)
     for i in range(count):
         for j in range(i):
             wanted = 0.0 if owner[i] == owner[j] else mean_inverse(

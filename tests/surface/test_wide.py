@@ -139,13 +139,13 @@ def test_small_foils(sim, size):
 
 
 def test_foils_seen_edge_on(sim):
-    """Invariant: the thicker, the larger; none is left without a solution, which is told."""
+    """Invariant: the thicker, the larger, within 4 %; none is left without a solution."""
     before = 0.0
     for thickness in (1e-5, 1e-4, 3e-4, 5e-4, 1e-3, 2e-3):
         pose = cs.Pose.from_euler((0.01, 0.0, 0.12), (math.pi / 2, 0.0, 0.2))
         found = sim.step(cs.Scene([cs.Body(cs.Box((0.2, 0.2, thickness)), pose)]))
         assert found.stats.solver_error < 0.15 * found.delta.max()
-        assert found.delta[0, 0] > 0.97 * before
+        assert found.delta[0, 0] > 0.96 * before
         before = found.delta[0, 0]
 
 
@@ -181,7 +181,13 @@ def test_how_many_pieces(shape, pieces):
     ids=repr,
 )
 def test_shapes_with_more_surface_are_wide(shape, area):
-    """Analytic: areas, which need be known to 15 % for capsules and ellipsoids."""
+    """Analytic: areas, which need be known to 15 % for capsules and ellipsoids. What is no box
+    counts less, and dielectrics still less."""
+    filled = 0.36 * area
+    area *= 1.0 if isinstance(shape, cs.Box) else 0.4
+    if wide_pieces(shape, False, 0.0):
+        assert wide_pieces(shape, False, 0.85 * filled) == wide_pieces(shape, True, 0.85 * area)
+        assert wide_pieces(shape, False, 1.15 * filled) == 0
     assert wide_pieces(shape, True, 0.85 * area) == (
         10_000 if shape.bounds()[1, 2] > 0.5 else 5_000
     )
@@ -244,7 +250,7 @@ def test_which_bodies_are_wide(sim):
     [
         ("stripe", "learning", [0.07]),  # electrodes 5 mm wide count as 8 mm
         ("stripe", "standard", [0.05, 0.07]),
-        ("stripe", "fine", [0.07]),
+        ("stripe", "fine", [0.05, 0.07]),
         ("six_patch_bare", "standard", []),  # 15 mm
     ],
 )  # fmt: skip
@@ -440,9 +446,9 @@ def test_the_reference_of_one_skin(simulators, open_skin):
 
 
 def test_weights_of_functions():
-    """Analytic: even on a ball. Differential: on a limb, those of panels with energies. Of a plate
-    they are the areas."""
-    for shape, bound in ((cs.Sphere(0.1), 0.08), (cs.Capsule(0.09, 0.5), 0.12)):
+    """Analytic: even on a ball. Differential: on a limb and a plate, those of panels that have
+    energies."""
+    for shape, bound in ((cs.Sphere(0.1), 0.08), (cs.Capsule(0.09, 0.5), 0.12), (PLATE, 0.3)):
         panels = panels_of(shape, 5000, merge=False)
         body = WideBody(panels, panels_of)
         density = body.weights / panels.areas
@@ -452,5 +458,3 @@ def test_weights_of_functions():
         ratio = density / wanted[near]
         ratio /= np.average(ratio, weights=panels.areas)
         assert np.sqrt(np.average((ratio - 1) ** 2, weights=panels.areas)) < bound
-    panels = panels_of(PLATE, 5000)
-    assert WideBody(panels, panels_of).weights is panels.areas

@@ -55,6 +55,7 @@ BODY = np.dtype(
         ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
         ("known", np.int64),  # functions that have energies and impedances there, the first ones
         ("spread", np.int64),  # second moments of a changing surface, else 0: it has no energies
+        ("means", np.int64), ("top", np.int64),  # means of 1/r within its first so many clusters
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("neutral", np.int64),  # whether it carries no net charge
@@ -294,14 +295,24 @@ def charged_tree(panels: SurfacePanels, clusters: Clusters, charge: Array) -> Tr
     share[single] = charge[panel[single]] / charge.sum()
     center[single], spread[single] = panels.centers[panel[single]], panels.moments[panel[single]]
     tree_kernels.moments(kids, panel, share, center, spread)
+    points, extent, soft = four_points_of(center, spread)
+    return Tree(kids, clusters.function, panel, share, center, points, extent, soft)
+
+
+def four_points_of(center: Array, spread: Array) -> tuple[Array, Array, Array]:
+    """Four points (k, 4, 3), extents and least distances (k,) of clusters, see :class:`Tree`.
+
+    Args:
+        center: Centres of charge [m], shape (k, 3).
+        spread: Second central moments of the charge over the charge [m²], shape (k, 3, 3).
+    """
     size, axes = np.linalg.eigh(spread)
     size = np.maximum(size, 0.0)
     arms = (axes * np.sqrt(size)[:, None]).transpose(0, 2, 1)
     signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     points = center[:, None] + signs @ arms[:, 1:]
     extent = np.sqrt(12.0 * size[:, 2])
-    soft = np.sqrt((SOFT * extent) ** 2 + ROUND * size[:, 0])
-    return Tree(kids, clusters.function, panel, share, center, points, extent, soft)
+    return points, extent, np.sqrt((SOFT * extent) ** 2 + ROUND * size[:, 0])
 
 
 def split(features: Array, charge: Array) -> Clusters:

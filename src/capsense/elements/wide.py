@@ -16,9 +16,18 @@ from threadpoolctl import threadpool_limits
 
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
+from capsense.elements.mean_kernels import means_between
 from capsense.elements.panels import SurfacePanels
 from capsense.elements.pieces import ChangingBody
-from capsense.elements.rigid import LEAST_CHARGE, Clusters, equilibrium, features, once, split
+from capsense.elements.rigid import (
+    LEAST_CHARGE,
+    Clusters,
+    equilibrium,
+    features,
+    four_points_of,
+    once,
+    split,
+)
 from capsense.errors import SolveError
 from capsense.scene import TriMesh
 from capsense.scene.shapes import Shape, ShapeKind
@@ -34,6 +43,9 @@ _ROUND = {
     ShapeKind.CAPSULE: math.pi / 4, ShapeKind.CYLINDER: math.pi / 4,
 }  # fmt: skip
 """About how much of the surface of its bounding box that of a shape is."""
+_BENT, _FILLED = 0.4, 0.36
+"""How much of the surface of what is no box counts, as less of it is near a sensor at a time; and
+how much of that of dielectrics, of whose inside few panels tell."""
 _SLENDER = 4.0
 """Lengths beyond so many widths do not make panels too wide."""
 _PIECE = 4e-3
@@ -45,14 +57,14 @@ COARSE, _THICK = 1000, 2.0
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
 _FOIL = 5e-5
 """Primitives thinner than this part of their width have no energies: their faces would be one."""
-_FACES, _ROUNDED, _FLAT = 12.0, 0.1, 0.5
+_FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 """Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
-of its faces: the first of a plate, of which four points do not tell the faces apart there; the
-second of others, whose limbs are told apart first. A plate is thicker than this part of its least
-extent. Its functions are weighted with the area, others with charges in equilibrium."""
-_CLUSTERS, _SQUARE = 1000, 2.97
-"""Clusters from which the charges of wide bodies are found, and the mean of 1/r in a square, times
-its side."""
+of its faces: the first of those with flat sides, of which four points do not tell the faces apart
+there; the second of others, whose limbs are told apart first. Those with flat sides are thicker
+than the third of their least extent."""
+_CLUSTERS, _KNOWN, _SQUARE = 1000, 1000, 2.97
+"""Clusters from which the charges of wide bodies are found, those from which the energies of larger
+ones are, and the mean of 1/r in a square, times its side."""
 _HALF_SPACE = 2.0
 """Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
@@ -69,6 +81,7 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
     """
     held = shape.__dict__.get("_pieces")
     if held is None:
+        counts = 1.0 if shape.kind is ShapeKind.BOX else _BENT
         low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
         mesh = isinstance(shape, TriMesh)
         part, area = (
@@ -78,14 +91,16 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
         wide = middle > WIDE or (low < _FOIL * middle and not mesh)
         doublings = math.ceil(math.log2(max(area / _PIECE**2 / _FEWEST, 1.0)))
         solid = not mesh and low >= _THICK * math.sqrt(area / COARSE)
-        held = math.inf if wide else part, _FEWEST * 2 ** min(doublings, _DOUBLINGS), solid
+        pieces = _FEWEST * 2 ** min(doublings, _DOUBLINGS)
+        conductor, filled = (math.inf if wide else part * x for x in (counts, _FILLED))
+        held = conductor, filled if solid else 0.0, pieces
         shape.__dict__["_pieces"] = held
-    surface, pieces, solid = held
-    return pieces if surface >= largest and (conducting or solid) else 0
+    conductor, dielectric, pieces = held
+    return pieces if (conductor if conducting else dielectric) >= largest else 0
 
 
 def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
-    """Thickness of a wide body [m], and whether it is a plate."""
+    """Thickness of a wide body [m], and whether it has flat sides."""
     arms = panels.centers - panels.centers.mean(axis=0)
     low = float(np.ptp(arms @ np.linalg.eigh(arms.T @ arms)[1], axis=0).min())
     thickness = panels.thickness if panels.closed else low / 3  # as of a ball
@@ -146,13 +161,36 @@ class WideBody(ChangingBody):
     """
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
-        thickness, plate = _thickness(panels)
-        self.most, self._coarse = thickness * (_FACES if plate else _ROUNDED), coarse
+        thickness, flat = _thickness(panels)
+        self.most, self._coarse = thickness * (_FACES if flat else _LIMBS), coarse
         self._at = features(panels.centers, panels.normals, self.most)
         tree = split(self._at, panels.areas)
-        self.weights = panels.areas if plate else _equilibrium(tree, panels)
+        self.weights = _equilibrium(tree, panels)
         super().__init__(tree, panels, charge=self.weights)
+        self._means = self._means_of_first()
         self.record["inside"] = _HALF_SPACE
+        self.record["means"], self.record["top"] = self._means.ctypes.data, self._top
+
+    def _means_of_first(self) -> Array32:
+        """Means of 1/r within the body's first clusters, row by row up to the diagonal [1/m].
+
+        Those of the smaller ones are of rectangles, those of larger ones are made up from them: a
+        rectangle stands badly for what is bent or has limbs.
+        """
+        kids, number, _ = _coarsest(self._kids, self._panel, _KNOWN)
+        self._top, last = len(kids), np.flatnonzero(number >= 0)
+        points, extent = four_points_of(self._center[last], self._spread[last])[:2]
+        points = np.ascontiguousarray(points[:, [0, 2, 1, 3]])  # the longer arm first
+        out: NDArray[np.floating] = means_between(points, extent)
+        for _ in range(2):  # rows of larger clusters, then columns
+            rows = np.empty((self._top, out.shape[1]))
+            rows[last] = out
+            for a in np.flatnonzero(number < 0)[::-1].tolist():
+                first, second = kids[a]
+                share = self._charge[first] / self._charge[a]
+                rows[a] = rows[second] + share * (rows[first] - rows[second])
+            out = rows.T
+        return np.concatenate([row[: k + 1] for k, row in enumerate(rows)], dtype=np.float32)
 
     @property
     def impedance(self) -> Array32:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import warp as wp
 
+from capsense.elements.mean_kernels import FAR
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
 from capsense.fleet.warp_cut import WIDTH, Response, WarpCut, four, row, smooth
 from capsense.surface.pair_kernels import _WIDE as WIDE
-from capsense.surface.pair_kernels import BARRIER, FAR
+from capsense.surface.pair_kernels import BARRIER
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

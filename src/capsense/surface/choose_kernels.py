@@ -123,6 +123,7 @@ def score(bodies, first, green, weight, scores):
     terminals, lead, total = green.terminals, green.lead, first[-1]
     means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
     met, crossing, linear = np.zeros(total, np.bool_), np.empty(total), np.empty(total)
+    told = np.empty(total)
     seen = np.empty(bodies.shape[0], np.int64)
     for b in range(bodies.shape[0]):
         body, o = bodies[b], first[b]
@@ -130,7 +131,7 @@ def score(bodies, first, green, weight, scores):
         charge, own = doubles(body.charge), doubles(body.own)
         span = slice(o, first[b + 1])
         seen[b] = _mean_potentials(
-            body, green, means[span], met[span], crossing[span], linear[span]
+            body, green, means[span], met[span], crossing[span], linear[span], told[span]
         )
         for k in range(seen[b] - 1, -1, -1):
             if not met[o + k]:
@@ -139,7 +140,7 @@ def score(bodies, first, green, weight, scores):
             if x >= 0 and met[o + x]:
                 p, t = np.float32(charge[x] / charge[k]), np.float32(linear[o + k])
                 q, r = (np.float32(1.0) - t) * p, (np.float32(1.0) - t) * (np.float32(1.0) - p)
-                stiffness = (1.0 - linear[o + k]) * body.scale / own[function[k]]
+                stiffness = told[o + k] * (1.0 - linear[o + k]) * body.scale / own[function[k]]
                 for i in range(lead):
                     whole = t * means[o + k, i] if t > 0.0 else np.float32(0.0)
                     means[o + k, i] = whole + q * means[o + x, i] + r * means[o + y, i]
@@ -157,24 +158,30 @@ def score(bodies, first, green, weight, scores):
     for b in range(bodies.shape[0]):
         span = slice(first[b], first[b] + seen[b])
         _raise_scores(
-            bodies[b], means[span], met[span], linear[span], crossing[span], weight, scores[span]
+            bodies[b],
+            means[span],
+            met[span],
+            (linear[span], told[span]),
+            crossing[span],
+            weight,
+            scores[span],
         )
     return seen
 
 
 @compiled
-def _mean_potentials(body, green, means, met, crossing, linear):
+def _mean_potentials(body, green, means, met, crossing, linear, told):
     """φ⁰ in the middle of clusters that see it as linear or have no parts, from the far sources.
 
     ``crossing`` is filled with how much each cluster crosses a wall, 0 to 1, ``linear`` with how
-    linear φ⁰ is there, and ``met`` with which clusters were looked at: none behind as many as are
-    returned.
+    linear φ⁰ is there, ``told`` with how much it is not in all clusters above, and ``met`` with
+    which clusters were looked at: none behind as many as are returned.
     """
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
     most = 2 * body.n - 1
     places, inner = np.empty(most, np.int64), np.empty(most)
     points, found = np.empty((most, 3), np.float32), 0
-    met[0], k, seen = True, -1, 1
+    met[0], told[0], k, seen = True, 1.0, -1, 1
     while k + 1 < seen:
         k += 1
         if not met[k]:
@@ -206,7 +213,8 @@ def _mean_potentials(body, green, means, met, crossing, linear):
             places[found], inner[found] = k, share
             found += 1
         if linear[k] < 1.0 and kids[2 * k] >= 0:
-            met[kids[2 * k]] = met[kids[2 * k + 1]] = True
+            for c in range(2):
+                met[kids[2 * k + c]], told[kids[2 * k + c]] = True, told[k] * (1.0 - linear[k])
             seen = max(seen, kids[2 * k + 1] + 1)
     columns = np.empty((3, SIMD_WIDTH * ((found + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
     for j in range(columns.shape[1]):
@@ -222,8 +230,11 @@ def _mean_potentials(body, green, means, met, crossing, linear):
 
 
 @compiled
-def _raise_scores(body, mean, met, linear, crossing, weight, scores):
+def _raise_scores(body, mean, met, evenness, crossing, weight, scores):
     """Score a body's first clusters from the mean potentials of those that were met.
+
+    What was met below a cluster that sees a linear potential does not count: ``evenness`` holds
+    ``linear`` and ``told`` of :func:`_mean_potentials`.
 
     No charge is beyond a wall. A part that crosses one can carry charge where it is inside only if
     it is split too, which its own score does not tell. So that is at least the score of the body,
@@ -231,6 +242,7 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
     """
     kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
     extent, count = doubles(body.extent), met.shape[0]
+    linear, told = evenness
     for k in range(count - 1, -1, -1):
         if not met[k]:
             scores[k] = _INHERITED
@@ -258,7 +270,8 @@ def _raise_scores(body, mean, met, linear, crossing, weight, scores):
         for c in range(2):
             part = kids[2 * k + c]
             if 0 <= part < count and met[part] and kids[2 * part] >= 0:
-                scores[part] += linear[part] * _DECAY * scores[k]
+                rest = 1.0 - told[part] * (1.0 - linear[part])
+                scores[part] = told[part] * scores[part] + rest * _DECAY * scores[k]
                 seen[part] = seen[k] * smooth((1.0 - linear[k]) / _SEEN)
     whole = scores[0]
     for k in range(count - 1, -1, -1):

@@ -19,13 +19,13 @@ import numpy as np
 
 from capsense._dense import multiply, multiply_simd
 from capsense._jit import compiled
+from capsense.elements.mean_kernels import cluster_moments
 from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, distances, near_share
 from capsense.surface.leaf_kernels import (
     near_pairs,
     pair_line,
     source_lines,
 )
-from capsense.surface.pair_kernels import cluster_moments
 
 _BLOCK = 32
 """Leaves taken at a time, whose tables stay in the cache."""

@@ -62,6 +62,10 @@ class Leaves(NamedTuple):
     within: NDArray[Any]
     """How much a changing body's clusters meet each other, 1 for a conductor; 0 for rigid bodies,
     which have energies of their own; shape (l,)."""
+    known: NDArray[Any]
+    """Rows in a table of means of 1/r within a body, -1 for none, and where it stands, (l, 2)."""
+    size: NDArray[Any]
+    """How many times as large as in such a table the body of each is, shape (l,)."""
 
 
 @compiled
@@ -71,11 +75,14 @@ def placed(bodies, cut, green):
     points, corners, true = np.empty((n, 4, 3)), np.empty((4, 3)), np.empty((n, 4, 3))
     extent, soft, out = np.empty(n), np.empty(n), np.empty(n)
     owner, within = np.empty(n, np.int64), np.zeros(n)
+    known, size = np.full((n, 2), -1), np.empty(n)
     moments, turn, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for j in range(n):
         a = cut.leaves[j]
         body = bodies[cut.body[a]]
-        owner[j], k = cut.body[a], cut.node[a]
+        owner[j], k, size[j] = cut.body[a], cut.node[a], body.scale
+        if k < body.top:
+            known[j, 0], known[j, 1] = k, body.means
         if body.spread != 0:
             within[j] = 1.0 + body.inside * body.softness
             spread, center = doubles(body.spread), doubles(body.center)
@@ -102,7 +109,7 @@ def placed(bodies, cut, green):
         out[j] = beyond(points[j], green)
         if green.cover < 1.0:
             lift(points[j], least_gap(extent[j], green.cover), green.box)
-    return Leaves(points, true, extent, soft, out, owner, within)
+    return Leaves(points, true, extent, soft, out, owner, within, known, size)
 
 
 @compiled

@@ -54,6 +54,7 @@ def reached(cut, leaves):
     points, true = np.empty((kept, 4, 3)), np.empty((kept, 4, 3))
     extent, soft, beyond, within = np.empty(kept), np.empty(kept), np.empty(kept), np.empty(kept)
     owner, at = np.empty(kept, np.int64), np.empty(kept, np.int64)
+    known, size = np.empty((kept, 2), np.int64), np.empty(kept)
     i = 0
     for j in range(n):
         a = cut.leaves[j]
@@ -64,13 +65,15 @@ def reached(cut, leaves):
                     points[i, q, k], true[i, q, k] = leaves.points[j, q, k], leaves.true[j, q, k]
             extent[i], soft[i], beyond[i] = leaves.extent[j], leaves.soft[j], leaves.beyond[j]
             owner[i], within[i] = leaves.owner[j], leaves.within[j]
+            known[i, 0], known[i, 1] = leaves.known[j, 0], leaves.known[j, 1]
+            size[i] = leaves.size[j]
             i += 1
     return (
         Cut(
             cut.body, cut.node, cut.kids, cut.share, parts, leaf, whole, cut.fade, cut.above,
             there, at,
         ),
-        Leaves(points, true, extent, soft, beyond, owner, within),
+        Leaves(points, true, extent, soft, beyond, owner, within, known, size),
     )  # fmt: skip
 
 

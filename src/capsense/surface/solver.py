@@ -50,15 +50,15 @@ class Preset:
     """Charge functions count that take up this part of an electrode's energy alone."""
     width: float = 2.5
     """They fade in up to so many times that."""
-    coarsest: float | None = 0.8
+    coarsest: float | None = 0.5
     """Bodies get panels of a few millimetres where these would be wider on average than so much of
     the electrodes' width, and where they are wide themselves; None for never."""
 
 
 PRESETS = {
     "standard": Preset(),
-    "learning": Preset(panels=300, threshold=0.08, coarsest=1.5),
-    "fine": Preset(panels=1400, threshold=0.004, coarsest=0.35),
+    "learning": Preset(panels=300, threshold=0.08, coarsest=0.95),
+    "fine": Preset(panels=1400, threshold=0.004, coarsest=0.33),
 }
 """Presets by name."""
 
