@@ -180,8 +180,8 @@ CONTACT = {
 @pytest.mark.parametrize("name", CONTACT)
 @pytest.mark.parametrize("design", ["six_patch_bare", "six_patch"])
 def test_contact_is_finite_and_monotone(simulators, design, name):
-    """Measured: from 3 mm to 0.5 mm into the face, large entries grow by small steps; those of a bar
-    within the face fall by 2 % once."""
+    """Measured: from 3 mm to 0.5 mm into the face, large entries grow by small steps; those of a
+    bar within the face fall by 2 % once."""
     shape, half, (x, y), turn = CONTACT[name]
     gaps = np.concatenate([np.arange(3e-3, 1.2e-3, -1e-4), np.arange(1.2e-3, -5.1e-4, -2.5e-5)])
     read = np.array([
