@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from capsense.elements import panel_kernels as kernels
 from capsense.elements import reference
 from capsense.elements.blocks import flux_block, free_block, impedance, panel_frames
-from capsense.elements.panels import SurfacePanels, panels_of
+from capsense.elements.panels import SurfacePanels, panels_of, polygon_panels
 from capsense.errors import SceneError
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere
 
@@ -402,3 +402,22 @@ def test_an_open_surface_has_no_inside():
     panels = panels_of(SQUARE, 50)
     with pytest.raises(SceneError, match="closed surface"):
         impedance(panels, free_block(panels))
+
+
+def test_two_kites_apart():
+    """Differential: the mean of 1/r over two polygons of unequal sides, by many small pieces."""
+    kites = np.array([
+        [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [2.0, 1.0, 0.0], [0.0, 2.5, 0.0]],
+        [[3.2, 0.5, 1.0], [6.0, 1.0, 1.0], [5.5, 4.0, 1.0], [4.0, 1.8, 1.0]],
+    ])  # fmt: skip
+    line = (np.arange(40) + 0.5) / 40
+    s, t = (x.ravel()[:, None] for x in np.meshgrid(line, line))
+    points, shares = [], []
+    for a, b, c, d in kites:
+        points.append((1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d)
+        sides = (1 - t) * (b - a) + t * (c - d), (1 - s) * (d - a) + s * (c - b)
+        area = np.linalg.norm(np.cross(*sides), axis=1)
+        shares.append(area / area.sum())
+    inverse = 1.0 / np.linalg.norm(points[0][:, None] - points[1], axis=2)
+    found = free_block(polygon_panels(kites, closed=False))[0, 1]
+    assert found == pytest.approx(shares[0] @ inverse @ shares[1], rel=1e-3)

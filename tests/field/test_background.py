@@ -61,3 +61,5 @@ def test_refined_settings(factor: float) -> None:
         assert settings.merge == pytest.approx(plain.merge / max(factor, 1.0))
     assert BuildSettings(3.0).refined(factor).panel_scale == pytest.approx(3.0 / factor)
     assert plain.merge < plain.edge < 0.01 < plain.far
+    assert 0.0 < plain.growth < 1.0
+    assert 0.0 < plain.growth_z < 1.0

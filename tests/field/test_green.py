@@ -256,6 +256,17 @@ def test_first_modes_hold_what_is_met_far_away() -> None:
     assert rest[-1] < 1e-3 * rest[0]
 
 
+def test_points_of_the_fit_are_all_over_the_domain() -> None:
+    """Measured: in each eighth of it."""
+    it = case("flat")
+    sources = it.green.near_sources.astype(float)
+    points = training_points(Surroundings(it.design, it.solution.model), sources, FEW)[0]
+    domain = it.design.domain
+    assert ((points > domain.lower) & (points < domain.upper)).all()
+    upper = points > 0.5 * (np.array(domain.lower) + domain.upper)
+    assert set(upper @ [1, 2, 4]) == set(range(8))
+
+
 def test_misfit_is_that_of_the_points_of_the_fit() -> None:
     """Analytic, but for the weights of distances, which it counts and this does not."""
     it = case("flat")

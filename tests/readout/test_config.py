@@ -230,6 +230,9 @@ def test_pairs_and_stepping_baseline():
     assert readout.schedule.slots == ((0,), (1,))
     assert readout.detector is not None
     assert (readout.detector.release, readout.detector.tracker) == (5.0, SteppingTracker())
+    plain = parse('chip = "fdc1004"\n[detector]\ntouch = 9\n').detector
+    assert plain is not None
+    assert plain.tracker == ExponentialTracker(1000)
 
 
 def test_a_tank_or_front_end_of_ones_own():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import pickle
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -458,3 +460,60 @@ def test_weights_of_functions():
         ratio = density / wanted[near]
         ratio /= np.average(ratio, weights=panels.areas)
         assert np.sqrt(np.average((ratio - 1) ** 2, weights=panels.areas)) < bound
+
+
+def means_of(body: WideBody) -> np.ndarray:
+    """The table of means of 1/r within the first clusters [1/m], (t, t)."""
+    count = int(body.record["top"])
+    place = ctypes.cast(int(body.record["means"]), ctypes.POINTER(ctypes.c_float))
+    rows = np.ctypeslib.as_array(place, (count * (count + 1) // 2,))
+    out = np.zeros((count, count))
+    out[np.tril_indices(count)] = rows
+    return out + np.tril(out, -1).T
+
+
+def test_means_of_large_clusters():
+    """Analytic: 1/R of a ball. Differential: panels with energies, for a plate. Invariant: a
+    cluster's are those of its parts, by their charges; energies are positive."""
+    ball, plate = (
+        WideBody(panels_of(shape, 5000, merge=False), panels_of)
+        for shape in (cs.Sphere(0.1), PLATE)
+    )
+    few = free_block(panels_of(PLATE, 1000))
+    assert means_of(ball)[0, 0] == pytest.approx(10.0, rel=2e-3)
+    assert means_of(plate)[0, 0] == pytest.approx(1 / equilibrium(few).sum(), rel=0.01)
+    for body in (ball, plate):
+        means = means_of(body)
+        kids, charge = (
+            np.ctypeslib.as_array(
+                ctypes.cast(int(body.record[name]), ctypes.POINTER(kind)), (2 * len(means),)
+            )
+            for name, kind in (("kids", ctypes.c_int64), ("charge", ctypes.c_double))
+        )
+        for k in range(0, 60, 7):
+            x, y = kids[2 * k : 2 * k + 2]
+            mixed = charge[x] * means[x] + charge[y] * means[y]
+            np.testing.assert_allclose(charge[k] * means[k], mixed, rtol=1e-5)
+        last = np.flatnonzero(kids[: 2 * len(means) : 2] >= len(means))
+        assert np.linalg.eigvalsh(means[np.ix_(last, last)]).min() > 0
+
+
+class WithoutTable(SurfaceSolver):
+    """Finds all means of 1/r anew, between rectangles."""
+
+    def functions_of(self, shape, conducting, share=1.0):
+        body, size = super().functions_of(shape, conducting, share)
+        body = copy(body)
+        body.record = body.record.copy()
+        body.record["top"] = 0
+        return body, size
+
+
+def test_a_table_of_means_changes_little(sim):
+    """Differential: a plate over the edge of the sensor, with means that are found at each step."""
+    scene = cs.Scene([cs.Body(PLATE, cs.Pose.from_euler((0.08, 0.0, 0.08), (0.0, 0.2, 0.1)))])
+    found, plain = (
+        kind(sim.background.green, sim.design).solve(scene).matrix
+        for kind in (SurfaceSolver, WithoutTable)
+    )
+    assert 0 < np.abs(found - plain).max() < 0.01 * np.abs(plain).max()
