@@ -4,6 +4,7 @@
   against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels do not
   help there.
 - wide boxes in parallel with the sensor, against 80,000 pieces, and what their readings tell of it.
+- a forearm and a palm near the sensor, against the same.
 - a ball, a limb and a box over the narrow electrodes of ``stripe``, against as many.
 - boxes that come down in steps of 0.02 mm: by how much a large entry falls in a step, at most.
 - a person's arm whose hand leaves the domain, against the preset fine.
@@ -104,6 +105,24 @@ def wide(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         middle, most = np.median(off, axis=0), np.max(off, axis=0)
         table = np.stack([middle, most, np.median(told, axis=0)], axis=1)
         yield f"gap {1e3 * gap:g} mm", table.ravel().tolist()
+
+
+def limbs(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Largest difference from many pieces, of each preset, at several gaps."""
+    finer = InPieces(sim.background.green, sim.design, preset=FINER)
+    sims = [cs.Simulator(DESIGN, preset=p, background=sim.background) for p in PRESETS]
+    lying = (0.0, np.pi / 2, 0.0)
+    for name, shape, half, turn in (
+        ("forearm, a capsule of 40 mm radius", cs.Capsule(0.04, 0.25), 0.04, lying),
+        ("palm, 80 x 90 x 25 mm", cs.Box((0.08, 0.09, 0.025)), 0.0125, (0.0, 0.0, 0.3)),
+    ):
+        out = []
+        for gap in (0.001, 0.002, 0.005, 0.01):
+            pose = cs.Pose.from_euler((0.01, 0.005, half + gap), turn)
+            scene = cs.Scene([cs.Body(shape, pose)])
+            truth = finer.solve(scene).matrix[:6, :6]
+            out += [apart(s.step(scene).delta, truth) for s in sims]
+        yield name, out
 
 
 def narrow(_: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
@@ -216,6 +235,7 @@ def skin(_: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
 
 PARTS = {
     "contact, presets learning, standard, fine, and 2,800 panels": contact,
+    "near limbs: gaps of 1, 2, 5, 10 mm, each preset": limbs,
     "wide boxes: median and largest error, and median estimate, of each preset": wide,
     "narrow electrodes: gaps of 2, 5, 10, 30 mm": narrow,
     "falls in a step: 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, of each preset": falls,
