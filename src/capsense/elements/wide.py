@@ -62,7 +62,7 @@ _FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 of its faces: the first of those with flat sides, of which four points do not tell the faces apart
 there; the second of others, whose limbs are told apart first. Those with flat sides are thicker
 than the third of their least extent."""
-_CLUSTERS, _KNOWN, _SQUARE = 1000, 1000, 2.97
+_CLUSTERS, _KNOWN, _SQUARE = 700, 1000, 2.97
 """Clusters from which the charges of wide bodies are found, those from which the energies of larger
 ones are, and the mean of 1/r in a square, times its side."""
 _HALF_SPACE = 2.0
@@ -181,16 +181,16 @@ class WideBody(ChangingBody):
         self._top, last = len(kids), np.flatnonzero(number >= 0)
         points, extent = four_points_of(self._center[last], self._spread[last])[:2]
         points = np.ascontiguousarray(points[:, [0, 2, 1, 3]])  # the longer arm first
-        out: NDArray[np.floating] = means_between(points, extent)
+        shares = (self._charge[kids[:, 0]] / self._charge[: self._top]).tolist()
+        out: Array32 = means_between(points, extent)
         for _ in range(2):  # rows of larger clusters, then columns
-            rows = np.empty((self._top, out.shape[1]))
+            rows = np.empty((self._top, out.shape[1]), np.float32)
             rows[last] = out
             for a in np.flatnonzero(number < 0)[::-1].tolist():
                 first, second = kids[a]
-                share = self._charge[first] / self._charge[a]
-                rows[a] = rows[second] + share * (rows[first] - rows[second])
+                rows[a] = rows[second] + shares[a] * (rows[first] - rows[second])
             out = rows.T
-        return np.concatenate([row[: k + 1] for k, row in enumerate(rows)], dtype=np.float32)
+        return np.concatenate([row[: k + 1] for k, row in enumerate(rows)])
 
     @property
     def impedance(self) -> Array32:
