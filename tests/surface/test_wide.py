@@ -137,7 +137,7 @@ def test_small_foils(sim, size):
         sim.step(cs.Scene([cs.Body(cs.Box((size, size, t)), cs.Pose((0.01, 0, 0.02)))])).delta
         for t in (1e-6 * size, 1e-3 * size)
     )
-    assert np.abs(found - truth).max() < 0.06 * truth.max()
+    assert np.abs(found - truth).max() < 0.05 * truth.max()
 
 
 def test_foils_seen_edge_on(sim):
@@ -450,7 +450,7 @@ def test_the_reference_of_one_skin(simulators, open_skin):
 def test_weights_of_functions():
     """Analytic: even on a ball. Differential: on a limb and a plate, those of panels that have
     energies."""
-    for shape, bound in ((cs.Sphere(0.1), 0.08), (cs.Capsule(0.09, 0.5), 0.12), (PLATE, 0.35)):
+    for shape, bound in ((cs.Sphere(0.1), 0.08), (cs.Capsule(0.09, 0.5), 0.12), (PLATE, 0.3)):
         panels = panels_of(shape, 5000, merge=False)
         body = WideBody(panels, panels_of)
         density = body.weights / panels.areas

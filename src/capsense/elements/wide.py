@@ -62,7 +62,7 @@ _FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 of its faces: the first of those with flat sides, of which four points do not tell the faces apart
 there; the second of others, whose limbs are told apart first. Those with flat sides are thicker
 than the third of their least extent."""
-_CLUSTERS, _KNOWN, _SQUARE = 700, 1000, 2.97
+_CLUSTERS, _KNOWN, _SQUARE = 1000, 1000, 2.97
 """Clusters from which the charges of wide bodies are found, those from which the energies of larger
 ones are, and the mean of 1/r in a square, times its side."""
 _HALF_SPACE = 2.0
