@@ -122,7 +122,7 @@ def test_a_seam_is_hardly_seen(simulators, axis, seams):
         sides[axis], place[axis] = high - low, (low + high) / 2
         return cs.Body(cs.Box(tuple(sides)), cs.Pose(place))
 
-    for gap, within in ((0.002, 0.23), (0.005, 0.1), (0.01, 0.06), (0.02, 0.035), (0.05, 0.015)):
+    for gap, within in ((0.002, 0.23), (0.005, 0.1), (0.01, 0.06), (0.02, 0.035), (0.05, 0.02)):
         whole = delta(sim, piece(-0.075, 0.075, gap))
         for seam in np.linspace(-0.0597, 0.0597, seams):  # whose parts are of as many sizes
             halves = piece(-0.075, seam, gap), piece(seam, 0.075, gap)

@@ -37,7 +37,7 @@ def simulator():
     [
         (32, 1.4, 3.2, 57),
         (64, 0.5, 1.2, 80),
-        pytest.param(128, 0.35, 0.45, 89, marks=pytest.mark.e2e),
+        pytest.param(128, 0.35, 0.45, 87, marks=pytest.mark.e2e),
     ],
 )
 def test_errors_over_the_reference_map(scenes, simulator, budget, single, every, close):
