@@ -924,10 +924,11 @@ def test_scores(name: str) -> None:
     check_scores(scenes()[name])
 
 
-def test_scores_of_a_body_on_a_capacitance_across_a_wall() -> None:
+@pytest.mark.parametrize("scale", [1.0, 1.7])
+def test_scores_of_a_body_on_a_capacitance_across_a_wall(scale: float) -> None:
     """Differential: its net charge costs the energy of the capacitance too."""
     wall = float(packed_green().room[1, 0])
-    check_scores(Scene([body(BOX, (wall - 0.01, 0.0, 0.05), tie=20.0)]))
+    check_scores(Scene([body(BOX, (wall - 0.01, 0.0, 0.05), tie=20.0, scale=scale)]))
 
 
 def check_scores(scene: Scene) -> None:
