@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import gc
+import os
+import pickle
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
@@ -12,7 +17,9 @@ import pytest
 from numba.core import event
 from numba.core.errors import TypingError
 
+import capsense
 from capsense import _jit
+from capsense.field.green_kernels import smooth
 
 
 class Pair(NamedTuple):
@@ -121,6 +128,19 @@ def test_garbage_is_collected_after_an_error() -> None:
             wrong(1.0)
         assert gc.isenabled() == on
     gc.enable()
+
+
+def test_a_kernel_in_another_process(tmp_path: Path) -> None:
+    """Regression: kernels could be pickled, but not be unpickled."""
+    (tmp_path / "kernel").write_bytes(pickle.dumps(smooth))
+    code = "import pickle, sys; print(pickle.load(open(sys.argv[1], 'rb'))(0.25))"
+    run = [sys.executable, "-c", code, str(tmp_path / "kernel")]
+    path = os.pathsep.join([str(Path(capsense.__file__).parents[1]), *sys.path])
+    done = subprocess.run(
+        run, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == smooth(0.25)
 
 
 def test_this_version_of_numba_is_known() -> None:

@@ -97,7 +97,8 @@ class _Kernel(_Part):
 
     _kept = _Cache
 
-    def __init__(self, py_func: Any, targetoptions: Any) -> None:
+    def __init__(self, py_func: Any, locals: Any, targetoptions: Any) -> None:
+        # Numba makes it anew in this way when it is unpickled
         whole, part = _compilers()
         super().__init__(py_func, targetoptions, whole)
         options = {**targetoptions, "no_cpython_wrapper": True}
@@ -147,7 +148,7 @@ def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     options["no_cfunc_wrapper"] = True  # nothing calls kernels by address
 
     def decorate(function: Callable[..., Any]) -> Any:
-        return function if _OFF else _Kernel(function, targetoptions=options)
+        return function if _OFF else _Kernel(function, None, options)
 
     return decorate
 

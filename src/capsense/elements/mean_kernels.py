@@ -52,14 +52,12 @@ def means_within(points, extent, size, i, start, tables, line, room):
     row = known[i, 0]
     if row >= 0:
         table, o = singles(known[i, 1]), row * (row + 1) // 2
-        for j in range(start, i):
+        for j in range(start, i + 1):
             if known[j, 0] >= 0:
                 line[j] = table[o + known[j, 0]] / size
-    _near_rectangles(frames, extent, i, start, line, room)
-    if row >= 0:
-        line[i] = singles(known[i, 1])[row * (row + 1) // 2 + row] / size
     else:
         line[i] = _self_mean(arm(points[i, 0], points[i, 1]), arm(points[i, 0], points[i, 2]))
+    _near_rectangles(frames, extent, i, start, line, room)
 
 
 @compiled

@@ -21,7 +21,6 @@ from capsense.elements.panels import SurfacePanels
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import (
     LEAST_CHARGE,
-    Clusters,
     equilibrium,
     features,
     four_points_of,
@@ -62,9 +61,9 @@ _FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 of its faces: the first of those with flat sides, of which four points do not tell the faces apart
 there; the second of others, whose limbs are told apart first. Those with flat sides are thicker
 than the third of their least extent."""
-_CLUSTERS, _KNOWN, _SQUARE = 1000, 1000, 2.97
-"""Clusters from which the charges of wide bodies are found, those from which the energies of larger
-ones are, and the mean of 1/r in a square, times its side."""
+_CLUSTERS, _SQUARE = 1000, 2.97
+"""Clusters from which the charges of wide bodies are found, and the energies of larger ones; and
+the mean of 1/r in a square, times its side."""
 _HALF_SPACE = 2.0
 """Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
@@ -125,15 +124,12 @@ def _coarsest(kids: Ints, panel: Ints, count: int) -> tuple[Ints, Ints, Ints]:
     return first, np.where(last, np.cumsum(last) - 1, -1), above
 
 
-def _equilibrium(tree: Clusters, panels: SurfacePanels) -> Array:
-    """About the charges that put all panels at one potential, from some clusters of them, (n,).
+def _equilibrium(panels: SurfacePanels, cluster: Ints) -> Array:
+    """About the charges that put all panels at one potential, from clusters of them, (n,) -> (n,).
 
     Limbs and edges carry more than their share of the surface. What is wrong here, functions of
     smaller clusters make right.
     """
-    _, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)
-    cluster = np.empty(len(panels), np.int64)
-    cluster[tree.panel[tree.panel >= 0]] = number[above]
     area = np.bincount(cluster, panels.areas)
     center = np.stack([np.bincount(cluster, panels.areas * x) / area for x in panels.centers.T])
     square = ((center[:, :, None] - center[:, None]) ** 2).sum(axis=0)
@@ -165,28 +161,33 @@ class WideBody(ChangingBody):
         self.most, self._coarse = thickness * (_FACES if flat else _LIMBS), coarse
         self._at = features(panels.centers, panels.normals, self.most)
         tree = split(self._at, panels.areas)
-        self.weights = _equilibrium(tree, panels)
+        kids, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)
+        cluster = np.empty(len(panels), np.int64)
+        cluster[tree.panel[tree.panel >= 0]] = number[above]
+        self.weights = _equilibrium(panels, cluster)
         super().__init__(tree, panels, charge=self.weights)
-        self._means = self._means_of_first()
+        self._means = self._means_of(kids, np.flatnonzero(number >= 0))
         self.record["inside"] = _HALF_SPACE
-        self.record["means"], self.record["top"] = self._means.ctypes.data, self._top
+        self.record["means"], self.record["top"] = self._means.ctypes.data, len(kids)
 
-    def _means_of_first(self) -> Array32:
+    def _means_of(self, kids: Ints, last: Ints) -> Array32:
         """Means of 1/r within the body's first clusters, row by row up to the diagonal [1/m].
 
         Those of the smaller ones are of rectangles, those of larger ones are made up from them: a
         rectangle stands badly for what is bent or has limbs.
+
+        Args:
+            kids: Parts of the clusters, -1 where they are not split among these, shape (t, 2).
+            last: Those that are not.
         """
-        kids, number, _ = _coarsest(self._kids, self._panel, _KNOWN)
-        self._top, last = len(kids), np.flatnonzero(number >= 0)
         points, extent = four_points_of(self._center[last], self._spread[last])[:2]
         points = np.ascontiguousarray(points[:, [0, 2, 1, 3]])  # the longer arm first
-        shares = (self._charge[kids[:, 0]] / self._charge[: self._top]).tolist()
+        shares = (self._charge[kids[:, 0]] / self._charge[: len(kids)]).tolist()
         out: Array32 = means_between(points, extent)
         for _ in range(2):  # rows of larger clusters, then columns
-            rows = np.empty((self._top, out.shape[1]), np.float32)
+            rows = np.empty((len(kids), out.shape[1]), np.float32)
             rows[last] = out
-            for a in np.flatnonzero(number < 0)[::-1].tolist():
+            for a in np.flatnonzero(kids[:, 0] >= 0)[::-1].tolist():
                 first, second = kids[a]
                 rows[a] = rows[second] + shares[a] * (rows[first] - rows[second])
             out = rows.T
