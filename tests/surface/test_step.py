@@ -23,13 +23,13 @@ from capsense._dense import cholesky, multiply, multiply_simd, substitute
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block
 from capsense.elements.matter import CONDUCTING, UNIT
+from capsense.elements.mean_kernels import four_points
 from capsense.elements.panels import panels_of
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import BODY, Clusters, RigidShape, rigid_shape, split
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.surface.choose_kernels import Cut, choose
-from capsense.surface.leaf_kernels import four_points
 from capsense.surface.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
 from capsense.surface.score_kernels import score
 from capsense.surface.solve_kernels import Reduced, _add_products, _products, factorise, reduced

@@ -25,54 +25,142 @@ from capsense._simd import (
     where_above,
 )
 from capsense.elements.panel_kernels import rectangle_potential
+from capsense.elements.rigid import ROUND, SOFT
 from capsense.field.green_kernels import smooth
 
 FAR = 0.75
 """Clusters farther apart than so many of their joint extents are met by their moments; nearer ones
 point by point, and in closed form if they are of one surface."""
+_TOGETHER = 64
+"""Pairs of rectangles that are met at a time."""
 _UPON = 0.1
 """Rectangles nearer to each other than so many of their shorter side lie upon each other."""
 
 
 @compiled
-def means_within(points, extent, size, i, start, tables, line, room):
-    """Fill a line with the means of 1/r within a body: of cluster i, those before it, and itself.
+def four_points(a, center, v, out):
+    """Four points of equal weight with a centre and the two largest of its second moments.
 
     Args:
-        points, extent: Of the clusters [m], shapes (l, 4, 3), (l,).
-        size: How many times as large as in its table of means the body is.
-        i, start: The cluster, and the first one of its body.
-        tables: :func:`cluster_moments` and :func:`rectangles` of the clusters; and their rows in
-            the table of means, -1 for none, and where it stands, shape (l, 2).
-        line: Filled from ``start`` to ``i`` [1/m], shape (w,).
-        room: Room to work in, shape (28, w).
+        a: Second central moments [m²], shape (3, 3); lost.
+        center: [m], shape (3,).
+        v: Room to work in, shape (3, 3).
+        out: Filled [m], shape (4, 3).
+
+    Returns:
+        Length of a uniform rod with the largest second moment, and the distance below which 1/r
+        from the points is bounded [m].
     """
-    shapes, frames, known = tables
-    far_means(shapes, i, shapes, i, line)
-    row = known[i, 0]
-    if row >= 0:
-        table, o = singles(known[i, 1]), row * (row + 1) // 2
-        for j in range(start, i + 1):
-            if known[j, 0] >= 0:
-                line[j] = table[o + known[j, 0]] / size
-    else:
-        line[i] = _self_mean(arm(points[i, 0], points[i, 1]), arm(points[i, 0], points[i, 2]))
-    _near_rectangles(frames, extent, i, start, line, room)
+    for i in range(3):
+        for k in range(3):
+            v[i, k] = 1.0 if i == k else 0.0
+    for _ in range(6):  # Jacobi's rotations
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if abs(a[p, q]) < 1e-12 * (abs(a[p, p]) + abs(a[q, q])) + 1e-300:
+                    continue
+                angle = 0.5 * math.atan2(2.0 * a[p, q], a[q, q] - a[p, p])
+                c, s = math.cos(angle), math.sin(angle)
+                for k in range(3):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
+                    x, y = v[k, p], v[k, q]
+                    v[k, p], v[k, q] = c * x - s * y, s * x + c * y
+    least = 0
+    for i in range(1, 3):
+        if a[i, i] < a[least, least]:
+            least = i
+    first, second = (least + 1) % 3, (least + 2) % 3
+    if a[first, first] < a[second, second]:
+        first, second = second, first
+    long = math.sqrt(max(a[first, first], 0.0))
+    short = math.sqrt(max(a[second, second], 0.0))
+    for i in range(3):
+        x, y = long * v[i, first], short * v[i, second]
+        out[0, i], out[1, i] = center[i] + x + y, center[i] + x - y
+        out[2, i], out[3, i] = center[i] - x + y, center[i] - x - y
+    extent = math.sqrt(12.0) * long
+    return extent, math.sqrt((SOFT * extent) ** 2 + ROUND * max(a[least, least], 0.0))
 
 
 @compiled
-def means_between(points, extent):
-    """Means of 1/r between all clusters of a body, shapes (k, 4, 3), (k,) -> (k, k)."""
+def points_of_each(center, spread):
+    """Four points, and distances below which 1/r is bounded, of clusters: (k, 4, 3) and (k,)."""
+    count = center.shape[0]
+    points, soft = np.empty((count, 4, 3)), np.empty(count)
+    moments, turn = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(count):
+        for i in range(3):
+            for j in range(3):
+                moments[i, j] = spread[k, i, j]
+        _, soft[k] = four_points(moments, center[k], turn, points[k])
+    return points, soft
+
+
+@compiled
+def add_means(points, extent, body, weight, tables, out):
+    """Add the weighted means of 1/r within a body: between its clusters, and of each with itself.
+
+    Args:
+        points, extent: Of the clusters [m], shapes (l, 4, 3), (l,).
+        body: The body's first cluster, the one behind its last, and how many times as large as in
+            its table of means it is.
+        weight: Of each row up to the diagonal, shape (l,).
+        tables: :func:`cluster_moments` and :func:`rectangles` of the clusters; and their rows in
+            the table of means, -1 for none, and where it stands, shape (l, 2).
+        out: Rows up to the diagonal are added to [1/m], shape (l, l).
+    """
+    start, stop, size = body
+    shapes, frames, known = tables
+    line = np.empty(shapes.shape[1], np.float32)
+    near, room = np.empty((2, _TOGETHER), np.int64), np.empty((53, _TOGETHER), np.float32)
+    count = np.int64(0)
+    for i in range(start, stop):
+        far_means(shapes, i, shapes, i, line)
+        row = known[i, 0]
+        if row >= 0:
+            table, o = singles(known[i, 1]), row * (row + 1) // 2
+            line[i] = table[o + row] / size
+            for j in range(start, i):
+                if line[j] < 0.0 and known[j, 0] >= 0:
+                    line[j] = table[o + known[j, 0]] / size
+        else:
+            line[i] = _self_mean(arm(points[i, 0], points[i, 1]), arm(points[i, 0], points[i, 2]))
+        for j in range(start, i + 1):
+            if line[j] >= 0.0:
+                out[i, j] += weight[i] * line[j]
+                continue
+            near[0, count], near[1, count] = i, j
+            count += 1
+            if count == _TOGETHER:
+                _add_rectangles(frames, extent, near, count, weight, room, out)
+                count = np.int64(0)
+    _add_rectangles(frames, extent, near, count, weight, room, out)
+
+
+@compiled
+def means_between(points):
+    """Means of 1/r between all clusters of a body, the longer arm first, (k, 4, 3) -> (k, k)."""
     n = points.shape[0]
-    out, wanted, known = np.empty((n, n), np.float32), np.ones(n), np.full((n, 2), -1)
-    tables = cluster_moments(points, extent), rectangles(points, wanted), known
-    width = tables[0].shape[1]
-    line, room = np.empty(width, np.float32), np.empty((28, width), np.float32)
-    for i in range(n):
-        means_within(points, extent, 1.0, i, 0, tables, line, room)
-        for j in range(i + 1):
-            out[i, j] = out[j, i] = line[j]
+    out, weight, known = np.zeros((n, n), np.float32), np.ones(n), np.full((n, 2), -1)
+    extent = np.empty(n)
+    for j in range(n):
+        extent[j] = math.sqrt(12.0) * arm(points[j, 0], points[j, 2])
+    tables = cluster_moments(points, extent), rectangles(points, weight), known
+    add_means(points, extent, (0, n, 1.0), weight, tables, out)
+    mirror(out)
     return out
+
+
+@compiled
+def mirror(matrix):
+    """Fill in what is above the diagonal of a symmetric matrix."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
 
 
 @compiled
@@ -166,8 +254,8 @@ def rectangles(points, wanted):
 
 
 @compiled
-def _near_rectangles(table, extent, i, start, out, room):
-    """Replace what is negative in a line by the mean of 1/r between rectangles of one surface.
+def _add_rectangles(table, extent, near, count, weight, room, out):
+    """Add the weighted means of 1/r between pairs of rectangles of one surface.
 
     It is that over four points on one of them, the other in closed form, and the other way about:
     the larger one counts in closed form.
@@ -175,31 +263,29 @@ def _near_rectangles(table, extent, i, start, out, room):
     Args:
         table: As of :func:`rectangles`, shape (26, l).
         extent: Of the clusters [m], shape (l,).
-        i, start: The cluster, and the first of those before it that are looked at.
-        out: The line, shape (w,).
-        room: Room to work in, shape (28, w).
+        near: The two numbers of each pair, shape (2, w).
+        count: How many pairs there are.
+        weight: Of the first of each, shape (l,).
+        room: Room to work in, shape (53, w).
+        out: As there.
     """
-    count, n, width, own = 0, table.shape[1], room.shape[1], np.empty((26, SIMD_WIDTH), np.float32)
-    for k in range(26):
-        put_span(own, SIMD_WIDTH * k, splat(at(table, k * n + i)))
-    for j in range(start, i):
-        if at(out, j) < 0.0:
-            for k in range(26):
-                room[k, count] = at(table, k * n + j)
-            ratio = (extent[i] / extent[j]) ** 4
-            room[26, count], room[27, count] = ratio / (1.0 + ratio), j
-            count += 1
+    n, width = table.shape[1], room.shape[1]
+    for k in range(count):
+        i, j = near[0, k], near[1, k]
+        for q in range(26):
+            room[q, k], room[26 + q, k] = at(table, q * n + i), at(table, q * n + j)
+        ratio = (extent[i] / extent[j]) ** 4
+        room[52, k] = ratio / (1.0 + ratio)
     for k in range(0, count, SIMD_WIDTH):
         mine = theirs = splat(np.float32(0.0))
         for q in range(4):
-            mine = vadd(mine, rectangle_potential(own, 12 * SIMD_WIDTH, room, 3 * q * width + k))
-            theirs = vadd(
-                theirs, rectangle_potential(room, 12 * width + k, own, 3 * q * SIMD_WIDTH)
-            )
-        put_span(room, k, vmadd(span(room, 26 * width + k), vsub(mine, theirs), theirs))
+            point, other = 3 * q * width + k, (26 + 3 * q) * width + k
+            mine = vadd(mine, rectangle_potential(room, 12 * width + k, room, other))
+            theirs = vadd(theirs, rectangle_potential(room, 38 * width + k, room, point))
+        put_span(room, k, vmadd(span(room, 52 * width + k), vsub(mine, theirs), theirs))
     for k in range(count):
-        j = int(room[27, k])
-        out[j] = _upon(table, i, j, 0.25 * at(room, k))
+        i, j = near[0, k], near[1, k]
+        out[i, j] += weight[i] * _upon(table, i, j, 0.25 * at(room, k))
 
 
 @compiled

@@ -54,7 +54,7 @@ BODY = np.dtype(
         ("energy", np.int64),
         ("impedance", np.int64),  # all of these: where the arrays of a RigidShape stand
         ("known", np.int64),  # functions that have energies and impedances there, the first ones
-        ("spread", np.int64),  # second moments of a changing surface, else 0: it has no energies
+        ("spread", np.int64),  # second moments of a changing surface, which has no points, else 0
         ("means", np.int64), ("top", np.int64),  # means of 1/r within its first so many clusters
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),

@@ -16,14 +16,13 @@ from threadpoolctl import threadpool_limits
 
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
-from capsense.elements.mean_kernels import means_between
+from capsense.elements.mean_kernels import means_between, points_of_each
 from capsense.elements.panels import SurfacePanels
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import (
     LEAST_CHARGE,
     equilibrium,
     features,
-    four_points_of,
     once,
     split,
 )
@@ -166,6 +165,9 @@ class WideBody(ChangingBody):
         cluster[tree.panel[tree.panel >= 0]] = number[above]
         self.weights = _equilibrium(panels, cluster)
         super().__init__(tree, panels, charge=self.weights)
+        self._points, self._soft = points_of_each(self._center, self._spread)
+        for name in ("points", "soft"):  # the body is rigid: they are needed at every step
+            self.record[name] = getattr(self, f"_{name}").ctypes.data
         self._means = self._means_of(kids, np.flatnonzero(number >= 0))
         self.record["inside"] = _HALF_SPACE
         self.record["means"], self.record["top"] = self._means.ctypes.data, len(kids)
@@ -180,10 +182,8 @@ class WideBody(ChangingBody):
             kids: Parts of the clusters, -1 where they are not split among these, shape (t, 2).
             last: Those that are not.
         """
-        points, extent = four_points_of(self._center[last], self._spread[last])[:2]
-        points = np.ascontiguousarray(points[:, [0, 2, 1, 3]])  # the longer arm first
         shares = (self._charge[kids[:, 0]] / self._charge[: len(kids)]).tolist()
-        out: Array32 = means_between(points, extent)
+        out: Array32 = means_between(self._points[last])
         for _ in range(2):  # rows of larger clusters, then columns
             rows = np.empty((len(kids), out.shape[1]), np.float32)
             rows[last] = out

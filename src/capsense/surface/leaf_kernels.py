@@ -31,7 +31,7 @@ from capsense._simd import (
     vsub,
     where_above,
 )
-from capsense.elements.rigid import ROUND, SOFT
+from capsense.elements.mean_kernels import arm, four_points
 from capsense.field.green_kernels import (
     FAR_LEAST,
     NEAR_LEAST,
@@ -60,8 +60,8 @@ class Leaves(NamedTuple):
     owner: NDArray[Any]
     """Body of each, ascending, shape (l,)."""
     within: NDArray[Any]
-    """How much a changing body's clusters meet each other, 1 for a conductor; 0 for rigid bodies,
-    which have energies of their own; shape (l,)."""
+    """How much clusters of a body meet each other, 1 for a conductor; 0 for those of a body that
+    has energies of its own; shape (l,)."""
     known: NDArray[Any]
     """Rows in a table of means of 1/r within a body, -1 for none, and where it stands, (l, 2)."""
     size: NDArray[Any]
@@ -83,8 +83,9 @@ def placed(bodies, cut, green):
         owner[j], k, size[j] = cut.body[a], cut.node[a], body.scale
         if k < body.top:
             known[j, 0], known[j, 1] = k, body.means
-        if body.spread != 0:
+        if body.energy == 0:  # clusters meet each other at every step
             within[j] = 1.0 + body.inside * body.softness
+        if body.points == 0:
             spread, center = doubles(body.spread), doubles(body.center)
             for i in range(3):
                 middle[i] = center[3 * k + i]
@@ -92,11 +93,12 @@ def placed(bodies, cut, green):
                     moments[i, q] = spread[9 * k + 3 * i + q]
             extent[j], soft[j] = four_points(moments, middle, turn, corners)
         else:
-            extent[j], soft[j] = doubles(body.extent)[k], doubles(body.soft)[k]
-            local = doubles(body.points)
+            local, soft[j] = doubles(body.points), doubles(body.soft)[k]
             for q in range(4):
                 for i in range(3):
                     corners[q, i] = local[12 * k + 3 * q + i]
+            long = max(arm(corners[0], corners[1]), arm(corners[0], corners[2]))
+            extent[j] = math.sqrt(12.0) * long
         extent[j], soft[j] = body.scale * extent[j], body.scale * soft[j]
         for q in range(4):
             for i in range(3):
@@ -110,55 +112,6 @@ def placed(bodies, cut, green):
         if green.cover < 1.0:
             lift(points[j], least_gap(extent[j], green.cover), green.box)
     return Leaves(points, true, extent, soft, out, owner, within, known, size)
-
-
-@compiled
-def four_points(a, center, v, out):
-    """Four points of equal weight with a centre and the two largest of its second moments.
-
-    Args:
-        a: Second central moments [m²], shape (3, 3); lost.
-        center: [m], shape (3,).
-        v: Room to work in, shape (3, 3).
-        out: Filled [m], shape (4, 3).
-
-    Returns:
-        Length of a uniform rod with the largest second moment, and the distance below which 1/r
-        from the points is bounded [m].
-    """
-    for i in range(3):
-        for k in range(3):
-            v[i, k] = 1.0 if i == k else 0.0
-    for _ in range(6):  # Jacobi's rotations
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if abs(a[p, q]) < 1e-12 * (abs(a[p, p]) + abs(a[q, q])) + 1e-300:
-                    continue
-                angle = 0.5 * math.atan2(2.0 * a[p, q], a[q, q] - a[p, p])
-                c, s = math.cos(angle), math.sin(angle)
-                for k in range(3):
-                    x, y = a[k, p], a[k, q]
-                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
-                for k in range(3):
-                    x, y = a[p, k], a[q, k]
-                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
-                    x, y = v[k, p], v[k, q]
-                    v[k, p], v[k, q] = c * x - s * y, s * x + c * y
-    least = 0
-    for i in range(1, 3):
-        if a[i, i] < a[least, least]:
-            least = i
-    first, second = (least + 1) % 3, (least + 2) % 3
-    if a[first, first] < a[second, second]:
-        first, second = second, first
-    long = math.sqrt(max(a[first, first], 0.0))
-    short = math.sqrt(max(a[second, second], 0.0))
-    for i in range(3):
-        x, y = long * v[i, first], short * v[i, second]
-        out[0, i], out[1, i] = center[i] + x + y, center[i] + x - y
-        out[2, i], out[3, i] = center[i] - x + y, center[i] - x - y
-    extent = math.sqrt(12.0) * long
-    return extent, math.sqrt((SOFT * extent) ** 2 + ROUND * max(a[least, least], 0.0))
 
 
 @compiled

@@ -22,10 +22,11 @@ from capsense._simd import (
     vsub,
 )
 from capsense.elements.mean_kernels import (
+    add_means,
     arm,
     cluster_moments,
     far_means,
-    means_within,
+    mirror,
     rectangles,
 )
 from capsense.field.green_kernels import smooth
@@ -60,8 +61,7 @@ def leaf_pairs(leaves, floor):
             image[j, q, 2] = 2.0 * floor - points[j, q, 2]
     shapes, mirrored = cluster_moments(points, extent), cluster_moments(image, extent)
     flat, below = _flat(points, soft), _flat(image, soft)
-    tables = shapes, rectangles(points, leaves.within), leaves.known
-    line, room = np.empty(shapes.shape[1], np.float32), np.empty((28, shapes.shape[1]), np.float32)
+    line, room = np.empty(shapes.shape[1], np.float32), np.empty((14, shapes.shape[1]), np.float32)
     behind = 0  # clusters of bodies before this one's
     for i in range(n):
         if owner[i] != owner[behind]:
@@ -75,14 +75,16 @@ def leaf_pairs(leaves, floor):
             _near_means(flat, i, flat, behind, line, room)
             for j in range(behind):
                 out[i, j] += line[j]
-        if leaves.within[i] > 0.0:
-            means_within(points, extent, leaves.size[i], i, behind, tables, line, room)
-            for j in range(behind, i + 1):
-                out[i, j] += leaves.within[i] * line[j]
-        for j in range(i):
-            out[j, i] = out[i, j]
         out[i, i] += BARRIER * leaves.beyond[i] ** 3
+    tables, start = (shapes, rectangles(points, leaves.within), leaves.known), 0
+    for i in range(n):
+        if i + 1 == n or owner[i + 1] != owner[i]:
+            if leaves.within[i] > 0.0:
+                body = start, i + 1, leaves.size[i]
+                add_means(points, extent, body, leaves.within, tables, out)
+            start = i + 1
     _add_lifted(leaves, out)
+    mirror(out)
     return out
 
 
@@ -104,7 +106,6 @@ def _add_lifted(leaves, out):
                 more = mean_inverse(points[i], points[j], soft)
                 more -= mean_inverse(true[i], true[j], soft)
                 out[i, j] += more
-                out[j, i] += more
 
 
 @compiled
