@@ -83,29 +83,41 @@ def leaf_pairs(leaves, floor):
                 body = start, i + 1, leaves.size[i]
                 add_means(points, extent, body, leaves.within, tables, out)
             start = i + 1
-    _add_lifted(leaves, out)
+    _add_lifted(leaves, flat, line, room, out)
     mirror(out)
     return out
 
 
 @compiled
-def _add_lifted(leaves, out):
-    """Add to pairs of a rigid body what they meet each other more for being lifted."""
-    points, true = leaves.points, leaves.true
+def _add_lifted(leaves, flat, line, room, out):
+    """Add to pairs of a rigid body what they meet each other more for being lifted.
+
+    Args:
+        leaves: The clusters.
+        flat: :func:`_flat` of their points.
+        line, room: Room to work in.
+        out: Rows up to the diagonal are added to [1/m], shape (l, l).
+    """
+    points, true, owner = leaves.points, leaves.true, leaves.owner
     n = points.shape[0]
-    lifted = np.zeros(n, np.bool_)
+    lifted, some = np.zeros(n, np.bool_), False
     for i in range(n):
         for q in range(4):
             for k in range(3):
                 if abs(points[i, q, k] - true[i, q, k]) > LIFTED:
                     lifted[i] = leaves.within[i] == 0.0
+        some = some or lifted[i]
+    if not some:
+        return
+    before, unlifted = _flat(true, leaves.soft), np.empty(line.shape[0], np.float32)
     for i in range(n):
         for j in range(i):
-            if (lifted[i] or lifted[j]) and leaves.owner[i] == leaves.owner[j]:
-                soft = max(leaves.soft[i], leaves.soft[j])
-                more = mean_inverse(points[i], points[j], soft)
-                more -= mean_inverse(true[i], true[j], soft)
-                out[i, j] += more
+            wanted = owner[i] == owner[j] and (lifted[i] or lifted[j])
+            line[j] = unlifted[j] = np.float32(-1.0) if wanted else np.float32(0.0)
+        _near_means(flat, i, flat, i, line, room)
+        _near_means(before, i, before, i, unlifted, room)
+        for j in range(i):
+            out[i, j] += line[j] - unlifted[j]
 
 
 @compiled
