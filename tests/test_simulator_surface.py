@@ -151,6 +151,23 @@ def test_a_reading_does_not_depend_on_those_before_it(sim):
     np.testing.assert_array_equal(first, third)
 
 
+def test_a_reading_does_not_depend_on_other_bodies_before_it(sim):
+    """Differential: a sensor at rest, to the last bit. Bodies that change places, a long one that
+    slides, and a mesh of parts that come and go."""
+    balls = [ball(0.06), ball(0.06, radius=0.02).moved(cs.Pose((0.08, 0.0, 0.05)))]
+    rod = cs.Body(cs.Capsule(0.02, 3.0), cs.Pose.from_euler((0, 0, 0.06), (0, np.pi / 2, 0)))
+    far, near = (cs.Box((0.3, 0.05, 0.05)).to_trimesh() for _ in range(2))
+    vertices = np.concatenate([far.vertices, near.vertices + (0.6, 0.0, 0.0)])
+    mesh = cs.TriMesh(vertices, np.concatenate([far.faces, near.faces + len(far.vertices)]))
+    scenes = [cs.Scene(balls), cs.Scene([b.moved(balls[0].pose) for b in balls[::-1]])]
+    for body in (rod, cs.Body(mesh, cs.Pose((0.0, 0.0, 0.06)))):
+        for x in (0.0, -0.6, 0.3):
+            scenes.append(cs.Scene([body.moved(cs.Pose((x, 0.0, 0.06), body.pose.quaternion))]))
+    for scene in scenes:
+        wanted = sim.copy().step(scene).delta
+        np.testing.assert_array_equal(sim.step(scene).delta, wanted)
+
+
 def test_smooth_on_the_way_towards_the_sensor(sim):
     """Measured: a finger in steps of 0.05 mm."""
     turn = (0.1494, 0.2344, 0.1494, 0.9491)

@@ -12,7 +12,7 @@ import gc
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -163,16 +163,20 @@ more than half of the time of a scan. Room that a kernel needs is therefore hand
 """
 
 
-@contextmanager
-def first_use() -> Iterator[None]:
+def first_use() -> AbstractContextManager[None]:
     """Say, if the first use in a process takes long, that kernels are compiled.
 
     It is a warning of the logger ``capsense``, which goes to standard error unless told otherwise.
     """
+    return _NOTHING if _done else _told()
+
+
+_NOTHING = nullcontext()
+
+
+@contextmanager
+def _told() -> Iterator[None]:
     global _done
-    if _done:
-        yield
-        return
     often = "once, and is then kept" if _kernel_cache.kept else "in each process"
     told = f"compiling the solver for this processor; it takes about 15 seconds {often}"
     timer = threading.Timer(WAIT, _log.warning, [told])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from capsense.design.model import Design
 from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
 from capsense.elements.panels import longer, windowed
 from capsense.elements.pieces import ChangingBody
-from capsense.elements.rigid import BODY, RigidShape
+from capsense.elements.rigid import RigidShape
 from capsense.elements.store import functions_of
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import Change, Charges
@@ -24,8 +24,8 @@ from capsense.field.green_kernels import SHORE, pack_green
 from capsense.scene import Scene, TriMesh
 from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
-from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape, ShapeKind
+from capsense.surface.packing import Laid, PackedBodies, View, laid_out, same
 from capsense.surface.step import Solution, potential_change, solve, solve_each, solve_lossy
 
 Array = NDArray[np.float64]
@@ -61,59 +61,6 @@ PRESETS = {
     "fine": Preset(panels=1400, threshold=0.004, coarsest=0.33),
 }
 """Presets by name."""
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A scene, and the n bodies of it that reach into the domain."""
-
-    scene: Scene
-    packed: PackedScene
-    met: NDArray[np.intp]
-    """Their places in the scene, shape (n,)."""
-    matter: Matter
-    """What they are made of."""
-
-
-@dataclass(frozen=True, eq=False)
-class PackedBodies:
-    """The bodies of a scene that reach into the domain, as the kernels take them."""
-
-    records: NDArray[np.void]
-    """One :data:`BODY` each, or one for each part of a large mesh, shape (n,)."""
-    chosen: NDArray[np.intp]
-    """Their places in the scene, shape (n,)."""
-    matter: Matter
-    """What they are made of and what ties them to ground."""
-    shapes: list[RigidShape | ChangingBody]
-    """What the records point to."""
-    offsets: Array
-    """From the bodies' origins to those of the parts of them that are solved for [m], (n, 3)."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Laid:
-    """Records of bodies but for where they stand, which is all that changes at most steps."""
-
-    whole: Matter
-    """What the bodies are made of,"""
-    places: list[int]
-    """body of each part, its functions and its size [m]: what the records follow from."""
-    found: list[tuple[RigidShape | ChangingBody, float]]
-    records: NDArray[np.void]
-    matter: Matter
-    """What the parts are made of."""
-    shapes: list[RigidShape | ChangingBody]
-
-
-def _laid_out(
-    whole: Matter, places: list[int], found: list[tuple[RigidShape | ChangingBody, float]]
-) -> _Laid:
-    shapes, matter = [shape for shape, _ in found], whole.repeated(places)
-    records = np.array([s.record for s in shapes], BODY)
-    records["scale"] = [size for _, size in found]
-    matter.write(records, shapes)
-    return _Laid(whole, places, found, records, matter, shapes)
 
 
 def _electrode_width(design: Design) -> float:
@@ -157,7 +104,7 @@ class SurfaceSolver:
         self._sight = self.green.room + SHORE * np.array([[-1.0], [1.0]])
         """Corners of the box beyond which no charge is [m], shape (2, 3)."""
         self._last: tuple[View, Solution] | None = None
-        self._laid: _Laid | None = None
+        self._laid: Laid | None = None
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
         coarsest = self.preset.coarsest
         self._largest = coarsest and self.preset.panels * (coarsest * _electrode_width(design)) ** 2
@@ -321,8 +268,27 @@ class SurfaceSolver:
 
     def pack(self, view: View) -> PackedBodies:
         """Lay out the bodies that reach into the domain."""
-        matter, packed = self._joined(view), view.packed
+        matter, packed, laid = self._joined(view), view.packed, self._laid
+        bodies = [packed.shapes[k] for k in view.met.tolist()]
+        offsets: list[tuple[int, Array]] = []
+        if laid is None or laid.whole is not matter or not same(laid.bodies, bodies):
+            laid, offsets = self._lay_out(view, matter, bodies)
+            self._laid = laid
+        records, chosen = laid.records.copy(), view.met[laid.places]
+        records["rotation"] = rotation = packed.rotation[chosen]
+        records["position"] = packed.position[chosen]
+        shift = np.zeros((len(chosen), 3))
+        for i, at in offsets:
+            shift[i] = rotation[i] @ at
+            records["position"][i] += shift[i]
+        return PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
+
+    def _lay_out(
+        self, view: View, matter: Matter, bodies: list[Shape]
+    ) -> tuple[Laid, list[tuple[int, Array]]]:
+        """Records of the bodies, and where parts of them stand in their frames [m], if not at 0."""
         found: list[tuple[RigidShape | ChangingBody, float]] = []
+        solved: list[Shape] = []
         places: list[int] = []
         offsets: list[tuple[int, Array]] = []
         conducting = view.matter.conducting.tolist()
@@ -332,18 +298,12 @@ class SurfaceSolver:
                 offsets.append((len(places), at))
             for part in parts:
                 found.append(self.functions_of(part, conducting[place], share))
+                solved.append(part)
                 places.append(place)
         laid = self._laid
         if laid is None or laid.whole is not matter or (laid.places, laid.found) != (places, found):
-            laid = self._laid = _laid_out(matter, places, found)
-        records, chosen = laid.records.copy(), view.met[places]
-        records["rotation"] = rotation = packed.rotation[chosen]
-        records["position"] = packed.position[chosen]
-        shift = np.zeros((len(chosen), 3))
-        for i, at in offsets:
-            shift[i] = rotation[i] @ at
-            records["position"][i] += shift[i]
-        return PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
+            laid = laid_out(matter, places, found)
+        return replace(laid, bodies=bodies if same(solved, bodies) else None), offsets
 
     def _joined(self, view: View) -> Matter:
         """What bodies are made of, with conductors that touch as one.

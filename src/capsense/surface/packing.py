@@ -1,0 +1,78 @@
+"""The bodies of a scene as the step takes them, and what of that stays from step to step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from operator import is_
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.elements.matter import Matter
+from capsense.elements.pieces import ChangingBody
+from capsense.elements.rigid import BODY, RigidShape
+from capsense.scene import Scene
+from capsense.scene.scene import PackedScene
+from capsense.scene.shapes import Shape
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scene, and the n bodies of it that reach into the domain."""
+
+    scene: Scene
+    packed: PackedScene
+    met: NDArray[np.intp]
+    """Their places in the scene, shape (n,)."""
+    matter: Matter
+    """What they are made of."""
+
+
+@dataclass(frozen=True, eq=False)
+class PackedBodies:
+    """The bodies of a scene that reach into the domain, as the kernels take them."""
+
+    records: NDArray[np.void]
+    """One :data:`BODY` each, or one for each part of a large mesh, shape (n,)."""
+    chosen: NDArray[np.intp]
+    """Their places in the scene, shape (n,)."""
+    matter: Matter
+    """What they are made of and what ties them to ground."""
+    shapes: list[RigidShape | ChangingBody]
+    """What the records point to."""
+    offsets: Array
+    """From the bodies' origins to those of the parts of them that are solved for [m], (n, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """Records of bodies but for where they stand, which is all that changes at most steps."""
+
+    bodies: list[Shape] | None
+    """The bodies, where each is solved for as a whole wherever it stands, else None."""
+    whole: Matter
+    """What the bodies are made of,"""
+    places: list[int]
+    """body of each part, its functions and its size [m]: what the records follow from."""
+    found: list[tuple[RigidShape | ChangingBody, float]]
+    records: NDArray[np.void]
+    matter: Matter
+    """What the parts are made of."""
+    shapes: list[RigidShape | ChangingBody]
+
+
+def laid_out(
+    whole: Matter, places: list[int], found: list[tuple[RigidShape | ChangingBody, float]]
+) -> Laid:
+    shapes, matter = [shape for shape, _ in found], whole.repeated(places)
+    records = np.array([s.record for s in shapes], BODY)
+    records["scale"] = [size for _, size in found]
+    matter.write(records, shapes)
+    return Laid(None, whole, places, found, records, matter, shapes)
+
+
+def same(known: list[Shape] | None, bodies: list[Shape]) -> bool:
+    """Whether two lists hold the same objects."""
+    return known is not None and len(known) == len(bodies) and all(map(is_, known, bodies))
