@@ -157,7 +157,7 @@ def test_a_reading_does_not_depend_on_other_bodies_before_it(sim):
     balls = [ball(0.06), ball(0.06, radius=0.02).moved(cs.Pose((0.08, 0.0, 0.05)))]
     rod = cs.Body(cs.Capsule(0.02, 3.0), cs.Pose.from_euler((0, 0, 0.06), (0, np.pi / 2, 0)))
     far, near = (cs.Box((0.3, 0.05, 0.05)).to_trimesh() for _ in range(2))
-    vertices = np.concatenate([far.vertices, near.vertices + (0.6, 0.0, 0.0)])
+    vertices = np.concatenate([far.vertices, np.add(near.vertices, (0.6, 0.0, 0.0))])
     mesh = cs.TriMesh(vertices, np.concatenate([far.faces, near.faces + len(far.vertices)]))
     scenes = [cs.Scene(balls), cs.Scene([b.moved(balls[0].pose) for b in balls[::-1]])]
     for body in (rod, cs.Body(mesh, cs.Pose((0.0, 0.0, 0.06)))):

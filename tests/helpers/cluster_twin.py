@@ -15,9 +15,9 @@ from capsense.field.green_kernels import Green
 from capsense.surface import step
 from capsense.surface.choose_kernels import Cut, Functions, functions_of
 from capsense.surface.leaf_kernels import leaf_rows, placed
+from capsense.surface.packing import PackedBodies, View
 from capsense.surface.pair_kernels import BARRIER, bound_images, leaf_pairs
 from capsense.surface.solve_kernels import System, assembled, leaf_charges, reduced
-from capsense.surface.packing import PackedBodies, View
 from capsense.surface.solver import SurfaceSolver
 
 Array = NDArray[np.float64]
