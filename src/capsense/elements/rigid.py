@@ -170,20 +170,21 @@ class RigidShape(Frozen):
         return self.energy.nbytes + (0 if z is None else z.nbytes)
 
 
-def rigid_shape(panels: SurfacePanels, *, apart: bool = False) -> RigidShape:
+def rigid_shape(panels: SurfacePanels, *, apart: bool = False, most: float = np.inf) -> RigidShape:
     """Work out charge functions and energies.
 
     Args:
         panels: The surface.
         apart: Whether it is known that no two panels lie within each other, as on a primitive. Of
             others it is looked into, at some cost.
+        most: Opposite normals count as twice so much apart at most [m], in telling faces apart.
 
     Raises:
         SolveError: The panels lie within each other, so that their block is not definite.
     """
     free = free_block(panels)
     charge = equilibrium(free) if apart else _made_definite(free)
-    tree = build_tree(panels, np.maximum(charge, LEAST_CHARGE * charge.max()))
+    tree = build_tree(panels, np.maximum(charge, LEAST_CHARGE * charge.max()), most)
     return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
 
 
@@ -271,9 +272,13 @@ def _substitute(factor: Array, x: Array) -> None:
             x[j] -= factor[i, j] * x[i]
 
 
-def build_tree(panels: SurfacePanels, charge: Array) -> Tree:
-    """Split panels into clusters; ``charge`` (n,) is their equilibrium charge, above zero."""
-    return charged_tree(panels, split(features(panels.centers, panels.normals), charge), charge)
+def build_tree(panels: SurfacePanels, charge: Array, most: float = np.inf) -> Tree:
+    """Split panels into clusters; ``charge`` (n,) is their equilibrium charge, above zero.
+
+    Opposite normals count as twice ``most`` [m] apart at most.
+    """
+    at = features(panels.centers, panels.normals, most)
+    return charged_tree(panels, split(at, charge), charge)
 
 
 def features(centers: Array, normals: Array, most: float = np.inf) -> Array:

@@ -109,6 +109,11 @@ _EACH = 0.2
 _MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
+_THIN = 12.0
+"""Half of how many times as wide as it is thick a cluster of a primitive may be before its faces are
+told apart: on a thin plate, charge on one does nearly what it does on the other, and an estimate
+that takes their functions for independent counts it twice."""
+
 _LOCK = OneAtATime()
 _SHAPES: OrderedDict[Hashable, RigidShape | ChangingBody] = OrderedDict()
 
@@ -162,7 +167,8 @@ def _wide_of(whole: Shape, count: int, _: str) -> WideBody:
 def _rigid_of(whole: Shape, count: int, name: str) -> RigidShape:
     if isinstance(whole, TriMesh):
         return _mesh_shape(whole, count, name)
-    return rigid_shape(panels_of(whole, count), apart=True)
+    panels = panels_of(whole, count)
+    return rigid_shape(panels, apart=True, most=_THIN * panels.thickness)
 
 
 def _kept(
