@@ -110,9 +110,9 @@ _MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
 _THIN = 12.0
-"""Half of how many times as wide as it is thick a cluster of a primitive may be before its faces are
-told apart: on a thin plate, charge on one does nearly what it does on the other, and an estimate
-that takes their functions for independent counts it twice."""
+"""Half of how many times as wide as it is thick a cluster of a thin conductor may be before its
+faces are told apart: on a thin plate, charge on one does nearly what it does on the other, and an
+estimate that takes their functions for independent counts it twice."""
 
 _LOCK = OneAtATime()
 _SHAPES: OrderedDict[Hashable, RigidShape | ChangingBody] = OrderedDict()
@@ -139,20 +139,33 @@ def functions_of(
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
-    return rigid(shape, count * (2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1))
+    thin = conducting and not isinstance(shape, TriMesh) and _is_thin(shape)
+    many = 2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1
+    return rigid(shape, count * many, thin=thin)
 
 
-def rigid(shape: Shape, count: int) -> tuple[RigidShape, float]:
+def _is_thin(shape: Shape) -> bool:
+    low, middle, _ = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
+    return bool(low < 0.1 * middle)
+
+
+def rigid(shape: Shape, count: int, *, thin: bool = False) -> tuple[RigidShape, float]:
     """Return the charge functions of a shape of some size, and how many times as large it is.
 
     Args:
         shape: A primitive or a mesh.
         count: About how many panels cover a primitive; meshes get more.
+        thin: Whether it is a thin conductor, whose faces are told apart in small clusters only.
 
     Raises:
         SceneError: The shape has no surface that can be covered with panels.
     """
-    return _kept(shape, count, "_rigid", _rigid_of)
+    return _kept(shape, count, "_thin" if thin else "_rigid", _thin_of if thin else _rigid_of)
+
+
+def _thin_of(whole: Shape, count: int, _: str) -> RigidShape:
+    panels = panels_of(whole, count)
+    return rigid_shape(panels, apart=True, most=_THIN * panels.thickness)
 
 
 def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:
@@ -167,8 +180,7 @@ def _wide_of(whole: Shape, count: int, _: str) -> WideBody:
 def _rigid_of(whole: Shape, count: int, name: str) -> RigidShape:
     if isinstance(whole, TriMesh):
         return _mesh_shape(whole, count, name)
-    panels = panels_of(whole, count)
-    return rigid_shape(panels, apart=True, most=_THIN * panels.thickness)
+    return rigid_shape(panels_of(whole, count), apart=True)
 
 
 def _kept(
