@@ -143,12 +143,12 @@ def add_means(points, extent, body, weight, tables, out):
 
 @compiled
 def means_between(points):
-    """Means of 1/r between all clusters of a body, the longer arm first, (k, 4, 3) -> (k, k)."""
+    """Means of 1/r between all clusters of a body, shape (k, 4, 3) -> (k, k)."""
     n = points.shape[0]
     out, weight, known = np.zeros((n, n), np.float32), np.ones(n), np.full((n, 2), -1)
     extent = np.empty(n)
     for j in range(n):
-        extent[j] = math.sqrt(12.0) * arm(points[j, 0], points[j, 2])
+        extent[j] = extent_of(points[j])
     tables = cluster_moments(points, extent), rectangles(points, weight), known
     add_means(points, extent, (0, n, 1.0), weight, tables, out)
     mirror(out)
@@ -227,6 +227,12 @@ def arm(first, second):
     for i in range(3):
         total += (first[i] - second[i]) ** 2
     return 0.5 * math.sqrt(total)
+
+
+@compiled
+def extent_of(points):
+    """Length [m] of a uniform rod with the largest second moment of four points, shape (4, 3)."""
+    return math.sqrt(12.0) * max(arm(points[0], points[1]), arm(points[0], points[2]))
 
 
 @compiled

@@ -20,7 +20,7 @@ from capsense._thread_pool import OneAtATime
 from capsense.elements.panels import panels_of, polygon_panels
 from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
-from capsense.elements.wide import COARSE, WideBody, wide_pieces
+from capsense.elements.wide import COARSE, FACES, WideBody, wide_pieces
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
 from capsense.scene import (
@@ -109,11 +109,6 @@ _EACH = 0.2
 _MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
-_THIN = 12.0
-"""Half of how many times as wide as it is thick a cluster of a thin conductor may be before its
-faces are told apart: on a thin plate, charge on one does nearly what it does on the other, and an
-estimate that takes their functions for independent counts it twice."""
-
 _LOCK = OneAtATime()
 _SHAPES: OrderedDict[Hashable, RigidShape | ChangingBody] = OrderedDict()
 
@@ -139,33 +134,31 @@ def functions_of(
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
-    thin = conducting and not isinstance(shape, TriMesh) and _is_thin(shape)
     many = 2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1
-    return rigid(shape, count * many, thin=thin)
+    return rigid(shape, count * many, conducting=conducting)
 
 
-def _is_thin(shape: Shape) -> bool:
-    low, middle, _ = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
-    return bool(low < 0.1 * middle)
-
-
-def rigid(shape: Shape, count: int, *, thin: bool = False) -> tuple[RigidShape, float]:
+def rigid(shape: Shape, count: int, *, conducting: bool = False) -> tuple[RigidShape, float]:
     """Return the charge functions of a shape of some size, and how many times as large it is.
 
     Args:
         shape: A primitive or a mesh.
         count: About how many panels cover a primitive; meshes get more.
-        thin: Whether it is a thin conductor, whose faces are told apart in small clusters only.
+        conducting: Whether it holds no field inside. On a thin conductor, charge on one face does
+            nearly what it does on the other: faces are told apart in small clusters only, as the
+            estimate of the step takes functions for independent.
 
     Raises:
         SceneError: The shape has no surface that can be covered with panels.
     """
-    return _kept(shape, count, "_thin" if thin else "_rigid", _thin_of if thin else _rigid_of)
+    if isinstance(shape, TriMesh) or not conducting:
+        return _kept(shape, count, "_rigid", _rigid_of)
+    return _kept(shape, count, "_conductor", _conductor_of)
 
 
-def _thin_of(whole: Shape, count: int, _: str) -> RigidShape:
+def _conductor_of(whole: Shape, count: int, _: str) -> RigidShape:
     panels = panels_of(whole, count)
-    return rigid_shape(panels, apart=True, most=_THIN * panels.thickness)
+    return rigid_shape(panels, apart=True, most=FACES * panels.thickness)
 
 
 def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:

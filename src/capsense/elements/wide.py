@@ -55,7 +55,7 @@ COARSE, _THICK = 1000, 2.0
 thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
 _FOIL = 5e-5
 """Primitives thinner than this part of their width have no energies: their faces would be one."""
-_FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
+FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 """Clusters of a wide body that are more than twice so many times as wide as it is thick hold both
 of its faces: the first of those with flat sides, of which four points do not tell the faces apart
 there; the second of others, whose limbs are told apart first. Those with flat sides are thicker
@@ -157,7 +157,7 @@ class WideBody(ChangingBody):
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
         thickness, flat = _thickness(panels)
-        self.most, self._coarse = thickness * (_FACES if flat else _LIMBS), coarse
+        self.most, self._coarse = thickness * (FACES if flat else _LIMBS), coarse
         self._at = features(panels.centers, panels.normals, self.most)
         tree = split(self._at, panels.areas)
         kids, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)

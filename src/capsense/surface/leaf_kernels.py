@@ -7,7 +7,6 @@ the modes ψ of g.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +30,7 @@ from capsense._simd import (
     vsub,
     where_above,
 )
-from capsense.elements.mean_kernels import arm, four_points
+from capsense.elements.mean_kernels import extent_of, four_points
 from capsense.field.green_kernels import (
     FAR_LEAST,
     NEAR_LEAST,
@@ -97,8 +96,7 @@ def placed(bodies, cut, green):
             for q in range(4):
                 for i in range(3):
                     corners[q, i] = local[12 * k + 3 * q + i]
-            long = max(arm(corners[0], corners[1]), arm(corners[0], corners[2]))
-            extent[j] = math.sqrt(12.0) * long
+            extent[j] = extent_of(corners)
         extent[j], soft[j] = body.scale * extent[j], body.scale * soft[j]
         for q in range(4):
             for i in range(3):
