@@ -106,19 +106,19 @@ def add_means(points, extent, body, weight, tables, out):
 
     Args:
         points, extent: Of the clusters [m], shapes (l, 4, 3), (l,).
-        body: The body's first cluster, the one behind its last, and how many times as large as in
-            its table of means it is.
+        body: The body's first cluster, the first whose row is wanted, the one behind its last, and
+            how many times as large as in its table of means it is.
         weight: Of each row up to the diagonal, shape (l,).
         tables: :func:`cluster_moments` and :func:`rectangles` of the clusters; and their rows in
             the table of means, -1 for none, and where it stands, shape (l, 2).
         out: Rows up to the diagonal are added to [1/m], shape (l, l).
     """
-    start, stop, size = body
+    start, first, stop, size = body
     shapes, frames, known = tables
     line = np.empty(shapes.shape[1], np.float32)
     near, room = np.empty((2, _TOGETHER), np.int64), np.empty((53, _TOGETHER), np.float32)
     count = np.int64(0)
-    for i in range(start, stop):
+    for i in range(first, stop):
         far_means(shapes, i, shapes, i, line)
         row = known[i, 0]
         if row >= 0:
@@ -150,7 +150,7 @@ def means_between(points):
     for j in range(n):
         extent[j] = extent_of(points[j])
     tables = cluster_moments(points, extent), rectangles(points, weight), known
-    add_means(points, extent, (0, n, 1.0), weight, tables, out)
+    add_means(points, extent, (0, 0, n, 1.0), weight, tables, out)
     mirror(out)
     return out
 

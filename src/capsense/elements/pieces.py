@@ -228,7 +228,7 @@ def _pixel_tree(views: int, sides: int, rows: int, columns: int, ratio: float) -
     return split(features, np.ones(len(view)))
 
 
-_OWN = 4.0
+OWN = 4.0
 """Energy of a charge function times the extent of its cluster, as far as scores need it."""
 
 
@@ -282,10 +282,10 @@ class ChangingBody:
         self.capacitance = 0.35 * float(extent[0])
         """About that in free space over 4π eps0 [m]."""
         self._own = np.empty(n)
-        self._own[0] = 0.5 * _OWN / extent[0]
-        self._own[self._function[~single]] = _OWN / extent[~single]
+        self._own[0] = 0.5 * OWN / extent[0]
+        self._own[self._function[~single]] = OWN / extent[~single]
         record = np.zeros(1, BODY)[0]
-        record["n"], record["scale"] = n, 1.0
+        record["n"], record["stored"], record["scale"] = n, nodes, 1.0
         record["inside"] = INSIDE if sheet == 0.0 else 0.0
         for name in ("kids", "function", "charge", "center", "spread", "own", "extent"):
             record[name] = getattr(self, f"_{name}").ctypes.data

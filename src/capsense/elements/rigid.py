@@ -31,6 +31,8 @@ Ints = NDArray[np.int64]
 INSIDE = 2.5
 """Interior impedance of a surface that is open or changes, over its energy in free space: it is 3
 for a ball in an even field, and 2 for the face of a half-space."""
+HALF_SPACE = 2.0
+"""The same where a surface is flat and thick."""
 SOFT, ROUND = 0.15, 0.82
 """1/r from the four points of a cluster is bounded below a distance whose square is that of its
 extent times the first, squared, and its least second moment times the second. Two flat squares, or
@@ -48,7 +50,8 @@ LEAST_CHARGE = 1e-6
 """Smallest charge of a panel, as a part of the largest: those within a cavity have none."""
 BODY = np.dtype(
     [
-        ("n", np.int64),  # panels; there are 2 n - 1 clusters
+        ("n", np.int64),  # panels, or parts of them; there are 2 n - 1 clusters
+        ("stored", np.int64),  # the first so many of these are no parts of panels
         ("kids", np.int64), ("function", np.int64), ("charge", np.int64), ("center", np.int64),
         ("points", np.int64), ("extent", np.int64), ("soft", np.int64), ("own", np.int64),
         ("energy", np.int64),
@@ -140,6 +143,7 @@ class RigidShape(Frozen):
         """What the kernels take of a body that its shape tells; points to arrays held here."""
         record = np.zeros(1, BODY)[0]
         record["n"] = record["known"] = len(self.panels)
+        record["stored"] = 2 * len(self.panels) - 1
         record["energy"], record["own"] = self.energy.ctypes.data, self.own.ctypes.data
         for name in ("kids", "function", "charge", "center", "points", "extent", "soft"):
             record[name] = getattr(self.tree, name).ctypes.data

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense.elements.panels import panels_of, polygon_panels
+from capsense.elements.parts import refined
 from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
 from capsense.elements.wide import COARSE, FACES, WideBody, wide_pieces
@@ -116,7 +117,12 @@ T = TypeVar("T", bound=RigidShape | ChangingBody)
 
 
 def functions_of(
-    shape: Shape, count: int, *, conducting: bool, largest: float | None = None
+    shape: Shape,
+    count: int,
+    *,
+    conducting: bool,
+    largest: float | None = None,
+    finest: float | None = None,
 ) -> tuple[RigidShape | ChangingBody, float]:
     """Charge functions of any shape from about ``count`` panels, and its size [m].
 
@@ -126,6 +132,8 @@ def functions_of(
         conducting: Whether it holds no field inside.
         largest: Shapes of so much surface or more [m²], or that are wide, get panels of a few
             millimetres instead; None for none of them.
+        finest: Panels of the others are cut into parts where they are longer than this [m]; None
+            for none of them.
     """
     if isinstance(shape, Layers):
         return ChangingBody(*layer_pieces(shape)), 1.0
@@ -135,7 +143,17 @@ def functions_of(
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
     many = 2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1
-    return rigid(shape, count * many, conducting=conducting)
+    found, size = rigid(shape, count * many, conducting=conducting)
+    return (found if finest is None else _in_parts(found, finest / size)), size
+
+
+def _in_parts(shape: RigidShape, finest: float) -> RigidShape:
+    """A shape with parts no longer than half of ``finest`` to all of it, made once."""
+    doublings = math.floor(math.log2(finest))
+    known: dict[int, RigidShape] = shape.__dict__.setdefault("_refined", {})
+    if doublings not in known:
+        known[doublings] = refined(shape, 2.0**doublings)
+    return known[doublings]
 
 
 def rigid(shape: Shape, count: int, *, conducting: bool = False) -> tuple[RigidShape, float]:

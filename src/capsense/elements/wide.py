@@ -20,6 +20,7 @@ from capsense.elements.mean_kernels import means_between, points_of_each
 from capsense.elements.panels import SurfacePanels
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import (
+    HALF_SPACE,
     LEAST_CHARGE,
     equilibrium,
     features,
@@ -63,8 +64,6 @@ than the third of their least extent."""
 _CLUSTERS, _SQUARE = 1000, 2.97
 """Clusters from which the charges of wide bodies are found, and the energies of larger ones; and
 the mean of 1/r in a square, times its side."""
-_HALF_SPACE = 2.0
-"""Impedance of the inside over the energy in free space where a surface is flat and thick."""
 
 
 def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
@@ -169,7 +168,7 @@ class WideBody(ChangingBody):
         for name in ("points", "soft"):  # the body is rigid: they are needed at every step
             self.record[name] = getattr(self, f"_{name}").ctypes.data
         self._means = self._means_of(kids, np.flatnonzero(number >= 0))
-        self.record["inside"] = _HALF_SPACE
+        self.record["inside"] = HALF_SPACE
         self.record["means"], self.record["top"] = self._means.ctypes.data, len(kids)
 
     def _means_of(self, kids: Ints, last: Ints) -> Array32:
@@ -206,7 +205,7 @@ class WideBody(ChangingBody):
         panels = self._coarse()
         with threadpool_limits(1, "blas"):  # bits depend on how many threads a BLAS has
             free = free_block(panels)
-            more = impedance(panels, free) - _HALF_SPACE * free
+            more = impedance(panels, free) - HALF_SPACE * free
         kids, number, above = _coarsest(self._kids, self._panel, len(panels))
         single = np.flatnonzero(self._panel >= 0)
         on = cKDTree(features(panels.centers, panels.normals, self.most)).query(self._at)[1]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled
 from capsense._simd import doubles, integers
 from capsense.field.green_kernels import smooth
-from capsense.surface.score_kernels import DECAY, INHERITED, score
+from capsense.surface.score_kernels import DECAY, INHERITED, PARTS, score
 
 _FULL = 0.1
 """How far something of a cluster within reach has to be represented for its function to be whole:
@@ -76,7 +76,7 @@ def chosen(bodies, green, threshold, width):
     for b in range(bodies.shape[0]):
         first[b + 1] = first[b] + 2 * bodies[b].n - 1
     weight, scores = np.empty(green.terminals), np.empty(first[-1])
-    seen = score(bodies, first, green, weight, scores)
+    seen = score(bodies, first, green, threshold, weight, scores)
     return choose(bodies, first, seen, scores, threshold, width)
 
 
@@ -85,14 +85,15 @@ def choose(bodies, first, seen, scores, threshold, width):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
     A function fades in while its score grows from ``threshold`` to ``width`` times that. Scores
-    that are inherited are written where they are used.
+    that are inherited are written where they are used. A panel that was looked into is left to its
+    parts as far as the function above it would be there if it were one of parts.
     """
     total = first[-1]
     state, place = np.full(total, np.int8(-1)), np.empty(total, np.int64)
     fades, above, met = np.empty(total), np.empty(total), np.empty(total, np.int64)
     count = leaves = np.int64(0)  # not the literal, for which Numba would compile another version
     for b in range(bodies.shape[0]):
-        kids = integers(bodies[b].kids)
+        kids, stored = integers(bodies[b].kids), bodies[b].stored
         o, k, last = first[b], -1, 0
         state[o], above[o] = FRONTIER, 1.0
         while k < last:
@@ -107,17 +108,28 @@ def choose(bodies, first, seen, scores, threshold, width):
             leaves += _whole(state[o + k], above[o + k]) > 0.0
             if state[o + k] == LEAF:
                 continue
-            x = math.log(max(scores[o + k], 1e-300) / threshold) / math.log(width)
-            fades[o + k] = min(smooth(x), above[o + k])
+            fades[o + k] = min(_faded(scores[o + k], threshold, width), above[o + k])
             state[o + k] = USED if fades[o + k] > 0.0 else FRONTIER
             for c in range(2):
-                part = o + kids[2 * k + c]
-                state[part] = LEAF if state[o + k] == FRONTIER else FRONTIER
+                part, below = o + kids[2 * k + c], kids[2 * kids[2 * k + c]]
                 above[part] = fades[o + k]
-                if part - o >= seen[b] or scores[part] == INHERITED:
+                inherits = (seen[b] <= part - o < stored) or scores[part] == INHERITED
+                if part - o < stored <= below:
+                    share = 0.0 if inherits else _faded(PARTS * scores[o + k], threshold, width)
+                    above[part] = min(above[part], share)
+                state[part] = FRONTIER if above[part] > 0.0 else LEAF
+                if inherits:
                     scores[part] = DECAY * scores[o + k]
+                    if below >= stored:
+                        scores[o + below] = scores[o + below + 1] = INHERITED
                 last = max(last, part - o)
     return _collect(bodies, first, state, place, fades, above, met[:count], leaves)
+
+
+@compiled
+def _faded(score, threshold, width):
+    """How far a function of some score is faded in, 0 to 1."""
+    return smooth(math.log(max(score, 1e-300) / threshold) / math.log(width))
 
 
 @compiled

@@ -80,7 +80,7 @@ def leaf_pairs(leaves, floor):
     for i in range(n):
         if i + 1 == n or owner[i + 1] != owner[i]:
             if leaves.within[i] > 0.0:
-                body = start, i + 1, leaves.size[i]
+                body = start, start, i + 1, leaves.size[i]
                 add_means(points, extent, body, leaves.within, tables, out)
             start = i + 1
     _add_lifted(leaves, flat, line, room, out)

@@ -27,6 +27,9 @@ DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 INHERITED = -1.0
 """Score of what has :data:`DECAY` times that of the cluster above."""
+PARTS = 1.0
+"""What the scores of parts of panels count, over those of whole ones: the means that their energies
+are taken from cost more time."""
 _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 _CROSSED = 0.3
@@ -41,7 +44,7 @@ _WIDE = 0.08, 0.12
 
 
 @compiled
-def score(bodies, first, green, weight, scores):
+def score(bodies, first, green, threshold, weight, scores):
     """Share of the electrodes' energies that each charge function takes up alone.
 
     Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
@@ -49,9 +52,11 @@ def score(bodies, first, green, weight, scores):
     are small against their distance from the design, and cross no wall, are not looked into: φ⁰ is
     linear there. Where nothing was looked at the score is :data:`INHERITED`.
 
+    Panels are looked into where functions above them count: see :func:`_score_parts`.
+
     Returns:
-        How many of a body's first clusters hold all that were looked at, shape (b,); scores of
-        others, which are inherited too, are not written.
+        How many of a body's first clusters hold all that were looked at but parts of panels, shape
+        (b,); scores of others, which are inherited too, are not written.
     """
     terminals, lead, total = green.terminals, green.lead, first[-1]
     means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
@@ -60,23 +65,18 @@ def score(bodies, first, green, weight, scores):
     seen = np.empty(bodies.shape[0], np.int64)
     for b in range(bodies.shape[0]):
         body, o = bodies[b], first[b]
-        kids, function = integers(body.kids), integers(body.function)
-        charge, own = doubles(body.charge), doubles(body.own)
+        kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
         span = slice(o, first[b + 1])
+        met[o], told[o] = True, 1.0
         seen[b] = _mean_potentials(
-            body, green, means[span], met[span], crossing[span], linear[span], told[span]
-        )
+            body, green, (0, 1, body.stored),
+            means[span], met[span], crossing[span], linear[span], told[span],
+        )  # fmt: skip
+        _make_up(body, (0, seen[b]), means[span], met[span], linear[span])
         for k in range(seen[b] - 1, -1, -1):
-            if not met[o + k]:
-                continue
             x, y = kids[2 * k], kids[2 * k + 1]
-            if x >= 0 and met[o + x]:
-                p, t = np.float32(charge[x] / charge[k]), np.float32(linear[o + k])
-                q, r = (np.float32(1.0) - t) * p, (np.float32(1.0) - t) * (np.float32(1.0) - p)
+            if met[o + k] and x >= 0 and met[o + x]:
                 stiffness = told[o + k] * (1.0 - linear[o + k]) * body.scale / own[function[k]]
-                for i in range(lead):
-                    whole = t * means[o + k, i] if t > 0.0 else np.float32(0.0)
-                    means[o + k, i] = whole + q * means[o + x, i] + r * means[o + y, i]
                 for i in range(terminals):
                     d = float(means[o + x, i] - means[o + y, i])
                     energy[i] += d * d * stiffness
@@ -99,22 +99,37 @@ def score(bodies, first, green, weight, scores):
             weight,
             scores[span],
         )
+        span = slice(first[b], first[b + 1])
+        _score_parts(
+            bodies[b], green, seen[b], means[span], met[span],
+            (linear[span], told[span], crossing[span]), (threshold, weight), scores[span],
+        )  # fmt: skip
     return seen
 
 
 @compiled
-def _mean_potentials(body, green, means, met, crossing, linear, told):
+def _mean_potentials(body, green, span, means, met, crossing, linear, told):
     """φ⁰ in the middle of clusters that see it as linear or have no parts, from the far sources.
 
-    ``crossing`` is filled with how much each cluster crosses a wall, 0 to 1, ``linear`` with how
-    linear φ⁰ is there, ``told`` with how much it is not in all clusters above, and ``met`` with
-    which clusters were looked at: none behind as many as are returned.
+    Args:
+        body: The body.
+        green: Green's function of the design.
+        span: First cluster, the one behind the last that was ``met`` before, and the one behind all
+            that are.
+        means: Filled [V], shape (n, lead).
+        met: Which clusters are looked at, shape (n,); extended.
+        crossing: Filled with how much each cluster crosses a wall, 0 to 1.
+        linear: Filled with how linear φ⁰ is there.
+        told: Filled with how much it is not in all clusters above.
+
+    Returns:
+        The cluster behind the last one that was looked at.
     """
     kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
-    most = 2 * body.n - 1
-    places, inner = np.empty(most, np.int64), np.empty(most)
-    points, found = np.empty((most, 3), np.float32), 0
-    met[0], told[0], k, seen = True, 1.0, -1, 1
+    start, seen, stop = span
+    places, inner = np.empty(stop - start, np.int64), np.empty(stop - start)
+    points, found = np.empty((stop - start, 3), np.float32), 0
+    k = start - 1
     while k + 1 < seen:
         k += 1
         if not met[k]:
@@ -142,13 +157,16 @@ def _mean_potentials(body, green, means, met, crossing, linear, told):
             lift(points[found : found + 1], least_gap(size, green.cover), green.box)
         for i in range(green.lead):
             means[k, i] = 0.0
-        if share > 0.0 and (linear[k] > 0.0 or kids[2 * k] < 0):
+        whole = not 0 <= kids[2 * k] < stop
+        if share > 0.0 and (linear[k] > 0.0 or whole):
             places[found], inner[found] = k, share
             found += 1
-        if linear[k] < 1.0 and kids[2 * k] >= 0:
+        if linear[k] < 1.0 and not whole:
             for c in range(2):
                 met[kids[2 * k + c]], told[kids[2 * k + c]] = True, told[k] * (1.0 - linear[k])
             seen = max(seen, kids[2 * k + 1] + 1)
+    if found == 0:
+        return seen
     columns = np.empty((3, SIMD_WIDTH * ((found + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
     for j in range(columns.shape[1]):
         for i in range(3):
@@ -160,6 +178,96 @@ def _mean_potentials(body, green, means, met, crossing, linear, told):
         for i in range(green.lead):
             means[places[j], i] = inner[j] * phi[i, j]
     return seen
+
+
+@compiled
+def _make_up(body, span, means, met, linear):
+    """Mean potentials of clusters from those of their parts, where they do not see a linear one."""
+    kids, charge, one = integers(body.kids), doubles(body.charge), np.float32(1.0)
+    for k in range(span[1] - 1, span[0] - 1, -1):
+        if not met[k]:
+            continue
+        x, y = kids[2 * k], kids[2 * k + 1]
+        if x >= 0 and met[x]:
+            p, t = np.float32(charge[x] / charge[k]), np.float32(linear[k])
+            q, r = (one - t) * p, (one - t) * (one - p)
+            for i in range(means.shape[1]):
+                whole = t * means[k, i] if t > 0.0 else np.float32(0.0)
+                means[k, i] = whole + q * means[x, i] + r * means[y, i]
+
+
+@compiled
+def _score_parts(body, green, seen, means, met, looks, limits, scores):
+    """Score panels that have parts, and these, where the cluster above the panel needs them.
+
+    Args:
+        body: The body.
+        green: Green's function of the design.
+        seen: How many of its first clusters hold all that were looked at.
+        means, met: Of :func:`_mean_potentials`, of all clusters.
+        looks: ``linear``, ``told`` and ``crossing``, as there.
+        limits: The threshold, and the weights of the terminals.
+        scores: Filled.
+    """
+    kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
+    (linear, told, crossing), (threshold, weight) = looks, limits
+    stored, clusters = body.stored, 2 * body.n - 1
+    if stored == clusters:
+        return
+    panels, above = np.empty((2, stored), np.int64)
+    last, count = stored, 0
+    for k in range(seen):
+        if not met[k] or not 0 <= kids[2 * k] < seen or PARTS * scores[k] <= threshold:
+            continue
+        for c in range(2):
+            panel = kids[2 * k + c]
+            part = kids[2 * panel]
+            if not met[panel] or part < stored:
+                continue
+            panels[count], above[count] = panel, k
+            count += 1
+            for d in range(2):
+                met[part + d], told[part + d] = True, told[panel] * (1.0 - linear[panel])
+            last = max(last, part + 2)
+    if count == 0:
+        return
+    last = _mean_potentials(
+        body, green, (stored, last, clusters), means, met, crossing, linear, told
+    )
+    _make_up(body, (stored, last), means, met, linear)
+    for j in range(last - stored + count):  # parts first
+        k = last - 1 - j if j < last - stored else panels[j - last + stored]
+        if not met[k]:
+            continue
+        a, scores[k] = kids[2 * k], 0.0
+        if a >= 0 and met[a]:
+            value = 0.0
+            for i in range(weight.shape[0]):
+                d = float(means[a, i] - means[a + 1, i])
+                value += weight[i] * d * d
+            value *= PARTS * body.scale / own[function[k]]
+            for c in range(2):
+                value = max(value, scores[a + c]) + 0.5 * min(value, scores[a + c])
+            scores[k] = (1.0 - linear[k]) * value
+        elif a >= 0:
+            scores[a] = scores[a + 1] = INHERITED
+    for j in range(count + last - stored):  # wholes first
+        k = panels[j] if j < count else j - count + stored
+        if not met[k]:
+            continue
+        if j < count:
+            _pass_on(k, PARTS * scores[above[j]], linear, told, scores)
+        a = kids[2 * k]
+        for c in range(2):
+            if a >= 0 and met[a] and kids[2 * (a + c)] >= 0:
+                _pass_on(a + c, scores[k], linear, told, scores)
+
+
+@compiled
+def _pass_on(part, above, linear, told, scores):
+    """Let a cluster have a part of the score above it as far as that sees a linear potential."""
+    rest = 1.0 - told[part] * (1.0 - linear[part])
+    scores[part] = told[part] * scores[part] + rest * DECAY * above
 
 
 @compiled
@@ -203,8 +311,7 @@ def _raise_scores(body, mean, met, evenness, crossing, weight, scores):
         for c in range(2):
             part = kids[2 * k + c]
             if 0 <= part < count and met[part] and kids[2 * part] >= 0:
-                rest = 1.0 - told[part] * (1.0 - linear[part])
-                scores[part] = told[part] * scores[part] + rest * DECAY * scores[k]
+                _pass_on(part, scores[k], linear, told, scores)
                 seen[part] = seen[k] * smooth((1.0 - linear[k]) / _SEEN)
     whole = scores[0]
     for k in range(count - 1, -1, -1):

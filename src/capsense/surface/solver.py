@@ -53,11 +53,13 @@ class Preset:
     coarsest: float | None = 0.5
     """Bodies get panels of a few millimetres where these would be wider on average than so much of
     the electrodes' width, and where they are wide themselves; None for never."""
+    finest: float | None = 4e-3
+    """Panels of other bodies have parts where they are longer than this [m]; None for none."""
 
 
 PRESETS = {
     "standard": Preset(),
-    "learning": Preset(panels=300, threshold=0.08, coarsest=0.95),
+    "learning": Preset(panels=300, threshold=0.08, coarsest=0.95, finest=None),
     "fine": Preset(panels=1400, threshold=0.004, coarsest=0.33),
 }
 """Presets by name."""
@@ -356,4 +358,6 @@ class SurfaceSolver:
     ) -> tuple[RigidShape | ChangingBody, float]:
         """Charge functions of a body from a share of the usual panels, and its size."""
         panels = round(share * self.preset.panels)
-        return functions_of(shape, panels, conducting=conducting, largest=self._largest)
+        return functions_of(
+            shape, panels, conducting=conducting, largest=self._largest, finest=self.preset.finest
+        )

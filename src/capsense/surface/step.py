@@ -16,6 +16,7 @@ from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs
+from capsense.surface.part_kernels import add_parts
 from capsense.surface.reach_kernels import reached
 from capsense.surface.solve_kernels import (
     COARSE,
@@ -75,6 +76,7 @@ def prepared(
     cut, leaves = reached(cut, placed(bodies, cut, green))
     rows = leaf_rows(leaves.points, leaves.beyond, green)
     pairs = leaf_pairs(leaves, green.floor)
+    add_parts(bodies, cut, leaves, pairs)
     bound_images(leaves, rows, pairs, green)
     functions = functions_of(bodies, cut, leaves.beyond)
     return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
