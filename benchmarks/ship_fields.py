@@ -140,11 +140,11 @@ def fingerprint() -> list[float]:
         }
     )
     found = build_background(design, BuildSettings(panel_scale=8.0))
-    points = np.array([[-0.015, 0.0, 0.01], [0.015, 0.0, 0.01], [0.0, 0.0, 0.02]])
+    points = np.array([[-0.015, 0.0, 0.003], [0.015, 0.0, 0.01], [0.0, 0.0, 0.02]])
     potentials = found.green.phi0(points)
     answers = np.diag(found.green.g(points, points))
     rough = (found.n_panels, *found.capacitance.ravel())
-    sizes = chain.from_iterable(np.atleast_1d(v) for v in astuple(GreenSettings()))
+    sizes = chain.from_iterable(np.ravel(v).tolist() for v in astuple(GreenSettings()))
     fitted = (*potentials.ravel(), *answers)
     assert len(fitted) == _FITTED
     return [float(f"{value:.8e}") for value in (*rough, *sizes, *fitted)]

@@ -17,6 +17,7 @@ from capsense.field.background import BackgroundField
 from capsense.field.boundary import Accuracy, BoundarySolution, build_model, terminals
 from capsense.field.cache import load_background, save_background
 from capsense.field.green import (
+    LEVELS,
     TABLES,
     GreenFunction,
     _rounded,
@@ -36,7 +37,10 @@ from capsense.field.green_points import (
 
 Array = np.ndarray
 
-FEW = GreenSettings(near_sources=360, near_spacing=2.8e-3, far_sources=160, far_spacing=3.6e-3)
+FEW = GreenSettings(
+    near_sources=360, near_spacing=2.8e-3, middle_sources=260, middle_spacing=3.2e-3,
+    far_sources=160, far_spacing=3.6e-3,
+)  # fmt: skip
 """Sizes for designs of a few centimetres."""
 FEWER = replace(FEW, training=300, wide=400, far_training=1000)
 """As many charges, fitted at a third of the points, for designs of many panels."""
@@ -205,22 +209,28 @@ def test_near_and_far_agree_where_they_meet(name: str, gap: float) -> None:
     it, radius = case(name), 0.012
     points = ball(np.array([-0.01, 0.006, it.green.box[1, 2] + gap + radius]), radius)
     found = []
-    for blend in ([1.0, 2.0], [-2.0, -1.0], [0.018, 0.030]):  # near, far, some of both
-        green = replace(it.green, blend=np.array(blend))
+    near, far, mixed = [1.0, 2.0], [-2.0, -1.0], [0.018, 0.030]
+    for blends in ([near, near], [far, near], [far, far], [mixed, near], [far, mixed]):
+        green = replace(it.green, blends=np.array(blends))
         psi = green.psi(points)
         found.append(delta(points, radius, psi @ psi.T, green.phi0(points), green.floor))
     for other in found[1:]:
         assert np.abs(other - found[0]).max() < 2e-3 * np.abs(found[0]).max()
 
 
-def test_share_falls_smoothly_from_one_to_zero() -> None:
+def test_shares_change_smoothly() -> None:
+    """Invariant: each representation is alone somewhere, and gives way smoothly to the next."""
     it = case("flat").green
     z = it.box[1, 2] + np.linspace(0.0, 0.03, 301)
-    share = it.share(np.stack([0 * z, 0 * z, z], axis=1))
-    assert share[z - it.box[1, 2] <= it.blend[0]].min() == 1.0
-    assert share[z - it.box[1, 2] >= it.blend[1]].max() == 0.0
-    assert (np.diff(share) <= 0.0).all()
-    assert np.abs(np.diff(share, 2)).max() < 6 * (1e-4 / 0.006) ** 2 * 1.01
+    shares, off = it.shares(np.stack([0 * z, 0 * z, z], axis=1)), z - it.box[1, 2]
+    (first, second), (third, fourth) = it.blends
+    assert shares[0, off <= first].min() == 1.0
+    assert shares[1, (off >= second) & (off <= third)].min() == 1.0
+    assert shares[2, off >= fourth].min() == 1.0
+    np.testing.assert_allclose(shares.sum(axis=0), 1.0, atol=1e-14)
+    assert (np.diff(shares[0]) <= 0.0).all()
+    assert (np.diff(shares[2]) >= 0.0).all()
+    assert np.abs(np.diff(shares, 2)).max() < 6 * (1e-4 / (second - first)) ** 2 * 1.01
     inside = it.box.mean(axis=0)[None]
     assert it.distance(inside)[0] == 0.0
     outside = it.box[1] + np.array([[0.003, 0.004, 0.0], [0.0, 0.003, 0.004]])
@@ -247,7 +257,10 @@ def test_first_modes_hold_what_is_met_far_away() -> None:
     surface = Surroundings(it.design, it.solution.model)
     away, near = (
         basis(points, sources, it.green.floor) @ it.green.near_modes
-        for points, _ in (far_points(surface, sources, FEW), training_points(surface, sources, FEW))
+        for points, _ in (
+            far_points(surface, sources, FEW, FEW.blends[-1][0]),
+            training_points(surface, sources, FEW),
+        )
     )
     held, most = (away**2).sum(axis=0), np.linalg.svd(away, compute_uv=False) ** 2
     assert held[:kept].sum() == pytest.approx(most[:kept].sum(), rel=1e-5)
@@ -281,7 +294,8 @@ def test_misfit_is_that_of_the_points_of_the_fit() -> None:
 def test_charges_lie_where_no_body_can_be(name: str) -> None:
     it = case(name)
     lower, upper = it.design.domain.lower, it.design.domain.upper
-    for sources in (it.green.near_sources, it.green.far_sources):
+    for level in LEVELS:
+        sources = getattr(it.green, f"{level}_sources")
         inside = ((sources > lower) & (sources < upper)).all(axis=1)
         assert (~inside).sum() == 125
         if name == "curved":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from unittest.mock import patch
 
 import numpy as np
@@ -148,7 +149,15 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 
 
 def twin_of(fleet: cs.Fleet) -> cs.Simulator:
-    """A simulator with the shapes of a fleet; use it within :func:`same_functions`."""
+    """A simulator with the shapes of a fleet; use it within :func:`same_functions`.
+
+    Fleets on Warp do without the middle one of the Green's function's representations.
+    """
     simulator = cs.Simulator(fleet.design)
-    simulator._solver = fleet._solver
+    simulator._solver = copy(fleet._solver)
+    green = simulator._solver.green
+    (near, _, far), (_, start) = green.levels, green.blends
+    simulator._solver.green = green._replace(
+        levels=(near, far, far), blends=np.array([start, start + 1.0])
+    )
     return simulator

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from capsense.elements.mean_kernels import FAR
-from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, Green
+from capsense.field.green_kernels import Green
 from capsense.surface.step import Solution
 
 Array = np.ndarray
@@ -59,16 +59,20 @@ def _energy(points: Array, solution: Solution, green: Green) -> Array:
 
 
 def _rows(points: Array, still: Array, green: Green) -> Array:
-    """Means of φ⁰ and ψ over the leaves; near and far give way to each other as they did."""
+    """Means of φ⁰ and ψ over the leaves; levels give way to each other as they did."""
     centre = still.mean(axis=1)
     off = np.linalg.norm(
         np.maximum(0, np.maximum(green.box[0] - centre, centre - green.box[1])), axis=1
     )
-    x = np.clip((green.blend[1] - off) / (green.blend[1] - green.blend[0]), 0.0, 1.0)
-    share = (x * x * (3 - 2 * x))[:, None]
-    rows = share * (_potentials(points, green.near, green.floor, NEAR_LEAST) @ green.near_table)
-    far = (1 - share) * (_potentials(points, green.far, green.floor, FAR_LEAST) @ green.far_table)
-    rows[:, : far.shape[1]] += far
+    rows = np.zeros((len(points), green.levels[0].table.shape[1]))
+    share = [np.zeros(len(points))]
+    for start, end in green.blends:
+        x = np.clip((end - off) / (end - start), 0.0, 1.0)
+        share.append(x * x * (3 - 2 * x))
+    share.append(np.ones(len(points)))
+    for level, part in zip(green.levels, np.diff(share, axis=0), strict=True):
+        found = _potentials(points, level.sources, green.floor, level.least) @ level.table
+        rows[:, : found.shape[1]] += part[:, None] * found
     return rows
 
 

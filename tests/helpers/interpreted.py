@@ -85,9 +85,10 @@ def thinned(green: Any) -> Any:
         return green
     import dataclasses
 
-    near, far = (np.linspace(0, len(s) - 1, 40).astype(int) for s in (
-        green.near_sources, green.far_sources))  # fmt: skip
-    parts = {"near": (near, 16), "far": (far, 8)}
+    parts = {
+        name: (np.linspace(0, len(getattr(green, f"{name}_sources")) - 1, 40).astype(int), modes)
+        for name, modes in (("near", 16), ("middle", 12), ("far", 8))
+    }
     tables = {}
     for name, (kept, modes) in parts.items():
         scale = np.float32(len(getattr(green, f"{name}_sources")) / len(kept))

@@ -115,12 +115,18 @@ def interaction(found: Clusters, green: GreenFunction, out: Array) -> Array:
 
 
 def four_point_mean(points: Array, green: GreenFunction, name: str) -> Array:
-    """Means of ``green.psi`` or ``phi0``; near gives way to far by a cluster's centre."""
-    share = green.share(points.mean(axis=1))[:, None]
-    near, far = replace(green, blend=(1e8, 1e9)), replace(green, blend=(-2.0, -1.0))
-    each = [getattr(g, name)(points.reshape(-1, 3)) for g in (near, far)]
-    first, second = (values.reshape(len(points), 4, -1).mean(axis=1) for values in each)
-    return share * first + (1 - share) * second
+    """Means of ``green.psi`` or ``phi0``; levels give way to each other by a cluster's centre."""
+    beyond, before = (1e8, 1e9), (-2.0, -1.0)
+    out = 0.0
+    for share, blends in zip(
+        green.shares(points.mean(axis=1)),
+        ((beyond, beyond), (before, beyond), (before, before)),
+        strict=True,
+    ):
+        alone = replace(green, blends=np.array(blends))
+        values = getattr(alone, name)(points.reshape(-1, 3))
+        out = out + share[:, None] * values.reshape(len(points), 4, -1).mean(axis=1)
+    return out
 
 
 def inverse_distances(points: Array, others: Array, soft: Array) -> Array:

@@ -30,8 +30,8 @@ SETTINGS = BuildSettings(panel_scale=8.0, mesh=MeshSettings().refined(0.5))
 FIT = "response to charges: fit"
 """The last stage of a build but one."""
 FEW = GreenSettings(
-    near_sources=60, far_sources=40, modes=40, far_modes=16, training=150, wide=150,
-    far_training=400,
+    near_sources=60, middle_sources=50, far_sources=40, modes=40, middle_modes=24, far_modes=16,
+    training=150, wide=150, far_training=400,
 )  # fmt: skip
 
 

@@ -11,7 +11,15 @@ from plain_leaves import plain_leaves
 from surface_scenes import Placed, green_of, pack
 
 import capsense as cs
-from capsense.field.green_kernels import beyond, distances, least_gap, lift, pack_green
+from capsense.field.green import LEVELS
+from capsense.field.green_kernels import (
+    beyond,
+    distances,
+    least_gap,
+    level_share,
+    lift,
+    pack_green,
+)
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import placed
 from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
@@ -37,21 +45,36 @@ def test_places_of_many_terminals() -> None:
     sim = cs.Simulator("six_patch_bare")
     green, rng = sim.background.green, np.random.default_rng(3)
     for terminals in (7, 8, 9, 17):
-        near, far = (
-            rng.uniform(size=(len(phi), terminals)).astype(phi.dtype)
-            for phi in (green.near_phi, green.far_phi)
-        )
-        packed = pack_green(replace(green, near_phi=near, far_phi=far), sim.design)
+        phis = [
+            rng.uniform(size=(len(getattr(green, f"{name}_phi")), terminals)).astype(np.float32)
+            for name in LEVELS
+        ]
+        named = {f"{name}_phi": phi for name, phi in zip(LEVELS, phis, strict=True)}
+        packed = pack_green(replace(green, **named), sim.design)
         lead = 8 * math.ceil(terminals / 8)
         assert (packed.terminals, packed.lead) == (terminals, lead)
-        for table, phi, modes in (
-            (packed.near_table, near, green.near_modes), (packed.far_table, far, green.far_modes),
-            (packed.score_table, far, np.empty((0, 0))),
-        ):  # fmt: skip
+        tables = [
+            (level.table, phi, getattr(green, f"{name}_modes"))
+            for level, phi, name in zip(packed.levels, phis, LEVELS, strict=True)
+        ]
+        for table, phi, modes in [*tables, (packed.score_table, phis[-1], np.empty((0, 0)))]:
             np.testing.assert_array_equal(table[: len(phi), :terminals], phi)
             assert (table[:, terminals:lead] == 0.0).all()
             rows, columns = modes.shape
             np.testing.assert_array_equal(table[:rows, lead : lead + columns], modes)
+
+
+def test_shares_of_levels_add_to_one() -> None:
+    """Twin, and invariant: at each distance there are at most two, that add to one."""
+    green = cs.Simulator("six_patch_bare").background.green
+    high = np.linspace(0.0, 0.03, 301)
+    points = green.box.mean(axis=0) * [1, 1, 0] + high[:, None] * [0, 0, 1]
+    points[:, 2] += green.box[1, 2]
+    found = np.array([[level_share(d, k, green.blends) for d in high] for k in range(3)])
+    np.testing.assert_allclose(found.sum(axis=0), 1.0, atol=1e-14)
+    assert found.min() == 0.0
+    assert (found > 0).sum(axis=0).max() == 2
+    np.testing.assert_allclose(found, green.shares(points), atol=1e-6)
 
 
 def test_far_points_stay() -> None:

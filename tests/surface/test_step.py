@@ -907,7 +907,7 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
-    seen = score(bodies, first, green, np.empty(green.terminals), scores)
+    seen = score(bodies, first, green, 0.015, np.empty(green.terminals), scores)
     cut = choose(bodies, first, seen, scores.copy(), threshold, WIDTH)
     for o, (_, shape) in zip(first, scene, strict=False):
         kids = shape.tree.kids

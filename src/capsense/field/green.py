@@ -8,7 +8,8 @@ the image q* of the charge in it, and of everything else, which lowers the poten
 
 The modes ψ_k, and the potentials φ⁰_i of the terminals, are those of a few hundred point charges s,
 each with its image in the floor, where no body can be: behind the electrodes, inside of layers and
-housings, and outside of the walls. Farther from the sensor fewer charges and fewer modes do.
+housings, and outside of the walls. Farther from the sensor fewer charges and fewer modes do, so
+that there are three representations of them.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ from capsense.field.green_points import (
 Array = NDArray[np.float64]
 Table = NDArray[np.float32]
 
-TABLES = ("near_sources", "near_modes", "near_phi", "far_sources", "far_modes", "far_phi")
+LEVELS = ("near", "middle", "far")
+"""Representations, each for points farther from the sensor than the one before."""
+TABLES = tuple(f"{level}_{name}" for level in LEVELS for name in ("sources", "modes", "phi"))
 """Fields of a :class:`GreenFunction` in single precision."""
 
 _MIDDLE = 0.05
@@ -60,6 +63,12 @@ class GreenFunction:
     """Coefficients of the modes ψ [m^½], those that reach farthest first, shape (s, modes)."""
     near_phi: Table
     """Coefficients of the potentials φ⁰ with a terminal at 1 V [V·m], shape (s, terminals)."""
+    middle_sources: Table
+    """Point charges of the middle representation [m], shape (m, 3)."""
+    middle_modes: Table
+    """Coefficients of the first modes, shape (m, middle modes); the others are zero there."""
+    middle_phi: Table
+    """Coefficients of the potentials φ⁰, shape (m, terminals)."""
     far_sources: Table
     """Point charges of the far representation [m], shape (f, 3)."""
     far_modes: Table
@@ -68,8 +77,9 @@ class GreenFunction:
     """Coefficients of the potentials φ⁰, shape (f, terminals)."""
     box: Array
     """Lower and upper corner of electrodes, conductors and layers [m], shape (2, 3)."""
-    blend: Array
-    """Distances from ``box`` where the far representation starts, the near one ends [m], (2,)."""
+    blends: Array
+    """Distances from ``box`` where the middle representation starts and the near one ends, and
+    where the far one starts and the middle one ends [m], shape (2, 2)."""
     clearance: float
     """Distance from the design's surfaces down to which the modes were fitted [m]."""
     misfit: float
@@ -87,27 +97,28 @@ class GreenFunction:
         """Distance from ``box`` [m], zero inside, shape (n, 3) -> (n,)."""
         return outside(self.box, points)
 
-    def share(self, points: Array) -> Array:
-        """Share of the near representation: 1 near, 0 far, a smoothstep between, (n,)."""
-        start, end = self.blend
-        t = np.clip((end - self.distance(points)) / (end - start), 0.0, 1.0)
-        return t * t * (3 - 2 * t)
+    def shares(self, points: Array) -> Array:
+        """Share of each representation, smoothsteps between them, shape (n, 3) -> (3, n)."""
+        distance = self.distance(points)
+        up_to = [np.zeros(len(points))]  # of a representation and those before
+        for start, end in self.blends:
+            t = np.clip((end - distance) / (end - start), 0.0, 1.0)
+            up_to.append(t * t * (3 - 2 * t))
+        return np.diff([*up_to, np.ones(len(points))], axis=0)
 
     def psi(self, points: Array) -> Array:
         """Modes at points [m], shape (n, 3) -> (n, modes)."""
-        return self._sum(points, self.near_modes, self.far_modes)
+        return self._sum(points, self.near_modes, self.middle_modes, self.far_modes)
 
     def phi0(self, points: Array) -> Array:
         """Potential [V] of each terminal at 1 V, others at 0, shape (n, 3) -> (n, terminals)."""
-        return self._sum(points, self.near_phi, self.far_phi)
+        return self._sum(points, self.near_phi, self.middle_phi, self.far_phi)
 
-    def _sum(self, points: Array, near: Table, far: Table) -> Array:
-        """Potentials of both representations' charges, each where it has a share, (n, k)."""
-        share = self.share(points)
-        out = np.zeros((len(points), near.shape[1]))
-        for sources, table, part in (
-            (self.near_sources, near, share), (self.far_sources, far, 1 - share),
-        ):  # fmt: skip
+    def _sum(self, points: Array, *tables: Table) -> Array:
+        """Potentials of all representations' charges, each where it has a share, (n, k)."""
+        out = np.zeros((len(points), tables[0].shape[1]))
+        sources_of = self.near_sources, self.middle_sources, self.far_sources
+        for sources, table, part in zip(sources_of, tables, self.shares(points), strict=True):
             here = np.flatnonzero(part)
             values = basis(points[here], sources, self.floor) @ table.astype(np.float64)
             out[here, : table.shape[1]] += part[here, None] * values
@@ -167,10 +178,11 @@ def build_green(
     progress("response to charges: where")
     surface = Surroundings(design, model)
     walls = wall_sources(design, settings)
-    near, far = (
+    near, middle, far = (
         np.concatenate([surface.sources(count, spacing, settings.depth), walls])
         for count, spacing in (
             (settings.near_sources, settings.near_spacing),
+            (settings.middle_sources, settings.middle_spacing),
             (settings.far_sources, settings.far_spacing),
         )
     )
@@ -186,22 +198,25 @@ def build_green(
     modes = fit.factor(wanted, settings.modes)
     near_phi = _fit_phi(points, distances, near, floor, phi)
 
-    away, distances = far_points(surface, near, settings)
-    far_weight = _weight(distances)
-    there = basis(away, near, floor) * far_weight
+    away = [far_points(surface, near, settings, start) for start, _ in settings.blends]
+    there = [basis(x, near, floor) for x, _ in away]
     psi = fit.matrix @ (modes * fit.scale[:, None])
-    n_far = min(settings.far_modes, modes.shape[1])
-    turn = _turn(there @ modes, psi, n_far)
+    counts = [min(n, modes.shape[1]) for n in (settings.middle_modes, settings.far_modes)]
+    seen = [_weight(d) * (b @ modes) for (_, d), b in zip(away, there, strict=True)]
+    turn = _turn((seen[1], 0), (seen[0], counts[1]), (psi, counts[0]))
     modes, psi = modes @ turn, psi @ turn
     misfit = float(np.linalg.norm(wanted - psi @ psi.T) / np.linalg.norm(wanted))
-    far_fit = _Fit(basis(away, far, floor) * far_weight, settings.regularisation)
-    far_modes = far_fit.solve(there @ modes[:, :n_far])
-    far_phi = _fit_phi(away, distances, far, floor, basis(away, near, floor) @ near_phi)
-    tables = (near, _rounded(modes), near_phi, far, _rounded(far_modes), far_phi)
+    tables = [near, _rounded(modes), near_phi]
+    for sources, (x, d), b, count in zip((middle, far), away, there, counts, strict=True):
+        fit = _Fit(basis(x, sources, floor) * _weight(d), settings.regularisation)
+        tables += [
+            sources, _rounded(fit.solve(_weight(d) * (b @ modes[:, :count]))),
+            _fit_phi(x, d, sources, floor, b @ near_phi),
+        ]  # fmt: skip
     if not all(np.isfinite(t).all() for t in tables):
         raise FieldError(f"the Green's function of design {design.name!r} is not finite")
     numbers = {
-        "floor": floor, "box": design_box(design), "blend": settings.blend,
+        "floor": floor, "box": design_box(design), "blends": np.array(settings.blends),
         "clearance": settings.clearance, "misfit": misfit,
     }  # fmt: skip
     return from_arrays({**dict(zip(TABLES, tables, strict=True)), **numbers})
@@ -285,14 +300,14 @@ def _fit_phi(points: Array, distances: Array, sources: Array, floor: float, phi:
     return _Fit(basis(points, sources, floor) * weight, _FINE).solve(phi * weight)
 
 
-def _turn(far: Array, near: Array, count: int) -> Array:
+def _turn(*stages: tuple[Array, int]) -> Array:
     """Orthogonal matrix (modes, modes) that sorts modes by what they are worth.
 
-    The first ``count`` columns hold as much as can be of the values ``far`` (points, modes), the
-    others are sorted by the values ``near``.
+    Of each stage, values (points, modes) and a count: modes from that one on hold as much as can be
+    of the values, the first of them most.
     """
-    turn = np.eye(far.shape[1])
-    for values, first in ((far, 0), (near, count)):
+    turn = np.eye(stages[0][0].shape[1])
+    for values, first in stages:
         rest = values @ turn[:, first:]
         vector = np.linalg.eigh(rest.T @ rest)[1][:, ::-1]
         turn[:, first:] = turn[:, first:] @ vector

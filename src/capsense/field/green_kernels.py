@@ -29,11 +29,11 @@ from capsense._simd import (
     where_above,
 )
 from capsense.design.model import Design
-from capsense.field.green import GreenFunction
+from capsense.field.green import LEVELS, GreenFunction
 
-NEAR_LEAST, FAR_LEAST = 1e-3, 3e-3
-"""Distances from near and far sources [m] below which their potential grows no more. They lie
-deeper than that under the surfaces of the design."""
+LEAST = 1e-3, 2e-3, 3e-3
+"""Distances from near, middle and far sources [m] below which their potential grows no more. They
+lie deeper than that under the surfaces of the design."""
 SHORE = 5e-3
 """Bodies fade out over this distance beyond the room, and behind the face of a flat design [m]."""
 NEAR_FACE = 2e-3
@@ -53,22 +53,27 @@ MARGIN = 0.015
 walls take nearly all of what would meet it."""
 
 
-class Green(NamedTuple):
-    """A design's Green's function, as the kernels take it; single precision.
+class Level(NamedTuple):
+    """Point charges that stand for a design at some distances from it; single precision.
 
-    There are a multiple of ``WIDTH`` sources. The last of them, without charge, are far away.
+    There are a multiple of ``WIDTH``. The last of them, without charge, are far away.
     """
 
-    near: NDArray[Any]
-    """Sources for points near the sensor [m], shape (3, s)."""
-    near_table: NDArray[Any]
-    """What each source adds to φ⁰ and ψ, shape (s, w)."""
-    far: NDArray[Any]
-    """Sources for points far from it [m], shape (3, f)."""
-    far_table: NDArray[Any]
-    """The same of these, shape (f, v), v <= w."""
+    sources: NDArray[Any]
+    """Where they are [m], shape (3, s)."""
+    table: NDArray[Any]
+    """What each adds to φ⁰ and ψ, shape (s, w); fewer columns where fewer modes count."""
+    least: float
+    """No point counts as nearer to one than this [m]."""
+
+
+class Green(NamedTuple):
+    """A design's Green's function, as the kernels take it."""
+
+    levels: tuple[Level, Level, Level]
+    """Charges for points near the sensor, for those farther away, and for those far away."""
     score_table: NDArray[Any]
-    """φ⁰ alone, from the far sources, shape (f, lead)."""
+    """φ⁰ alone, from the last of these, shape (f, lead)."""
     lead: int
     """Columns of φ⁰, padded."""
     terminals: int
@@ -79,8 +84,8 @@ class Green(NamedTuple):
     """Height of the floor [m]."""
     box: NDArray[Any]
     """Corners of the design [m], shape (2, 3)."""
-    blend: NDArray[Any]
-    """Distances [m] from ``box`` between which near sources give way to far ones, shape (2,)."""
+    blends: NDArray[Any]
+    """Distances [m] from ``box`` between which a level gives way to the next one, shape (2, 2)."""
     room: NDArray[Any]
     """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
     cover: float
@@ -104,23 +109,22 @@ def pack_green(green: GreenFunction, design: Design) -> Green:
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
 
-    def sources(positions: NDArray) -> NDArray:
-        out = np.full((3, _padded(len(positions))), _AWAY, np.float32)
-        out[:, : len(positions)] = positions.T
-        return out
+    def level(positions: NDArray, phi: NDArray, modes: NDArray, least: float) -> Level:
+        sources = np.full((3, _padded(len(positions))), _AWAY, np.float32)
+        sources[:, : len(positions)] = positions.T
+        table = np.zeros((_padded(len(phi)), _padded(lead + modes.shape[1])), np.float32)
+        table[: len(phi), :terminals] = phi
+        table[: len(phi), lead : lead + modes.shape[1]] = modes
+        return Level(sources, table, least)
 
-    def table(phi: NDArray, modes: NDArray) -> NDArray:
-        out = np.zeros((_padded(len(phi)), _padded(lead + modes.shape[1])), np.float32)
-        out[: len(phi), :terminals] = phi
-        out[: len(phi), lead : lead + modes.shape[1]] = modes
-        return out
-
-    far = table(green.far_phi, green.far_modes)
+    near, middle, far = (
+        level(*(getattr(green, f"{name}_{part}") for part in ("sources", "phi", "modes")), least)
+        for name, least in zip(LEVELS, LEAST, strict=True)
+    )
     return Green(
-        sources(green.near_sources), table(green.near_phi, green.near_modes),
-        sources(green.far_sources), far, np.ascontiguousarray(far[:, :lead]),
-        lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blend, float), room, cover_of(design),
+        (near, middle, far), np.ascontiguousarray(far.table[:, :lead]), lead, terminals,
+        len(design.electrodes), float(green.floor), np.asarray(green.box, float),
+        np.asarray(green.blends, float), room, cover_of(design),
     )  # fmt: skip
 
 
@@ -281,6 +285,12 @@ def distances(points, green):
 
 
 @compiled
-def near_share(distance, blend):
-    """One below the first distance of a blend, zero above the second, smooth in between."""
-    return smooth((blend[1] - distance) / (blend[1] - blend[0]))
+def level_share(distance, level, blends):
+    """Share of a level at a distance from the design; over the levels they add to one."""
+    up_to, before, last = 1.0, 0.0, blends.shape[0]
+    if level < last:
+        up_to = smooth((blends[level, 1] - distance) / (blends[level, 1] - blends[level, 0]))
+    if level > 0:
+        start, end = blends[level - 1, 0], blends[level - 1, 1]
+        before = smooth((end - distance) / (end - start))
+    return up_to - before

@@ -35,6 +35,10 @@ class GreenSettings:
     """Largest number of point charges behind the sensor, near representation."""
     near_spacing: float = 2.4e-3
     """Smallest distance of neighbouring point charges, near representation [m]."""
+    middle_sources: int = 440
+    """As ``near_sources``, middle representation."""
+    middle_spacing: float = 3.1e-3
+    """As ``near_spacing``, middle representation [m]."""
     far_sources: int = 220
     """As ``near_sources``, far representation."""
     far_spacing: float = 4.5e-3
@@ -43,6 +47,8 @@ class GreenSettings:
     """Depth of the point charges behind the surfaces, in spacings."""
     modes: int = 180
     """Largest number of modes."""
+    middle_modes: int = 104
+    """Largest number of modes where the middle representation is used."""
     far_modes: int = 56
     """Largest number of modes far away."""
     wall_grid: int = 5
@@ -54,11 +60,12 @@ class GreenSettings:
     wide: int = 1200
     """How many more there are all over the domain, where potentials are small."""
     far_training: int = 3000
-    """Points that the far representation is fitted at, to the near one."""
+    """Points that the middle and the far representation are fitted at, to the near one."""
     clearance: float = 2e-3
     """Smallest distance of these points from the design [m]."""
-    blend: tuple[float, float] = (0.012, 0.018)
-    """Distances where the far representation starts and the near one ends [m]."""
+    blends: tuple[tuple[float, float], ...] = ((0.0035, 0.005), (0.012, 0.018))
+    """Distances where the middle representation starts and the near one ends [m], and where the far
+    one starts and the middle one ends."""
     regularisation: float = 4e-9
     """Squared singular values below this share of the largest count for little."""
 
@@ -215,12 +222,13 @@ def wall_sources(design: Design, settings: GreenSettings) -> Array:
 
 
 def far_points(
-    surface: Surroundings, sources: Array, settings: GreenSettings
+    surface: Surroundings, sources: Array, settings: GreenSettings, start: float
 ) -> tuple[Array, Array]:
-    """Points where the far representation is used, and their distances from the design [m]."""
+    """Points where a representation is used that starts at a distance from the design [m], and
+    their distances from it [m], (n, 3), (n,)."""
     count = settings.far_training
-    points = reachable_points(surface, sources, 0.5 * settings.blend[0], count // 2)
-    away = outside(design_box(surface.design), points) > 0.8 * settings.blend[0]
+    points = reachable_points(surface, sources, 0.5 * start, count // 2)
+    away = outside(design_box(surface.design), points) > 0.8 * start
     if away.sum() > len(sources):  # else the box ends near the sensor
         points = points[away]
     points = points[np.random.default_rng(1).permutation(len(points))[:count]]

@@ -115,7 +115,9 @@ class Fleet:
         finer: dict[Preset, Preset] = {"learning": "standard", "standard": "fine"}
         self.finer = finer.get(preset) if device == "cpu" else "fine"
         if device != "cpu":
-            chosen_preset = replace(chosen_preset, panels=_PANELS * budget, coarsest=None)
+            chosen_preset = replace(
+                chosen_preset, panels=_PANELS * budget, coarsest=None, finest=None
+            )
         self._solver = SurfaceSolver(
             field.green, self.design, excitation_frequency=self.excitation_frequency,
             preset=chosen_preset,

@@ -276,10 +276,11 @@ def as_transforms(poses: Any, room: Any) -> Any:
 
 def _response(solver: SurfaceSolver, device: Any) -> Any:
     out, green = warp_cut.Response(), solver.green
-    sources = np.concatenate([green.far.T, green.near.T]).astype(np.float32)
-    (count, width), size = green.far_table.shape, warp_cut.SOURCES
-    table = np.zeros((size * -(-len(sources) // size), green.near_table.shape[1]), np.float32)
-    table[:count, :width], table[count : len(sources)] = green.far_table, green.near_table
+    near, _, far = green.levels  # threads of a block take turns: a third level saves no time there
+    sources = np.concatenate([far.sources.T, near.sources.T]).astype(np.float32)
+    (count, width), size = far.table.shape, warp_cut.SOURCES
+    table = np.zeros((size * -(-len(sources) // size), near.table.shape[1]), np.float32)
+    table[:count, :width], table[count : len(sources)] = far.table, near.table
     columns = np.ascontiguousarray(table.T).reshape(len(table.T), -1, size)
     parts = table[: len(sources)].reshape(len(sources), -1, warp_cut.WIDTH)
     out.sources = wp.array(sources, dtype=wp.vec3, device=device)
@@ -288,7 +289,7 @@ def _response(solver: SurfaceSolver, device: Any) -> Any:
     out.far, out.passes = count, width // warp_cut.WIDTH
     out.lead, out.terminals, out.middle = green.lead, green.terminals, wp.vec3(*solver.middle)
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
-    out.blend0, out.blend1 = green.blend.tolist()
+    out.blend0, out.blend1 = green.blends[-1].tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (
         (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.room)
     )

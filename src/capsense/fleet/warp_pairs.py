@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.elements.mean_kernels import FAR
-from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST
+from capsense.field.green_kernels import LEAST
 from capsense.fleet.warp_cut import WIDTH, Response, WarpCut, four, row, smooth
 from capsense.surface.pair_kernels import _WIDE as WIDE
 from capsense.surface.pair_kernels import BARRIER
@@ -26,7 +26,7 @@ _BARRIER, _STIFF = wp.constant(BARRIER), wp.constant(600.0)
 """Energy of charge that is out of reach [1/m]; with losses at most the second number [m] over the
 square of a large cluster's extent: more of it would hide what is in reach, see ``warp_cut.weigh``.
 """
-_NEAR_LEAST, _FAR_LEAST = wp.constant(NEAR_LEAST), wp.constant(FAR_LEAST)
+_NEAR_LEAST, _FAR_LEAST = wp.constant(LEAST[0]), wp.constant(LEAST[-1])
 
 
 @wp.struct

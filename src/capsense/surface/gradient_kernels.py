@@ -20,7 +20,7 @@ import numpy as np
 from capsense._dense import multiply, multiply_simd
 from capsense._jit import compiled
 from capsense.elements.mean_kernels import cluster_moments
-from capsense.field.green_kernels import FAR_LEAST, NEAR_LEAST, distances, near_share
+from capsense.field.green_kernels import distances, level_share
 from capsense.surface.leaf_kernels import (
     near_pairs,
     pair_line,
@@ -73,37 +73,34 @@ def jacobian(solution, bodies, green):
 def _add_design(points, charge, bounds, green, work):
     """Add forces and torques by the design's sources, (b, 6, lead, lead)."""
     n, lead, floor = points.shape[0], charge.shape[1], green.floor
-    distance = distances(points, green)
-    near_part, far_part = np.empty(n), np.empty(n)
-    for j in range(n):
-        near_part[j] = near_share(distance[j], green.blend)
-        far_part[j] = 1.0 - near_part[j]
-    near = _source_sums(points, charge, near_part, bounds, green.near, (floor, NEAR_LEAST))
-    far = _source_sums(points, charge, far_part, bounds, green.far, (floor, FAR_LEAST))
-    modes = np.zeros((lead, green.near_table.shape[1]), np.float32)
-    _add_modes(near, green.near_table, modes)
-    _add_modes(far, green.far_table, modes)
+    distance, share = distances(points, green), np.empty(n)
+    modes = np.zeros((lead, green.levels[0].table.shape[1]), np.float32)
+    sums = [np.empty((0, 0, 0, 0), np.float32) for _ in green.levels]
+    for k in range(len(green.levels)):
+        level = green.levels[k]
+        for j in range(n):
+            share[j] = level_share(distance[j], k, green.blends)
+        sums[k] = _source_sums(points, charge, share, bounds, level, floor)
+        _add_modes(sums[k], level.table, modes)
     right = np.zeros((modes.shape[1], lead), np.float32)
     for i in range(lead):
         right[i, i] = 1.0
         for k in range(lead, modes.shape[1]):
             right[k, i] = modes[i, k]
-    _add_work(near, green.near, green.near_table, right, work)
-    _add_work(far, green.far, green.far_table, right, work)
+    for k in range(len(green.levels)):
+        _add_work(sums[k], green.levels[k].sources, green.levels[k].table, right, work)
 
 
 @compiled
-def _source_sums(points, charge, share, bounds, sources, limits):
+def _source_sums(points, charge, share, bounds, level, floor):
     """Sums over each body's charges, weighted with ``share``, of what a source does to them.
-
-    ``limits`` are the height of the floor and the least distance from a source [m].
 
     Returns:
         Shape (b, 6, lead, s), the six numbers of
         :func:`capsense.surface.leaf_kernels.source_lines`; b = 0 where no weight is above zero.
     """
+    sources, floor, least = level.sources, np.float32(floor), np.float32(level.least)
     count, lead, width = bounds.shape[0] - 1, charge.shape[1], sources.shape[1]
-    floor, least = np.float32(limits[0]), np.float32(limits[1])
     some_count = 0
     for j in range(points.shape[0]):
         some_count += share[j] > 0.0

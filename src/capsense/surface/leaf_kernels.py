@@ -32,13 +32,11 @@ from capsense._simd import (
 )
 from capsense.elements.mean_kernels import extent_of, four_points
 from capsense.field.green_kernels import (
-    FAR_LEAST,
-    NEAR_LEAST,
     beyond,
     distances,
     least_gap,
+    level_share,
     lift,
-    near_share,
     source_potentials,
 )
 
@@ -117,52 +115,28 @@ def leaf_rows(points, beyond, green):
     """Rows of the leaves, shape (l, w); no wider than those of far points where none is near."""
     distance = distances(points, green)
     n = points.shape[0]
-    near = False
-    for j in range(n):
-        near = near or distance[j] < green.blend[1]
-    out = np.zeros((n, green.near_table.shape[1] if near else green.far_table.shape[1]), np.float32)
     chosen, share = np.empty(n, np.int64), np.empty(n)
-    some = np.empty((n, 4, 3), np.float32)
-    for far in range(2):
-        count = 0
+    some, out = np.empty((n, 4, 3), np.float32), np.empty((0, 0), np.float32)
+    for k in range(len(green.levels)):
+        count, level = 0, green.levels[k]
         for j in range(n):
-            part = near_share(distance[j], green.blend)
-            part = (1.0 - part if far == 1 else part) * (1.0 - beyond[j])
+            part = level_share(distance[j], k, green.blends) * (1.0 - beyond[j])
             if part > 0.0:
                 chosen[count], share[count] = j, part
                 for q in range(4):
                     for i in range(3):
                         some[count, q, i] = points[j, q, i]
                 count += 1
-        if count == 0:
-            continue
-        if far == 1:
-            _add_rows(
-                some[:count],
-                chosen,
-                share,
-                green.far,
-                green.far_table,
-                green.floor,
-                FAR_LEAST,
-                out,
-            )
-        else:
-            _add_rows(
-                some[:count],
-                chosen,
-                share,
-                green.near,
-                green.near_table,
-                green.floor,
-                NEAR_LEAST,
-                out,
-            )
+        if out.shape[0] == 0 and (count > 0 or k + 1 == len(green.levels)):
+            out = np.zeros((n, level.table.shape[1]), np.float32)
+        if count > 0:
+            _add_rows(some[:count], chosen, share, level, green.floor, out)
     return out
 
 
 @compiled
-def _add_rows(points, chosen, share, sources, table, floor, least, out):
+def _add_rows(points, chosen, share, level, floor, out):
+    sources, table, least = level
     values = np.empty((points.shape[0], sources.shape[1]), np.float32)
     source_potentials(points, sources, np.float32(floor), np.float32(least), values)
     rows = np.empty((points.shape[0], table.shape[1]), np.float32)

@@ -9,7 +9,6 @@ import numpy as np
 from capsense._jit import compiled
 from capsense._simd import SIMD_WIDTH, doubles, integers
 from capsense.field.green_kernels import (
-    FAR_LEAST,
     NEAR_FACE,
     SHORE,
     least_gap,
@@ -172,8 +171,9 @@ def _mean_potentials(body, green, span, means, met, crossing, linear, told):
         for i in range(3):
             columns[i, j] = points[min(j, found - 1), i]
     phi = np.empty((green.lead, columns.shape[1]), np.float32)
-    limits = np.float32(green.floor), np.float32(FAR_LEAST)
-    point_potentials(columns, green.far, green.score_table, limits, phi)
+    far = green.levels[-1]
+    limits = np.float32(green.floor), np.float32(far.least)
+    point_potentials(columns, far.sources, green.score_table, limits, phi)
     for j in range(found):
         for i in range(green.lead):
             means[places[j], i] = inner[j] * phi[i, j]
