@@ -38,7 +38,7 @@ from capsense.field.green_points import (
 Array = np.ndarray
 
 FEW = GreenSettings(
-    near_sources=360, near_spacing=2.8e-3, middle_sources=260, middle_spacing=3.2e-3,
+    near_sources=360, near_spacing=2.8e-3, middle_sources=320, middle_spacing=2.9e-3,
     far_sources=160, far_spacing=3.6e-3,
 )  # fmt: skip
 """Sizes for designs of a few centimetres."""
@@ -203,19 +203,20 @@ def test_reciprocity_and_grounding(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DESIGNS)
-@pytest.mark.parametrize("gap", [0.012, 0.018])
-def test_near_and_far_agree_where_they_meet(name: str, gap: float) -> None:
-    """No kink in a capacitance, whichever of the two the points of a ball use."""
+@pytest.mark.parametrize("gap", [0.005, 0.012, 0.018])
+def test_levels_agree_where_they_meet(name: str, gap: float) -> None:
+    """No kink in a capacitance, whichever of the levels the points of a ball use."""
     it, radius = case(name), 0.012
     points = ball(np.array([-0.01, 0.006, it.green.box[1, 2] + gap + radius]), radius)
     found = []
     near, far, mixed = [1.0, 2.0], [-2.0, -1.0], [0.018, 0.030]
-    for blends in ([near, near], [far, near], [far, far], [mixed, near], [far, mixed]):
+    used = [[near, near], [far, near], [far, far], [mixed, near], [far, mixed]]
+    for blends in used[: 2 if gap < 0.01 else None]:
         green = replace(it.green, blends=np.array(blends))
         psi = green.psi(points)
         found.append(delta(points, radius, psi @ psi.T, green.phi0(points), green.floor))
     for other in found[1:]:
-        assert np.abs(other - found[0]).max() < 2e-3 * np.abs(found[0]).max()
+        assert np.abs(other - found[0]).max() < (5 if gap < 0.01 else 2) * 1e-3 * found[0].max()
 
 
 def test_shares_change_smoothly() -> None:
