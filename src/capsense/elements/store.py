@@ -142,18 +142,18 @@ def functions_of(
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
-    many = 2 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1
-    found, size = rigid(shape, count * many, conducting=conducting)
+    many = 1.3 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1
+    found, size = rigid(shape, round(count * many), conducting=conducting)
     return (found if finest is None else _in_parts(found, finest / size)), size
 
 
 def _in_parts(shape: RigidShape, finest: float) -> RigidShape:
-    """A shape with parts no longer than half of ``finest`` to all of it, made once."""
-    doublings = math.floor(math.log2(finest))
+    """A shape with parts no longer than ``finest``, or 0.7 times that, made once."""
+    power = math.floor(2.0 * math.log2(finest))
     known: dict[int, RigidShape] = shape.__dict__.setdefault("_refined", {})
-    if doublings not in known:
-        known[doublings] = refined(shape, 2.0**doublings)
-    return known[doublings]
+    if power not in known:
+        known[power] = refined(shape, 2.0 ** (power / 2.0))
+    return known[power]
 
 
 def rigid(shape: Shape, count: int, *, conducting: bool = False) -> tuple[RigidShape, float]:

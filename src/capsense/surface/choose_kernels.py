@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled
 from capsense._simd import doubles, integers
 from capsense.field.green_kernels import smooth
-from capsense.surface.score_kernels import DECAY, INHERITED, PARTS, score
+from capsense.surface.score_kernels import DECAY, INHERITED, score
 
 _FULL = 0.1
 """How far something of a cluster within reach has to be represented for its function to be whole:
@@ -75,20 +75,20 @@ def chosen(bodies, green, threshold, width):
     first = np.zeros(bodies.shape[0] + 1, np.int64)
     for b in range(bodies.shape[0]):
         first[b + 1] = first[b] + 2 * bodies[b].n - 1
-    weight, scores = np.empty(green.terminals), np.empty(first[-1])
-    seen = score(bodies, first, green, threshold, weight, scores)
-    return choose(bodies, first, seen, scores, threshold, width)
+    weight, scores, entry = np.empty(green.terminals), np.empty(first[-1]), np.empty(first[-1])
+    seen = score(bodies, first, green, threshold, weight, scores, entry)
+    return choose(bodies, first, seen, (scores, entry), threshold, width)
 
 
 @compiled
-def choose(bodies, first, seen, scores, threshold, width):
+def choose(bodies, first, seen, found, threshold, width):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
     A function fades in while its score grows from ``threshold`` to ``width`` times that. Scores
     that are inherited are written where they are used. A panel that was looked into is left to its
     parts as far as the function above it would be there if it were one of parts.
     """
-    total = first[-1]
+    total, (scores, entry) = first[-1], found
     state, place = np.full(total, np.int8(-1)), np.empty(total, np.int64)
     fades, above, met = np.empty(total), np.empty(total), np.empty(total, np.int64)
     count = leaves = np.int64(0)  # not the literal, for which Numba would compile another version
@@ -113,15 +113,15 @@ def choose(bodies, first, seen, scores, threshold, width):
             for c in range(2):
                 part, below = o + kids[2 * k + c], kids[2 * kids[2 * k + c]]
                 above[part] = fades[o + k]
-                inherits = (seen[b] <= part - o < stored) or scores[part] == INHERITED
+                inherits = part - o < stored and (
+                    part - o >= seen[b] or scores[part] == INHERITED
+                )
                 if part - o < stored <= below:
-                    share = 0.0 if inherits else _faded(PARTS * scores[o + k], threshold, width)
+                    share = 0.0 if inherits else _faded(entry[part], threshold, width)
                     above[part] = min(above[part], share)
                 state[part] = FRONTIER if above[part] > 0.0 else LEAF
                 if inherits:
                     scores[part] = DECAY * scores[o + k]
-                    if below >= stored:
-                        scores[o + below] = scores[o + below + 1] = INHERITED
                 last = max(last, part - o)
     return _collect(bodies, first, state, place, fades, above, met[:count], leaves)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capsense._jit import compiled
 from capsense._simd import SIMD_WIDTH, doubles, integers
@@ -26,9 +28,7 @@ DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
 INHERITED = -1.0
 """Score of what has :data:`DECAY` times that of the cluster above."""
-PARTS = 1.0
-"""What the scores of parts of panels count, over those of whole ones: the means that their energies
-are taken from cost more time."""
+POWER = 3.0
 _LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 _CROSSED = 0.3
@@ -38,12 +38,41 @@ so much that no definite matrix were left."""
 _SEEN = 0.1
 """Part of a cluster that does not see a linear potential from which on what crosses a wall within
 it counts in full."""
+_SCREENED, _TOUCHING = 2.0 * math.pi, 3e-4
+"""A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
+of size l has, 1 - exp(-2π d / l) of their energy; and what is added to d [m]."""
 _WIDE = 0.08, 0.12
 """Clusters come to be large between these extents [m]."""
 
 
+class Looks(NamedTuple):
+    """What was found out of the clusters of a body that were looked at; shapes (n,)."""
+
+    met: NDArray[Any]
+    """Which these are."""
+    means: NDArray[Any]
+    """Mean of φ⁰ [V], shape (n, lead)."""
+    linear: NDArray[Any]
+    """How linear φ⁰ is there, 0 to 1."""
+    told: NDArray[Any]
+    """How much it is not in all clusters above."""
+    crossing: NDArray[Any]
+    """How much it crosses a wall."""
+    stiff: NDArray[Any]
+    """Energy of its charge function in front of a grounded design, over that in free space."""
+
+
 @compiled
-def score(bodies, first, green, threshold, weight, scores):
+def _looks(looks, start, stop):
+    """Those of some clusters."""
+    return Looks(
+        looks.met[start:stop], looks.means[start:stop], looks.linear[start:stop],
+        looks.told[start:stop], looks.crossing[start:stop], looks.stiff[start:stop],
+    )  # fmt: skip
+
+
+@compiled
+def score(bodies, first, green, threshold, weight, scores, entry):
     """Share of the electrodes' energies that each charge function takes up alone.
 
     Writes the weights 1/energy of the terminals, and into ``scores`` the score of every cluster,
@@ -57,115 +86,134 @@ def score(bodies, first, green, threshold, weight, scores):
         How many of a body's first clusters hold all that were looked at but parts of panels, shape
         (b,); scores of others, which are inherited too, are not written.
     """
-    terminals, lead, total = green.terminals, green.lead, first[-1]
-    means, energy = np.empty((total, lead), np.float32), np.zeros(terminals)
-    met, crossing, linear = np.zeros(total, np.bool_), np.empty(total), np.empty(total)
-    told = np.empty(total)
-    seen = np.empty(bodies.shape[0], np.int64)
+    terminals, total = green.terminals, first[-1]
+    all_looks = Looks(
+        np.zeros(total, np.bool_), np.empty((total, green.lead), np.float32), np.empty(total),
+        np.empty(total), np.empty(total), np.empty(total),
+    )  # fmt: skip
+    energy, seen = np.zeros(terminals), np.empty(bodies.shape[0], np.int64)
     for b in range(bodies.shape[0]):
-        body, o = bodies[b], first[b]
-        kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
-        span = slice(o, first[b + 1])
-        met[o], told[o] = True, 1.0
-        seen[b] = _mean_potentials(
-            body, green, (0, 1, body.stored),
-            means[span], met[span], crossing[span], linear[span], told[span],
-        )  # fmt: skip
-        _make_up(body, (0, seen[b]), means[span], met[span], linear[span])
+        body, looks = bodies[b], _looks(all_looks, first[b], first[b + 1])
+        kids, means = integers(body.kids), looks.means
+        seen[b] = _look(body, green, looks)
         for k in range(seen[b] - 1, -1, -1):
             x, y = kids[2 * k], kids[2 * k + 1]
-            if met[o + k] and x >= 0 and met[o + x]:
-                stiffness = told[o + k] * (1.0 - linear[o + k]) * body.scale / own[function[k]]
+            if looks.met[k] and 0 <= x < seen[b] and looks.met[x]:
+                stiffness = looks.told[k] * (1.0 - looks.linear[k]) / _energy(body, looks, k) * looks.stiff[k]
                 for i in range(terminals):
-                    d = float(means[o + x, i] - means[o + y, i])
+                    d = float(means[x, i] - means[y, i])
                     energy[i] += d * d * stiffness
         if not body.neutral:
             for i in range(terminals):
-                energy[i] += float(means[o, i]) ** 2 / (own[0] / body.scale + body.tie)
+                energy[i] += float(means[0, i]) ** 2 / _net_energy(body)
     whole = 0.0
     for i in range(terminals):
         whole += energy[i] ** 2
     for i in range(terminals):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
     for b in range(bodies.shape[0]):
-        span = slice(first[b], first[b] + seen[b])
-        _raise_scores(
-            bodies[b],
-            means[span],
-            met[span],
-            (linear[span], told[span]),
-            crossing[span],
-            weight,
-            scores[span],
-        )
-        span = slice(first[b], first[b + 1])
-        _score_parts(
-            bodies[b], green, seen[b], means[span], met[span],
-            (linear[span], told[span], crossing[span]), (threshold, weight), scores[span],
-        )  # fmt: skip
+        looks = _looks(all_looks, first[b], first[b + 1])
+        of = scores[first[b] : first[b + 1]]
+        _raise_scores(bodies[b], _looks(looks, 0, seen[b]), weight, of[: seen[b]])
+        enter = entry[first[b] : first[b + 1]]
+        _score_parts(bodies[b], green, seen[b], looks, (threshold, weight), of, enter)
     return seen
 
 
 @compiled
-def _mean_potentials(body, green, span, means, met, crossing, linear, told):
-    """φ⁰ in the middle of clusters that see it as linear or have no parts, from the far sources.
+def _energy(body, looks, k):
+    """Energy of the function of a cluster [1/m]."""
+    own = doubles(body.own)[integers(body.function)[k]]
+    return looks.stiff[k] * own / body.scale
+
+
+@compiled
+def _net_energy(body):
+    """Energy of a body's net charge [1/m]."""
+    return doubles(body.own)[0] / body.scale + body.tie
+
+
+@compiled
+def _placed(body, green, k, points, found, looks):
+    """Place the middle of cluster k in row ``found`` of ``points`` (n, 3).
+
+    Returns:
+        Square of its distance from the design [m²], how far it is from the next wall, negative
+        beyond it, and how far it is beyond all of them [m].
+    """
+    center, size = doubles(body.center), body.scale * doubles(body.extent)[k]
+    square = out = 0.0
+    room = 1.0
+    for i in range(3):
+        x = body.position[i]
+        for q in range(3):
+            x += body.scale * body.rotation[i, q] * center[3 * k + q]
+        points[found, i] = x
+        off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
+        square += off * off
+        room = min(room, x - green.room[0, i], green.room[1, i] - x)
+        out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
+    looks.stiff[k] = 1.0 - math.exp(-_SCREENED * (math.sqrt(square) + _TOUCHING) / size)
+    if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
+        lift(points[found : found + 1], least_gap(size, green.cover), green.box)
+    return square, room, math.sqrt(out)
+
+
+@compiled
+def _look(body, green, looks):
+    """Look at a body's clusters, and into those that do not see a linear potential.
+
+    φ⁰ is that in their middle, from the far sources, or is made up from their parts. Panels are not
+    looked into.
 
     Args:
         body: The body.
         green: Green's function of the design.
-        span: First cluster, the one behind the last that was ``met`` before, and the one behind all
-            that are.
-        means: Filled [V], shape (n, lead).
-        met: Which clusters are looked at, shape (n,); extended.
-        crossing: Filled with how much each cluster crosses a wall, 0 to 1.
-        linear: Filled with how linear φ⁰ is there.
-        told: Filled with how much it is not in all clusters above.
+        looks: Filled.
 
     Returns:
         The cluster behind the last one that was looked at.
     """
-    kids, center, extent = integers(body.kids), doubles(body.center), doubles(body.extent)
-    start, seen, stop = span
-    places, inner = np.empty(stop - start, np.int64), np.empty(stop - start)
-    points, found = np.empty((stop - start, 3), np.float32), 0
-    k = start - 1
+    kids, extent, stop = integers(body.kids), doubles(body.extent), body.stored
+    places, inner = np.empty(stop, np.int64), np.empty(stop)
+    points, found = np.empty((stop, 3), np.float32), 0
+    looks.met[0], looks.told[0], k, seen = True, 1.0, -1, 1
     while k + 1 < seen:
         k += 1
-        if not met[k]:
+        if not looks.met[k]:
             continue
-        square = out = 0.0
-        room = 1.0
-        for i in range(3):
-            x = body.position[i]
-            for q in range(3):
-                x += body.scale * body.rotation[i, q] * center[3 * k + q]
-            points[found, i] = x
-            off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
-            square += off * off
-            room = min(room, x - green.room[0, i], green.room[1, i] - x)
-            out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
-        size, share, linear[k] = body.scale * extent[k], 1.0 - smooth(math.sqrt(out) / SHORE), 0.0
-        crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
+        square, room, out = _placed(body, green, k, points, found, looks)
+        size, share = body.scale * extent[k], 1.0 - smooth(out / SHORE)
+        looks.crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
             (size - _LONG[0]) / (_LONG[1] - _LONG[0])
         )
+        looks.linear[k] = 0.0
         if k >= _COARSE:
             part = size / math.sqrt(square + 1e-12)
             even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
-            linear[k] = (1.0 - share * (1.0 - even)) * (1.0 - crossing[k])
-        if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
-            lift(points[found : found + 1], least_gap(size, green.cover), green.box)
+            looks.linear[k] = (1.0 - share * (1.0 - even)) * (1.0 - looks.crossing[k])
         for i in range(green.lead):
-            means[k, i] = 0.0
+            looks.means[k, i] = 0.0
         whole = not 0 <= kids[2 * k] < stop
-        if share > 0.0 and (linear[k] > 0.0 or whole):
+        if share > 0.0 and (looks.linear[k] > 0.0 or whole):
             places[found], inner[found] = k, share
             found += 1
-        if linear[k] < 1.0 and not whole:
+        if looks.linear[k] < 1.0 and not whole:
             for c in range(2):
-                met[kids[2 * k + c]], told[kids[2 * k + c]] = True, told[k] * (1.0 - linear[k])
+                part = kids[2 * k + c]
+                looks.met[part], looks.told[part] = True, looks.told[k] * (1.0 - looks.linear[k])
             seen = max(seen, kids[2 * k + 1] + 1)
+    _far_potentials(points[:found], places, inner, green, looks.means)
+    _make_up(body, seen, looks)
+    return seen
+
+
+@compiled
+def _far_potentials(points, places, share, green, means):
+    """Fill rows ``places`` of ``means`` with φ⁰ at points (k, 3), times a share of each."""
+    found = points.shape[0]
     if found == 0:
-        return seen
+        return
     columns = np.empty((3, SIMD_WIDTH * ((found + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
     for j in range(columns.shape[1]):
         for i in range(3):
@@ -176,20 +224,20 @@ def _mean_potentials(body, green, span, means, met, crossing, linear, told):
     point_potentials(columns, far.sources, green.score_table, limits, phi)
     for j in range(found):
         for i in range(green.lead):
-            means[places[j], i] = inner[j] * phi[i, j]
-    return seen
+            means[places[j], i] = share[j] * phi[i, j]
 
 
 @compiled
-def _make_up(body, span, means, met, linear):
+def _make_up(body, seen, looks):
     """Mean potentials of clusters from those of their parts, where they do not see a linear one."""
     kids, charge, one = integers(body.kids), doubles(body.charge), np.float32(1.0)
-    for k in range(span[1] - 1, span[0] - 1, -1):
-        if not met[k]:
+    means = looks.means
+    for k in range(seen - 1, -1, -1):
+        if not looks.met[k]:
             continue
         x, y = kids[2 * k], kids[2 * k + 1]
-        if x >= 0 and met[x]:
-            p, t = np.float32(charge[x] / charge[k]), np.float32(linear[k])
+        if 0 <= x < seen and looks.met[x]:
+            p, t = np.float32(charge[x] / charge[k]), np.float32(looks.linear[k])
             q, r = (one - t) * p, (one - t) * (one - p)
             for i in range(means.shape[1]):
                 whole = t * means[k, i] if t > 0.0 else np.float32(0.0)
@@ -197,122 +245,64 @@ def _make_up(body, span, means, met, linear):
 
 
 @compiled
-def _score_parts(body, green, seen, means, met, looks, limits, scores):
-    """Score panels that have parts, and these, where the cluster above the panel needs them.
-
-    Args:
-        body: The body.
-        green: Green's function of the design.
-        seen: How many of its first clusters hold all that were looked at.
-        means, met: Of :func:`_mean_potentials`, of all clusters.
-        looks: ``linear``, ``told`` and ``crossing``, as there.
-        limits: The threshold, and the weights of the terminals.
-        scores: Filled.
-    """
-    kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
-    (linear, told, crossing), (threshold, weight) = looks, limits
-    stored, clusters = body.stored, 2 * body.n - 1
-    if stored == clusters:
-        return
-    panels, above = np.empty((2, stored), np.int64)
-    last, count = stored, 0
-    for k in range(seen):
-        if not met[k] or not 0 <= kids[2 * k] < seen or PARTS * scores[k] <= threshold:
-            continue
-        for c in range(2):
-            panel = kids[2 * k + c]
-            part = kids[2 * panel]
-            if not met[panel] or part < stored:
-                continue
-            panels[count], above[count] = panel, k
-            count += 1
-            for d in range(2):
-                met[part + d], told[part + d] = True, told[panel] * (1.0 - linear[panel])
-            last = max(last, part + 2)
-    if count == 0:
-        return
-    last = _mean_potentials(
-        body, green, (stored, last, clusters), means, met, crossing, linear, told
-    )
-    _make_up(body, (stored, last), means, met, linear)
-    for j in range(last - stored + count):  # parts first
-        k = last - 1 - j if j < last - stored else panels[j - last + stored]
-        if not met[k]:
-            continue
-        a, scores[k] = kids[2 * k], 0.0
-        if a >= 0 and met[a]:
-            value = 0.0
-            for i in range(weight.shape[0]):
-                d = float(means[a, i] - means[a + 1, i])
-                value += weight[i] * d * d
-            value *= PARTS * body.scale / own[function[k]]
-            for c in range(2):
-                value = max(value, scores[a + c]) + 0.5 * min(value, scores[a + c])
-            scores[k] = (1.0 - linear[k]) * value
-        elif a >= 0:
-            scores[a] = scores[a + 1] = INHERITED
-    for j in range(count + last - stored):  # wholes first
-        k = panels[j] if j < count else j - count + stored
-        if not met[k]:
-            continue
-        if j < count:
-            _pass_on(k, PARTS * scores[above[j]], linear, told, scores)
-        a = kids[2 * k]
-        for c in range(2):
-            if a >= 0 and met[a] and kids[2 * (a + c)] >= 0:
-                _pass_on(a + c, scores[k], linear, told, scores)
+def _own_score(body, looks, k, weight):
+    """Score of the function of a cluster, from the potentials of its two parts."""
+    x, value = integers(body.kids)[2 * k], 0.0
+    for i in range(weight.shape[0]):
+        d = float(looks.means[x, i] - looks.means[x + 1, i])
+        value += weight[i] * d * d
+    return value / (_energy(body, looks, k) * looks.stiff[k])
 
 
 @compiled
-def _pass_on(part, above, linear, told, scores):
+def _raised(value, first, second):
+    """A score, raised by those of the two parts."""
+    for below in (first, second):
+        value = max(value, below) + 0.5 * min(value, below)
+    return value
+
+
+@compiled
+def _pass_on(part, above, looks, scores):
     """Let a cluster have a part of the score above it as far as that sees a linear potential."""
-    rest = 1.0 - told[part] * (1.0 - linear[part])
-    scores[part] = told[part] * scores[part] + rest * DECAY * above
+    rest = 1.0 - looks.told[part] * (1.0 - looks.linear[part])
+    scores[part] = looks.told[part] * scores[part] + rest * DECAY * above
 
 
 @compiled
-def _raise_scores(body, mean, met, evenness, crossing, weight, scores):
+def _raise_scores(body, looks, weight, scores):
     """Score a body's first clusters from the mean potentials of those that were met.
 
-    What was met below a cluster that sees a linear potential does not count: ``evenness`` holds
-    ``linear`` and ``told`` of :func:`_mean_potentials`.
+    What was met below a cluster that sees a linear potential does not count.
 
     No charge is beyond a wall. A part that crosses one can carry charge where it is inside only if
     it is split too, which its own score does not tell. So that is at least the score of the body,
     times the part's share of its length.
     """
-    kids, function, own = integers(body.kids), integers(body.function), doubles(body.own)
-    extent, count = doubles(body.extent), met.shape[0]
-    linear, told = evenness
+    kids, extent, count = integers(body.kids), doubles(body.extent), scores.shape[0]
+    met, crossing = looks.met, looks.crossing
     for k in range(count - 1, -1, -1):
         if not met[k]:
             scores[k] = INHERITED
             continue
         a, scores[k] = kids[2 * k], 0.0
         if 0 <= a < count and met[a]:
-            value = 0.0
-            for i in range(weight.shape[0]):
-                d = float(mean[a, i] - mean[kids[2 * k + 1], i])
-                value += weight[i] * d * d
-            value *= body.scale / own[function[k]]
-            for c in range(2):
-                below = scores[kids[2 * k + c]]
-                value = max(value, below) + 0.5 * min(value, below)
-            scores[k] = (1.0 - linear[k]) * value
+            own = _own_score(body, looks, k, weight)
+            scores[k] = (1.0 - looks.linear[k]) * _raised(own, scores[a], scores[a + 1])
     if not body.neutral:
         net = 0.0
         for i in range(weight.shape[0]):
-            net += weight[i] * float(mean[0, i]) ** 2
-        scores[0] = max(scores[0], crossing[0] * net / (own[0] / body.scale + body.tie))
+            net += weight[i] * float(looks.means[0, i]) ** 2
+        scores[0] = max(scores[0], crossing[0] * net / _net_energy(body))
     seen = np.ones(count)
     for k in range(count):
         if not met[k]:
             continue
         for c in range(2):
             part = kids[2 * k + c]
-            if 0 <= part < count and met[part] and kids[2 * part] >= 0:
-                _pass_on(part, scores[k], linear, told, scores)
-                seen[part] = seen[k] * smooth((1.0 - linear[k]) / _SEEN)
+            if 0 <= part < count and met[part] and 0 <= kids[2 * part] < body.stored:
+                _pass_on(part, scores[k], looks, scores)
+                seen[part] = seen[k] * smooth((1.0 - looks.linear[k]) / _SEEN)
     whole = scores[0]
     for k in range(count - 1, -1, -1):
         if not met[k]:
@@ -322,3 +312,75 @@ def _raise_scores(body, mean, met, evenness, crossing, weight, scores):
         scores[k] = max(scores[k], seen[k] * crossing[k] * least)
         if 0 <= kids[2 * k] < count:
             scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
+
+
+@compiled
+def _score_parts(body, green, seen, looks, limits, scores, entry):
+    """Score panels that have parts, and these, where the cluster above the panel needs them.
+
+    Where a cluster is far from the design, charge within its panels does nothing: scores count in
+    as much as the design leaves parts of them less energy than they have in free space. They are
+    raised by those directly below them alone, so that parts are looked at only where the whole is
+    split.
+
+    Args:
+        body: The body.
+        green: Green's function of the design.
+        seen: How many of its first clusters hold all that were looked at.
+        looks: What was found of these; extended.
+        limits: The threshold, and the weights of the terminals.
+        scores: Of all its clusters; those of panels and their parts are filled.
+        entry: Filled for panels: score from which on they have parts.
+    """
+    kids, stored, (threshold, weight) = integers(body.kids), body.stored, limits
+    if stored == 2 * body.n - 1:
+        return
+    nodes, count = np.empty(stored, np.int64), 0
+    for k in range(seen):
+        entry[k] = 0.0
+    for k in range(seen):
+        if not looks.met[k] or not 0 <= kids[2 * k] < seen or scores[k] <= threshold:
+            continue
+        for c in range(2):
+            panel = kids[2 * k + c]
+            if looks.met[panel] and kids[2 * panel] >= stored:
+                entry[panel] = (1.0 - looks.stiff[panel] ** 2) * scores[k]
+                if entry[panel] > threshold:
+                    nodes[count] = panel
+                    count += 1
+    nodes = nodes[:count]
+    _score_nodes(body, green, nodes, looks, weight, scores)
+    while nodes.shape[0] > 0:
+        below, count = np.empty(2 * nodes.shape[0], np.int64), 0
+        for k in nodes:
+            for c in range(2):
+                if kids[2 * (kids[2 * k] + c)] >= 0:
+                    below[count] = kids[2 * k] + c
+                    count += 1
+                else:
+                    scores[kids[2 * k] + c] = 0.0
+        _score_nodes(body, green, below[:count], looks, weight, scores)
+        count = 0
+        for k in nodes:
+            a = kids[2 * k]
+            scores[k] = _raised(scores[k], scores[a], scores[a + 1])
+            for c in range(2):
+                if scores[k] > threshold and kids[2 * (a + c)] >= 0:
+                    below[count] = a + c
+                    count += 1
+        nodes = below[:count]
+
+
+@compiled
+def _score_nodes(body, green, nodes, looks, weight, scores):
+    """Score panels and parts by themselves, whatever the potential is like."""
+    kids, many = integers(body.kids), 2 * nodes.shape[0]
+    points, places, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
+    for j in range(many):
+        places[j] = kids[2 * nodes[j // 2]] + j % 2
+        out = _placed(body, green, places[j], points, j, looks)[2]
+        inner[j] = 1.0 - smooth(out / SHORE)
+    _far_potentials(points, places, inner, green, looks.means)
+    for k in nodes:
+        share = 1.0 - looks.stiff[k] * looks.stiff[k]
+        scores[k] = share * _own_score(body, looks, k, weight)

@@ -53,7 +53,7 @@ class Preset:
     coarsest: float | None = 0.5
     """Bodies get panels of a few millimetres where these would be wider on average than so much of
     the electrodes' width, and where they are wide themselves; None for never."""
-    finest: float | None = 4e-3
+    finest: float | None = 8e-3
     """Panels of other bodies have parts where they are longer than this [m]; None for none."""
 
 
