@@ -90,7 +90,7 @@ def standing(vertices: Array, faces: NDArray[np.int64]) -> Standing:
     return Standing(grid * own[order][place[np.lexsort(place.T[::-1])]], axes, middle)
 
 
-VERSION = 6
+VERSION = 7
 """Of stored shapes: to be raised when the same mesh would get other panels or functions."""
 
 _log = logging.getLogger(__name__)
@@ -103,11 +103,13 @@ _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
 _LEAST = 1e-9
 """The least of their lengths, over the largest."""
-_TRIANGLES = 1.6
+_EDGED = 1.3
+"""Panels of a shape with edges, over those of a round one."""
+_TRIANGLES = 2.2
 """So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
-_EACH = 0.2
+_EACH = 0.28
 """Triangles for each part of a mesh of several parts, over the panels of a primitive."""
-_MOST = 2.8
+_MOST = 4.0
 """No mesh has more triangles than so many times that."""
 
 _LOCK = OneAtATime()
@@ -128,7 +130,7 @@ def functions_of(
 
     Args:
         shape: The shape.
-        count: Panels of a round one; one with edges has twice as many.
+        count: Panels of a round one; others have more.
         conducting: Whether it holds no field inside.
         largest: Shapes of so much surface or more [m²], or that are wide, get panels of a few
             millimetres instead; None for none of them.
@@ -142,7 +144,7 @@ def functions_of(
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
-    many = 1.3 if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1
+    many = _EDGED if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1.0
     found, size = rigid(shape, round(count * many), conducting=conducting)
     return (found if finest is None else _in_parts(found, finest / size)), size
 

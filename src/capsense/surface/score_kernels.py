@@ -41,6 +41,9 @@ it counts in full."""
 _SCREENED, _TOUCHING = 2.0 * math.pi, 3e-4
 """A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
 of size l has, 1 - exp(-2π d / l) of their energy; and what is added to d [m]."""
+_FREE = 0.1
+"""Panels are not looked into where the design takes so much or less of the square of that energy,
+and more and more as it takes more."""
 _WIDE = 0.08, 0.12
 """Clusters come to be large between these extents [m]."""
 
@@ -113,9 +116,9 @@ def score(bodies, first, green, threshold, weight, scores, entry):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
     for b in range(bodies.shape[0]):
         looks = _looks(all_looks, first[b], first[b + 1])
-        of = scores[first[b] : first[b + 1]]
+        of, enter = scores[first[b] : first[b + 1]], entry[first[b] : first[b + 1]]
+        _score_panels(bodies[b], green, seen[b], looks, weight, of)
         _raise_scores(bodies[b], _looks(looks, 0, seen[b]), weight, of[: seen[b]])
-        enter = entry[first[b] : first[b + 1]]
         _score_parts(bodies[b], green, seen[b], looks, (threshold, weight), of, enter)
     return seen
 
@@ -270,6 +273,25 @@ def _pass_on(part, above, looks, scores):
 
 
 @compiled
+def _share(looks, k):
+    """What the score of a panel or a part counts."""
+    return max(0.0, 1.0 - looks.stiff[k] * looks.stiff[k] - _FREE) / (1.0 - _FREE)
+
+
+@compiled
+def _score_panels(body, green, seen, looks, weight, scores):
+    """Score panels that were met and have parts, if near; others have no score of their own."""
+    kids, nodes, count = integers(body.kids), np.empty(seen, np.int64), 0
+    for k in range(seen):
+        scores[k] = 0.0
+        if looks.met[k] and kids[2 * k] >= body.stored and _share(looks, k) > 0.0:
+            nodes[count] = k
+            count += 1
+    _score_nodes(body, green, nodes[:count], looks, weight, scores)
+    _raise_nodes(body, green, nodes[:count], looks, weight, scores)
+
+
+@compiled
 def _raise_scores(body, looks, weight, scores):
     """Score a body's first clusters from the mean potentials of those that were met.
 
@@ -285,7 +307,7 @@ def _raise_scores(body, looks, weight, scores):
         if not met[k]:
             scores[k] = INHERITED
             continue
-        a, scores[k] = kids[2 * k], 0.0
+        a = kids[2 * k]
         if 0 <= a < count and met[a]:
             own = _own_score(body, looks, k, weight)
             scores[k] = (1.0 - looks.linear[k]) * _raised(own, scores[a], scores[a + 1])
@@ -316,12 +338,10 @@ def _raise_scores(body, looks, weight, scores):
 
 @compiled
 def _score_parts(body, green, seen, looks, limits, scores, entry):
-    """Score panels that have parts, and these, where the cluster above the panel needs them.
+    """Score the parts of panels where the cluster above the panel needs them.
 
-    Where a cluster is far from the design, charge within its panels does nothing: scores count in
-    as much as the design leaves parts of them less energy than they have in free space. They are
-    raised by those directly below them alone, so that parts are looked at only where the whole is
-    split.
+    Scores of panels and parts are raised by those directly below them alone, so that parts are
+    looked at only where the whole is split.
 
     Args:
         body: The body.
@@ -329,51 +349,59 @@ def _score_parts(body, green, seen, looks, limits, scores, entry):
         seen: How many of its first clusters hold all that were looked at.
         looks: What was found of these; extended.
         limits: The threshold, and the weights of the terminals.
-        scores: Of all its clusters; those of panels and their parts are filled.
+        scores: Of all its clusters; those of parts are filled, those of their panels raised.
         entry: Filled for panels: score from which on they have parts.
     """
     kids, stored, (threshold, weight) = integers(body.kids), body.stored, limits
     if stored == 2 * body.n - 1:
         return
-    nodes, count = np.empty(stored, np.int64), 0
+    nodes, count = np.empty(seen, np.int64), 0
     for k in range(seen):
-        entry[k] = 0.0
-    for k in range(seen):
-        if not looks.met[k] or not 0 <= kids[2 * k] < seen or scores[k] <= threshold:
+        if not looks.met[k] or not 0 <= kids[2 * k] < seen:
             continue
         for c in range(2):
             panel = kids[2 * k + c]
             if looks.met[panel] and kids[2 * panel] >= stored:
-                entry[panel] = (1.0 - looks.stiff[panel] ** 2) * scores[k]
+                entry[panel] = _share(looks, panel) * scores[k]
                 if entry[panel] > threshold:
                     nodes[count] = panel
                     count += 1
-    nodes = nodes[:count]
-    _score_nodes(body, green, nodes, looks, weight, scores)
-    while nodes.shape[0] > 0:
-        below, count = np.empty(2 * nodes.shape[0], np.int64), 0
-        for k in nodes:
+    while count > 0:
+        below, many = np.empty(2 * count, np.int64), 0
+        for k in nodes[:count]:
             for c in range(2):
-                if kids[2 * (kids[2 * k] + c)] >= 0:
-                    below[count] = kids[2 * k] + c
-                    count += 1
-                else:
-                    scores[kids[2 * k] + c] = 0.0
-        _score_nodes(body, green, below[:count], looks, weight, scores)
-        count = 0
-        for k in nodes:
-            a = kids[2 * k]
-            scores[k] = _raised(scores[k], scores[a], scores[a + 1])
-            for c in range(2):
-                if scores[k] > threshold and kids[2 * (a + c)] >= 0:
-                    below[count] = a + c
-                    count += 1
-        nodes = below[:count]
+                part = kids[2 * k] + c
+                if scores[k] > threshold and kids[2 * part] >= 0:
+                    below[many] = part
+                    many += 1
+        _raise_nodes(body, green, below[:many], looks, weight, scores)
+        nodes, count = below, many
+
+
+@compiled
+def _raise_nodes(body, green, nodes, looks, weight, scores):
+    """Raise the scores of panels or parts, which are known, by those of their parts."""
+    kids, below, count = integers(body.kids), np.empty(2 * nodes.shape[0], np.int64), 0
+    for k in nodes:
+        for c in range(2):
+            part = kids[2 * k] + c
+            scores[part] = 0.0
+            if kids[2 * part] >= 0:
+                below[count] = part
+                count += 1
+    _score_nodes(body, green, below[:count], looks, weight, scores)
+    for k in nodes:
+        a = kids[2 * k]
+        scores[k] = _raised(scores[k], scores[a], scores[a + 1])
 
 
 @compiled
 def _score_nodes(body, green, nodes, looks, weight, scores):
-    """Score panels and parts by themselves, whatever the potential is like."""
+    """Score panels and parts by themselves, whatever the potential is like.
+
+    Where a cluster is far from the design, charge within its panels does nothing: scores count in
+    as much as the design leaves these less energy than they have in free space.
+    """
     kids, many = integers(body.kids), 2 * nodes.shape[0]
     points, places, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
     for j in range(many):
@@ -382,5 +410,4 @@ def _score_nodes(body, green, nodes, looks, weight, scores):
         inner[j] = 1.0 - smooth(out / SHORE)
     _far_potentials(points, places, inner, green, looks.means)
     for k in nodes:
-        share = 1.0 - looks.stiff[k] * looks.stiff[k]
-        scores[k] = share * _own_score(body, looks, k, weight)
+        scores[k] = _share(looks, k) * _own_score(body, looks, k, weight)

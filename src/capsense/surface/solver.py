@@ -44,23 +44,23 @@ _NARROW = 8e-3
 class Preset:
     """How finely a scene is resolved."""
 
-    panels: int = 700
-    """About how many panels cover a round shape; one with edges has twice as many."""
+    panels: int = 500
+    """About how many panels cover a round shape; others have more."""
     threshold: float = 0.015
     """Charge functions count that take up this part of an electrode's energy alone."""
     width: float = 2.5
     """They fade in up to so many times that."""
-    coarsest: float | None = 0.5
+    coarsest: float | None = 0.6
     """Bodies get panels of a few millimetres where these would be wider on average than so much of
     the electrodes' width, and where they are wide themselves; None for never."""
-    finest: float | None = 8e-3
+    finest: float | None = 4e-3
     """Panels of other bodies have parts where they are longer than this [m]; None for none."""
 
 
 PRESETS = {
     "standard": Preset(),
     "learning": Preset(panels=300, threshold=0.08, coarsest=0.95, finest=None),
-    "fine": Preset(panels=1400, threshold=0.004, coarsest=0.33),
+    "fine": Preset(panels=1000, threshold=0.004, coarsest=0.4, finest=3e-3),
 }
 """Presets by name."""
 
