@@ -307,7 +307,7 @@ def reduced(
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
-LONG, SHORE = (0.03, 0.06), 5e-3
+LONG, SHORE, TOUCHING = (0.03, 0.06), 5e-3, 3e-4
 
 
 def scores(
@@ -351,7 +351,7 @@ def scores(
         for k in means:
             if own[k] > 0:
                 x, y = kids[k]
-                value = weight @ (means[x] - means[y]) ** 2 / own[k]
+                value = weight @ (means[x] - means[y]) ** 2 / (own[k] * looks[k].stiff**2)
                 for below in (score[x], score[y]):
                     value = max(value, below) + 0.5 * min(value, below)
                 score[k] = (1 - linear[k]) * value
@@ -385,6 +385,8 @@ class Look(NamedTuple):
     """How linear it sees the potential."""
     crossing: float
     """How much it crosses a wall."""
+    stiff: float
+    """Energy of its function before a plane at that distance, over that in free space."""
     size: float
     """Its length [m]."""
 
@@ -416,7 +418,8 @@ def _means(
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
         even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
         even = 1 - within * (1 - _smooth(even))
-        looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, size)
+        stiff = 1 - math.exp(-2 * math.pi * (green.distance(point[None])[0] + TOUCHING) / size)
+        looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, stiff, size)
         if kids[k, 0] >= 0 and looks[k].linear < 1:
             wanted += kids[k].tolist()
     return {k: out[k] for k in sorted(out, reverse=True)}, looks

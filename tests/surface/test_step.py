@@ -907,8 +907,9 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
-    seen = score(bodies, first, green, 0.015, np.empty(green.terminals), scores)
-    cut = choose(bodies, first, seen, scores.copy(), threshold, WIDTH)
+    entry = np.full(first[-1], math.nan)
+    seen = score(bodies, first, green, threshold, np.empty(green.terminals), scores, entry)
+    cut = choose(bodies, first, seen, (scores.copy(), entry), threshold, WIDTH)
     for o, (_, shape) in zip(first, scene, strict=False):
         kids = shape.tree.kids
         for k in np.flatnonzero(kids[:, 0] >= 0):

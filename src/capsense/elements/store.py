@@ -103,7 +103,7 @@ _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
 _LEAST = 1e-9
 """The least of their lengths, over the largest."""
-_EDGED = 1.3
+_EDGED = 1.6
 """Panels of a shape with edges, over those of a round one."""
 _TRIANGLES = 2.2
 """So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
@@ -134,8 +134,8 @@ def functions_of(
         conducting: Whether it holds no field inside.
         largest: Shapes of so much surface or more [m²], or that are wide, get panels of a few
             millimetres instead; None for none of them.
-        finest: Panels of the others are cut into parts where they are longer than this [m]; None
-            for none of them.
+        finest: Panels of other conductors are cut into parts where they are longer than this [m];
+            None for none of them.
     """
     if isinstance(shape, Layers):
         return ChangingBody(*layer_pieces(shape)), 1.0
@@ -146,7 +146,9 @@ def functions_of(
         return in_pieces(shape, pieces)
     many = _EDGED if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1.0
     found, size = rigid(shape, round(count * many), conducting=conducting)
-    return (found if finest is None else _in_parts(found, finest / size)), size
+    if finest is None or not conducting:
+        return found, size
+    return _in_parts(found, finest / size), size
 
 
 def _in_parts(shape: RigidShape, finest: float) -> RigidShape:

@@ -38,7 +38,7 @@ so much that no definite matrix were left."""
 _SEEN = 0.1
 """Part of a cluster that does not see a linear potential from which on what crosses a wall within
 it counts in full."""
-_SCREENED, _TOUCHING = 2.0 * math.pi, 3e-4
+_SCREENED, _TOUCHING = 2.0 * math.pi, 0.8e-3
 """A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
 of size l has, 1 - exp(-2π d / l) of their energy; and what is added to d [m]."""
 _FREE = 0.1
@@ -156,7 +156,7 @@ def _placed(body, green, k, points, found, looks):
         square += off * off
         room = min(room, x - green.room[0, i], green.room[1, i] - x)
         out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
-    looks.stiff[k] = 1.0 - math.exp(-_SCREENED * (math.sqrt(square) + _TOUCHING) / size)
+    looks.stiff[k] = 1.0 - math.exp(-_SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING) / size)
     if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
         lift(points[found : found + 1], least_gap(size, green.cover), green.box)
     return square, room, math.sqrt(out)
