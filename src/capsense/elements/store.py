@@ -103,13 +103,14 @@ _DIGITS = 9
 """Primitives whose proportions agree to so many digits share their functions."""
 _LEAST = 1e-9
 """The least of their lengths, over the largest."""
-_EDGED = 1.6
-"""Panels of a shape with edges, over those of a round one."""
-_TRIANGLES = 2.2
+_EDGED, _MORE = 600, 1.15
+"""Shapes with edges have twice as many panels as round ones, but no more than the first, or the
+second times as many."""
+_TRIANGLES = 1.6
 """So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
-_EACH = 0.28
+_EACH = 0.2
 """Triangles for each part of a mesh of several parts, over the panels of a primitive."""
-_MOST = 4.0
+_MOST = 2.8
 """No mesh has more triangles than so many times that."""
 
 _LOCK = OneAtATime()
@@ -144,8 +145,9 @@ def functions_of(
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
-    many = _EDGED if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER) else 1.0
-    found, size = rigid(shape, round(count * many), conducting=conducting)
+    if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER):
+        count = min(2 * count, max(_EDGED, round(_MORE * count)))
+    found, size = rigid(shape, count, conducting=conducting)
     if finest is None or not conducting:
         return found, size
     return _in_parts(found, finest / size), size

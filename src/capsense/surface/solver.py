@@ -44,13 +44,13 @@ _NARROW = 8e-3
 class Preset:
     """How finely a scene is resolved."""
 
-    panels: int = 500
+    panels: int = 700
     """About how many panels cover a round shape; others have more."""
     threshold: float = 0.015
     """Charge functions count that take up this part of an electrode's energy alone."""
     width: float = 2.5
     """They fade in up to so many times that."""
-    coarsest: float | None = 0.6
+    coarsest: float | None = 0.5
     """Bodies get panels of a few millimetres where these would be wider on average than so much of
     the electrodes' width, and where they are wide themselves; None for never."""
     finest: float | None = 4e-3
