@@ -207,8 +207,8 @@ CONTACT = {
 @pytest.mark.parametrize("name", CONTACT)
 @pytest.mark.parametrize("design", ["six_patch_bare", "six_patch"])
 def test_contact_is_finite_and_monotone(simulators, design, name):
-    """Measured: from 3 mm to 0.5 mm into the face, large entries grow by small steps; those of a
-    bar within the face fall by 2 % once."""
+    """Measured: from 3 mm to 0.5 mm into the face, large entries grow by small steps; those of
+    boxes within the face fall by 1 % a step at most."""
     shape, half, (x, y), turn = CONTACT[name]
     gaps = np.concatenate([np.arange(3e-3, 1.2e-3, -1e-4), np.arange(1.2e-3, -5.1e-4, -2.5e-5)])
     read = np.array([
@@ -220,9 +220,9 @@ def test_contact_is_finite_and_monotone(simulators, design, name):
     read = read[:, read[-1] > 0.1 * read[-1].max()]
     change = np.diff(np.log(read), axis=0)
     assert change[gaps[1:] > 0.0].min() > -1e-4
-    assert change.min() > (-0.03 if name == "bar" else -3e-3)
+    assert change.min() > (-0.015 if name in ("bar", "box") else -3e-3)
     assert change.max() < 0.1
-    assert read[-1].max() < 50e-12
+    assert read[-1].max() < 55e-12
 
 
 def test_deep_in_the_sensor_a_reading_says_that_it_is_rough(sim):

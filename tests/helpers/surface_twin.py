@@ -307,7 +307,7 @@ def reduced(
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
-LONG, SHORE, TOUCHING = (0.03, 0.06), 5e-3, 3e-4
+LONG, SHORE, TOUCHING = (0.03, 0.06), 5e-3, 8e-4
 
 
 def scores(
@@ -418,7 +418,8 @@ def _means(
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
         even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
         even = 1 - within * (1 - _smooth(even))
-        stiff = 1 - math.exp(-2 * math.pi * (green.distance(point[None])[0] + TOUCHING) / size)
+        off = math.hypot(green.distance(point[None])[0], TOUCHING)
+        stiff = 1 - math.exp(-2 * math.pi * off / size)
         looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, stiff, size)
         if kids[k, 0] >= 0 and looks[k].linear < 1:
             wanted += kids[k].tolist()

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.elements.panels import SurfacePanels, polygon_panels
+from capsense.elements.panels import SurfacePanels
 from capsense.elements.pieces import OWN
 from capsense.elements.rigid import HALF_SPACE, SOFT, RigidShape
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_MOST = 6
-"""Panels are halved at most so often."""
+_MOST = 3
+"""Panels are halved at most so often: to eight parts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,89 +63,113 @@ class RefinedShape(RigidShape):
 
 def refined(shape: RigidShape, finest: float) -> RigidShape:
     """A shape with parts of its panels where these are longer than ``finest`` [m], else itself."""
-    if _sides(shape.panels.corners).max() <= finest:
+    if _sides(_flat(shape.panels)[0]).max() <= finest:
         return shape
-    return RefinedShape(
-        shape.panels, shape.tree, shape.energy, shape.capacitance, shape, finest
-    )
+    return RefinedShape(shape.panels, shape.tree, shape.energy, shape.capacitance, shape, finest)
+
+
+def _flat(panels: SurfacePanels) -> tuple[Array, Array]:
+    """Corners in the plane of each panel [m], (2, 4, n), and the axes of these planes, (2, n, 3).
+
+    Their origins are the panels' centres.
+    """
+    first = panels.corners[:, 1] - panels.corners[:, 0]
+    first = first / np.linalg.norm(first, axis=1)[:, None]
+    axes = np.stack([first, np.cross(panels.normals, first)])
+    return np.einsum("nqi,ani->aqn", panels.corners - panels.centers[:, None], axes), axes
 
 
 def _sides(corners: Array) -> Array:
-    """Mean lengths of the two pairs of opposite sides (0, 1) and (1, 2), (n, 4, 3) -> (n, 2)."""
-    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    return 0.5 * (length[:, :2] + length[:, 2:])
+    """Mean lengths of the two pairs of opposite sides [m], (2, 4, n) -> (2, n)."""
+    length = np.hypot(*(np.roll(corners, -1, axis=1) - corners))
+    return np.asarray(0.5 * (length[:2] + length[2:]))
 
 
 def halved(corners: Array, finest: float) -> tuple[Array, Ints, Ints]:
     """Halve polygons across their longer sides, breadth first.
 
     Args:
-        corners: Of n panels [m], shape (n, 4, 3).
+        corners: Of n panels in planes of their own [m], shape (2, 4, n).
         finest: Those with a longer side are halved [m].
 
     Returns:
-        Corners of the panels and all their parts, shape (k, 4, 3); the parts of each, -1 where it
+        Corners of the panels and all their parts, shape (2, 4, k); the parts of each, -1 where it
         has none, shape (k, 2); and the panel that it lies in, shape (k,).
     """
-    levels, kids, panel, count = [corners], [], [np.arange(len(corners))], len(corners)
+    levels, kids, panel, count = [corners], [], [np.arange(corners.shape[2])], corners.shape[2]
     for level in range(_MOST + 1):
-        last = levels[-1]
-        sides = _sides(last)
-        long = np.flatnonzero((sides.max(axis=1) > finest) & (level < _MOST))
-        parts = np.full((len(last), 2), -1)
+        sides = _sides(levels[-1])
+        long = np.flatnonzero((sides.max(axis=0) > finest) & (level < _MOST))
+        parts = np.full((sides.shape[1], 2), -1)
         parts[long] = count + np.arange(2 * len(long)).reshape(-1, 2)
         kids.append(parts)
         if not len(long):
             break
         count += 2 * len(long)
+        whole = levels[-1][:, :, long]
         # brought to where sides (0, 1) and (2, 3) are the longer ones
-        turn = (np.arange(4) + (sides[long, 1] > sides[long, 0])[:, None]) % 4
-        a, b, c, d = np.take_along_axis(last[long], turn[:, :, None], axis=1).transpose(1, 0, 2)
+        whole = np.where(sides[1, long] > sides[0, long], np.roll(whole, -1, axis=1), whole)
+        a, b, c, d = whole.transpose(1, 0, 2)
         near, far = 0.5 * (a + b), 0.5 * (c + d)
-        both = np.stack([np.stack([a, near, far, d], 1), np.stack([near, b, c, far], 1)], axis=1)
-        levels.append(both.reshape(-1, 4, 3))
+        both = np.stack([np.stack([a, near, far, d], 1), np.stack([near, b, c, far], 1)], axis=3)
+        levels.append(both.reshape(2, 4, -1))
         panel.append(np.repeat(panel[-1][long], 2))
-    return np.concatenate(levels), np.concatenate(kids), np.concatenate(panel)
+    return np.concatenate(levels, axis=2), np.concatenate(kids), np.concatenate(panel)
 
 
-def _four_points(panels: SurfacePanels) -> tuple[Array, Array]:
-    """As ``rigid.four_points_of`` of flat panels: points (n, 4, 3) and extents (n,) [m]."""
-    first = panels.corners[:, 1] - panels.corners[:, 0]
-    first = first / np.linalg.norm(first, axis=1)[:, None]
-    second = np.cross(panels.normals, first)
-    across = (panels.moments @ second[:, :, None])[:, :, 0]
-    xx = np.einsum("ni,nij,nj->n", first, panels.moments, first)
-    yy, xy = (second * across).sum(axis=1), (first * across).sum(axis=1)
-    spread = np.hypot(0.5 * (xx - yy), xy)
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)[:, None]
-    long = np.sqrt(0.5 * (xx + yy) + spread)
-    short = np.sqrt(np.maximum(0.5 * (xx + yy) - spread, 0.0))
-    u = long[:, None] * (np.cos(angle) * first + np.sin(angle) * second)
-    v = short[:, None] * (np.cos(angle) * second - np.sin(angle) * first)
-    arms = np.stack([u + v, u - v, v - u, -u - v], axis=1)
-    return panels.centers[:, None] + arms, math.sqrt(12.0) * long
+def _moments(corners: Array) -> tuple[Array, Array, Array]:
+    """Areas (n,), centroids (2, n) and second central moments xx, yy, xy (3, n) of polygons."""
+    origin = corners[:, 0]
+    u, v, w = (corners[:, k] - origin for k in (1, 2, 3))
+    double = np.stack([u[0] * v[1] - u[1] * v[0], v[0] * w[1] - v[1] * w[0]])
+    area = double.sum(axis=0)
+    center, moments = np.zeros_like(origin), np.zeros((3, len(area)))
+    for part, (a, b) in zip(double / area, ((u, v), (v, w)), strict=True):
+        # of a triangle with one corner at the origin
+        center += part * (a + b) / 3
+        for x in (a, b, a + b):
+            moments += part / 12 * np.stack([x[0] * x[0], x[1] * x[1], x[0] * x[1]])
+    moments -= np.stack([center[0] ** 2, center[1] ** 2, center[0] * center[1]])
+    return 0.5 * np.abs(area), origin + center, moments
 
 
 def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
     """What a record points to of a shape's clusters and, behind them, of its panels' parts."""
-    tree, m = shape.tree, len(shape.panels)
-    corners, kids, panel = halved(shape.panels.corners, shape.finest)
-    parts = polygon_panels(corners[m:])
-    points, extent = _four_points(parts)
-    place = np.arange(len(corners)) + m - 1  # clusters of panels and parts
+    panels, tree, m = shape.panels, shape.tree, len(shape.panels)
+    flat, axes = _flat(panels)
+    corners, kids, panel = halved(flat, shape.finest)
+    area, center, (xx, yy, xy) = _moments(corners[:, :, m:])
+    axes, middle = axes[:, panel[m:]], panels.centers[panel[m:]]
+    # the four points of each, as ``rigid.four_points_of`` finds them
+    turn, spread = 0.5 * np.arctan2(2 * xy, xx - yy), np.hypot(0.5 * (xx - yy), xy)
+    long = np.sqrt(0.5 * (xx + yy) + spread)
+    short = np.sqrt(np.maximum(0.5 * (xx + yy) - spread, 0.0))
+    cos, sin = np.cos(turn), np.sin(turn)
+    first, second = _lines(axes, long * cos, long * sin), _lines(axes, -short * sin, short * cos)
+    centers = middle + _lines(axes, *center)
+    points = np.empty((len(area), 4, 3))
+    for q, (p, r) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        points[:, q] = centers + p * first + r * second
+    place = np.arange(len(panel)) + m - 1  # clusters of panels and parts
     place[tree.panel[tree.panel >= 0]] = np.flatnonzero(tree.panel >= 0)
     cut = np.flatnonzero(kids[:, 0] >= 0)
-    all_kids = np.concatenate([tree.kids, np.full((len(parts), 2), -1)])
+    all_kids = np.concatenate([tree.kids, np.full((len(area), 2), -1)])
     all_kids[place[cut]] = place[kids[cut]]
-    function = np.concatenate([tree.function, np.full(len(parts), -1)])
+    function = np.concatenate([tree.function, np.full(len(area), -1)])
     function[place[cut]] = m + np.arange(len(cut))
-    density = tree.charge[place[:m]] / shape.panels.areas
+    density = tree.charge[place[:m]] / panels.areas
+    extent = math.sqrt(12.0) * long
     size = np.concatenate([tree.extent, extent])
-    own = np.concatenate([shape.own, OWN / size[place[cut]]])
     return {
-        "kids": all_kids, "function": function, "own": own,
-        "charge": np.concatenate([tree.charge, density[panel[m:]] * parts.areas]),
-        "center": np.concatenate([tree.center, parts.centers]),
-        "points": np.concatenate([tree.points, points]), "extent": size,
+        "kids": all_kids, "function": function, "extent": size,
+        "own": np.concatenate([shape.own, OWN / size[place[cut]]]),
+        "charge": np.concatenate([tree.charge, density[panel[m:]] * area]),
+        "center": np.concatenate([tree.center, centers]),
+        "points": np.concatenate([tree.points, points]),
         "soft": np.concatenate([tree.soft, SOFT * extent]),
     }  # fmt: skip
+
+
+def _lines(axes: Array, x: Array, y: Array) -> Array:
+    """From coordinates in planes of axes (2, n, 3) to vectors, (n, 3)."""
+    return np.asarray(x[:, None] * axes[0] + y[:, None] * axes[1])

@@ -104,8 +104,8 @@ _DIGITS = 9
 _LEAST = 1e-9
 """The least of their lengths, over the largest."""
 _EDGED, _MORE = 600, 1.15
-"""Shapes with edges have twice as many panels as round ones, but no more than the first, or the
-second times as many."""
+"""Shapes with edges have twice as many panels as round ones; those with parts of panels no more
+than the first, or the second times as many."""
 _TRIANGLES = 1.6
 """So many triangles of a mesh resolve what one panel of a primitive does, mostly rectangles."""
 _EACH = 0.2
@@ -145,12 +145,13 @@ def functions_of(
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
         return in_pieces(shape, pieces)
+    if not conducting:
+        finest = None
     if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER):
-        count = min(2 * count, max(_EDGED, round(_MORE * count)))
+        edged = 2 * count if finest is None else max(_EDGED, round(_MORE * count))
+        count = min(2 * count, edged)
     found, size = rigid(shape, count, conducting=conducting)
-    if finest is None or not conducting:
-        return found, size
-    return _in_parts(found, finest / size), size
+    return (found if finest is None else _in_parts(found, finest / size)), size
 
 
 def _in_parts(shape: RigidShape, finest: float) -> RigidShape:
