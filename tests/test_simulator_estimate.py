@@ -68,7 +68,7 @@ def test_it_tells_of_panels_that_are_too_coarse(pair: Pair) -> None:
     few, many = (
         SurfaceSolver(
             sim.background.green, sim.design,
-            preset=Preset(panels=n, threshold=t, coarsest=None),
+            preset=Preset(panels=n, threshold=t, coarsest=None, finest=None),
         )
         for n, t in ((100, 1e-6), (1400, 1e-4))
     )  # fmt: skip

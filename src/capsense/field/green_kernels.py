@@ -109,7 +109,10 @@ def pack_green(green: GreenFunction, design: Design) -> Green:
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
 
-    def level(positions: NDArray, phi: NDArray, modes: NDArray, least: float) -> Level:
+    def level(name: str, least: float) -> Level:
+        positions, phi, modes = (
+            getattr(green, f"{name}_{part}") for part in ("sources", "phi", "modes")
+        )
         sources = np.full((3, _padded(len(positions))), _AWAY, np.float32)
         sources[:, : len(positions)] = positions.T
         table = np.zeros((_padded(len(phi)), _padded(lead + modes.shape[1])), np.float32)
@@ -117,10 +120,7 @@ def pack_green(green: GreenFunction, design: Design) -> Green:
         table[: len(phi), lead : lead + modes.shape[1]] = modes
         return Level(sources, table, least)
 
-    near, middle, far = (
-        level(*(getattr(green, f"{name}_{part}") for part in ("sources", "phi", "modes")), least)
-        for name, least in zip(LEVELS, LEAST, strict=True)
-    )
+    near, middle, far = map(level, LEVELS, LEAST)
     return Green(
         (near, middle, far), np.ascontiguousarray(far.table[:, :lead]), lead, terminals,
         len(design.electrodes), float(green.floor), np.asarray(green.box, float),

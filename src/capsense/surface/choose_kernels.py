@@ -113,9 +113,7 @@ def choose(bodies, first, seen, found, threshold, width):
             for c in range(2):
                 part, below = o + kids[2 * k + c], kids[2 * kids[2 * k + c]]
                 above[part] = fades[o + k]
-                inherits = part - o < stored and (
-                    part - o >= seen[b] or scores[part] == INHERITED
-                )
+                inherits = part - o < stored and (part - o >= seen[b] or scores[part] == INHERITED)
                 if part - o < stored <= below:
                     share = 0.0 if inherits else _faded(entry[part], threshold, width)
                     above[part] = min(above[part], share)

@@ -102,7 +102,12 @@ def score(bodies, first, green, threshold, weight, scores, entry):
         for k in range(seen[b] - 1, -1, -1):
             x, y = kids[2 * k], kids[2 * k + 1]
             if looks.met[k] and 0 <= x < seen[b] and looks.met[x]:
-                stiffness = looks.told[k] * (1.0 - looks.linear[k]) / _energy(body, looks, k) * looks.stiff[k]
+                stiffness = (
+                    looks.told[k]
+                    * (1.0 - looks.linear[k])
+                    / _energy(body, looks, k)
+                    * looks.stiff[k]
+                )
                 for i in range(terminals):
                     d = float(means[x, i] - means[y, i])
                     energy[i] += d * d * stiffness
