@@ -151,16 +151,12 @@ def functions_of(
         edged = 2 * count if finest is None else max(_EDGED, round(_MORE * count))
         count = min(2 * count, edged)
     found, size = rigid(shape, count, conducting=conducting)
-    return (found if finest is None else _in_parts(found, finest / size)), size
-
-
-def _in_parts(shape: RigidShape, finest: float) -> RigidShape:
-    """A shape with parts no longer than ``finest``, or 0.7 times that, made once."""
-    power = math.floor(2.0 * math.log2(finest))
-    known: dict[int, RigidShape] = shape.__dict__.setdefault("_refined", {})
-    if power not in known:
-        known[power] = refined(shape, 2.0 ** (power / 2.0))
-    return known[power]
+    if finest is None:
+        return found, size
+    power = math.floor(2.0 * math.log2(finest / size))  # to 0.7 times that: sizes can share parts
+    return _kept(
+        shape, count, f"_parts {power}", lambda *_: refined(found, 2.0 ** (power / 2.0))
+    )  # fmt: skip
 
 
 def rigid(shape: Shape, count: int, *, conducting: bool = False) -> tuple[RigidShape, float]:

@@ -276,7 +276,7 @@ def as_transforms(poses: Any, room: Any) -> Any:
 
 def _response(solver: SurfaceSolver, device: Any) -> Any:
     out, green = warp_cut.Response(), solver.green
-    near, _, far = green.levels  # threads of a block take turns: a third level saves no time there
+    near, _, far = green.levels  # the middle level is not used here
     sources = np.concatenate([far.sources.T, near.sources.T]).astype(np.float32)
     (count, width), size = far.table.shape, warp_cut.SOURCES
     table = np.zeros((size * -(-len(sources) // size), near.table.shape[1]), np.float32)

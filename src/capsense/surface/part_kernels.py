@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import compiled
-from capsense.elements.mean_kernels import add_means, cluster_moments, extent_of, rectangles
+from capsense.elements.mean_kernels import add_means, cluster_moments, rectangles
 
 
 @compiled
@@ -41,13 +41,8 @@ def _add_of_body(body, cut, leaves, span, out):
     factor = np.float32(1.0 + body.inside * body.softness)
     group, weight, groups = _panels(body, cut, (first, stop))
     n = stop - start
-    points, extent, wanted = np.empty((n, 4, 3)), np.empty(n), np.ones(n)
-    for j in range(n):
-        for q in range(4):
-            for i in range(3):
-                points[j, q, i] = leaves.true[start + j, q, i]
-        extent[j] = extent_of(points[j])
-    known, means = np.full((n, 2), -1), np.zeros((n, n), np.float32)
+    points, extent = leaves.true[start:stop], leaves.extent[start:stop]
+    known, wanted, means = np.full((n, 2), -1), np.ones(n), np.zeros((n, n), np.float32)
     tables = cluster_moments(points, extent), rectangles(points, wanted), known
     add_means(points, extent, (0, first - start, n, 1.0), wanted, tables, means)
     parts, off = stop - first, first - start
