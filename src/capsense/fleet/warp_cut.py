@@ -14,8 +14,8 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import DEEP, GAP, SHORE, STEEP
+from capsense.surface.look_kernels import LONG
 from capsense.surface.pair_kernels import BARRIER, LIFTED
-from capsense.surface.score_kernels import _LONG as LONG
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

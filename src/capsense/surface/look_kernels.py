@@ -24,7 +24,7 @@ _LINEAR = 0.45, 0.58
 those larger than the second do not; in between they come to do."""
 _COARSE = 31
 """So many clusters, the coarsest of a body, are looked into wherever they are."""
-_LONG = 0.03, 0.06
+LONG = 0.03, 0.06
 """Clusters that cross a wall come to be looked into where they are longer than this [m]."""
 _SCREENED, _TOUCHING = 2.0 * math.pi, 0.8e-3
 """A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
@@ -109,7 +109,7 @@ def look(body, green, looks):
         square, room, out = place(body, green, k, points, found, looks)
         size, share = body.scale * extent[k], 1.0 - smooth(out / SHORE)
         looks.crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
-            (size - _LONG[0]) / (_LONG[1] - _LONG[0])
+            (size - LONG[0]) / (LONG[1] - LONG[0])
         )
         looks.linear[k] = 0.0
         if k >= _COARSE:
