@@ -208,7 +208,7 @@ CONTACT = {
 @pytest.mark.parametrize("design", ["six_patch_bare", "six_patch"])
 def test_contact_is_finite_and_monotone(simulators, design, name):
     """Measured: from 3 mm to 0.5 mm into the face, large entries grow by small steps; those of
-    boxes within the face fall by 1 % a step at most."""
+    boxes within the face fall by 1 % a step at most, those of a bar there by 3 % once."""
     shape, half, (x, y), turn = CONTACT[name]
     gaps = np.concatenate([np.arange(3e-3, 1.2e-3, -1e-4), np.arange(1.2e-3, -5.1e-4, -2.5e-5)])
     read = np.array([
@@ -220,7 +220,7 @@ def test_contact_is_finite_and_monotone(simulators, design, name):
     read = read[:, read[-1] > 0.1 * read[-1].max()]
     change = np.diff(np.log(read), axis=0)
     assert change[gaps[1:] > 0.0].min() > -1e-4
-    assert change.min() > (-0.015 if name in ("bar", "box") else -3e-3)
+    assert change.min() > {"bar": -0.03, "box": -0.015}.get(name, -3e-3)
     assert change.max() < 0.1
     assert read[-1].max() < 55e-12
 

@@ -307,7 +307,7 @@ def reduced(
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
-LONG, SHORE, TOUCHING = (0.03, 0.06), 5e-3, 8e-4
+LONG, SHORE, TOUCHING, BEHIND = (0.03, 0.06), 5e-3, 8e-4, 4e-3
 
 
 def scores(
@@ -419,7 +419,8 @@ def _means(
         even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
         even = 1 - within * (1 - _smooth(even))
         off = math.hypot(green.distance(point[None])[0], TOUCHING)
-        stiff = 1 - math.exp(-2 * math.pi * off / size)
+        front = _smooth(1 + (point[2] - green.box[1, 2]) / BEHIND)
+        stiff = 1 - front * math.exp(-2 * math.pi * off / size)
         looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, stiff, size)
         if kids[k, 0] >= 0 and looks[k].linear < 1:
             wanted += kids[k].tolist()

@@ -29,6 +29,9 @@ LONG = 0.03, 0.06
 _SCREENED, _TOUCHING = 2.0 * math.pi, 0.8e-3
 """A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
 of size l has, 1 - exp(-2π d / l) of their energy; the second counts as the other leg of d [m]."""
+_BEHIND = 4e-3
+"""So far behind its face [m] a flat design leaves functions all of their energy: many of them among
+its sources would leave no definite matrix."""
 
 
 class Looks(NamedTuple):
@@ -78,6 +81,9 @@ def place(body, green, k, points, found, looks):
         room = min(room, x - green.room[0, i], green.room[1, i] - x)
         out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
     looks.stiff[k] = 1.0 - math.exp(-_SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING) / size)
+    if green.cover < 1.0:  # behind the face of a flat design clusters meet no plane
+        front = smooth(1.0 + (points[found, 2] - green.box[1, 2]) / _BEHIND)
+        looks.stiff[k] = 1.0 - front * (1.0 - looks.stiff[k])
     if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
         lift(points[found : found + 1], least_gap(size, green.cover), green.box)
     return square, room, math.sqrt(out)
