@@ -237,3 +237,13 @@ def test_parts_come_smoothly() -> None:
     large = read[-1] > 0.03 * read[-1].max()
     assert change[:, large].min() > 0.0
     assert np.abs(np.diff(change[:, large], axis=0)).max() < 0.01
+
+
+@pytest.mark.skipif(ON, reason="takes long")
+def test_parts_that_hardly_come_in() -> None:
+    """Regression: where parts stood for less of their panel than rounding leaves, nothing did."""
+    sim = cs.Simulator("six_patch_bare", preset="fine")
+    box = cs.Body(cs.Box((0.04, 0.04, 0.02)), cs.Pose((0.004, 0.003, 0.01 + 2e-5)), "steel")
+    with pytest.warns(UserWarning, match="touch"):
+        delta = sim.step(cs.Scene([box])).delta
+    assert_physical(sim.baseline + delta)

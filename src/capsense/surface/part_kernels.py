@@ -91,7 +91,10 @@ def _panels(body, cut, span):
                     number[a - begin] = count
                     count += 1
                 number[x - begin] = number[a - begin]
-                share[x - begin] = share[a - begin] * cut.parts[a, c]
+                part = cut.parts[a, c]
+                if part == 0.0 and cut.node[a] < body.stored:  # they hardly stand for it yet
+                    part = cut.share[a] if c == 0 else 1.0 - cut.share[a]
+                share[x - begin] = share[a - begin] * part
     whole = np.zeros(count)
     for j in range(first, stop):
         a = cut.leaves[j]
