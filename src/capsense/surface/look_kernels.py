@@ -48,7 +48,7 @@ class Looks(NamedTuple):
     crossing: NDArray[Any]
     """How much it crosses a wall."""
     stiff: NDArray[Any]
-    """Energy of its charge function in front of a grounded design, over that in free space."""
+    """Energy of its charge function in front of a flat design, over that in free space."""
 
 
 @compiled
@@ -80,10 +80,11 @@ def place(body, green, k, points, found, looks):
         square += off * off
         room = min(room, x - green.room[0, i], green.room[1, i] - x)
         out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
-    looks.stiff[k] = 1.0 - math.exp(-_SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING) / size)
-    if green.cover < 1.0:  # behind the face of a flat design clusters meet no plane
+    looks.stiff[k] = 1.0
+    if green.cover < 1.0:  # a plane, and in front of it; the box of other designs is no surface
         front = smooth(1.0 + (points[found, 2] - green.box[1, 2]) / _BEHIND)
-        looks.stiff[k] = 1.0 - front * (1.0 - looks.stiff[k])
+        off = math.sqrt(square + _TOUCHING * _TOUCHING)
+        looks.stiff[k] -= front * math.exp(-_SCREENED * off / size)
     if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
         lift(points[found : found + 1], least_gap(size, green.cover), green.box)
     return square, room, math.sqrt(out)
