@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from capsense._jit import compiled
+from capsense._jit import kernel
 from capsense._simd import at, horizontal_sum, madd, muladd, put_span, span, splat, vmadd
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""
 
 
-@compiled
+@kernel
 def multiply(left, table, out):
     """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 32."""
     multiply_part(left, table, left.shape[1], table.shape[1], out)
 
 
-@compiled
+@kernel
 def multiply_part(left, table, depth, width, out):
     """The same, of the first ``depth`` rows of the table and the first ``width`` columns only.
 
@@ -63,7 +63,7 @@ def multiply_part(left, table, depth, width, out):
             _put(out, i * w + j, a0, a1, a2, a3)
 
 
-@compiled
+@kernel
 def _put(out, place, a, b, c, d):
     put_span(out, place, a)
     put_span(out, place + 8, b)
@@ -71,7 +71,7 @@ def _put(out, place, a, b, c, d):
     put_span(out, place + 24, d)
 
 
-@compiled
+@kernel
 def multiply_simd(left, table, out):
     """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 8, k of 4."""
     k, s, w = left.shape[0], left.shape[1], table.shape[1]
@@ -91,7 +91,7 @@ def multiply_simd(left, table, out):
             put_span(out, o + 3 * w, d)
 
 
-@compiled
+@kernel
 def cholesky(matrix):
     """Replace the lower half of a symmetric matrix (n, n) by its Cholesky factor.
 
@@ -144,7 +144,7 @@ def cholesky(matrix):
     return True
 
 
-@compiled
+@kernel
 def substitute(factor, sides):
     """Replace right-hand sides (n, m) by the solution; ``factor`` is from :func:`cholesky`.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense.adapters.meshes import Terrain
 from capsense.adapters.rules import Tie
 from capsense.design.model import Domain
@@ -256,7 +256,7 @@ def _diverged(what: str) -> SceneError:
     )
 
 
-@compiled
+@kernel
 def _multiply(a: Array, b: Array, out: Array) -> None:
     """Quaternion product a b, (x, y, z, w)."""
     x1, y1, z1, w1 = a[0], a[1], a[2], a[3]
@@ -267,7 +267,7 @@ def _multiply(a: Array, b: Array, out: Array) -> None:
     out[3] = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
 
 
-@compiled
+@kernel
 def _rotate(q: Array, v: Array, out: Array) -> None:
     """Turn v by the unit quaternion q: v + 2 u × (u × v + w v), with q = (u, w)."""
     x, y, z, w = q[0], q[1], q[2], q[3]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from capsense._dense import WIDTH
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import (
     SIMD_WIDTH,
     at,
@@ -37,7 +37,7 @@ _UPON = 0.1
 """Rectangles nearer to each other than so many of their shorter side lie upon each other."""
 
 
-@compiled
+@kernel
 def four_points(a, center, v, out):
     """Four points of equal weight with a centre and the two largest of its second moments.
 
@@ -155,7 +155,7 @@ def means_between(points):
     return out
 
 
-@compiled
+@kernel
 def mirror(matrix):
     """Fill in what is above the diagonal of a symmetric matrix."""
     for i in range(matrix.shape[0]):
@@ -179,13 +179,13 @@ def cluster_moments(points, extent):
     return out
 
 
-@compiled
+@kernel
 def room_for(clusters):
     """Columns of a table of so many clusters."""
     return WIDTH * ((clusters + WIDTH - 1) // WIDTH)
 
 
-@compiled
+@kernel
 def far_means(shapes, i, others, count, out):
     """Means of 1/r between cluster i and the first others, by second moments; -1 for near ones."""
     width, zero, near = shapes.shape[1], splat(np.float32(0.0)), splat(np.float32(-1.0))
@@ -220,7 +220,7 @@ def far_means(shapes, i, others, count, out):
         put_span(out, j, where_above(square, vmul(far, far), value, near))
 
 
-@compiled
+@kernel
 def arm(first, second):
     """Half the distance [m] between two of the four points."""
     total = 0.0
@@ -229,7 +229,7 @@ def arm(first, second):
     return 0.5 * math.sqrt(total)
 
 
-@compiled
+@kernel
 def extent_of(points):
     """Length [m] of a uniform rod with the largest second moment of four points, shape (4, 3)."""
     return math.sqrt(12.0) * max(arm(points[0], points[1]), arm(points[0], points[2]))
@@ -259,7 +259,7 @@ def rectangles(points, wanted):
     return out
 
 
-@compiled
+@kernel
 def _add_rectangles(table, extent, near, count, weight, room, out):
     """Add the weighted means of 1/r between pairs of rectangles of one surface.
 
@@ -294,7 +294,7 @@ def _add_rectangles(table, extent, near, count, weight, room, out):
         out[i, j] += weight[i] * _upon(table, i, j, 0.25 * at(room, k))
 
 
-@compiled
+@kernel
 def _upon(table, i, j, value):
     """Bound a mean of 1/r between rectangles that all but coincide, as the two faces of a foil.
 
@@ -317,7 +317,7 @@ def _upon(table, i, j, value):
     return value + smooth(1.0 - gap / (_UPON * short)) * min(0.0, bound - value)
 
 
-@compiled
+@kernel
 def _self_mean(first, second):
     """Mean of 1/r [1/m] within a rectangle of two given standard deviations [m]."""
     a, b = math.sqrt(12.0) * first + 1e-9, math.sqrt(12.0) * second + 1e-9

@@ -197,7 +197,7 @@ def fill_flux(panels, out):
         out[k, k] = 0.0
 
 
-@compiled
+@kernel
 def rectangle_potential(frames, o, points, p):
     """Potentials of unit charge spread evenly over eight rectangles, at a point each [1/m].
 
@@ -244,13 +244,13 @@ def rectangle_potential(frames, o, points, p):
     return vdiv(vsub(out, vmul(z, angle)), vmul(splat(np.float32(4.0)), vmul(a, b)))
 
 
-@compiled
+@kernel
 def _root(square):
     """Square root of numbers above zero."""
     return vmul(square, rsqrt(square))
 
 
-@compiled
+@kernel
 def _side(end, start, far, near, square):
     """``log((end + far) / (start + near))``, far² = end² + square and near² = start² + square.
 
@@ -264,14 +264,14 @@ def _side(end, start, far, near, square):
     return vlog(vdiv(over, under))
 
 
-@compiled
+@kernel
 def _between(p, q, r, s):
     """``atan(p / q) - atan(r / s)``, q and s above zero."""
     zero = splat(np.float32(0.0))
     return angle_of(vmadd(q, s, vmul(p, r)), vmadd(p, s, vsub(zero, vmul(r, q))))
 
 
-@compiled
+@kernel
 def angle_of(x, y):
     """Angle of the points (x, y), from -π to π, to 3e-7; 0 at the origin."""
     zero, tiny = splat(np.float32(0.0)), splat(np.float32(1e-37))

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from capsense._dense import cholesky
 from capsense._frozen import Frozen
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
@@ -256,13 +256,13 @@ def _made_definite(free: Array) -> Array:
     return charge
 
 
-@compiled
+@kernel
 def _factored(matrix: Array) -> bool:
     """Cholesky on one core: several threads of LAPACK hinder each other on busy machines."""
     return cholesky(matrix)
 
 
-@compiled
+@kernel
 def _substitute(factor: Array, x: Array) -> None:
     """Solve ``factor @ factor.T @ x_new = x`` in place; compiled for the same reason as above."""
     n = x.shape[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 
 _COLUMNS = 64
 """Columns of a matrix that are taken at a time."""
@@ -88,7 +88,7 @@ def _sort(values, members):
             root = child
 
 
-@compiled
+@kernel
 def _cut(values, members, charges, of_normals, last):
     """How many of the sorted members the first part gets; of equal cuts, the first or the last."""
     n = values.shape[0]
@@ -118,7 +118,7 @@ def _cut(values, members, charges, of_normals, last):
     return cut
 
 
-@compiled
+@kernel
 def moments(kids, panel, charge, center, spread):
     """Charge, centre of charge and second central moments of all clusters, from their parts.
 
@@ -204,7 +204,7 @@ def energies_of_functions(rows, kids, panel, charge, function, out):
                     out[i, j] = out[j, i]
 
 
-@compiled
+@kernel
 def prune(kids, panel, wanted, new_kids, new_panel, function, room):
     """Leave out panels: clusters without any go, those with one part left become that part.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._dense import WIDTH
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import (
     SIMD_WIDTH,
     at,
@@ -132,7 +132,7 @@ def _padded(count: int) -> int:
     return WIDTH * -(-count // WIDTH)
 
 
-@compiled
+@kernel
 def source_potentials(points, sources, floor, least, out):
     """Mean over four points of the potential of every unit source and its image in the floor.
 
@@ -158,7 +158,7 @@ def source_potentials(points, sources, floor, least, out):
             put_span(out, i * width + s, madd(quarter, value, zero))
 
 
-@compiled
+@kernel
 def point_potentials(points, sources, table, limits, out):
     """Potentials of sources and their images at points, for every column of their charges.
 
@@ -198,7 +198,7 @@ def point_potentials(points, sources, table, limits, out):
             put_span(out, o + 7 * count, a7)
 
 
-@compiled
+@kernel
 def _potential(x, y, z, sx, sy, up, down, bound):
     """Potential at (x, y, z) of a unit charge at height ``up`` and of its image at ``down``.
 
@@ -211,14 +211,14 @@ def _potential(x, y, z, sx, sy, up, down, bound):
     return vsub(direct, rsqrt(vmadd(ez, ez, across)))
 
 
-@compiled
+@kernel
 def smooth(x):
     """Smoothstep: 0 up to 0, 1 from 1 on."""
     x = min(1.0, max(0.0, x))
     return x * x * (3.0 - 2.0 * x)
 
 
-@compiled
+@kernel
 def beyond(points, green):
     """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face."""
     out, depth = 0.0, 1.0
@@ -234,13 +234,13 @@ def beyond(points, green):
     return smooth(max(math.sqrt(out), deep) / SHORE)
 
 
-@compiled
+@kernel
 def least_gap(extent, cover):
     """Least gap [m] between a cluster and a flat design, see :data:`GAP`."""
     return max(GAP[3], min(GAP[1], max(GAP[0], extent * extent / GAP[2])) - cover)
 
 
-@compiled
+@kernel
 def lift(points, gap, box):
     """Keep points (k, 3) off a flat design: a distance d < 2 gap becomes gap + d² / (4 gap).
 
@@ -284,7 +284,7 @@ def distances(points, green):
     return out
 
 
-@compiled
+@kernel
 def level_share(distance, level, blends):
     """Share of a level at a distance from the design; over the levels they add to one."""
     up_to, before, last = 1.0, 0.0, blends.shape[0]

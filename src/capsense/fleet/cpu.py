@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled, first_use
+from capsense._jit import compiled, first_use, kernel
 from capsense._thread_pool import in_parts
 from capsense.elements.matter import SHUT, UNIT
 from capsense.elements.rigid import BODY
@@ -117,7 +117,7 @@ def _seen(
     return count
 
 
-@compiled
+@kernel
 def _connect(bodies: Bodies, e: int, records: Any, place: Any, c: int) -> None:
     """Make a body one conductor with those that it is joined with, as ``Matter.write`` does.
 
@@ -144,7 +144,7 @@ def _connect(bodies: Bodies, e: int, records: Any, place: Any, c: int) -> None:
         records[c].tie = 0.0 if grounded else 1.0 / ground if ground > 0.0 else SHUT
 
 
-@compiled
+@kernel
 def _matrix(pose: Array, out: Array) -> None:
     """Rotation matrix of a pose."""
     x, y, z, w = pose[3], pose[4], pose[5], pose[6]
@@ -155,7 +155,7 @@ def _matrix(pose: Array, out: Array) -> None:
     out[1, 2], out[2, 1] = 2.0 * (y * z - x * w), 2.0 * (y * z + x * w)
 
 
-@compiled
+@kernel
 def _position(poses: Poses, e: int, b: int, s: int, turn: Array, body: Any) -> None:
     """Set the position of a record to that of a body in a sensor's frame."""
     for i in range(3):
@@ -165,7 +165,7 @@ def _position(poses: Poses, e: int, b: int, s: int, turn: Array, body: Any) -> N
         body.position[i] = at
 
 
-@compiled
+@kernel
 def _placed(
     bodies: Bodies, e: int, b: int, poses: Poses, s: int, turns: tuple[Array, Array], room: Array,
     record: Any,

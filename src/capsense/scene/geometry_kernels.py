@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def _sort(centers: Array, levels: int, order: NDArray[np.int64]) -> None:
             part[:] = part[np.argsort(centers[part, wide])]
 
 
-@compiled
+@kernel
 def _enclose(boxes: Boxes) -> None:
     """Fill in the corners of the boxes."""
     count, levels = len(boxes.triangles), boxes.levels
@@ -78,7 +78,7 @@ def _enclose(boxes: Boxes) -> None:
                     high[axis] = max(high[axis], boxes.triangles[m, corner, axis])
 
 
-@compiled
+@kernel
 def segment_distance2(px: float, py: float, pz: float, ex: float, ey: float, ez: float) -> float:
     """Squared distance from p to the segment from the origin to e."""
     length2 = ex * ex + ey * ey + ez * ez
@@ -89,7 +89,7 @@ def segment_distance2(px: float, py: float, pz: float, ex: float, ey: float, ez:
     return qx * qx + qy * qy + qz * qz
 
 
-@compiled
+@kernel
 def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
     """Squared distance from a point to a triangle, shape (3, 3); slivers are fine."""
     px, py, pz = x - tri[0, 0], y - tri[0, 1], z - tri[0, 2]
@@ -129,7 +129,7 @@ def signed_distances(boxes: Boxes, points: Array, out: Array) -> None:
         out[n] = -distance if _winding(boxes, x, y, z, stack) != 0 else distance
 
 
-@compiled
+@kernel
 def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
     """Squared distance to a box, zero inside."""
     dx = max(0.0, max(box[0, 0] - x, x - box[1, 0]))
@@ -138,7 +138,7 @@ def _box_distance2(box: Array, x: float, y: float, z: float) -> float:
     return dx * dx + dy * dy + dz * dz
 
 
-@compiled
+@kernel
 def _distance2(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64],
                least: Array, best: float) -> float:  # fmt: skip
     """Squared distance to the nearest triangle, known to be at most ``best``.
@@ -170,7 +170,7 @@ def _distance2(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int
     return best
 
 
-@compiled
+@kernel
 def _winding(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64]) -> int:
     """How often the surface winds around a point, from its crossings of a ray along z."""
     count, levels = len(boxes.triangles), boxes.levels
@@ -196,7 +196,7 @@ def _winding(boxes: Boxes, x: float, y: float, z: float, stack: NDArray[np.int64
     return total
 
 
-@compiled
+@kernel
 def _around(tri: Array, x: float, y: float) -> int:
     """Whether a triangle, seen along z, lies around a point: 1, -1 from behind, else 0.
 
@@ -216,7 +216,7 @@ def _around(tri: Array, x: float, y: float) -> int:
     return out
 
 
-@compiled
+@kernel
 def _height(tri: Array, x: float, y: float) -> float:
     """Height of a triangle's plane at (x, y), within its own [m]."""
     ux, uy, uz = tri[1, 0] - tri[0, 0], tri[1, 1] - tri[0, 1], tri[1, 2] - tri[0, 2]

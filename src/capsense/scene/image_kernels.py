@@ -13,13 +13,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 
-@compiled
+@kernel
 def sort_slots(front: Array, back: Array, f: Array32, b: Array32, reach: Array) -> int:
     """Sort the intervals of every pixel, drop what is none, unite what overlaps.
 
@@ -71,7 +71,7 @@ MAX_GROUPS = 64
 """Different permittivities that one frame may hold."""
 
 
-@compiled
+@kernel
 def sort_pixels(depth: Array, eps_r: Array, near: float, far: float, conductor: float,
                 group: NDArray[np.int8], known: Array) -> int:  # fmt: skip
     """Number the materials of a frame in order of appearance.
@@ -120,7 +120,7 @@ def sort_pixels(depth: Array, eps_r: Array, near: float, far: float, conductor: 
     return n
 
 
-@compiled
+@kernel
 def pick(front: Array, back: Array, group: NDArray[np.int8], which: int, flip_rows: bool,
          flip_columns: bool, f: Array, b: Array) -> bool:  # fmt: skip
     """Copy the intervals of one material, the others as NaN, and turn the image upright.
@@ -149,7 +149,7 @@ LEAST_COSINE = 0.2
 """A sheet more inclined to the image than this cosine tells is not thickened any further."""
 
 
-@compiled
+@kernel
 def _order(
     x0: float, y0: float, x1: float, y1: float, x2: float, y2: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -163,14 +163,14 @@ def _order(
     return x0, y0, x1, y1, x2, y2
 
 
-@compiled
+@kernel
 def _edge_at(x0: float, y0: float, x1: float, y1: float, y: float) -> float:
     """Where an edge, lower end first, crosses the line at y; between its ends to the last bit."""
     x = x0 + (y - y0) * ((x1 - x0) / (y1 - y0))
     return min(max(x, min(x0, x1)), max(x0, x1))
 
 
-@compiled
+@kernel
 def _span(
     x0: float, y0: float, x1: float, y1: float, x2: float, y2: float, y: float
 ) -> tuple[float, float]:
@@ -186,7 +186,7 @@ def _whole(x: float, last: int) -> int:
     return int(math.ceil(min(max(x, 0.0), float(last))))
 
 
-@compiled
+@kernel
 def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Array32,
          count: Ints) -> int:  # fmt: skip
     """Meet every pixel's ray with every triangle.
@@ -237,7 +237,7 @@ def scan(p: Array, faces: Ints, dx: float, dy: float, thickness: float, met: Arr
     return most
 
 
-@compiled
+@kernel
 def pair(met: Array32, count: Ints, sheet: bool, front: Array, back: Array) -> None:
     """Turn the depths that rays met into intervals.
 

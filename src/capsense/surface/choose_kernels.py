@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
 from capsense.field.green_kernels import smooth
 from capsense.surface.score_kernels import DECAY, INHERITED, score
@@ -124,13 +124,13 @@ def choose(bodies, first, seen, found, threshold, width):
     return _collect(bodies, first, state, place, fades, above, met[:count], leaves)
 
 
-@compiled
+@kernel
 def _faded(score, threshold, width):
     """How far a function of some score is faded in, 0 to 1."""
     return smooth(math.log(max(score, 1e-300) / threshold) / math.log(width))
 
 
-@compiled
+@kernel
 def _whole(state, above):
     """How far a cluster is represented by itself: it gives way to its parts as it is entered."""
     return 1.0 if state == LEAF else 1.0 - smooth(above / _PARTED)
@@ -210,13 +210,13 @@ def functions_of(bodies, cut, beyond):
     )  # fmt: skip
 
 
-@compiled
+@kernel
 def is_there(cut, a):
     """Whether anything of a cluster is within reach."""
     return cut.whole[a] + cut.parts[a, 0] + cut.parts[a, 1] > 0.0
 
 
-@compiled
+@kernel
 def _function(body, node):
     return integers(body.function)[node]
 

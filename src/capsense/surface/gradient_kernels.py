@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._dense import multiply, multiply_simd
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense.elements.mean_kernels import cluster_moments
 from capsense.field.green_kernels import distances, level_share
 from capsense.surface.leaf_kernels import (
@@ -141,7 +141,7 @@ def _narrowed(table, columns):
     return out
 
 
-@compiled
+@kernel
 def _add(addend, out):
     for i in range(out.shape[0]):
         for k in range(out.shape[1]):
@@ -235,7 +235,7 @@ def _add_pairs(solution, bounds, floor, work):
         _add_contracted(sums, coefficients, work[b])
 
 
-@compiled
+@kernel
 def _weigh(shapes, i, others, n, sign, weight):
     """Give the clusters that cluster i meets by moments the weight ``sign``, others zero."""
     sign, none = np.float32(sign), np.float32(0.0)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._dense import multiply
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import (
     SIMD_WIDTH,
     at,
@@ -147,7 +147,7 @@ def _add_rows(points, chosen, share, level, floor, out):
             to[i] += part * line[i]
 
 
-@compiled
+@kernel
 def source_lines(points, sources, floor, least, out):
     """What every source does to the sum over four points (k, 4, 3), each of unit charge.
 
@@ -187,7 +187,7 @@ def source_lines(points, sources, floor, least, out):
             _put_six(out, o, layer, (value, fx, fy, fz, gx, gy))
 
 
-@compiled
+@kernel
 def _put_six(out, place, layer, six):
     a, b, c, d, e, f = six
     put_span(out, place, a)
@@ -198,7 +198,7 @@ def _put_six(out, place, layer, six):
     put_span(out, place + 5 * layer, f)
 
 
-@compiled
+@kernel
 def pair_line(shapes, i, others, weight, out, row):
     """Add force and torque on cluster i by others, by moments, to row ``row`` of ``out``."""
     width = others.shape[1]
@@ -248,14 +248,14 @@ def pair_line(shapes, i, others, weight, out, row):
         ))  # fmt: skip
 
 
-@compiled
+@kernel
 def _cross(x, y, u, v):
     """``x v - y u``."""
     zero = splat(np.float32(0.0))
     return vmadd(x, v, vsub(zero, vmul(y, u)))
 
 
-@compiled
+@kernel
 def near_pairs(points, others, soft, i, own, weight, near, line):
     """The same for clusters without weight, point by point, but those from own[0] to own[1].
 

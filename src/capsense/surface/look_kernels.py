@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import SIMD_WIDTH, doubles, integers
 from capsense.field.green_kernels import (
     NEAR_FACE,
@@ -60,7 +60,7 @@ def looks_of(looks, start, stop):
     )  # fmt: skip
 
 
-@compiled
+@kernel
 def place(body, green, k, points, found, looks):
     """Place the middle of cluster k in row ``found`` of ``points`` (n, 3).
 
@@ -158,7 +158,7 @@ def far_potentials(points, places, share, green, means):
             means[places[j], i] = share[j] * phi[i, j]
 
 
-@compiled
+@kernel
 def _make_up(body, seen, looks):
     """Mean potentials of clusters from those of their parts, where they do not see a linear one."""
     kids, charge, one = integers(body.kids), doubles(body.charge), np.float32(1.0)

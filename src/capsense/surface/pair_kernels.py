@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import (
     SIMD_WIDTH,
     at,
@@ -154,7 +154,7 @@ def bound_images(leaves, rows, pairs, green):
         pairs[j, j] += max(0.0, extra) * smooth(10.0 * extra / met)
 
 
-@compiled
+@kernel
 def _mirror_mean(t):
     """Mean of 1/r between parallel unit squares a distance t apart, one above the other."""
     a, b, square = math.sqrt(1.0 + t * t), math.sqrt(2.0 + t * t), t * t
@@ -176,7 +176,7 @@ def _flat(points, soft):
     return out
 
 
-@compiled
+@kernel
 def _near_means(flat, i, others, length, out, room):
     """Replace what is negative in a line by :func:`mean_inverse` of cluster i and those others."""
     count, n, width = 0, flat.shape[1], room.shape[1]
@@ -207,7 +207,7 @@ def _near_means(flat, i, others, length, out, room):
         out[int(room[13, k])] = at(room, k)
 
 
-@compiled
+@kernel
 def mean_inverse(first, second, soft):
     """Mean of 1/r [1/m] over four points of each of two clusters, shapes (4, 3).
 

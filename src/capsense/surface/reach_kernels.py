@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import integers, singles
 from capsense.surface.choose_kernels import Cut, is_there
 from capsense.surface.leaf_kernels import Leaves
@@ -77,7 +77,7 @@ def reached(cut, leaves):
     )  # fmt: skip
 
 
-@compiled
+@kernel
 def _moved(cut, a):
     """How much of f_A is in the charge of cluster A that is within reach."""
     return cut.parts[a, 0] * (1.0 - cut.share[a]) - cut.parts[a, 1] * cut.share[a]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
 from capsense.field.green_kernels import SHORE, smooth
 from capsense.surface.look_kernels import Looks, far_potentials, look, looks_of, place
@@ -79,19 +79,19 @@ def score(bodies, first, green, threshold, weight, scores, entry):
     return seen
 
 
-@compiled
+@kernel
 def _energy(body, k):
     """Energy of the function of a cluster in free space [1/m]."""
     return doubles(body.own)[integers(body.function)[k]] / body.scale
 
 
-@compiled
+@kernel
 def _net_energy(body):
     """Energy of a body's net charge [1/m]."""
     return doubles(body.own)[0] / body.scale + body.tie
 
 
-@compiled
+@kernel
 def _own_score(body, looks, k, weight):
     """Score of the function of a cluster, from the potentials of its two parts.
 
@@ -104,7 +104,7 @@ def _own_score(body, looks, k, weight):
     return value / (_energy(body, k) * looks.stiff[k] * looks.stiff[k])
 
 
-@compiled
+@kernel
 def _raised(value, first, second):
     """A score, raised by those of the two parts."""
     for below in (first, second):
@@ -112,14 +112,14 @@ def _raised(value, first, second):
     return value
 
 
-@compiled
+@kernel
 def _pass_on(part, above, looks, scores):
     """Let a cluster have a part of the score above it as far as that sees a linear potential."""
     rest = 1.0 - looks.told[part] * (1.0 - looks.linear[part])
     scores[part] = looks.told[part] * scores[part] + rest * DECAY * above
 
 
-@compiled
+@kernel
 def _share(looks, k):
     """What the score of a panel or a part counts."""
     return max(0.0, 1.0 - looks.stiff[k] * looks.stiff[k] - _FREE) / (1.0 - _FREE)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._dense import WIDTH, cholesky, multiply_part, substitute
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense._simd import SIMD_WIDTH, at, madd, put_span, span, splat, vsub
 from capsense.surface.reach_kernels import add_own
 
@@ -59,7 +59,7 @@ class Reduced(NamedTuple):
     """What was added to the diagonal to make it definite, relative; -1 where nothing did."""
 
 
-@compiled
+@kernel
 def _differences(cut, functions, values, out, start):
     """Integrals with the first functions of what has the means ``values`` (k, m) on clusters.
 
@@ -74,7 +74,7 @@ def _differences(cut, functions, values, out, start):
             put_span(out, o + i, vsub(span(values, x * width + i), less))
 
 
-@compiled
+@kernel
 def _climb(cut, values):
     """Fill the means (k, m) of all clusters of a cut from those of its leaves, m as above."""
     width, zero = values.shape[1], splat(np.float32(0.0))
@@ -169,7 +169,7 @@ def _integrals(cut, functions, rows, pairs):
     return wide, outer
 
 
-@compiled
+@kernel
 def _whole_spans(columns):
     return SIMD_WIDTH * max(1, (columns + SIMD_WIDTH - 1) // SIMD_WIDTH)
 
@@ -190,7 +190,7 @@ def _products(psi, solved):
     return out
 
 
-@compiled
+@kernel
 def _depth(rows):
     """Up to which column rows have anything; the last modes are zero far from the sensor."""
     depth = rows.shape[1]
@@ -202,7 +202,7 @@ def _depth(rows):
     return 0
 
 
-@compiled
+@kernel
 def _add_matter(bodies, functions, matrix, own):
     """Add what ties bodies to ground, and the sheets of dielectrics."""
     solved = functions.solved
@@ -284,7 +284,7 @@ def reduced(functions, system, adjoint):
     return Reduced(delta, left, coarse, x, shift)
 
 
-@compiled
+@kernel
 def factorise(matrix, root, own, factor):
     """Cholesky factor of √t A √t with A's own diagonal.
 
@@ -308,7 +308,7 @@ def factorise(matrix, root, own, factor):
     return -1.0
 
 
-@compiled
+@kernel
 def _add_products(left, right, out):
     """``out += left.T @ right``, shapes (n, m), (n, m) and (m, m); m a multiple of 8."""
     n, m = left.shape

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
@@ -82,7 +82,7 @@ def prepared(
     return cut, leaves, functions, assembled(bodies, cut, functions, rows, pairs, green.lead)
 
 
-@compiled
+@kernel
 def estimate(
     delta: NDArray[Any], left: NDArray[Any], coarse: NDArray[Any], shift: float, electrodes: int
 ) -> float:
@@ -154,7 +154,7 @@ def solve_each(
     return delta, error, size
 
 
-@compiled
+@kernel
 def eliminate(matrix: NDArray[np.complex128], sides: NDArray[np.complex128]) -> None:
     """Replace right-hand sides (n, m) by the solution for a symmetric complex matrix (n, n), lost.
 
