@@ -116,5 +116,8 @@ def start() -> None:
     for name, twin in TWINS.items():
         setattr(_simd, name, twin)
     from capsense.elements import rigid
+    from capsense.field import grid_kernels
+
+    grid_kernels.ALONG = 3  # every simulator fills a table
 
     rigid.BODY = np.dtype((np.record, rigid.BODY))

@@ -12,11 +12,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
 from capsense.field.green import GreenFunction
+from capsense.field.green_kernels import Green
+from capsense.field.grid_kernels import Grid
 
 Array = np.ndarray
 SOFT, ROUND = 0.15, 0.82
@@ -308,21 +311,26 @@ def reduced(
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
 LONG, SHORE, TOUCHING, BEHIND = (0.03, 0.06), 5e-3, 8e-4, 4e-3
+CLOSE, GROWTH = (8e-3, 12e-3), 0.2
 
 
 def scores(
-    pieces: tuple[Piece, ...], trees: list[tuple[Array, Array, Array]], green, room: Array
+    pieces: tuple[Piece, ...],
+    trees: list[tuple[Array, Array, Array]],
+    green: GreenFunction,
+    packed: Green,
 ) -> list[Array]:
     """Share of the electrodes' energies that each split takes up alone, raised from below.
 
-    Parts that cross a wall have at least their share of that of their body, by length.
+    Of the packed Green's function, its table and room are taken. Parts that cross a wall have at
+    least their share of that of their body, by length.
     """
     seen, stiff = [], []
     energy = np.zeros(green.far_phi.shape[1])
     for piece, (kids, panel, charge) in zip(pieces, trees, strict=True):
         share = shares(kids, panel, charge)
         block = free_block(piece.panels) / piece.scale
-        means, looks = _means(piece, kids, share, green, room)
+        means, looks = _means(piece, kids, share, green, packed)
         linear = {k: look.linear for k, look in looks.items()}
         net = 0.0
         own, told = np.zeros(len(kids)), np.ones(len(kids))
@@ -374,6 +382,21 @@ def scores(
     return out
 
 
+def tabulated(grid: Grid, point: Array) -> Array:
+    """Value of a table at a point: a product of SciPy's splines, over all nodes."""
+    count, first, side = grid.size.astype(float)
+    low, high = grid.box.astype(float)
+    within = np.clip(point, low, high)
+    off = (point - within) / side
+    u = (within - low) / side + np.sign(off) * np.log1p(GROWTH * np.abs(off)) / GROWTH - first
+    basis, values = BSpline.basis_element(np.arange(-1.5, 2.0), extrapolate=False), grid.values
+    values = values.astype(float).reshape(*count.astype(int), -1)
+    for i in range(3):
+        weights = np.nan_to_num(basis(np.clip(u[i], 1, count[i] - 2) - np.arange(count[i])))
+        values = np.tensordot(weights, values, axes=1)
+    return values
+
+
 def members_of(share: Array, cluster: int) -> Array:
     return np.flatnonzero(share[:, cluster])
 
@@ -397,9 +420,10 @@ def _smooth(x: float) -> float:
 
 
 def _means(
-    piece: Piece, kids: Array, share: Array, green: GreenFunction, room: Array
+    piece: Piece, kids: Array, share: Array, green: GreenFunction, packed: Green
 ) -> tuple[dict[int, Array], dict[int, Look]]:
     """Potentials in the centres of the clusters that are looked at, finest first, and the looks."""
+    room = packed.room
     sources = green.far_sources.astype(float)
     image = sources * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * green.floor]
     out, looks = {}, {}
@@ -411,7 +435,9 @@ def _means(
         near = 1 / np.maximum(np.linalg.norm(point - sources, axis=1), LEAST)
         inside = min((point - room[0]).min(), (room[1] - point).min())
         off = np.linalg.norm(np.maximum(np.maximum(room[0] - point, point - room[1]), 0.0))
-        out[k] = (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
+        close = _smooth((CLOSE[1] - green.distance(point[None])[0]) / (CLOSE[1] - CLOSE[0]))
+        out[k] = (1 - close) * tabulated(packed.grid, point)[: green.far_phi.shape[1]]
+        out[k] += close * (near - 1 / np.linalg.norm(point - image, axis=1)) @ green.far_phi
         within = 1 - _smooth(off / SHORE)
         out[k] *= within
         crossing = _smooth(2 - 4 * abs(inside) / size)

@@ -57,7 +57,9 @@ def test_places_of_many_terminals() -> None:
             (level.table, phi, getattr(green, f"{name}_modes"))
             for level, phi, name in zip(packed.levels, phis, LEVELS, strict=True)
         ]
-        for table, phi, modes in [*tables, (packed.score_table, phis[-1], np.empty((0, 0)))]:
+        assert packed.grid.values.shape[1] == lead
+        assert (packed.grid.values[:, terminals:] == 0.0).all()
+        for table, phi, modes in tables:
             np.testing.assert_array_equal(table[: len(phi), :terminals], phi)
             assert (table[:, terminals:lead] == 0.0).all()
             rows, columns = modes.shape

@@ -934,7 +934,7 @@ def test_scores_of_a_body_on_a_capacitance_across_a_wall(scale: float) -> None:
 
 def check_scores(scene: Scene) -> None:
     _, found, first = cut_of(scene, 0.1)
-    wanted = twin.scores(scene.pieces, scene.trees, exact(), packed_green().room)
+    wanted = twin.scores(scene.pieces, scene.trees, exact(), packed_green())
     for b, each in enumerate(wanted):
         mine = found[first[b] : first[b + 1]]
         np.testing.assert_allclose(mine, each, rtol=2e-3, atol=2e-6 * found.max())

@@ -30,6 +30,7 @@ from capsense._simd import (
 )
 from capsense.design.model import Design
 from capsense.field.green import LEVELS, GreenFunction
+from capsense.field.grid_kernels import Grid, grid_over
 
 LEAST = 1e-3, 2e-3, 3e-3
 """Distances from near, middle and far sources [m] below which their potential grows no more. They
@@ -74,6 +75,8 @@ class Green(NamedTuple):
     """Charges for points near the sensor, for those farther away, and for those far away."""
     score_table: NDArray[Any]
     """φ⁰ alone, from the last of these, shape (f, lead)."""
+    grid: Grid
+    """The same as a table over the domain, roughly."""
     lead: int
     """Columns of φ⁰, padded."""
     terminals: int
@@ -121,9 +124,19 @@ def pack_green(green: GreenFunction, design: Design) -> Green:
         return Level(sources, table, least)
 
     near, middle, far = map(level, LEVELS, LEAST)
+    score_table = np.ascontiguousarray(far.table[:, :lead])
+    limits = np.float32(green.floor), np.float32(far.least)
+
+    def phi(points: NDArray[np.float64]) -> NDArray[np.float32]:
+        columns = np.full((3, _padded(len(points))), _AWAY, np.float32)
+        columns[:, : len(points)] = points.T
+        out = np.empty((lead, columns.shape[1]), np.float32)
+        point_potentials(columns, far.sources, score_table, limits, out)
+        return np.clip(out[:, : len(points)].T, 0.0, 1.0)
+
     return Green(
-        (near, middle, far), np.ascontiguousarray(far.table[:, :lead]), lead, terminals,
-        len(design.electrodes), float(green.floor), np.asarray(green.box, float),
+        (near, middle, far), score_table, grid_over(np.asarray(green.box, float), walls, phi),
+        lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
         np.asarray(green.blends, float), room, cover_of(design),
     )  # fmt: skip
 

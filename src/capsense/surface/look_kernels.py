@@ -18,6 +18,7 @@ from capsense.field.green_kernels import (
     point_potentials,
     smooth,
 )
+from capsense.field.grid_kernels import grid_values, to_grid
 
 _LINEAR = 0.45, 0.58
 """Clusters smaller than the first part of their distance from the design see a linear potential,
@@ -29,9 +30,14 @@ LONG = 0.03, 0.06
 _SCREENED, _TOUCHING = 2.0 * math.pi, 0.8e-3
 """A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
 of size l has, 1 - exp(-2π d / l) of their energy; the second counts as the other leg of d [m]."""
+_FREED = 20.0
+"""Exponent from which on that is not looked at: it is 2e-9."""
 _BEHIND = 4e-3
 """So far behind its face [m] a flat design leaves functions all of their energy: many of them among
 its sources would leave no definite matrix."""
+_CLOSE = 8e-3, 12e-3
+"""Within the first distance from a flat design [m] potentials are those of its charges, beyond the
+second those of the table."""
 
 
 class Looks(NamedTuple):
@@ -83,8 +89,9 @@ def place(body, green, k, points, found, looks):
     looks.stiff[k] = 1.0
     if green.cover < 1.0:  # a plane, and in front of it; the box of other designs is no surface
         front = smooth(1.0 + (points[found, 2] - green.box[1, 2]) / _BEHIND)
-        off = math.sqrt(square + _TOUCHING * _TOUCHING)
-        looks.stiff[k] -= front * math.exp(-_SCREENED * off / size)
+        far = _SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING)
+        if far < _FREED * size:
+            looks.stiff[k] -= front * math.exp(-far / size)
     if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
         lift(points[found : found + 1], least_gap(size, green.cover), green.box)
     return square, room, math.sqrt(out)
@@ -105,10 +112,23 @@ def look(body, green, looks):
     Returns:
         The cluster behind the last one that was looked at.
     """
+    places, inner = np.empty(body.stored, np.int64), np.empty(body.stored)
+    points = np.empty((body.stored, 3), np.float32)
+    seen, found = _look_into(body, green, looks, points, places, inner)
+    far_potentials(points[:found], places[:found], inner, green, looks.means)
+    _make_up(body, seen, looks)
+    return seen
+
+
+@kernel
+def _look_into(body, green, looks, points, places, inner):
+    """The same but for potentials, which are wanted at points, times a part of each, in places.
+
+    Returns:
+        The cluster behind the last one that was looked at, and how many points there are.
+    """
     kids, extent, stop = integers(body.kids), doubles(body.extent), body.stored
-    places, inner = np.empty(stop, np.int64), np.empty(stop)
-    points, found = np.empty((stop, 3), np.float32), 0
-    looks.met[0], looks.told[0], k, seen = True, 1.0, -1, 1
+    looks.met[0], looks.told[0], k, seen, found = True, 1.0, -1, 1, 0
     while k + 1 < seen:
         k += 1
         if not looks.met[k]:
@@ -134,28 +154,68 @@ def look(body, green, looks):
                 part = kids[2 * k + c]
                 looks.met[part], looks.told[part] = True, looks.told[k] * (1.0 - looks.linear[k])
             seen = max(seen, kids[2 * k + 1] + 1)
-    far_potentials(points[:found], places, inner, green, looks.means)
-    _make_up(body, seen, looks)
-    return seen
+    return seen, found
 
 
 @compiled
 def far_potentials(points, places, share, green, means):
-    """Fill rows ``places`` of ``means`` with φ⁰ at points (k, 3), times a share of each."""
+    """Fill rows ``places`` of ``means`` with φ⁰ at points (k, 3), times a share of each.
+
+    That is from a table, and close to the face of a flat design from its charges.
+    """
     found = points.shape[0]
-    if found == 0:
-        return
+    near, close, rest = np.arange(found), np.empty(found), np.empty(found)
     columns = np.empty((3, SIMD_WIDTH * ((found + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
-    for j in range(columns.shape[1]):
-        for i in range(3):
-            columns[i, j] = points[min(j, found - 1), i]
+    _put_columns(points, near, columns)
+    to_grid(columns, green.grid)
+    count = _close(points, share, green, near, close, rest)
+    grid_values(columns, green.grid, rest, places, means)
+    if count == 0:
+        return
+    columns = np.empty((3, SIMD_WIDTH * ((count + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
     phi = np.empty((green.lead, columns.shape[1]), np.float32)
-    far = green.levels[-1]
-    limits = np.float32(green.floor), np.float32(far.least)
-    point_potentials(columns, far.sources, green.score_table, limits, phi)
-    for j in range(found):
+    _put_columns(points, near[:count], columns)
+    limits = np.float32(green.floor), np.float32(green.levels[-1].least)
+    point_potentials(columns, green.levels[-1].sources, green.score_table, limits, phi)
+    for j in range(count):
         for i in range(green.lead):
-            means[places[j], i] = share[j] * phi[i, j]
+            means[places[near[j]], i] += np.float32(close[j]) * phi[i, j]
+
+
+@kernel
+def _close(points, share, green, near, close, rest):
+    """Split shares of points (k, 3) into those close to the face of a flat design and the rest.
+
+    Args:
+        points, share, green: As of :func:`far_potentials`.
+        near: Filled with the points that are close, shape (k,).
+        close: Filled with these parts of theirs, shape (k,).
+        rest: Filled with what is left of each share, shape (k,).
+
+    Returns:
+        How many are close.
+    """
+    count = 0
+    for j in range(points.shape[0]):
+        square, part = 0.0, 0.0
+        for i in range(3):
+            x = points[j, i]
+            square += max(green.box[0, i] - x, x - green.box[1, i], 0.0) ** 2
+        if green.cover < 1.0 and square < _CLOSE[1] * _CLOSE[1]:
+            part = share[j] * smooth((_CLOSE[1] - math.sqrt(square)) / (_CLOSE[1] - _CLOSE[0]))
+            near[count], close[count] = j, part
+            count += 1
+        rest[j] = share[j] - part
+    return count
+
+
+@kernel
+def _put_columns(points, some, out):
+    """Fill ``out`` (3, p) with some of the points (k, 3), the last one of them repeated."""
+    for j in range(out.shape[1]):
+        k = some[min(j, some.shape[0] - 1)]
+        for i in range(3):
+            out[i, j] = points[k, i]
 
 
 @kernel

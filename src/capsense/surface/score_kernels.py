@@ -51,20 +51,11 @@ def score(bodies, first, green, threshold, weight, scores, entry):
         np.empty(total), np.empty(total), np.empty(total),
     )  # fmt: skip
     energy, seen = np.zeros(terminals), np.empty(bodies.shape[0], np.int64)
+    counts = np.empty(total)
     for b in range(bodies.shape[0]):
-        body, looks = bodies[b], looks_of(all_looks, first[b], first[b + 1])
-        kids, means = integers(body.kids), looks.means
-        seen[b] = look(body, green, looks)
-        for k in range(seen[b] - 1, -1, -1):
-            x, y = kids[2 * k], kids[2 * k + 1]
-            if looks.met[k] and 0 <= x < seen[b] and looks.met[x]:
-                stiffness = looks.told[k] * (1.0 - looks.linear[k]) / _energy(body, k)
-                for i in range(terminals):
-                    d = float(means[x, i] - means[y, i])
-                    energy[i] += d * d * stiffness
-        if not body.neutral:
-            for i in range(terminals):
-                energy[i] += float(means[0, i]) ** 2 / _net_energy(body)
+        looks = looks_of(all_looks, first[b], first[b + 1])
+        seen[b] = look(bodies[b], green, looks)
+        _add_energies(bodies[b], looks, seen[b], energy)
     whole = 0.0
     for i in range(terminals):
         whole += energy[i] ** 2
@@ -74,9 +65,25 @@ def score(bodies, first, green, threshold, weight, scores, entry):
         looks = looks_of(all_looks, first[b], first[b + 1])
         of, enter = scores[first[b] : first[b + 1]], entry[first[b] : first[b + 1]]
         _score_panels(bodies[b], green, seen[b], looks, weight, of)
-        _raise_scores(bodies[b], looks_of(looks, 0, seen[b]), weight, of[: seen[b]])
+        _raise_scores(bodies[b], looks_of(looks, 0, seen[b]), weight, of[: seen[b]], counts)
         _score_parts(bodies[b], green, seen[b], looks, (threshold, weight), of, enter)
     return seen
+
+
+@kernel
+def _add_energies(body, looks, seen, energy):
+    """Add what the first clusters of a body take up of each terminal's energy, by themselves."""
+    kids, means = integers(body.kids), looks.means
+    for k in range(seen - 1, -1, -1):
+        x, y = kids[2 * k], kids[2 * k + 1]
+        if looks.met[k] and 0 <= x < seen and looks.met[x]:
+            stiffness = looks.told[k] * (1.0 - looks.linear[k]) / _energy(body, k)
+            for i in range(energy.shape[0]):
+                d = float(means[x, i] - means[y, i])
+                energy[i] += d * d * stiffness
+    if not body.neutral:
+        for i in range(energy.shape[0]):
+            energy[i] += float(means[0, i]) ** 2 / _net_energy(body)
 
 
 @kernel
@@ -138,15 +145,15 @@ def _score_panels(body, green, seen, looks, weight, scores):
     _raise_nodes(body, green, nodes[:count], looks, weight, scores)
 
 
-@compiled
-def _raise_scores(body, looks, weight, scores):
+@kernel
+def _raise_scores(body, looks, weight, scores, counts):
     """Score a body's first clusters from the mean potentials of those that were met.
 
     What was met below a cluster that sees a linear potential does not count.
 
     No charge is beyond a wall. A part that crosses one can carry charge where it is inside only if
     it is split too, which its own score does not tell. So that is at least the score of the body,
-    times the part's share of its length.
+    times the part's share of its length. ``counts`` (n,) is room to work in.
     """
     kids, extent, count = integers(body.kids), doubles(body.extent), scores.shape[0]
     met, crossing = looks.met, looks.crossing
@@ -163,7 +170,8 @@ def _raise_scores(body, looks, weight, scores):
         for i in range(weight.shape[0]):
             net += weight[i] * float(looks.means[0, i]) ** 2
         scores[0] = max(scores[0], crossing[0] * net / _net_energy(body))
-    seen = np.ones(count)
+    for k in range(count):
+        counts[k] = 1.0
     for k in range(count):
         if not met[k]:
             continue
@@ -171,14 +179,14 @@ def _raise_scores(body, looks, weight, scores):
             part = kids[2 * k + c]
             if 0 <= part < count and met[part] and 0 <= kids[2 * part] < body.stored:
                 _pass_on(part, scores[k], looks, scores)
-                seen[part] = seen[k] * smooth((1.0 - looks.linear[k]) / _SEEN)
+                counts[part] = counts[k] * smooth((1.0 - looks.linear[k]) / _SEEN)
     whole = scores[0]
     for k in range(count - 1, -1, -1):
         if not met[k]:
             continue
         wide = smooth((body.scale * extent[k] - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
         least = max(_CROSSED * wide, whole * extent[k] / extent[0])
-        scores[k] = max(scores[k], seen[k] * crossing[k] * least)
+        scores[k] = max(scores[k], counts[k] * crossing[k] * least)
         if 0 <= kids[2 * k] < count:
             scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
 
