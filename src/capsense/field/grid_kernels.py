@@ -64,13 +64,12 @@ def grid_over(box: Array, walls: Array, function: Callable[[Array], NDArray[np.f
     last = np.ceil(even + np.log1p(GROWTH * np.maximum(high - box[1], 0.0) / side) / GROWTH) + 1.0
     size = np.array([last - first + 1.0, first, side])
     grid = Grid(box.astype(np.float32), size.astype(np.float32), np.empty((0, 0), np.float32))
-    values = function(nodes_of(grid))
-    shape = values.shape
-    values = values.reshape(*size[0].astype(int), -1)
+    found = function(nodes_of(grid))
+    values = found.astype(float).reshape(*size[0].astype(int), -1)
     for axis in range(3):  # so that the spline meets polynomials of second degree
         ends = [(1, 1) if k == axis else (0, 0) for k in range(4)]
         values = values - np.diff(np.pad(values, ends, "edge"), n=2, axis=axis) / 8
-    return grid._replace(values=np.ascontiguousarray(values.reshape(shape), np.float32))
+    return grid._replace(values=np.ascontiguousarray(values.reshape(found.shape), np.float32))
 
 
 def nodes_of(grid: Grid) -> Array:
