@@ -12,6 +12,7 @@ from numba import njit
 
 from capsense._simd import (
     SIMD_WIDTH,
+    WIDE,
     at,
     dot,
     has_guess,
@@ -28,25 +29,29 @@ from capsense._simd import (
     vmul,
     vsub,
     where_above,
+    wide_span,
+    wide_splat,
 )
 from capsense.elements.panel_kernels import angle_of
 
 ROOTS = """
 import numpy as np
 from numba import njit
-from capsense._simd import put_span, rsqrt, span
+from capsense._simd import put_span, rsqrt, span, wide_span
 
 @njit
-def roots(x, one, eight):
+def roots(x, one, eight, sixteen):
     for k in range(x.size):
         one[k] = rsqrt(x[k])
     for k in range(0, x.size, 8):
         put_span(eight, k, rsqrt(span(x, k)))
+    for k in range(0, x.size, 16):
+        put_span(sixteen, k, rsqrt(wide_span(x, k)))
 
 x = np.geomspace(1e-30, 1e30, 20_000).astype(np.float32)
-one, eight = np.empty_like(x), np.empty_like(x)
-roots(x, one, eight)
-for found in (one, eight):
+one, eight, sixteen = np.empty((3, x.size), np.float32)
+roots(x, one, eight, sixteen)
+for found in (one, eight, sixteen):
     assert np.abs(found * np.sqrt(x.astype(float)) - 1.0).max() < 3e-7
 guess = "rsqrtps" in "".join(roots.inspect_asm().values())
 """
@@ -142,17 +147,27 @@ def test_scalars_are_multiplied_and_added(kind):
 
 
 def test_roots():
-    """Analytic: to the 3e-7 that is promised, for one and for eight, from 1e-30 to 1e30."""
+    """Analytic: to the 3e-7 that is promised, for one, eight, sixteen, from 1e-30 to 1e30."""
     found = {}
     exec(ROOTS, found)
     target = found["roots"].targetctx.codegen().magic_tuple()
     assert found["guess"] == has_guess(target)
 
 
-def test_roots_on_other_processors():
-    """The same where there is no guess to start from."""
-    env = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
-    subprocess.run([sys.executable, "-c", ROOTS + "assert not guess"], env=env, check=True)
+@pytest.mark.parametrize(
+    ("name", "features", "guess"), [("generic", "", False), ("haswell", "+avx,+avx2,+fma", True)]
+)
+def test_roots_on_other_processors(name, features, guess):
+    """The same where there is no guess to start from, and where there is one of eight only."""
+    env = {**os.environ, "NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features}
+    if guess and not has_guess(_combine.targetctx.codegen().magic_tuple()):
+        pytest.skip("this processor cannot run what is compiled for one with AVX")
+    code = ROOTS + f"assert guess == {guess}"
+    subprocess.run([sys.executable, "-c", code], env=env, check=True)
+
+
+def test_where_there_is_no_guess():
+    """Invariant: other kinds of processor, and x86 without AVX."""
     assert not has_guess(("aarch64-unknown-linux-gnu", "cortex-a72", "+neon"))
     assert not has_guess(("x86_64-unknown-linux-gnu", "nehalem", "+sse4.2,-avx,+avx512f"))
 
@@ -178,6 +193,28 @@ def test_spans_begin_anywhere(kind):
 
 
 @njit
+def _wide(x, y, scalar, two, out, sums):
+    for k in range(0, x.size, WIDE):
+        left, right = wide_span(x, k), wide_span(y, k)
+        value = vmadd(left, right, vadd(madd(scalar, left, wide_splat(two)), right))
+        value = where_above(left, right, value, dot(left, right, left, right, left, left, value))
+        put_span(out, k, value)
+        sums[k // WIDE] = horizontal_sum(value)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_sixteen_at_a_time(kind):
+    """Differential: products, sums, choices and their sums, element by element."""
+    x, y = np.random.default_rng(8).normal(size=(2, 9, WIDE)).astype(kind)
+    out, sums = np.full_like(x, np.nan), np.empty(9, kind)
+    _wide(x, y, kind(-1.5), kind(2.0), out, sums)
+    wanted = x * y - 1.5 * x + 2.0 + y
+    wanted = np.where(x > y, wanted, x * y + y * x + x * x + wanted)
+    np.testing.assert_allclose(out, wanted, rtol=0, atol=60 * np.finfo(kind).eps)
+    np.testing.assert_allclose(sums, wanted.sum(axis=1), rtol=0, atol=300 * np.finfo(kind).eps)
+
+
+@njit
 def _quotients(x, y, out):
     for k in range(0, x.size, SIMD_WIDTH):
         put_span(out, k, vdiv(span(x, k), span(y, k)))
@@ -187,12 +224,14 @@ def _quotients(x, y, out):
 def _logarithms(x, out):
     for k in range(0, x.size, SIMD_WIDTH):
         put_span(out, k, vlog(span(x, k)))
+    for k in range(0, x.size - WIDE, 3 * WIDE):
+        put_span(out, k, vlog(wide_span(x, k)))
 
 
 @njit
 def _angles(y, x, out):
-    for k in range(0, x.size, SIMD_WIDTH):
-        put_span(out, k, angle_of(span(x, k), span(y, k)))
+    for k in range(0, x.size, WIDE):
+        put_span(out, k, angle_of(wide_span(x, k), wide_span(y, k)))
 
 
 def test_quotients() -> None:
@@ -222,12 +261,12 @@ def test_angles() -> None:
     rng = np.random.default_rng(5)
     angle, length = rng.uniform(-np.pi, np.pi, 80_000), 10.0 ** rng.uniform(-30, 30, 80_000)
     x, y = length * np.cos(angle), length * np.sin(angle)
-    x = np.append(x, [0, 1, 0, 1, 1, 1, 2, 0]).astype(np.float32)
-    y = np.append(y, [0, 0, 1, 1, -1, 0.41421357, 1, -1]).astype(np.float32)
+    x = np.append(x, 2 * [0, 1, 0, 1, 1, 1, 2, 0]).astype(np.float32)
+    y = np.append(y, 2 * [0, 0, 1, 1, -1, 0.41421357, 1, -1]).astype(np.float32)
     out = np.empty_like(x)
     _angles(y, x, out)
     truth = np.arctan2(y.astype(float), x.astype(float))
     assert np.abs(out - truth).max() < 4e-7
-    left = np.empty(8, np.float32)
-    _angles(np.zeros(8, np.float32), np.full(8, -1, np.float32), left)
+    left = np.empty(16, np.float32)
+    _angles(np.zeros(16, np.float32), np.full(16, -1, np.float32), left)
     np.testing.assert_allclose(left, np.pi, rtol=1e-7)

@@ -8,7 +8,18 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense._simd import at, horizontal_sum, madd, muladd, put_span, span, splat, vmadd
+from capsense._simd import (
+    at,
+    horizontal_sum,
+    madd,
+    muladd,
+    put_span,
+    span,
+    splat,
+    vmadd,
+    wide_span,
+    wide_splat,
+)
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""
@@ -24,51 +35,42 @@ def multiply(left, table, out):
 def multiply_part(left, table, depth, width, out):
     """The same, of the first ``depth`` rows of the table and the first ``width`` columns only.
 
-    Four rows and 32 columns at a time: sixteen sums stay in registers.
+    Four rows and 32 columns at a time: their sums stay in registers.
     """
     k, s, w = left.shape[0], left.shape[1], table.shape[1]
-    zero = splat(np.float32(0.0))
+    zero = wide_splat(np.float32(0.0))
     for j in range(0, width, WIDTH):
         for i in range(0, k - 3, 4):
-            a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = zero
-            c0 = c1 = c2 = c3 = d0 = d1 = d2 = d3 = zero
+            a0 = a1 = b0 = b1 = c0 = c1 = d0 = d1 = zero
             p = i * s
             for t in range(depth):
                 o = t * w + j
-                v0, v1, v2, v3 = (
-                    span(table, o),
-                    span(table, o + 8),
-                    span(table, o + 16),
-                    span(table, o + 24),
-                )
+                v0, v1 = wide_span(table, o), wide_span(table, o + 16)
                 x = at(left, p + t)
-                a0, a1, a2, a3 = madd(x, v0, a0), madd(x, v1, a1), madd(x, v2, a2), madd(x, v3, a3)
+                a0, a1 = madd(x, v0, a0), madd(x, v1, a1)
                 x = at(left, p + s + t)
-                b0, b1, b2, b3 = madd(x, v0, b0), madd(x, v1, b1), madd(x, v2, b2), madd(x, v3, b3)
+                b0, b1 = madd(x, v0, b0), madd(x, v1, b1)
                 x = at(left, p + 2 * s + t)
-                c0, c1, c2, c3 = madd(x, v0, c0), madd(x, v1, c1), madd(x, v2, c2), madd(x, v3, c3)
+                c0, c1 = madd(x, v0, c0), madd(x, v1, c1)
                 x = at(left, p + 3 * s + t)
-                d0, d1, d2, d3 = madd(x, v0, d0), madd(x, v1, d1), madd(x, v2, d2), madd(x, v3, d3)
-            _put(out, i * w + j, a0, a1, a2, a3)
-            _put(out, (i + 1) * w + j, b0, b1, b2, b3)
-            _put(out, (i + 2) * w + j, c0, c1, c2, c3)
-            _put(out, (i + 3) * w + j, d0, d1, d2, d3)
+                d0, d1 = madd(x, v0, d0), madd(x, v1, d1)
+            _put(out, i * w + j, a0, a1)
+            _put(out, (i + 1) * w + j, b0, b1)
+            _put(out, (i + 2) * w + j, c0, c1)
+            _put(out, (i + 3) * w + j, d0, d1)
         for i in range(k - k % 4, k):
-            a0 = a1 = a2 = a3 = zero
+            a0 = a1 = zero
             for t in range(depth):
                 o = t * w + j
                 x = at(left, i * s + t)
-                a0, a1 = madd(x, span(table, o), a0), madd(x, span(table, o + 8), a1)
-                a2, a3 = madd(x, span(table, o + 16), a2), madd(x, span(table, o + 24), a3)
-            _put(out, i * w + j, a0, a1, a2, a3)
+                a0, a1 = madd(x, wide_span(table, o), a0), madd(x, wide_span(table, o + 16), a1)
+            _put(out, i * w + j, a0, a1)
 
 
 @kernel
-def _put(out, place, a, b, c, d):
+def _put(out, place, a, b):
     put_span(out, place, a)
-    put_span(out, place + 8, b)
-    put_span(out, place + 16, c)
-    put_span(out, place + 24, d)
+    put_span(out, place + 16, b)
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Eight numbers as one value inside compiled code.
+"""Eight or sixteen numbers as one value inside compiled code.
 
 The functions below are one or a few LLVM instructions each, whatever the processor's own width:
 ``splat(s)`` fills all elements, ``vadd(u, v)`` is ``u + v``, ``vsub(u, v)`` is ``u - v``,
@@ -10,7 +10,8 @@ natural logarithm in single precision.
 
 ``at(x, k)`` is element k of a C-ordered array of any shape, ``span`` is the eight from k on, and
 ``put_span`` writes them: unlike ``x[k]``, which counts from the end where k is negative, they do
-not look at k.
+not look at k. ``wide_span`` and ``wide_splat`` make values of sixteen, for kernels that most of the
+time goes to: a processor with AVX-512 takes these at once, and others half by half.
 
 Products are fused with the sum that follows wherever the processor can, and sums are taken in the
 order that is written: bits do not depend on what else is compiled.
@@ -29,32 +30,32 @@ from numba.core.cgutils import get_or_insert_function
 from numba.extending import intrinsic, models, register_model
 
 SIMD_WIDTH = 8
+WIDE = 16
+"""Numbers in a value of :func:`wide_span`."""
 
 _INT = ir.IntType(32)
+_CODE = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
 
 
 class _VectorType(types.Type):
-    def __init__(self, element: Any) -> None:
-        super().__init__(name=f"{element}x{SIMD_WIDTH}")
-        self.element = element
-
-
-_SINGLE, _DOUBLE = _VectorType(types.float32), _VectorType(types.float64)
-_CODE = {
-    types.float32: ir.VectorType(ir.FloatType(), SIMD_WIDTH),
-    types.float64: ir.VectorType(ir.DoubleType(), SIMD_WIDTH),
-}
+    def __init__(self, element: Any, width: int) -> None:
+        super().__init__(name=f"{element}x{width}")
+        self.element, self.width = element, width
 
 
 @register_model(_VectorType)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _CODE[kind.element])
+        super().__init__(manager, kind, ir.VectorType(_CODE[kind.element], kind.width))
 
 
-def _of(element: Any) -> Any:
+def _of(element: Any, width: int = SIMD_WIDTH) -> Any:
     """The vector of elements of a type."""
-    return _DOUBLE if element == types.float64 else _SINGLE
+    return _VectorType(types.float64 if element == types.float64 else types.float32, width)
+
+
+def _single(value: Any) -> bool:
+    return isinstance(value, _VectorType) and value.element == types.float32
 
 
 def _place(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
@@ -62,15 +63,21 @@ def _place(context: Any, builder: Any, array_type: Any, array: Any, index: Any) 
     return builder.gep(data, [index])
 
 
-def _from(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    place = _place(context, builder, array_type, array, index)
-    return builder.bitcast(place, _CODE[array_type.dtype].as_pointer())
+def _from(width: int) -> Callable[..., Any]:
+    """How to find so many elements of an array."""
+
+    def code(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+        place = _place(context, builder, array_type, array, index)
+        kind = ir.VectorType(_CODE[array_type.dtype], width)
+        return builder.bitcast(place, kind.as_pointer())
+
+    return code
 
 
-def _fill(builder: Any, scalar: Any) -> Any:
-    blank = ir.Constant(ir.VectorType(scalar.type, SIMD_WIDTH), ir.Undefined)
+def _fill(builder: Any, scalar: Any, width: int = SIMD_WIDTH) -> Any:
+    blank = ir.Constant(ir.VectorType(scalar.type, width), ir.Undefined)
     first = builder.insert_element(blank, scalar, ir.Constant(_INT, 0))
-    zeros = ir.Constant(ir.VectorType(_INT, SIMD_WIDTH), [0] * SIMD_WIDTH)
+    zeros = ir.Constant(ir.VectorType(_INT, width), [0] * width)
     return builder.shuffle_vector(first, blank, zeros)
 
 
@@ -78,7 +85,7 @@ def multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     """Emit ``a b + c`` of scalars or vectors, fused where the processor can."""
     name = {ir.FloatType(): "f32", ir.DoubleType(): "f64"}
     kind = a.type
-    suffix = f"v{SIMD_WIDTH}{name[kind.element]}" if isinstance(kind, ir.VectorType) else name[kind]
+    suffix = f"v{kind.count}{name[kind.element]}" if isinstance(kind, ir.VectorType) else name[kind]
     signature = ir.FunctionType(kind, [kind] * 3)
     code = get_or_insert_function(builder.module, signature, f"llvm.fmuladd.{suffix}")
     return builder.call(code, [a, b, c])
@@ -109,25 +116,37 @@ def at(typing: Any, array: Any, index: Any) -> Any:
 @intrinsic
 def span(typing: Any, array: Any, index: Any) -> Any:
     """Eight elements from ``index`` on, as they lie in memory."""
-    return _of(array.dtype)(array, types.intp), _read(_from)
+    return _of(array.dtype)(array, types.intp), _read(_from(SIMD_WIDTH))
+
+
+@intrinsic
+def wide_span(typing: Any, array: Any, index: Any) -> Any:
+    """Sixteen elements from ``index`` on, as they lie in memory."""
+    return _of(array.dtype, WIDE)(array, types.intp), _read(_from(WIDE))
 
 
 @intrinsic
 def put_span(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write eight elements from ``index`` on, as they lie in memory."""
+    """Write the elements of a value from ``index`` on, as they lie in memory."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        where = _from(context, builder, signature.args[0], args[0], args[1])
+        where = _from(args[2].type.count)(context, builder, signature.args[0], args[0], args[1])
         builder.store(args[2], where).align = signature.args[0].dtype.bitwidth // 8
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, _of(array.dtype)), code
+    return types.void(array, types.intp, value), code
 
 
 @intrinsic
 def splat(typing: Any, scalar: Any) -> Any:
-    """A number in all elements."""
+    """A number in all of eight elements."""
     return _of(scalar)(scalar), _emit(_fill)
+
+
+@intrinsic
+def wide_splat(typing: Any, scalar: Any) -> Any:
+    """A number in all of sixteen elements."""
+    return _of(scalar, WIDE)(scalar), _emit(lambda builder, number: _fill(builder, number, WIDE))
 
 
 @intrinsic
@@ -159,7 +178,7 @@ def madd(typing: Any, scalar: Any, value: Any, addend: Any) -> Any:
     """``scalar * value + addend`` with a scalar in the precision of the vectors."""
 
     def code(builder: Any, s: Any, v: Any, w: Any) -> Any:
-        return multiply_add(builder, _fill(builder, s), v, w)
+        return multiply_add(builder, _fill(builder, s, v.type.count), v, w)
 
     return value(value.element, value, value), _emit(code)
 
@@ -197,14 +216,12 @@ def horizontal_sum(typing: Any, value: Any) -> Any:
     """The sum of all elements."""
 
     def code(builder: Any, parts: Any) -> Any:
-        width = SIMD_WIDTH
+        width = parts.type.count
         while width > 1:
             width //= 2
             blank = ir.Constant(parts.type, ir.Undefined)
             low, high = (
-                builder.shuffle_vector(
-                    parts, blank, ir.Constant(ir.VectorType(_INT, width), list(range(k, k + width)))
-                )
+                builder.shuffle_vector(parts, blank, _lanes(list(range(k, k + width))))
                 for k in (0, width)
             )
             parts = builder.fadd(low, high)
@@ -223,28 +240,27 @@ def muladd(typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 @intrinsic
 def rsqrt(typing: Any, value: Any) -> Any:
-    """``1 / sqrt(value)`` in single precision, to 3e-7, for one or eight normal numbers above zero.
+    """``1 / sqrt(value)`` in single precision, to 3e-7, for one or more normal numbers above zero.
 
-    A first guess, and Newton's steps. For eight numbers a processor with AVX has a guess to 4e-4,
-    which leaves one step. Elsewhere the bits of a float are nearly its logarithm, which makes a
-    guess that leaves three.
+    A first guess, and Newton's steps. For vectors a processor with AVX has a guess to 4e-4, one
+    with AVX-512 a better one of sixteen, which leaves one step. Elsewhere the bits of a float are
+    nearly its logarithm, which makes a guess that leaves three.
     """
-    if value not in (types.float32, _SINGLE):
+    if value != types.float32 and not _single(value):
         return None
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         (number,), kind = args, args[0].type
+        vector = isinstance(kind, ir.VectorType)
 
         def each(element: Any, same: float) -> Any:
-            if value == types.float32:
+            if not vector:
                 return ir.Constant(element, same)
-            return ir.Constant(ir.VectorType(element, SIMD_WIDTH), [same] * SIMD_WIDTH)
+            return ir.Constant(ir.VectorType(element, kind.count), [same] * kind.count)
 
-        if value == _SINGLE and has_guess(context.codegen().magic_tuple()):
-            guess = get_or_insert_function(
-                builder.module, ir.FunctionType(kind, [kind]), "llvm.x86.avx.rsqrt.ps.256"
-            )
-            y, steps = builder.call(guess, [number]), 1
+        target = context.codegen().magic_tuple()
+        if vector and has_guess(target):
+            y, steps = _guess(builder, number, "+avx512f" in target[2].split(",")), 1
         else:
             bits = each(_INT, 1).type
             half = builder.lshr(builder.bitcast(number, bits), each(_INT, 1))
@@ -256,6 +272,33 @@ def rsqrt(typing: Any, value: Any) -> Any:
         return y
 
     return value(value), code
+
+
+def _guess(builder: Any, number: Any, wide: bool) -> Any:
+    """The processor's guess of 1 / sqrt(x) for eight or sixteen numbers, these at once or not."""
+    kind = number.type
+    if kind.count == WIDE and wide:
+        mask = ir.IntType(WIDE)
+        signature = ir.FunctionType(kind, [kind, kind, mask])
+        name = "llvm.x86.avx512.rsqrt14.ps.512"
+        code = get_or_insert_function(builder.module, signature, name)
+        return builder.call(code, [number, ir.Constant(kind, ir.Undefined), ir.Constant(mask, -1)])
+    if kind.count == WIDE:
+        blank, parts = ir.Constant(kind, ir.Undefined), []
+        for first in (0, SIMD_WIDTH):
+            lanes = list(range(first, first + SIMD_WIDTH))
+            half = builder.shuffle_vector(number, blank, _lanes(lanes))
+            parts.append(_guess(builder, half, wide))
+        return builder.shuffle_vector(*parts, _lanes(list(range(WIDE))))
+    code = get_or_insert_function(
+        builder.module, ir.FunctionType(kind, [kind]), "llvm.x86.avx.rsqrt.ps.256"
+    )
+    return builder.call(code, [number])
+
+
+def _lanes(numbers: list[int]) -> Any:
+    """Which elements a shuffle takes."""
+    return ir.Constant(ir.VectorType(_INT, len(numbers)), numbers)
 
 
 _ROOT_HALF = 0x3F3504F3
@@ -270,15 +313,15 @@ _LOG_TWO = 0.693359375, -2.12194440e-4
 
 @intrinsic
 def vlog(typing: Any, value: Any) -> Any:
-    """Natural logarithm of eight normal numbers above zero, to 1e-7 or 1e-7 of it."""
-    if value != _SINGLE:
+    """Natural logarithm of normal numbers above zero, to 1e-7 or 1e-7 of it."""
+    if not _single(value):
         return None
 
     def code(builder: Any, number: Any) -> Any:
-        whole = ir.VectorType(_INT, SIMD_WIDTH)
+        whole = ir.VectorType(_INT, number.type.count)
 
         def each(same: float, kind: Any = number.type) -> Any:
-            return ir.Constant(kind, [same] * SIMD_WIDTH)
+            return ir.Constant(kind, [same] * kind.count)
 
         bits = builder.bitcast(number, whole)
         power = builder.ashr(builder.sub(bits, each(_ROOT_HALF, whole)), each(23, whole))

@@ -34,7 +34,7 @@ def waves(points: Array) -> Array:
 
 def columns_of(points: Array) -> NDArray[np.float32]:
     """Points as kernels take them, (3, p), the last one repeated."""
-    out = np.repeat(points[-1:], 8 * -(-len(points) // 8), axis=0)
+    out = np.repeat(points[-1:], 16 * -(-len(points) // 16), axis=0)
     out[: len(points)] = points
     return np.ascontiguousarray(out.T, np.float32)
 

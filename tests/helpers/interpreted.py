@@ -35,13 +35,21 @@ def span(x: Array, k: int) -> Array:
     return out
 
 
+def wide_span(x: Array, k: int) -> Array:
+    return np.concatenate([span(x, k), span(x, k + 8)])
+
+
 def put_span(x: Array, k: int, value: Array) -> None:
     assert k >= 0
-    _flat(x)[k : k + 8] = value
+    _flat(x)[k : k + len(value)] = value
 
 
 def splat(value: Any) -> Array:
     return np.full(8, value)
+
+
+def wide_splat(value: Any) -> Array:
+    return np.full(16, value)
 
 
 def madd(scalar: Any, value: Array, addend: Array) -> Array:
@@ -58,6 +66,7 @@ def _pointer(kind: Any) -> Any:
 
 TWINS = {
     "at": at, "span": span, "put_span": put_span, "splat": splat, "madd": madd, "rsqrt": rsqrt,
+    "wide_span": wide_span, "wide_splat": wide_splat,
     "vadd": lambda u, v: u + v, "vsub": lambda u, v: u - v, "vmul": lambda u, v: u * v,
     "vdiv": lambda u, v: u / v, "vlog": np.log,
     "vmadd": lambda u, v, w: u * v + w,

@@ -9,20 +9,20 @@ import numpy as np
 from capsense._dense import WIDTH
 from capsense._jit import compiled, kernel
 from capsense._simd import (
-    SIMD_WIDTH,
+    WIDE,
     at,
     dot,
     madd,
     put_span,
     rsqrt,
     singles,
-    span,
-    splat,
     vadd,
     vmadd,
     vmul,
     vsub,
     where_above,
+    wide_span,
+    wide_splat,
 )
 from capsense.elements.panel_kernels import rectangle_potential
 from capsense.elements.rigid import ROUND, SOFT
@@ -188,25 +188,33 @@ def room_for(clusters):
 @kernel
 def far_means(shapes, i, others, count, out):
     """Means of 1/r between cluster i and the first others, by second moments; -1 for near ones."""
-    width, zero, near = shapes.shape[1], splat(np.float32(0.0)), splat(np.float32(-1.0))
-    x, y, z = splat(at(shapes, i)), splat(at(shapes, width + i)), splat(at(shapes, 2 * width + i))
+    width, zero, near = shapes.shape[1], wide_splat(np.float32(0.0)), wide_splat(np.float32(-1.0))
+    x, y, z = (
+        wide_splat(at(shapes, i)),
+        wide_splat(at(shapes, width + i)),
+        wide_splat(at(shapes, 2 * width + i)),
+    )
     ax, ay, az = shapes[3, i], shapes[4, i], shapes[5, i]
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
-    own = splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
-    reach = splat(shapes[9, i])
-    for j in range(0, count, SIMD_WIDTH):
+    own = wide_splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
+    reach = wide_splat(shapes[9, i])
+    for j in range(0, count, WIDE):
         dx, dy, dz = (
-            vsub(x, span(others, j)),
-            vsub(y, span(others, width + j)),
-            vsub(z, span(others, 2 * width + j)),
+            vsub(x, wide_span(others, j)),
+            vsub(y, wide_span(others, width + j)),
+            vsub(z, wide_span(others, 2 * width + j)),
         )
         cx, cy, cz = (
-            span(others, 3 * width + j), span(others, 4 * width + j), span(others, 5 * width + j)
-        )  # fmt: skip
+            wide_span(others, 3 * width + j),
+            wide_span(others, 4 * width + j),
+            wide_span(others, 5 * width + j),
+        )
         ex, ey, ez = (
-            span(others, 6 * width + j), span(others, 7 * width + j), span(others, 8 * width + j)
-        )  # fmt: skip
-        square = dot(dx, dy, dz, dx, dy, dz, splat(np.float32(1e-12)))
+            wide_span(others, 6 * width + j),
+            wide_span(others, 7 * width + j),
+            wide_span(others, 8 * width + j),
+        )
+        square = dot(dx, dy, dz, dx, dy, dz, wide_splat(np.float32(1e-12)))
         inverse = rsqrt(square)
         second = vmul(inverse, inverse)
         a = madd(ax, dx, madd(ay, dy, madd(az, dz, zero)))
@@ -216,7 +224,7 @@ def far_means(shapes, i, others, count, out):
         along = vmadd(a, a, vmadd(b, b, vmadd(c, c, vmul(e, e))))
         excess = madd(np.float32(1.5), vmul(along, second), madd(np.float32(-0.5), whole, zero))
         value = vmadd(vmul(inverse, second), excess, inverse)
-        far = vadd(reach, span(others, 9 * width + j))
+        far = vadd(reach, wide_span(others, 9 * width + j))
         put_span(out, j, where_above(square, vmul(far, far), value, near))
 
 
@@ -282,13 +290,13 @@ def _add_rectangles(table, extent, near, count, weight, room, out):
             room[q, k], room[26 + q, k] = at(table, q * n + i), at(table, q * n + j)
         ratio = (extent[i] / extent[j]) ** 4
         room[52, k] = ratio / (1.0 + ratio)
-    for k in range(0, count, SIMD_WIDTH):
-        mine = theirs = splat(np.float32(0.0))
+    for k in range(0, count, WIDE):
+        mine = theirs = wide_splat(np.float32(0.0))
         for q in range(4):
             point, other = 3 * q * width + k, (26 + 3 * q) * width + k
             mine = vadd(mine, rectangle_potential(room, 12 * width + k, room, other))
             theirs = vadd(theirs, rectangle_potential(room, 38 * width + k, room, point))
-        put_span(room, k, vmadd(span(room, 52 * width + k), vsub(mine, theirs), theirs))
+        put_span(room, k, vmadd(wide_span(room, 52 * width + k), vsub(mine, theirs), theirs))
     for k in range(count):
         i, j = near[0, k], near[1, k]
         out[i, j] += weight[i] * _upon(table, i, j, 0.25 * at(room, k))

@@ -17,8 +17,6 @@ from capsense._jit import compiled, kernel
 from capsense._simd import (
     dot,
     rsqrt,
-    span,
-    splat,
     vadd,
     vdiv,
     vlog,
@@ -26,6 +24,8 @@ from capsense._simd import (
     vmul,
     vsub,
     where_above,
+    wide_span,
+    wide_splat,
 )
 
 NEAR = 2.2
@@ -199,7 +199,7 @@ def fill_flux(panels, out):
 
 @kernel
 def rectangle_potential(frames, o, points, p):
-    """Potentials of unit charge spread evenly over eight rectangles, at a point each [1/m].
+    """Potentials of unit charge spread evenly over sixteen rectangles, at a point each [1/m].
 
     The integral of 1/r over a rectangle with corners (left, below) and (x, y), seen from a height
     z > 0 (Wilton et al. 1984), with the logarithms, and the angles, of two corners in one.
@@ -211,20 +211,41 @@ def rectangle_potential(frames, o, points, p):
         points: Table whose columns hold points.
         p: Where the first coordinate of these stands.
     """
-    n, w, zero = points.shape[1], frames.shape[1], splat(np.float32(0.0))
-    dx = vsub(span(points, p), span(frames, o))
-    dy = vsub(span(points, p + n), span(frames, o + w))
-    dz = vsub(span(points, p + 2 * n), span(frames, o + 2 * w))
+    n, w, zero = points.shape[1], frames.shape[1], wide_splat(np.float32(0.0))
+    dx = vsub(wide_span(points, p), wide_span(frames, o))
+    dy = vsub(wide_span(points, p + n), wide_span(frames, o + w))
+    dz = vsub(wide_span(points, p + 2 * n), wide_span(frames, o + 2 * w))
     u, v, z = (
-        dot(dx, dy, dz, span(frames, o + 3 * w), span(frames, o + 4 * w), span(frames, o + 5 * w),
-            zero),
-        dot(dx, dy, dz, span(frames, o + 6 * w), span(frames, o + 7 * w), span(frames, o + 8 * w),
-            zero),
-        dot(dx, dy, dz, span(frames, o + 9 * w), span(frames, o + 10 * w),
-            span(frames, o + 11 * w), zero),
-    )  # fmt: skip
-    a, b = span(frames, o + 12 * w), span(frames, o + 13 * w)
-    z = vadd(where_above(z, zero, z, vsub(zero, z)), splat(np.float32(1e-9)))
+        dot(
+            dx,
+            dy,
+            dz,
+            wide_span(frames, o + 3 * w),
+            wide_span(frames, o + 4 * w),
+            wide_span(frames, o + 5 * w),
+            zero,
+        ),
+        dot(
+            dx,
+            dy,
+            dz,
+            wide_span(frames, o + 6 * w),
+            wide_span(frames, o + 7 * w),
+            wide_span(frames, o + 8 * w),
+            zero,
+        ),
+        dot(
+            dx,
+            dy,
+            dz,
+            wide_span(frames, o + 9 * w),
+            wide_span(frames, o + 10 * w),
+            wide_span(frames, o + 11 * w),
+            zero,
+        ),
+    )
+    a, b = wide_span(frames, o + 12 * w), wide_span(frames, o + 13 * w)
+    z = vadd(where_above(z, zero, z, vsub(zero, z)), wide_splat(np.float32(1e-9)))
     x, left, y, below = vsub(a, u), vsub(vsub(zero, a), u), vsub(b, v), vsub(vsub(zero, b), v)
     zz = vmul(z, z)
     xs, ls = vmadd(x, x, zz), vmadd(left, left, zz)
@@ -241,7 +262,7 @@ def rectangle_potential(frames, o, points, p):
         _between(vmul(x, y), vmul(z, r), vmul(x, below), vmul(z, s)),
         _between(vmul(left, y), vmul(z, t), vmul(left, below), vmul(z, e)),
     )
-    return vdiv(vsub(out, vmul(z, angle)), vmul(splat(np.float32(4.0)), vmul(a, b)))
+    return vdiv(vsub(out, vmul(z, angle)), vmul(wide_splat(np.float32(4.0)), vmul(a, b)))
 
 
 @kernel
@@ -256,7 +277,7 @@ def _side(end, start, far, near, square):
 
     Where a sum would be a small difference it is ``square`` over the other one.
     """
-    zero, one = splat(np.float32(0.0)), splat(np.float32(1.0))
+    zero, one = wide_splat(np.float32(0.0)), wide_splat(np.float32(1.0))
     last = vadd(far, where_above(end, zero, end, vsub(zero, end)))
     first = vadd(near, where_above(start, zero, start, vsub(zero, start)))
     over = vmul(where_above(end, zero, last, square), where_above(start, zero, one, first))
@@ -267,27 +288,27 @@ def _side(end, start, far, near, square):
 @kernel
 def _between(p, q, r, s):
     """``atan(p / q) - atan(r / s)``, q and s above zero."""
-    zero = splat(np.float32(0.0))
+    zero = wide_splat(np.float32(0.0))
     return angle_of(vmadd(q, s, vmul(p, r)), vmadd(p, s, vsub(zero, vmul(r, q))))
 
 
 @kernel
 def angle_of(x, y):
     """Angle of the points (x, y), from -π to π, to 3e-7; 0 at the origin."""
-    zero, tiny = splat(np.float32(0.0)), splat(np.float32(1e-37))
+    zero, tiny = wide_splat(np.float32(0.0)), wide_splat(np.float32(1e-37))
     up, right = where_above(y, zero, y, vsub(zero, y)), where_above(x, zero, x, vsub(zero, x))
     low, high = where_above(up, right, right, up), where_above(up, right, up, right)
-    wide = vsub(low, vmul(splat(np.float32(0.4142135624)), high))
+    wide = vsub(low, vmul(wide_splat(np.float32(0.4142135624)), high))
     above = where_above(wide, zero, vsub(low, high), low)
     below = where_above(wide, zero, vadd(low, high), high)
-    part = where_above(wide, zero, splat(np.float32(0.25 * math.pi)), zero)
+    part = where_above(wide, zero, wide_splat(np.float32(0.25 * math.pi)), zero)
     t = vdiv(above, where_above(below, tiny, below, tiny))
     square = vmul(t, t)
-    series = splat(np.float32(_ATAN[0]))
-    series = vmadd(series, square, splat(np.float32(_ATAN[1])))
-    series = vmadd(series, square, splat(np.float32(_ATAN[2])))
-    series = vmadd(series, square, splat(np.float32(_ATAN[3])))
+    series = wide_splat(np.float32(_ATAN[0]))
+    series = vmadd(series, square, wide_splat(np.float32(_ATAN[1])))
+    series = vmadd(series, square, wide_splat(np.float32(_ATAN[2])))
+    series = vmadd(series, square, wide_splat(np.float32(_ATAN[3])))
     angle = vadd(part, vmadd(vmul(series, square), t, t))
-    angle = where_above(up, right, vsub(splat(np.float32(0.5 * math.pi)), angle), angle)
-    angle = where_above(zero, x, vsub(splat(np.float32(math.pi)), angle), angle)
+    angle = where_above(up, right, vsub(wide_splat(np.float32(0.5 * math.pi)), angle), angle)
+    angle = where_above(zero, x, vsub(wide_splat(np.float32(math.pi)), angle), angle)
     return where_above(zero, y, vsub(zero, angle), angle)

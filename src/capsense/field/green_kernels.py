@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from capsense._dense import WIDTH
 from capsense._jit import compiled, kernel
 from capsense._simd import (
-    SIMD_WIDTH,
+    WIDE,
     at,
     madd,
     put_span,
     rsqrt,
-    span,
-    splat,
     vadd,
     vmadd,
     vmul,
     vsub,
     where_above,
+    wide_span,
+    wide_splat,
 )
 from capsense.design.model import Design
 from capsense.field.green import LEVELS, GreenFunction
@@ -151,23 +151,36 @@ def source_potentials(points, sources, floor, least, out):
 
     Args:
         points: [m], shape (k, 4, 3), single precision, as all that follows.
-        sources: [m], shape (3, s), s a multiple of 8.
+        sources: [m], shape (3, s), s a multiple of 16.
         floor: Height of the floor [m].
         least: No point counts as nearer to a source than this [m]; where bodies reach into the
             sensor, they would meet sources that stand for charges elsewhere.
         out: Filled [1/m], shape (k, s).
     """
-    width, quarter, zero = sources.shape[1], np.float32(0.25), splat(np.float32(0.0))
+    width, quarter, zero = sources.shape[1], np.float32(0.25), wide_splat(np.float32(0.0))
     for i in range(points.shape[0]):
-        for s in range(0, width, SIMD_WIDTH):
-            x, y, up = span(sources, s), span(sources, width + s), span(sources, 2 * width + s)
-            down, value = vsub(splat(np.float32(2.0) * floor), up), zero
+        for s in range(0, width, WIDE):
+            x, y, up = (
+                wide_span(sources, s),
+                wide_span(sources, width + s),
+                wide_span(sources, 2 * width + s),
+            )
+            down, value = vsub(wide_splat(np.float32(2.0) * floor), up), zero
             for q in range(4):
                 o = 12 * i + 3 * q
-                value = vadd(value, _potential(
-                    splat(at(points, o)), splat(at(points, o + 1)), splat(at(points, o + 2)),
-                    x, y, up, down, splat(least * least),
-                ))  # fmt: skip
+                value = vadd(
+                    value,
+                    _potential(
+                        wide_splat(at(points, o)),
+                        wide_splat(at(points, o + 1)),
+                        wide_splat(at(points, o + 2)),
+                        x,
+                        y,
+                        up,
+                        down,
+                        wide_splat(least * least),
+                    ),
+                )
             put_span(out, i * width + s, madd(quarter, value, zero))
 
 
@@ -176,7 +189,7 @@ def point_potentials(points, sources, table, limits, out):
     """Potentials of sources and their images at points, for every column of their charges.
 
     Args:
-        points: [m], shape (3, p), p a multiple of 8.
+        points: [m], shape (3, p), p a multiple of 16.
         sources: [m], shape (3, s).
         table: Charges, shape (s, c), c a multiple of 8.
         limits: Floor and ``least`` [m], as :func:`source_potentials` takes them.
@@ -184,17 +197,27 @@ def point_potentials(points, sources, table, limits, out):
     """
     count, width, columns = points.shape[1], sources.shape[1], table.shape[1]
     floor, least = limits
-    twice, bound = np.float32(2.0) * floor, splat(least * least)
-    for c in range(0, columns, SIMD_WIDTH):
-        for i in range(0, count, SIMD_WIDTH):
-            x, y, z = span(points, i), span(points, count + i), span(points, 2 * count + i)
-            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(np.float32(0.0))
+    twice, bound = np.float32(2.0) * floor, wide_splat(least * least)
+    for c in range(0, columns, 8):
+        for i in range(0, count, WIDE):
+            x, y, z = (
+                wide_span(points, i),
+                wide_span(points, count + i),
+                wide_span(points, 2 * count + i),
+            )
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = wide_splat(np.float32(0.0))
             for s in range(width):
                 up = at(sources, 2 * width + s)
                 value = _potential(
-                    x, y, z, splat(at(sources, s)), splat(at(sources, width + s)), splat(up),
-                    splat(twice - up), bound,
-                )  # fmt: skip
+                    x,
+                    y,
+                    z,
+                    wide_splat(at(sources, s)),
+                    wide_splat(at(sources, width + s)),
+                    wide_splat(up),
+                    wide_splat(twice - up),
+                    bound,
+                )
                 o = s * columns + c
                 a0, a1 = madd(at(table, o), value, a0), madd(at(table, o + 1), value, a1)
                 a2, a3 = madd(at(table, o + 2), value, a2), madd(at(table, o + 3), value, a3)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from capsense._jit import kernel
 from capsense._simd import (
     SIMD_WIDTH,
+    WIDE,
     at,
     madd,
     put_span,
@@ -26,6 +27,8 @@ from capsense._simd import (
     vmul,
     vsub,
     where_above,
+    wide_span,
+    wide_splat,
 )
 
 Array = NDArray[np.float64]
@@ -87,22 +90,22 @@ def nodes_of(grid: Grid) -> Array:
 @kernel
 def to_grid(points, grid):
     """Replace points (3, p) [m] by their coordinates in a grid, counted in cells from its first
-    node; p a multiple of 8."""
-    count, zero, one = points.shape[1], splat(np.float32(0.0)), splat(np.float32(1.0))
+    node; p a multiple of 16."""
+    count, zero, one = points.shape[1], wide_splat(np.float32(0.0)), wide_splat(np.float32(1.0))
     growth = np.float32(GROWTH)
     for i in range(3):
         inverse = np.float32(1.0) / grid.size[2, i]
-        low, high = splat(grid.box[0, i]), splat(grid.box[1, i])
-        for k in range(0, count, SIMD_WIDTH):
-            x = span(points, i * count + k)
+        low, high = wide_splat(grid.box[0, i]), wide_splat(grid.box[1, i])
+        for k in range(0, count, WIDE):
+            x = wide_span(points, i * count + k)
             above, below = vsub(x, high), vsub(low, x)
             inside = where_above(above, zero, high, where_above(below, zero, low, x))
             off = where_above(above, zero, above, where_above(below, zero, below, zero))
-            off = vlog(vadd(one, vmul(splat(growth * inverse), off)))
-            off = vmul(splat(np.float32(1.0) / growth), off)
+            off = vlog(vadd(one, vmul(wide_splat(growth * inverse), off)))
+            off = vmul(wide_splat(np.float32(1.0) / growth), off)
             off = where_above(above, zero, off, vsub(zero, off))
-            u = madd(inverse, vsub(inside, low), vsub(off, splat(grid.size[1, i])))
-            least, most = splat(np.float32(1.0)), splat(grid.size[0, i] - np.float32(2.0))
+            u = madd(inverse, vsub(inside, low), vsub(off, wide_splat(grid.size[1, i])))
+            least, most = wide_splat(np.float32(1.0)), wide_splat(grid.size[0, i] - np.float32(2.0))
             u = where_above(u, least, where_above(most, u, u, most), least)
             put_span(points, i * count + k, u)
 

@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 from capsense._dense import multiply
 from capsense._jit import compiled, kernel
 from capsense._simd import (
-    SIMD_WIDTH,
+    WIDE,
     at,
     dot,
     doubles,
     madd,
     put_span,
     rsqrt,
-    span,
-    splat,
     vadd,
     vmadd,
     vmul,
     vsub,
     where_above,
+    wide_span,
+    wide_splat,
 )
 from capsense.elements.mean_kernels import extent_of, four_points
 from capsense.field.green_kernels import (
@@ -158,18 +158,22 @@ def source_lines(points, sources, floor, least, out):
     """
     width = sources.shape[1]
     layer = out.shape[1] * width
-    zero = splat(np.float32(0.0))
-    two, bound = splat(np.float32(2.0) * floor), splat(least * least)
+    zero = wide_splat(np.float32(0.0))
+    two, bound = wide_splat(np.float32(2.0) * floor), wide_splat(least * least)
     for i in range(points.shape[0]):
-        for s in range(0, width, SIMD_WIDTH):
-            sx, sy, high = span(sources, s), span(sources, width + s), span(sources, 2 * width + s)
+        for s in range(0, width, WIDE):
+            sx, sy, high = (
+                wide_span(sources, s),
+                wide_span(sources, width + s),
+                wide_span(sources, 2 * width + s),
+            )
             low = vsub(two, high)
             value = fx = fy = fz = gx = gy = zero
             for q in range(4):
                 o = 12 * i + 3 * q
-                dx = vsub(splat(at(points, o)), sx)
-                dy = vsub(splat(at(points, o + 1)), sy)
-                z = splat(at(points, o + 2))
+                dx = vsub(wide_splat(at(points, o)), sx)
+                dy = vsub(wide_splat(at(points, o + 1)), sy)
+                z = wide_splat(at(points, o + 2))
                 dz, ez = vsub(z, high), vsub(z, low)
                 across = vmadd(dx, dx, vmul(dy, dy))
                 square = vmadd(dz, dz, across)
@@ -202,29 +206,33 @@ def _put_six(out, place, layer, six):
 def pair_line(shapes, i, others, weight, out, row):
     """Add force and torque on cluster i by others, by moments, to row ``row`` of ``out``."""
     width = others.shape[1]
-    layer, zero = out.shape[1] * width, splat(np.float32(0.0))
+    layer, zero = out.shape[1] * width, wide_splat(np.float32(0.0))
     x, y, z = shapes[0, i], shapes[1, i], shapes[2, i]
     ax, ay, az = shapes[3, i], shapes[4, i], shapes[5, i]
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
-    own = splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
-    for j in range(0, width, SIMD_WIDTH):
-        dx = vsub(splat(x), span(others, j))
-        dy = vsub(splat(y), span(others, width + j))
-        dz = vsub(splat(z), span(others, 2 * width + j))
+    own = wide_splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
+    for j in range(0, width, WIDE):
+        dx = vsub(wide_splat(x), wide_span(others, j))
+        dy = vsub(wide_splat(y), wide_span(others, width + j))
+        dz = vsub(wide_splat(z), wide_span(others, 2 * width + j))
         cx, cy, cz = (
-            span(others, 3 * width + j), span(others, 4 * width + j), span(others, 5 * width + j)
-        )  # fmt: skip
+            wide_span(others, 3 * width + j),
+            wide_span(others, 4 * width + j),
+            wide_span(others, 5 * width + j),
+        )
         ex, ey, ez = (
-            span(others, 6 * width + j), span(others, 7 * width + j), span(others, 8 * width + j)
-        )  # fmt: skip
-        inverse = rsqrt(dot(dx, dy, dz, dx, dy, dz, splat(np.float32(1e-12))))
+            wide_span(others, 6 * width + j),
+            wide_span(others, 7 * width + j),
+            wide_span(others, 8 * width + j),
+        )
+        inverse = rsqrt(dot(dx, dy, dz, dx, dy, dz, wide_splat(np.float32(1e-12))))
         second = vmul(inverse, inverse)
         a = madd(ax, dx, madd(ay, dy, madd(az, dz, zero)))
         b = madd(bx, dx, madd(by, dy, madd(bz, dz, zero)))
         c, e = dot(cx, cy, cz, dx, dy, dz, zero), dot(ex, ey, ez, dx, dy, dz, zero)
         whole = dot(cx, cy, cz, cx, cy, cz, dot(ex, ey, ez, ex, ey, ez, own))
         along = vmul(vmadd(a, a, vmadd(b, b, vmadd(c, c, vmul(e, e)))), second)
-        third = vmul(vmul(span(weight, j), inverse), second)
+        third = vmul(vmul(wide_span(weight, j), inverse), second)
         fifth = madd(np.float32(3.0), vmul(third, second), zero)
         radial = madd(np.float32(0.5), whole, madd(np.float32(-2.5), along, zero))
         radial = vmadd(fifth, radial, vsub(zero, third))
@@ -242,16 +250,16 @@ def pair_line(shapes, i, others, weight, out, row):
         tz = madd(x, fy, madd(-y, fx, _cross(ux, uy, dx, dy)))
         o = row * width + j
         _put_six(out, o, layer, (
-            vadd(fx, span(out, o)), vadd(fy, span(out, o + layer)),
-            vadd(fz, span(out, o + 2 * layer)), vadd(tx, span(out, o + 3 * layer)),
-            vadd(ty, span(out, o + 4 * layer)), vadd(tz, span(out, o + 5 * layer)),
+            vadd(fx, wide_span(out, o)), vadd(fy, wide_span(out, o + layer)),
+            vadd(fz, wide_span(out, o + 2 * layer)), vadd(tx, wide_span(out, o + 3 * layer)),
+            vadd(ty, wide_span(out, o + 4 * layer)), vadd(tz, wide_span(out, o + 5 * layer)),
         ))  # fmt: skip
 
 
 @kernel
 def _cross(x, y, u, v):
     """``x v - y u``."""
-    zero = splat(np.float32(0.0))
+    zero = wide_splat(np.float32(0.0))
     return vmadd(x, v, vsub(zero, vmul(y, u)))
 
 
@@ -274,10 +282,10 @@ def near_pairs(points, others, soft, i, own, weight, near, line):
         near[13, count] = j
         count += 1
     width = near.shape[1]
-    for k in range(0, count, SIMD_WIDTH):
-        zero = splat(np.float32(0.0))
+    for k in range(0, count, WIDE):
+        zero = wide_splat(np.float32(0.0))
         gx = gy = gz = tx = ty = tz = zero
-        bound = span(near, 12 * width + k)
+        bound = wide_span(near, 12 * width + k)
         for p in range(4):
             x, y, z = (
                 np.float32(points[i, p, 0]), np.float32(points[i, p, 1]),
@@ -286,9 +294,9 @@ def near_pairs(points, others, soft, i, own, weight, near, line):
             fx = fy = fz = zero
             for q in range(4):
                 o = 3 * q * width + k
-                dx = vsub(splat(x), span(near, o))
-                dy = vsub(splat(y), span(near, o + width))
-                dz = vsub(splat(z), span(near, o + 2 * width))
+                dx = vsub(wide_splat(x), wide_span(near, o))
+                dy = vsub(wide_splat(y), wide_span(near, o + width))
+                dz = vsub(wide_splat(z), wide_span(near, o + 2 * width))
                 s = dot(dx, dy, dz, dx, dy, dz, zero)
                 u = rsqrt(vmadd(s, s, bound))
                 # s / (s s + bound)^(5/4)

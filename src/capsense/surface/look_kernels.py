@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
-from capsense._simd import SIMD_WIDTH, doubles, integers
+from capsense._simd import WIDE, doubles, integers
 from capsense.field.green_kernels import (
     NEAR_FACE,
     SHORE,
@@ -165,14 +165,14 @@ def far_potentials(points, places, share, green, means):
     """
     found = points.shape[0]
     near, close, rest = np.arange(found), np.empty(found), np.empty(found)
-    columns = np.empty((3, SIMD_WIDTH * ((found + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
+    columns = np.empty((3, WIDE * ((found + WIDE - 1) // WIDE)), np.float32)
     _put_columns(points, near, columns)
     to_grid(columns, green.grid)
     count = _close(points, share, green, near, close, rest)
     grid_values(columns, green.grid, rest, places, means)
     if count == 0:
         return
-    columns = np.empty((3, SIMD_WIDTH * ((count + SIMD_WIDTH - 1) // SIMD_WIDTH)), np.float32)
+    columns = np.empty((3, WIDE * ((count + WIDE - 1) // WIDE)), np.float32)
     phi = np.empty((green.lead, columns.shape[1]), np.float32)
     _put_columns(points, near[:count], columns)
     limits = np.float32(green.floor), np.float32(green.levels[-1].least)

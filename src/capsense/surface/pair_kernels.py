@@ -8,18 +8,18 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import (
-    SIMD_WIDTH,
+    WIDE,
     at,
     dot,
     madd,
     put_span,
     rsqrt,
-    span,
-    splat,
     vadd,
     vmadd,
     vmul,
     vsub,
+    wide_span,
+    wide_splat,
 )
 from capsense.elements.mean_kernels import (
     add_means,
@@ -188,17 +188,21 @@ def _near_means(flat, i, others, length, out, room):
             room[12, count] = bound * bound * bound * bound + np.float32(1e-24)
             room[13, count] = j
             count += 1
-    zero = splat(np.float32(0.0))
-    for k in range(0, count, SIMD_WIDTH):
-        total, bound = zero, span(room, 12 * width + k)
+    zero = wide_splat(np.float32(0.0))
+    for k in range(0, count, WIDE):
+        total, bound = zero, wide_span(room, 12 * width + k)
         for q in range(4):
             o = 3 * q * width + k
-            ux, uy, uz = span(room, o), span(room, o + width), span(room, o + 2 * width)
+            ux, uy, uz = (
+                wide_span(room, o),
+                wide_span(room, o + width),
+                wide_span(room, o + 2 * width),
+            )
             for p in range(4):
                 o = 3 * p * n + i
-                dx = vsub(splat(at(flat, o)), ux)
-                dy = vsub(splat(at(flat, o + n)), uy)
-                dz = vsub(splat(at(flat, o + 2 * n)), uz)
+                dx = vsub(wide_splat(at(flat, o)), ux)
+                dy = vsub(wide_splat(at(flat, o + n)), uy)
+                dz = vsub(wide_splat(at(flat, o + 2 * n)), uz)
                 square = dot(dx, dy, dz, dx, dy, dz, zero)
                 fourth = vmadd(square, square, bound)
                 total = vadd(total, rsqrt(vmul(fourth, rsqrt(fourth))))

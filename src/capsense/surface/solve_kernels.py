@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capsense._dense import WIDTH, cholesky, multiply_part, substitute
 from capsense._jit import compiled, kernel
-from capsense._simd import SIMD_WIDTH, at, madd, put_span, span, splat, vsub
+from capsense._simd import WIDE, at, madd, put_span, span, vsub, wide_span, wide_splat
 from capsense.surface.reach_kernels import add_own
 
 SHEET = 6.0
@@ -63,33 +63,33 @@ class Reduced(NamedTuple):
 def _differences(cut, functions, values, out, start):
     """Integrals with the first functions of what has the means ``values`` (k, m) on clusters.
 
-    They fill m columns of ``out`` from ``start`` on, a row each function; m is a multiple of 8.
+    They fill m columns of ``out`` from ``start`` on, a row each function; m is a multiple of 16.
     """
-    width, zero = values.shape[1], splat(np.float32(0.0))
+    width, zero = values.shape[1], wide_splat(np.float32(0.0))
     for f in range(out.shape[0]):
         a, o = functions.cluster[f], f * out.shape[1] + start
         x, y = (cut.kids[a, 0], cut.kids[a, 1]) if a >= 0 else (-1 - a, np.int64(-1))
-        for i in range(0, width, SIMD_WIDTH):
-            less = span(values, y * width + i) if y >= 0 else zero
-            put_span(out, o + i, vsub(span(values, x * width + i), less))
+        for i in range(0, width, WIDE):
+            less = wide_span(values, y * width + i) if y >= 0 else zero
+            put_span(out, o + i, vsub(wide_span(values, x * width + i), less))
 
 
 @kernel
 def _climb(cut, values):
     """Fill the means (k, m) of all clusters of a cut from those of its leaves, m as above."""
-    width, zero = values.shape[1], splat(np.float32(0.0))
+    width, zero = values.shape[1], wide_splat(np.float32(0.0))
     for a in range(cut.node.shape[0] - 1, -1, -1):
         o, x, y = a * width, cut.kids[a, 0] * width, cut.kids[a, 1] * width
         if x < 0 and cut.leaf[a] < 0:
-            for i in range(0, width, SIMD_WIDTH):
+            for i in range(0, width, WIDE):
                 put_span(values, o + i, zero)
         elif x >= 0:
             whole = np.float32(cut.whole[a])
             p, q = np.float32(cut.parts[a, 0]), np.float32(cut.parts[a, 1])
-            for i in range(0, width, SIMD_WIDTH):
-                own = madd(whole, span(values, o + i), zero) if whole > 0.0 else zero
-                own = madd(q, span(values, y + i), own)
-                put_span(values, o + i, madd(p, span(values, x + i), own))
+            for i in range(0, width, WIDE):
+                own = madd(whole, wide_span(values, o + i), zero) if whole > 0.0 else zero
+                own = madd(q, wide_span(values, y + i), own)
+                put_span(values, o + i, madd(p, wide_span(values, x + i), own))
 
 
 @compiled
@@ -145,7 +145,7 @@ def _integrals(cut, functions, rows, pairs):
             means[cut.leaves[j], i] = rows[j, i]
     _climb(cut, means)
     _differences(cut, functions, means, wide, np.int64(0))
-    most = _whole_spans(max(_CACHED // clusters, SIMD_WIDTH * SIMD_WIDTH))
+    most = _whole_spans(max(_CACHED // clusters, 4 * WIDE))
     many = min(most, _whole_spans(leaves))
     half = np.empty((solved, many * ((leaves + many - 1) // many)), np.float32)
     part = np.zeros((clusters, many), np.float32)
@@ -171,7 +171,7 @@ def _integrals(cut, functions, rows, pairs):
 
 @kernel
 def _whole_spans(columns):
-    return SIMD_WIDTH * max(1, (columns + SIMD_WIDTH - 1) // SIMD_WIDTH)
+    return WIDE * max(1, (columns + WIDE - 1) // WIDE)
 
 
 @compiled
