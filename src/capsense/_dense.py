@@ -8,18 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense._simd import (
-    at,
-    horizontal_sum,
-    madd,
-    muladd,
-    put_span,
-    span,
-    splat,
-    vmadd,
-    wide_span,
-    wide_splat,
-)
+from capsense._simd import at, madd, put_span, span, splat, vadd, wide_span, wide_splat
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""
@@ -54,23 +43,23 @@ def multiply_part(left, table, depth, width, out):
                 c0, c1 = madd(x, v0, c0), madd(x, v1, c1)
                 x = at(left, p + 3 * s + t)
                 d0, d1 = madd(x, v0, d0), madd(x, v1, d1)
-            _put(out, i * w + j, a0, a1)
-            _put(out, (i + 1) * w + j, b0, b1)
-            _put(out, (i + 2) * w + j, c0, c1)
-            _put(out, (i + 3) * w + j, d0, d1)
+            _put(out, i * w + j, 16, a0, a1)
+            _put(out, (i + 1) * w + j, 16, b0, b1)
+            _put(out, (i + 2) * w + j, 16, c0, c1)
+            _put(out, (i + 3) * w + j, 16, d0, d1)
         for i in range(k - k % 4, k):
             a0 = a1 = zero
             for t in range(depth):
                 o = t * w + j
                 x = at(left, i * s + t)
                 a0, a1 = madd(x, wide_span(table, o), a0), madd(x, wide_span(table, o + 16), a1)
-            _put(out, i * w + j, a0, a1)
+            _put(out, i * w + j, 16, a0, a1)
 
 
 @kernel
-def _put(out, place, a, b):
+def _put(out, place, width, a, b):
     put_span(out, place, a)
-    put_span(out, place + 16, b)
+    put_span(out, place + width, b)
 
 
 @kernel
@@ -94,56 +83,79 @@ def multiply_simd(left, table, out):
 
 
 @kernel
+def whole_lines(n):
+    """Columns that a matrix of n rows has for :func:`cholesky`."""
+    return 16 * ((n + 15) // 16)
+
+
+@kernel
 def cholesky(matrix):
-    """Replace the lower half of a symmetric matrix (n, n) by its Cholesky factor.
+    """Replace the upper half of a symmetric matrix by its Cholesky factor U, ``matrix = Uᵀ U``.
+
+    Four rows and 16 columns at a time: their sums stay in registers.
+
+    Args:
+        matrix: Shape (n, w), w at least n and a multiple of 16; what is below the diagonal and
+            behind the first n columns is lost, and counts for nothing.
 
     Returns:
         Whether the matrix is positive definite.
     """
-    n = matrix.shape[0]
-    zero = splat(matrix[0, 0] * 0.0)
-    for i in range(n):
-        for j in range(0, i + 1, 4):
-            if j + 4 <= i:
-                a = b = c = d = zero
-                o, p = i * n, j * n
-                whole = j - j % 8
-                for k in range(0, whole, 8):
-                    v = span(matrix, o + k)
-                    a, b = vmadd(v, span(matrix, p + k), a), vmadd(v, span(matrix, p + n + k), b)
-                    c = vmadd(v, span(matrix, p + 2 * n + k), c)
-                    d = vmadd(v, span(matrix, p + 3 * n + k), d)
-                s0, s1, s2, s3 = (
-                    horizontal_sum(a),
-                    horizontal_sum(b),
-                    horizontal_sum(c),
-                    horizontal_sum(d),
-                )
-                for k in range(whole, j):
-                    x = at(matrix, o + k)
-                    s0 = muladd(x, at(matrix, p + k), s0)
-                    s1 = muladd(x, at(matrix, p + n + k), s1)
-                    s2 = muladd(x, at(matrix, p + 2 * n + k), s2)
-                    s3 = muladd(x, at(matrix, p + 3 * n + k), s3)
-                l0 = (matrix[i, j] - s0) / matrix[j, j]
-                l1 = (matrix[i, j + 1] - s1 - l0 * matrix[j + 1, j]) / matrix[j + 1, j + 1]
-                l2 = (matrix[i, j + 2] - s2 - l0 * matrix[j + 2, j]
-                      - l1 * matrix[j + 2, j + 1]) / matrix[j + 2, j + 2]  # fmt: skip
-                l3 = (matrix[i, j + 3] - s3 - l0 * matrix[j + 3, j] - l1 * matrix[j + 3, j + 1]
-                      - l2 * matrix[j + 3, j + 2]) / matrix[j + 3, j + 3]  # fmt: skip
-                matrix[i, j], matrix[i, j + 1], matrix[i, j + 2], matrix[i, j + 3] = l0, l1, l2, l3
-            else:
-                for e in range(j, min(j + 4, i + 1)):
-                    total = matrix[i, e]
-                    for k in range(e):
-                        total = muladd(-at(matrix, i * n + k), at(matrix, e * n + k), total)
-                    if e < i:
-                        matrix[i, e] = total / matrix[e, e]
-                    elif not total > 0.0:
-                        return False
-                    else:
-                        matrix[i, i] = np.sqrt(total)
+    n, w = matrix.shape
+    for i in range(0, n, 4):
+        _reduce(matrix, i)
+        for f in range(i, min(i + 4, n)):
+            begin = f - f % 8
+            for q in range(i, f):
+                x = -at(matrix, q * w + f)
+                for j in range(begin, w, 8):
+                    o = f * w + j
+                    put_span(matrix, o, madd(x, span(matrix, q * w + j), span(matrix, o)))
+            if not matrix[f, f] > 0.0:
+                return False
+            scale, zero = 1.0 / np.sqrt(matrix[f, f]), splat(0.0)
+            for j in range(begin, w, 8):
+                put_span(matrix, f * w + j, madd(scale, span(matrix, f * w + j), zero))
     return True
+
+
+@kernel
+def _reduce(matrix, i):
+    """Take off four rows from row i on what those before them account for."""
+    n, w = matrix.shape
+    for j in range(i - i % 16, w, 16):
+        if i + 4 <= n:
+            o = i * w + j
+            a0, b0, c0, d0 = (
+                span(matrix, o), span(matrix, o + w), span(matrix, o + 2 * w),
+                span(matrix, o + 3 * w),
+            )  # fmt: skip
+            a1, b1, c1, d1 = (
+                span(matrix, o + 8), span(matrix, o + w + 8), span(matrix, o + 2 * w + 8),
+                span(matrix, o + 3 * w + 8),
+            )  # fmt: skip
+            for p in range(i):
+                u, v = span(matrix, p * w + j), span(matrix, p * w + j + 8)
+                x = -at(matrix, p * w + i)
+                a0, a1 = madd(x, u, a0), madd(x, v, a1)
+                x = -at(matrix, p * w + i + 1)
+                b0, b1 = madd(x, u, b0), madd(x, v, b1)
+                x = -at(matrix, p * w + i + 2)
+                c0, c1 = madd(x, u, c0), madd(x, v, c1)
+                x = -at(matrix, p * w + i + 3)
+                d0, d1 = madd(x, u, d0), madd(x, v, d1)
+            _put(matrix, o, 8, a0, a1)
+            _put(matrix, o + w, 8, b0, b1)
+            _put(matrix, o + 2 * w, 8, c0, c1)
+            _put(matrix, o + 3 * w, 8, d0, d1)
+            continue
+        for f in range(i, n):
+            a0, a1 = span(matrix, f * w + j), span(matrix, f * w + j + 8)
+            for p in range(i):
+                x = -at(matrix, p * w + f)
+                a0 = madd(x, span(matrix, p * w + j), a0)
+                a1 = madd(x, span(matrix, p * w + j + 8), a1)
+            _put(matrix, f * w + j, 8, a0, a1)
 
 
 @kernel
@@ -152,16 +164,21 @@ def substitute(factor, sides):
 
     Columns go eight at a time; m is a multiple of 8.
     """
-    n, m = sides.shape
+    (n, m), w = sides.shape, factor.shape[1]
     for c in range(0, m, 8):
         for i in range(n):
-            total = span(sides, i * m + c)
-            for k in range(i):
-                total = madd(-at(factor, i * n + k), span(sides, k * m + c), total)
-            put_span(sides, i * m + c, madd(1.0 / factor[i, i], total, splat(0.0)))
+            line, o = i * w, i * m + c
+            total = madd(1.0 / at(factor, line + i), span(sides, o), splat(0.0))
+            put_span(sides, o, total)
+            for k in range(i + 1, n):
+                o = k * m + c
+                put_span(sides, o, madd(-at(factor, line + k), total, span(sides, o)))
         for i in range(n - 1, -1, -1):
-            done = madd(1.0 / factor[i, i], span(sides, i * m + c), splat(0.0))
-            put_span(sides, i * m + c, done)
-            for k in range(i):
-                put_span(sides, k * m + c,
-                         madd(-at(factor, i * n + k), done, span(sides, k * m + c)))  # fmt: skip
+            line, o = i * w, i * m + c
+            total, other = span(sides, o), splat(0.0)
+            for k in range(i + 1, n - 1, 2):
+                total = madd(-at(factor, line + k), span(sides, k * m + c), total)
+                other = madd(-at(factor, line + k + 1), span(sides, (k + 1) * m + c), other)
+            if (n - i) % 2 == 0:
+                total = madd(-at(factor, line + n - 1), span(sides, (n - 1) * m + c), total)
+            put_span(sides, o, madd(1.0 / at(factor, line + i), vadd(total, other), splat(0.0)))

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from capsense._dense import cholesky
+from capsense._dense import cholesky, substitute, whole_lines
 from capsense._frozen import Frozen
-from capsense._jit import compiled, kernel
+from capsense._jit import compiled
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.panels import SurfacePanels
@@ -243,37 +243,18 @@ def _made_definite(free: Array) -> Array:
     own = np.diag(free).copy()
     for extra in _EXTRA:
         np.fill_diagonal(free, (1.0 + extra) * own)
-        factor = free.copy()
-        if _factored(factor):
+        factor = np.zeros((len(free), whole_lines(len(free))))
+        factor[:, : len(free)] = free
+        if cholesky(factor):  # several threads of LAPACK hinder each other on busy machines
             break
     else:
         raise SolveError(
             f"the surface of {len(free)} panels meets itself, so that no charge can be told; "
             "remove doubled faces"
         )
-    charge = np.ones(len(free))
-    _substitute(factor, charge)
-    return charge
-
-
-@kernel
-def _factored(matrix: Array) -> bool:
-    """Cholesky on one core: several threads of LAPACK hinder each other on busy machines."""
-    return cholesky(matrix)
-
-
-@kernel
-def _substitute(factor: Array, x: Array) -> None:
-    """Solve ``factor @ factor.T @ x_new = x`` in place; compiled for the same reason as above."""
-    n = x.shape[0]
-    for i in range(n):
-        for j in range(i):
-            x[i] -= factor[i, j] * x[j]
-        x[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        x[i] /= factor[i, i]
-        for j in range(i):
-            x[j] -= factor[i, j] * x[i]
+    sides = np.ones((len(free), 8))
+    substitute(factor, sides)
+    return sides[:, 0].copy()
 
 
 def build_tree(panels: SurfacePanels, charge: Array, most: float = np.inf) -> Tree:

@@ -50,29 +50,35 @@ class PackedBodies:
 class Laid:
     """Records of bodies but for where they stand, which is all that changes at most steps."""
 
-    bodies: list[Shape] | None
-    """The bodies, where each is solved for as a whole wherever it stands, else None."""
+    bodies: list[Shape]
+    """The bodies,"""
     whole: Matter
-    """What the bodies are made of,"""
+    """what they are made of,"""
     places: list[int]
-    """body of each part, its functions and its size [m]: what the records follow from."""
+    """body of each part,"""
     found: list[tuple[RigidShape | ChangingBody, float]]
+    """its functions and its size [m]: what the records follow from."""
     records: NDArray[np.void]
     matter: Matter
     """What the parts are made of."""
     shapes: list[RigidShape | ChangingBody]
+    everywhere: bool = False
+    """Whether each body is solved for as a whole wherever it stands."""
 
 
 def laid_out(
-    whole: Matter, places: list[int], found: list[tuple[RigidShape | ChangingBody, float]]
+    whole: Matter,
+    bodies: list[Shape],
+    places: list[int],
+    found: list[tuple[RigidShape | ChangingBody, float]],
 ) -> Laid:
     shapes, matter = [shape for shape, _ in found], whole.repeated(places)
     records = np.array([s.record for s in shapes], BODY)
     records["scale"] = [size for _, size in found]
     matter.write(records, shapes)
-    return Laid(None, whole, places, found, records, matter, shapes)
+    return Laid(bodies, whole, places, found, records, matter, shapes)
 
 
-def same(known: list[Shape] | None, bodies: list[Shape]) -> bool:
+def same(known: list[Shape], bodies: list[Shape]) -> bool:
     """Whether two lists hold the same objects."""
-    return known is not None and len(known) == len(bodies) and all(map(is_, known, bodies))
+    return len(known) == len(bodies) and all(map(is_, known, bodies))

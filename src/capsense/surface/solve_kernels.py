@@ -8,9 +8,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._dense import WIDTH, cholesky, multiply_part, substitute
+from capsense._dense import WIDTH, cholesky, multiply_part, substitute, whole_lines
 from capsense._jit import compiled, kernel
-from capsense._simd import WIDE, at, madd, put_span, span, vsub, wide_span, wide_splat
+from capsense._simd import (
+    WIDE,
+    at,
+    horizontal_sum,
+    madd,
+    put_span,
+    span,
+    splat,
+    vmadd,
+    vsub,
+    wide_span,
+    wide_splat,
+)
 from capsense.surface.reach_kernels import add_own
 
 SHEET = 6.0
@@ -103,11 +115,9 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
     for f in range(total):
         for i in range(lead):
             phi[f, i] = wide[f, i]
-        square = 0.0
         for k in range(modes):
             psi[f, k] = wide[f, lead + k]
-            square += float(psi[f, k]) * float(psi[f, k])
-        own[f] = -square
+        own[f] = -_square(psi, f)
     response = _products(psi, solved)
     matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
     for f in range(total):
@@ -128,6 +138,15 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
     for f in range(solved):
         own[f] = matrix[f, f]
     return System(phi, matrix, rest, own)
+
+
+@kernel
+def _square(rows, f):
+    """Square of row f of some, whose length is a multiple of 8."""
+    width, total = rows.shape[1], splat(np.float32(0.0))
+    for k in range(f * width, (f + 1) * width, 8):
+        total = vmadd(span(rows, k), span(rows, k), total)
+    return float(horizontal_sum(total))
 
 
 @compiled
@@ -235,7 +254,7 @@ def reduced(functions, system, adjoint):
             root[f] = math.sqrt(fade)
         if fade < 1.0:
             lack[f] = GAIN * (1.0 - fade) * (1.0 - (1.0 - functions.above[f]) ** 4) / own[f]
-    factor, x = np.empty((solved, solved)), np.zeros((total, m))
+    factor, x = np.empty((solved, whole_lines(solved))), np.zeros((total, m))
     for f in range(solved):
         for i in range(m):
             x[f, i] = root[f] * phi[f, i]
@@ -286,7 +305,7 @@ def reduced(functions, system, adjoint):
 
 @kernel
 def factorise(matrix, root, own, factor):
-    """Cholesky factor of √t A √t with A's own diagonal.
+    """Cholesky factor of √t A √t with A's own diagonal; see :func:`capsense._dense.cholesky`.
 
     Where bodies lie within each other or within the sensor, approximate energies may leave no
     definite matrix. The diagonal is then raised, by so much that the energy left is not small.
@@ -294,13 +313,15 @@ def factorise(matrix, root, own, factor):
     Returns:
         By how much it was raised, relative to itself; -1 where there is no factor.
     """
-    shift = 0.0
-    if root.shape[0] == 0:  # no function counts
+    shift, n = 0.0, root.shape[0]
+    if n == 0:  # no function counts
         return shift
     while shift < 1e3:
-        for f in range(root.shape[0]):
-            for e in range(f):
+        for f in range(n):
+            for e in range(n):
                 factor[f, e] = root[f] * matrix[f, e] * root[e]
+            for e in range(n, factor.shape[1]):
+                factor[f, e] = 0.0
             factor[f, f] = matrix[f, f] + shift * abs(own[f])
         if cholesky(factor):
             return shift

@@ -15,7 +15,7 @@ from capsense.design.model import Design
 from capsense.elements.matter import UNIT, Matter, matter_of, sizes_of
 from capsense.elements.panels import longer, windowed
 from capsense.elements.pieces import ChangingBody
-from capsense.elements.rigid import RigidShape
+from capsense.elements.rigid import BODY, RigidShape
 from capsense.elements.store import functions_of
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import Change, Charges
@@ -36,6 +36,8 @@ _OF_MANY = 0.4
 _NO_SOLUTION = "the charges of the bodies cannot be told apart; look for bodies that coincide"
 _LARGE = 0.4
 """Meshes that are longer than this [m] are solved for part by part."""
+_LAYOUTS = 32
+"""So many layouts of bodies are kept."""
 _NARROW = 8e-3
 """Electrodes count as at least so wide [m]: fields of narrower ones reach bodies as a mean."""
 
@@ -106,7 +108,8 @@ class SurfaceSolver:
         self._sight = self.green.room + SHORE * np.array([[-1.0], [1.0]])
         """Corners of the box beyond which no charge is [m], shape (2, 3)."""
         self._last: tuple[View, Solution] | None = None
-        self._laid: Laid | None = None
+        self._laid: dict[tuple[int, ...], Laid] = {}
+        """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
         coarsest = self.preset.coarsest
         self._largest = coarsest and self.preset.panels * (coarsest * _electrode_width(design)) ** 2
@@ -114,7 +117,7 @@ class SurfaceSolver:
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
-        return self.__dict__ | {"_laid": None}
+        return self.__dict__ | {"_laid": {}}
 
     def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
         """Return what a scene changes.
@@ -159,11 +162,13 @@ class SurfaceSolver:
             except CapSenseError as error:
                 out[k] = error
         if plain:
-            counts = [0, *(len(bodies.records) for _, _, bodies in plain)]
-            records = np.concatenate([bodies.records for _, _, bodies in plain])
+            first = np.cumsum([0, *(len(bodies.records) for _, _, bodies in plain)])
+            records = np.empty(first[-1], BODY)  # numpy takes 10 µs for each to concatenate them
+            for (_, _, bodies), start, end in zip(plain, first, first[1:], strict=False):
+                records[start:end] = bodies.records
             with first_use():
                 delta, doubt, size = solve_each(
-                    records, np.cumsum(counts), self.green, self.preset.threshold, self.preset.width
+                    records, first, self.green, self.preset.threshold, self.preset.width
                 )
             delta, doubt = UNIT * delta, UNIT * doubt
             sound = np.isfinite(delta).all(axis=(1, 2))
@@ -270,12 +275,18 @@ class SurfaceSolver:
 
     def pack(self, view: View) -> PackedBodies:
         """Lay out the bodies that reach into the domain."""
-        matter, packed, laid = self._joined(view), view.packed, self._laid
+        matter, packed = self._joined(view), view.packed
         bodies = [packed.shapes[k] for k in view.met.tolist()]
         offsets: list[tuple[int, Array]] = []
-        if laid is None or laid.whole is not matter or not same(laid.bodies, bodies):
-            laid, offsets = self._lay_out(view, matter, bodies)
-            self._laid = laid
+        key = (id(matter), *map(id, bodies))
+        laid = self._laid.get(key)
+        if laid is None or not laid.everywhere:
+            laid, offsets = self._lay_out(view, matter, bodies, laid)
+            if len(self._laid) >= _LAYOUTS or not all(
+                isinstance(s, RigidShape) for s in laid.shapes
+            ):
+                self._laid.clear()  # what changes at every step is not kept
+            self._laid[key] = laid
         records, chosen = laid.records.copy(), view.met[laid.places]
         records["rotation"] = rotation = packed.rotation[chosen]
         records["position"] = packed.position[chosen]
@@ -286,9 +297,12 @@ class SurfaceSolver:
         return PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
 
     def _lay_out(
-        self, view: View, matter: Matter, bodies: list[Shape]
+        self, view: View, matter: Matter, bodies: list[Shape], laid: Laid | None
     ) -> tuple[Laid, list[tuple[int, Array]]]:
-        """Records of the bodies, and where parts of them stand in their frames [m], if not at 0."""
+        """Records of the bodies, and where parts of them stand in their frames [m], if not at 0.
+
+        ``laid`` is what was found of them when they stood elsewhere.
+        """
         found: list[tuple[RigidShape | ChangingBody, float]] = []
         solved: list[Shape] = []
         places: list[int] = []
@@ -302,10 +316,9 @@ class SurfaceSolver:
                 found.append(self.functions_of(part, conducting[place], share))
                 solved.append(part)
                 places.append(place)
-        laid = self._laid
-        if laid is None or laid.whole is not matter or (laid.places, laid.found) != (places, found):
-            laid = laid_out(matter, places, found)
-        return replace(laid, bodies=bodies if same(solved, bodies) else None), offsets
+        if laid is None or (laid.places, laid.found) != (places, found):
+            laid = laid_out(matter, bodies, places, found)
+        return replace(laid, everywhere=same(solved, bodies)), offsets
 
     def _joined(self, view: View) -> Matter:
         """What bodies are made of, with conductors that touch as one.

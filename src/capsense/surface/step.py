@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._dense import whole_lines
 from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
@@ -221,7 +222,8 @@ def solve_lossy(
     fade = functions.fade
     root = np.sqrt(fade[:n])
     faded = root[:, None] * matrix[:n] * root
-    shift = factorise(matrix[:n].real.copy(), root, diagonal.real.copy(), np.empty((n, n)))
+    factor = np.empty((n, whole_lines(n)))
+    shift = factorise(matrix[:n].real.copy(), root, diagonal.real.copy(), factor)
     np.fill_diagonal(faded, diagonal[:n] + shift * np.abs(diagonal[:n].real))
     solved = (root[:, None] * phi[:n, :m]).astype(complex)
     eliminate(faded, solved)
