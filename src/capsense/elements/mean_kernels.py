@@ -12,6 +12,7 @@ from capsense._simd import (
     WIDE,
     at,
     dot,
+    horizontal_sum,
     madd,
     put_span,
     rsqrt,
@@ -31,6 +32,8 @@ from capsense.field.green_kernels import smooth
 FAR = 0.75
 """Clusters farther apart than so many of their joint extents are met by their moments; nearer ones
 point by point, and in closed form if they are of one surface."""
+_AWAY = 1e3
+"""Where columns are that are no clusters' [m]."""
 _TOGETHER = 64
 """Pairs of rectangles that are met at a time."""
 _UPON = 0.1
@@ -115,30 +118,52 @@ def add_means(points, extent, body, weight, tables, out):
     """
     start, first, stop, size = body
     shapes, frames, known = tables
-    line = np.empty(shapes.shape[1], np.float32)
+    line = np.full(shapes.shape[1] + WIDE, np.float32(0.0))
     near, room = np.empty((2, _TOGETHER), np.int64), np.empty((53, _TOGETHER), np.float32)
     count = np.int64(0)
     for i in range(first, stop):
         far_means(shapes, i, shapes, i, line)
         row = known[i, 0]
+        own = singles(known[i, 1]) if row >= 0 else singles(np.int64(0))
         if row >= 0:
-            table, o = singles(known[i, 1]), row * (row + 1) // 2
-            line[i] = table[o + row] / size
-            for j in range(start, i):
-                if line[j] < 0.0 and known[j, 0] >= 0:
-                    line[j] = table[o + known[j, 0]] / size
+            line[i] = own[row * (row + 1) // 2 + row] / size
         else:
             line[i] = _self_mean(arm(points[i, 0], points[i, 1]), arm(points[i, 0], points[i, 2]))
-        for j in range(start, i + 1):
-            if line[j] >= 0.0:
-                out[i, j] += weight[i] * line[j]
+        for j in range(start, i + 1, WIDE):
+            end = min(j + WIDE, i + 1)
+            if not _some_below_zero(line, j):
+                add_line(line, weight[i], (j, end), out, i)
                 continue
-            near[0, count], near[1, count] = i, j
-            count += 1
-            if count == _TOGETHER:
+            for k in range(j, end):
+                if line[k] < 0.0 and row >= 0 and known[k, 0] >= 0:
+                    line[k] = own[row * (row + 1) // 2 + known[k, 0]] / size
+                if line[k] < 0.0:
+                    near[0, count], near[1, count] = i, k
+                    count += 1
+                else:
+                    out[i, k] += weight[i] * line[k]
+            if count + WIDE > _TOGETHER:
                 _add_rectangles(frames, extent, near, count, weight, room, out)
                 count = np.int64(0)
     _add_rectangles(frames, extent, near, count, weight, room, out)
+
+
+@kernel
+def _some_below_zero(line, start):
+    """Whether one of the sixteen numbers of a line from ``start`` on is below zero."""
+    zero, one = wide_splat(np.float32(0.0)), wide_splat(np.float32(1.0))
+    return horizontal_sum(where_above(zero, wide_span(line, start), one, zero)) > 0.0
+
+
+@kernel
+def add_line(line, factor, span, out, row):
+    """Add some numbers of a line, times a factor, to a row of ``out``; from span[0] to span[1]."""
+    (start, stop), factor = span, np.float32(factor)
+    whole, o = stop - (stop - start) % WIDE, row * out.shape[1]
+    for j in range(start, whole, WIDE):
+        put_span(out, o + j, madd(factor, wide_span(line, j), wide_span(out, o + j)))
+    for j in range(whole, stop):
+        out[row, j] += factor * line[j]
 
 
 @compiled
@@ -167,9 +192,11 @@ def mirror(matrix):
 def cluster_moments(points, extent):
     """Centre, the two arms and the reach of each cluster, a column each, shape (10, w).
 
-    There are as many columns as :func:`room_for` says; the last are no clusters'.
+    There are as many columns as :func:`room_for` says; the last are no clusters', and far away.
     """
     out = np.zeros((10, room_for(points.shape[0])), np.float32)
+    for j in range(points.shape[0], out.shape[1]):
+        out[0, j] = _AWAY
     for j in range(points.shape[0]):
         for i in range(3):
             out[i, j] = 0.5 * (points[j, 0, i] + points[j, 3, i])
@@ -187,7 +214,12 @@ def room_for(clusters):
 
 @kernel
 def far_means(shapes, i, others, count, out):
-    """Means of 1/r between cluster i and the first others, by second moments; -1 for near ones."""
+    """Means of 1/r between cluster i and the first others, by second moments; -1 for near ones.
+
+    Returns:
+        Whether there are near ones.
+    """
+    some = wide_splat(np.float32(0.0))
     width, zero, near = shapes.shape[1], wide_splat(np.float32(0.0)), wide_splat(np.float32(-1.0))
     x, y, z = (
         wide_splat(at(shapes, i)),
@@ -225,7 +257,10 @@ def far_means(shapes, i, others, count, out):
         excess = madd(np.float32(1.5), vmul(along, second), madd(np.float32(-0.5), whole, zero))
         value = vmadd(vmul(inverse, second), excess, inverse)
         far = vadd(reach, wide_span(others, 9 * width + j))
-        put_span(out, j, where_above(square, vmul(far, far), value, near))
+        limit = vmul(far, far)
+        put_span(out, j, where_above(square, limit, value, near))
+        some = where_above(square, limit, some, near)
+    return horizontal_sum(some) < 0.0
 
 
 @kernel

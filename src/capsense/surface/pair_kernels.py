@@ -22,6 +22,7 @@ from capsense._simd import (
     wide_splat,
 )
 from capsense.elements.mean_kernels import (
+    add_line,
     add_means,
     arm,
     cluster_moments,
@@ -53,7 +54,7 @@ def leaf_pairs(leaves, floor):
     """
     points, extent, owner, soft = leaves.points, leaves.extent, leaves.owner, leaves.soft
     n = points.shape[0]
-    out = np.empty((n, n), np.float32)
+    out = np.zeros((n, n), np.float32)
     image = np.empty((n, 4, 3))
     for j in range(n):
         for q in range(4):
@@ -66,15 +67,13 @@ def leaf_pairs(leaves, floor):
     for i in range(n):
         if owner[i] != owner[behind]:
             behind = i
-        far_means(shapes, i, mirrored, i + 1, line)
-        _near_means(flat, i, below, i + 1, line, room)
-        for j in range(i + 1):
-            out[i, j] = -line[j]
+        if far_means(shapes, i, mirrored, i + 1, line):
+            _near_means(flat, i, below, i + 1, line, room)
+        add_line(line, -1.0, (0, i + 1), out, i)
         if behind > 0:
-            far_means(shapes, i, shapes, behind, line)
-            _near_means(flat, i, flat, behind, line, room)
-            for j in range(behind):
-                out[i, j] += line[j]
+            if far_means(shapes, i, shapes, behind, line):
+                _near_means(flat, i, flat, behind, line, room)
+            add_line(line, 1.0, (0, behind), out, i)
         out[i, i] += BARRIER * leaves.beyond[i] ** 3
     tables, start = (shapes, rectangles(points, leaves.within), leaves.known), 0
     for i in range(n):
