@@ -69,45 +69,52 @@ class Leaves(NamedTuple):
 def placed(bodies, cut, green):
     """Place the leaves of a cut in the sensor frame."""
     n = cut.leaves.shape[0]
-    points, corners, true = np.empty((n, 4, 3)), np.empty((4, 3)), np.empty((n, 4, 3))
-    extent, soft, out = np.empty(n), np.empty(n), np.empty(n)
-    owner, within = np.empty(n, np.int64), np.zeros(n)
-    known, size = np.full((n, 2), -1), np.empty(n)
-    moments, turn, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    for j in range(n):
-        a = cut.leaves[j]
-        body = bodies[cut.body[a]]
-        owner[j], k, size[j] = cut.body[a], cut.node[a], body.scale
+    leaves = Leaves(
+        np.empty((n, 4, 3)), np.empty((n, 4, 3)), np.empty(n), np.empty(n), np.empty(n),
+        np.empty(n, np.int64), np.zeros(n), np.full((n, 2), -1), np.empty(n),
+    )  # fmt: skip
+    _fill_leaves(bodies, cut, green, leaves, (np.empty((3, 3)), np.empty((3, 3)), np.empty(3)))
+    return leaves
+
+
+@kernel
+def _fill_leaves(bodies, cut, green, leaves, room):
+    """The same; ``room`` is room to work in: two matrices and a vector of three."""
+    moments, turn, middle = room
+    for j in range(cut.leaves.shape[0]):
+        a, corners, points = cut.leaves[j], leaves.true[j], leaves.points[j]
+        body, k = bodies[cut.body[a]], cut.node[a]
+        leaves.owner[j], leaves.size[j] = cut.body[a], body.scale
         if k < body.top:
-            known[j, 0], known[j, 1] = k, body.means
+            leaves.known[j, 0], leaves.known[j, 1] = k, body.means
         if body.energy == 0:  # clusters meet each other at every step
-            within[j] = 1.0 + body.inside * body.softness
+            leaves.within[j] = 1.0 + body.inside * body.softness
         if body.points == 0:
             spread, center = doubles(body.spread), doubles(body.center)
             for i in range(3):
                 middle[i] = center[3 * k + i]
                 for q in range(3):
                     moments[i, q] = spread[9 * k + 3 * i + q]
-            extent[j], soft[j] = four_points(moments, middle, turn, corners)
+            extent, soft = four_points(moments, middle, turn, corners)
         else:
-            local, soft[j] = doubles(body.points), doubles(body.soft)[k]
+            local, soft = doubles(body.points), doubles(body.soft)[k]
             for q in range(4):
                 for i in range(3):
                     corners[q, i] = local[12 * k + 3 * q + i]
-            extent[j] = extent_of(corners)
-        extent[j], soft[j] = body.scale * extent[j], body.scale * soft[j]
+            extent = extent_of(corners)
+        extent *= body.scale
+        leaves.extent[j], leaves.soft[j] = extent, body.scale * soft
         for q in range(4):
             for i in range(3):
-                points[j, q, i] = body.position[i] + body.scale * (
+                points[q, i] = body.position[i] + body.scale * (
                     body.rotation[i, 0] * corners[q, 0] + body.rotation[i, 1] * corners[q, 1]
                     + body.rotation[i, 2] * corners[q, 2])  # fmt: skip
         for q in range(4):
             for i in range(3):
-                true[j, q, i] = points[j, q, i]
-        out[j] = beyond(points[j], green)
+                corners[q, i] = points[q, i]  # before it is lifted
+        leaves.beyond[j] = beyond(points, green)
         if green.cover < 1.0:
-            lift(points[j], least_gap(extent[j], green.cover), green.box)
-    return Leaves(points, true, extent, soft, out, owner, within, known, size)
+            lift(points, least_gap(extent, green.cover), green.box)
 
 
 @compiled
