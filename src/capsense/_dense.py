@@ -12,6 +12,8 @@ from capsense._simd import at, madd, put_span, span, splat, vadd, wide_span, wid
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""
+_TILE = 16
+"""Side of the tiles that a matrix is turned over in."""
 
 
 @kernel
@@ -84,8 +86,22 @@ def multiply_simd(left, table, out):
 
 @kernel
 def whole_lines(n):
-    """Columns that a matrix of n rows has for :func:`cholesky`."""
-    return 16 * ((n + 15) // 16)
+    """Columns that a matrix of n rows has for :func:`cholesky`.
+
+    An odd number of 16s, so that a column's elements do not compete for places in the cache.
+    """
+    return 16 * (((n + 15) // 16) | 1)
+
+
+@kernel
+def mirror(matrix):
+    """Fill in what is above the diagonal of a symmetric matrix, tile by tile."""
+    n = matrix.shape[0]
+    for first in range(0, n, _TILE):
+        for second in range(0, first + 1, _TILE):
+            for i in range(first, min(first + _TILE, n)):
+                for j in range(second, min(second + _TILE, i)):
+                    matrix[j, i] = matrix[i, j]
 
 
 @kernel

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from capsense._dense import WIDTH
+from capsense._dense import WIDTH, mirror
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
@@ -178,14 +178,6 @@ def means_between(points):
     add_means(points, extent, (0, 0, n, 1.0), weight, tables, out)
     mirror(out)
     return out
-
-
-@kernel
-def mirror(matrix):
-    """Fill in what is above the diagonal of a symmetric matrix."""
-    for i in range(matrix.shape[0]):
-        for j in range(i):
-            matrix[j, i] = matrix[i, j]
 
 
 @compiled

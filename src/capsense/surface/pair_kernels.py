@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from capsense._dense import mirror
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
@@ -27,7 +28,6 @@ from capsense.elements.mean_kernels import (
     arm,
     cluster_moments,
     far_means,
-    mirror,
     rectangles,
 )
 from capsense.field.green_kernels import smooth

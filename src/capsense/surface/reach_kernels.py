@@ -93,7 +93,8 @@ def add_own(bodies, cut, functions, inside, matrix, rest, own):
         functions: Their charge functions.
         inside: Whether it is the impedance of the inside that is added, which net charge does not
             meet, or the energies in free space.
-        matrix, rest, own: See :class:`~capsense.surface.solve_kernels.System`.
+        matrix, rest, own: See :class:`~capsense.surface.solve_kernels.System`; of the matrix, only
+            what is not above the diagonal is added to.
     """
     total, solved = functions.cluster.shape[0], functions.solved
     of, first = np.empty(total, np.int64), np.int64(0)
@@ -132,7 +133,6 @@ def add_own(bodies, cut, functions, inside, matrix, rest, own):
                     if e < solved:
                         if f < solved:
                             matrix[f, e] += factor * value
-                            matrix[e, f] = matrix[f, e]
                         else:
                             rest[f - solved, e] += factor * value
                     else:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._dense import WIDTH, cholesky, multiply_part, substitute, whole_lines
+from capsense._dense import WIDTH, cholesky, mirror, multiply_part, substitute, whole_lines
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
@@ -18,11 +18,13 @@ from capsense._simd import (
     put_span,
     span,
     splat,
+    vadd,
     vmadd,
     vsub,
     wide_span,
     wide_splat,
 )
+from capsense.surface.choose_kernels import is_there
 from capsense.surface.reach_kernels import add_own
 
 SHEET = 6.0
@@ -88,20 +90,21 @@ def _differences(cut, functions, values, out, start):
 
 @kernel
 def _climb(cut, values):
-    """Fill the means (k, m) of all clusters of a cut from those of its leaves, m as above."""
+    """Fill the means (k, m) of all clusters of a cut from those of its leaves, m as above.
+
+    Those of clusters of which nothing is within reach have to be zero before.
+    """
     width, zero = values.shape[1], wide_splat(np.float32(0.0))
     for a in range(cut.node.shape[0] - 1, -1, -1):
         o, x, y = a * width, cut.kids[a, 0] * width, cut.kids[a, 1] * width
-        if x < 0 and cut.leaf[a] < 0:
-            for i in range(0, width, WIDE):
-                put_span(values, o + i, zero)
-        elif x >= 0:
-            whole = np.float32(cut.whole[a])
-            p, q = np.float32(cut.parts[a, 0]), np.float32(cut.parts[a, 1])
-            for i in range(0, width, WIDE):
-                own = madd(whole, wide_span(values, o + i), zero) if whole > 0.0 else zero
-                own = madd(q, wide_span(values, y + i), own)
-                put_span(values, o + i, madd(p, wide_span(values, x + i), own))
+        if x < 0 or not is_there(cut, a):
+            continue
+        whole = np.float32(cut.whole[a])
+        p, q = np.float32(cut.parts[a, 0]), np.float32(cut.parts[a, 1])
+        for i in range(0, width, WIDE):
+            own = madd(whole, wide_span(values, o + i), zero) if whole > 0.0 else zero
+            own = madd(q, wide_span(values, y + i), own)
+            put_span(values, o + i, madd(p, wide_span(values, x + i), own))
 
 
 @compiled
@@ -125,16 +128,15 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
             parts = cut.kids[functions.cluster[f]]
             x, y = cut.leaf[parts[0]], cut.leaf[parts[1]]
             own[f] += float(pairs[x, x]) + float(pairs[y, y]) - 2.0 * float(pairs[x, y])
-        for e in range(min(f + 1, solved)):
-            value = float(outer[f, e]) - float(response[f, e])
-            if f < solved:
-                matrix[f, e] = value
-                matrix[e, f] = value
-            else:
-                rest[f - solved, e] = value
-    for inside in (False, True):
+            for e in range(solved):
+                rest[f - solved, e] = float(outer[f, e]) - float(response[f, e])
+            continue
+        for e in range(f + 1):
+            matrix[f, e] = float(outer[f, e]) - float(response[f, e])
+    for inside in (False, True):  # what is above the diagonal is filled in last
         add_own(bodies, cut, functions, inside, matrix, rest, own)
     _add_matter(bodies, functions, matrix, own)
+    mirror(matrix)
     for f in range(solved):
         own[f] = matrix[f, f]
     return System(phi, matrix, rest, own)
@@ -158,7 +160,7 @@ def _integrals(cut, functions, rows, pairs):
     """
     clusters, leaves, solved = cut.node.shape[0], cut.leaves.shape[0], functions.solved
     total, width = functions.cluster.shape[0], rows.shape[1]
-    means, wide = np.empty((clusters, width), np.float32), np.empty((total, width), np.float32)
+    means, wide = np.zeros((clusters, width), np.float32), np.empty((total, width), np.float32)
     for j in range(leaves):
         for i in range(width):
             means[cut.leaves[j], i] = rows[j, i]
@@ -228,7 +230,7 @@ def _add_matter(bodies, functions, matrix, own):
     for f in range(functions.cluster.shape[0]):
         body = bodies[functions.body[f]]
         if functions.cluster[f] < 0:
-            for e in range(solved):
+            for e in range(f + 1):
                 if functions.cluster[e] < 0 and bodies[functions.body[e]].group == body.group:
                     matrix[f, e] += body.tie
         elif body.sheet > 0.0:
@@ -271,15 +273,8 @@ def reduced(functions, system, adjoint):
     for f in range(total):
         if lack[f] > 0.0:
             for c in range(0, m, 8):
-                residual = span(phi, f * m + c)
-                for e in range(solved):
-                    value = (
-                        at(matrix, f * solved + e)
-                        if f < solved
-                        else at(rest, (f - solved) * solved + e)
-                    )
-                    residual = madd(-value, span(x, e * m + c), residual)
-                put_span(phi, f * m + c, residual)
+                met = _met(matrix, f, x, c) if f < solved else _met(rest, f - solved, x, c)
+                put_span(phi, f * m + c, vsub(span(phi, f * m + c), met))
     charge = np.zeros((total, m))
     for f in range(total):
         for i in range(m):
@@ -301,6 +296,23 @@ def reduced(functions, system, adjoint):
         for j in range(i):
             delta[i, j] = delta[j, i] = 0.5 * (delta[i, j] + delta[j, i])
     return Reduced(delta, left, coarse, x, shift)
+
+
+@kernel
+def _met(energies, f, charge, c):
+    """Potential of charges (n, m) for a function, by its row of energies; columns c to c + 7."""
+    n, m = energies.shape[1], charge.shape[1]
+    o, whole = f * n, n - n % 4
+    s0 = s1 = s2 = s3 = splat(0.0)
+    for e in range(0, whole, 4):
+        p = e * m + c
+        s0 = madd(at(energies, o + e), span(charge, p), s0)
+        s1 = madd(at(energies, o + e + 1), span(charge, p + m), s1)
+        s2 = madd(at(energies, o + e + 2), span(charge, p + 2 * m), s2)
+        s3 = madd(at(energies, o + e + 3), span(charge, p + 3 * m), s3)
+    for e in range(whole, n):
+        s0 = madd(at(energies, o + e), span(charge, e * m + c), s0)
+    return vadd(vadd(s0, s1), vadd(s2, s3))
 
 
 @kernel
