@@ -55,6 +55,23 @@ def test_each_reading_is_that_of_a_step_from_rest(tiny: cs.Simulator, threads: i
         views, expected = views[::-1], expected[::-1]
 
 
+def test_layouts_of_bodies_are_kept_and_stay_few(tiny: cs.Simulator) -> None:
+    """Invariant: the same reading, to the last bit, with a layout that was kept and without; no
+    more than a few are, and one of bodies that change."""
+    shapes = [cs.Sphere(0.005 + 1e-4 * k) for k in range(solver._LAYOUTS + 3)]
+    views = [cs.Scene([cs.Body(shape, cs.Pose((0.0, 0.0, 0.03)))]) for shape in shapes]
+    for view in [*views[:3], *views[:3]]:
+        np.testing.assert_array_equal(tiny.step(view).delta, tiny.copy().step(view).delta)
+    kept = tiny._solver._laid
+    assert len(kept) == 3
+    for view in views:
+        tiny.step(view)
+        assert 0 < len(kept) <= solver._LAYOUTS
+    for _ in range(2):
+        tiny.step(frame())
+        assert len(kept) == 1
+
+
 def test_the_sensor_itself_is_left_alone(tiny: cs.Simulator) -> None:
     """Its walk goes on as if there had been no batch."""
     other = tiny.copy()

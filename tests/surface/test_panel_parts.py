@@ -34,7 +34,7 @@ TURN = Rotation.from_euler("ZY", (0.4, math.pi / 2)).as_quat()
 
 @cache
 def shape_of(shape: cs.Shape, finest: float = 4e-3) -> RefinedShape:
-    found = refined(rigid_shape(panels_of(shape, fewer(200)), apart=True), finest)
+    found = refined(rigid_shape(panels_of(shape, fewer(200)), apart=True), finest, shape)
     assert isinstance(found, RefinedShape)
     return found
 
@@ -51,7 +51,7 @@ def tetrahedron() -> TriMesh:
 @pytest.mark.parametrize("shape", [LIMB, BLOCK, tetrahedron()], ids=["limb", "block", "mesh"])
 def test_parts_make_up_their_wholes(shape: cs.Shape) -> None:
     """Invariant: charges, centres and second moments of each panel and part are those of its two
-    parts together; those of panels as they were."""
+    parts together, along the panel; those of panels as they were."""
     made = shape_of(shape)
     arrays, tree, m = made._parts, made.tree, len(made.panels)
     kids, charge, center = arrays["kids"], arrays["charge"], arrays["center"]
@@ -71,13 +71,52 @@ def test_parts_make_up_their_wholes(shape: cs.Shape) -> None:
     second[panels] = made.panels.moments[tree.panel[panels]]
     cut = inner[kids[inner, 0] >= stored]
     assert set(cut) > set(panels[kids[panels, 0] >= 0])
+    normal = normals_of(made)
     for k in cut:
-        share = charge[kids[k]] / charge[k]
+        share, along = charge[kids[k]] / charge[k], np.eye(3) - np.outer(normal[k], normal[k])
         assert share.sum() == pytest.approx(1.0, abs=1e-12)
-        off = center[kids[k]] - center[k]
+        off = (center[kids[k]] - center[k]) @ along
         np.testing.assert_allclose(share @ off, 0.0, atol=1e-12)
-        whole = np.einsum("p,pij->ij", share, second[kids[k]] + off[:, :, None] * off[:, None])
-        np.testing.assert_allclose(whole, second[k], atol=1e-12)
+        below = along @ second[kids[k]] @ along + off[:, :, None] * off[:, None]
+        whole = np.einsum("p,pij->ij", share, below)
+        np.testing.assert_allclose(whole, along @ second[k] @ along, atol=1e-12)
+
+
+def normals_of(shape: RefinedShape) -> Array:
+    """Normal of the panel that each part lies in, and of panels; zero for other clusters."""
+    kids = shape._parts["kids"]
+    out = np.zeros((len(kids), 3))
+    for k in range(len(kids)):
+        if k < len(shape.tree.panel) and shape.tree.panel[k] >= 0:
+            out[k] = shape.panels.normals[shape.tree.panel[k]]
+        if kids[k, 0] >= 0 and out[k].any():
+            out[kids[k]] = out[k]
+    return out
+
+
+ROUND = [LIMB, cs.Sphere(0.05), cs.Cylinder(0.04, 0.1), cs.Ellipsoid((0.05, 0.04, 0.03))]
+
+
+@pytest.mark.parametrize("shape", ROUND, ids=repr)
+def test_parts_of_round_shapes_lie_on_them(shape: cs.Shape) -> None:
+    """Invariant: their points do, to a twentieth of how far the panels are off."""
+    made = shape_of(shape)
+    stored, points = 2 * len(made.panels) - 1, made._parts["points"]
+    corners = made.panels.corners.reshape(-1, 3)
+    off = np.abs(shape.signed_distance(points[stored:].reshape(-1, 3))).max()
+    assert off < 0.05 * np.abs(shape.signed_distance(corners)).max()
+    centers = made._parts["center"][stored:]
+    np.testing.assert_allclose(centers, points[stored:].mean(axis=1), atol=1e-15)
+
+
+def test_parts_of_flat_shapes_stay_in_their_panels() -> None:
+    """Invariant: nothing is moved but by rounding; nor are parts of a mesh, which is its panels."""
+    for shape in (BLOCK, tetrahedron()):
+        made = shape_of(shape)
+        stored, arms = 2 * len(made.panels) - 1, made._parts["points"]
+        arms = (arms - arms.mean(axis=1)[:, None])[stored:]
+        normal = normals_of(made)[stored:]
+        np.testing.assert_allclose(np.einsum("kqi,ki->kq", arms, normal), 0.0, atol=1e-15)
 
 
 def longer_side(panels: SurfacePanels) -> Array:
@@ -99,8 +138,8 @@ def test_parts_are_as_small_as_asked_for() -> None:
     assert (arrays["extent"][~end & (halvings > 0)] > 4e-3).all()
     whole = rigid_shape(panels_of(BLOCK, fewer(200)), apart=True)
     longest = float(longer_side(whole.panels).max())
-    assert refined(whole, 1.001 * longest) is whole
-    assert refined(whole, 0.999 * longest) is not whole
+    assert refined(whole, 1.001 * longest, BLOCK) is whole
+    assert refined(whole, 0.999 * longest, BLOCK) is not whole
 
 
 @pytest.mark.skipif(ON, reason="counts panels")

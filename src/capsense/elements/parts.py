@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from capsense.elements.panels import SurfacePanels
 from capsense.elements.pieces import OWN
 from capsense.elements.rigid import HALF_SPACE, SOFT, RigidShape
+from capsense.scene.shapes import Shape, ShapeKind
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,6 +36,8 @@ class RefinedShape(RigidShape):
     """The shape without parts, whose inside is shared."""
     finest: float
     """Parts with a side longer than this are halved [m]."""
+    surface: Shape
+    """Where they lie: panels of a round shape go through it, its parts are moved onto it."""
 
     @property
     def impedance(self) -> NDArray[np.float32]:
@@ -61,11 +64,19 @@ class RefinedShape(RigidShape):
         return self.whole.nbytes + sum(a.nbytes for a in self._parts.values())
 
 
-def refined(shape: RigidShape, finest: float) -> RigidShape:
-    """A shape with parts of its panels where these are longer than ``finest`` [m], else itself."""
+def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
+    """A shape with parts of its panels where these are longer than ``finest`` [m], else itself.
+
+    Args:
+        shape: The shape.
+        finest: Parts with a side longer than this are halved [m].
+        surface: What its panels stand for.
+    """
     if _sides(_flat(shape.panels)[0]).max() <= finest:
         return shape
-    return RefinedShape(shape.panels, shape.tree, shape.energy, shape.capacitance, shape, finest)
+    return RefinedShape(
+        shape.panels, shape.tree, shape.energy, shape.capacitance, shape, finest, surface
+    )
 
 
 def _flat(panels: SurfacePanels) -> tuple[Array, Array]:
@@ -150,6 +161,11 @@ def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
     points = np.empty((len(area), 4, 3))
     for q, (p, r) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         points[:, q] = centers + p * first + r * second
+    if shape.surface.kind is not ShapeKind.MESH:
+        normals = panels.normals[panel[m:]]
+        for q in range(4):
+            points[:, q] -= shape.surface.signed_distance(points[:, q])[:, None] * normals
+        centers = points.mean(axis=1)
     place = np.arange(len(panel)) + m - 1  # clusters of panels and parts
     place[tree.panel[tree.panel >= 0]] = np.flatnonzero(tree.panel >= 0)
     cut = np.flatnonzero(kids[:, 0] >= 0)

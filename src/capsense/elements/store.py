@@ -154,8 +154,9 @@ def functions_of(
     if finest is None:
         return found, size
     power = math.floor(2.0 * math.log2(finest / size))  # to 0.7 times that: sizes can share parts
+    side = 2.0 ** (power / 2.0)
     return _kept(
-        shape, count, f"_parts {power}", lambda *_: refined(found, 2.0 ** (power / 2.0))
+        shape, count, f"_parts {power}", lambda whole, *_: refined(found, side, whole)
     )  # fmt: skip
 
 

@@ -22,9 +22,9 @@ so much that no definite matrix were left."""
 _SEEN = 0.1
 """Part of a cluster that does not see a linear potential from which on what crosses a wall within
 it counts in full."""
-_FREE = 0.1
-"""Panels are not looked into where the design takes so much or less of the square of their
-functions' energy, and more and more as it takes more."""
+_FREE = 0.01, 0.1
+"""Panels come to be looked into where the design takes between these parts of the square of their
+functions' energy."""
 _WIDE = 0.08, 0.12
 """Clusters come to be large between these extents [m]."""
 
@@ -129,7 +129,8 @@ def _pass_on(part, above, looks, scores):
 @kernel
 def _share(looks, k):
     """What the score of a panel or a part counts."""
-    return max(0.0, 1.0 - looks.stiff[k] * looks.stiff[k] - _FREE) / (1.0 - _FREE)
+    taken = 1.0 - looks.stiff[k] * looks.stiff[k]
+    return min(1.0, max(0.0, (taken - _FREE[0]) / (_FREE[1] - _FREE[0])))
 
 
 @compiled

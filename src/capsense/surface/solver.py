@@ -295,10 +295,9 @@ class SurfaceSolver:
         laid = self._laid.get(key)
         if laid is None or not laid.everywhere:
             laid, offsets = self._lay_out(view, matter, bodies, laid)
-            if len(self._laid) >= _LAYOUTS or not all(
-                isinstance(s, RigidShape) for s in laid.shapes
-            ):
-                self._laid.clear()  # what changes at every step is not kept
+            rigid = all(isinstance(shape, RigidShape) for shape in laid.shapes)
+            if len(self._laid) >= _LAYOUTS or not rigid:  # what changes at each step is not kept
+                self._laid.clear()
             self._laid[key] = laid
         records, chosen = laid.records.copy(), view.met[laid.places]
         records["rotation"] = rotation = packed.rotation[chosen]
