@@ -1258,10 +1258,10 @@ def test_products_of_wide_matrices(m: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("between", "raised"), [(0.9, 0.0), (1.0005, 0.03), (1.05, 0.06), (1.1, 0.12)]
+    ("between", "raised"), [(0.9, 0.0), (1.0005, 0.12), (1.05, 0.24), (1.1, 0.48)]
 )
 def test_energies_that_are_not_definite_are_raised(between: float, raised: float) -> None:
-    """Analytic: the diagonal is raised by 0.03, 0.06, 0.12, … of itself, till it is definite."""
+    """Analytic: by four times the first of 0.03, 0.06, 0.12, … of itself that makes it so."""
     root, own = np.array([0.8, 0.5]), np.array([-2.0, 2.0])
     matrix = np.array([[2.0, 5.0 * between], [5.0 * between, 2.0]])
     factor, right = np.empty((2, 16)), np.random.default_rng(2).normal(size=(2, 8))

@@ -39,6 +39,8 @@ COARSE = 0.6
 ``benchmarks/limits.py`` sets the estimate beside the errors of wide boxes near a sensor."""
 _RAISE = 0.03
 """By what part of itself a diagonal is raised first."""
+_AMPLE = 4.0
+"""And by so many times what makes the matrix definite."""
 _ROWS = 4
 """Rows of a matrix whose products are taken at a time."""
 _CACHED = 100_000
@@ -320,12 +322,13 @@ def factorise(matrix, root, own, factor):
     """Cholesky factor of √t A √t with A's own diagonal; see :func:`capsense._dense.cholesky`.
 
     Where bodies lie within each other or within the sensor, approximate energies may leave no
-    definite matrix. The diagonal is then raised, by so much that the energy left is not small.
+    definite matrix. The diagonal is then raised, by more than what makes it definite: else little
+    energy might be left to some charge, and readings would be huge.
 
     Returns:
         By how much it was raised, relative to itself; -1 where there is no factor.
     """
-    shift, n = 0.0, root.shape[0]
+    shift, n, definite = 0.0, root.shape[0], False
     if n == 0:  # no function counts
         return shift
     while shift < 1e3:
@@ -335,9 +338,10 @@ def factorise(matrix, root, own, factor):
             for e in range(n, factor.shape[1]):
                 factor[f, e] = 0.0
             factor[f, f] = matrix[f, f] + shift * abs(own[f])
-        if cholesky(factor):
+        before, definite = definite, cholesky(factor)
+        if definite and (before or shift == 0.0):
             return shift
-        shift = max(_RAISE, 2.0 * shift)
+        shift = max(_RAISE, (_AMPLE if definite else 2.0) * shift)
     return -1.0
 
 
