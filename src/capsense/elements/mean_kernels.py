@@ -175,7 +175,7 @@ def means_between(points):
     for j in range(n):
         extent[j] = extent_of(points[j])
     tables = cluster_moments(points, extent), rectangles(points, weight), known
-    add_means(points, extent, (0, 0, n, 1.0), weight, tables, out)
+    add_means(points, extent, (np.int64(0), np.int64(0), n, 1.0), weight, tables, out)
     mirror(out)
     return out
 

@@ -128,7 +128,8 @@ def _look_into(body, green, looks, points, places, inner):
         The cluster behind the last one that was looked at, and how many points there are.
     """
     kids, extent, stop = integers(body.kids), doubles(body.extent), body.stored
-    looks.met[0], looks.told[0], k, seen, found = True, 1.0, -1, 1, 0
+    looks.met[0], looks.told[0] = True, 1.0
+    k, seen, found = np.int64(-1), np.int64(1), np.int64(0)
     while k + 1 < seen:
         k += 1
         if not looks.met[k]:

@@ -69,13 +69,13 @@ def leaf_pairs(leaves, floor):
             behind = i
         if far_means(shapes, i, mirrored, i + 1, line):
             _near_means(flat, i, below, i + 1, line, room)
-        add_line(line, -1.0, (0, i + 1), out, i)
+        add_line(line, -1.0, (np.int64(0), i + 1), out, i)
         if behind > 0:
             if far_means(shapes, i, shapes, behind, line):
                 _near_means(flat, i, flat, behind, line, room)
-            add_line(line, 1.0, (0, behind), out, i)
+            add_line(line, 1.0, (np.int64(0), behind), out, i)
         out[i, i] += BARRIER * leaves.beyond[i] ** 3
-    tables, start = (shapes, rectangles(points, leaves.within), leaves.known), 0
+    tables, start = (shapes, rectangles(points, leaves.within), leaves.known), np.int64(0)
     for i in range(n):
         if i + 1 == n or owner[i + 1] != owner[i]:
             if leaves.within[i] > 0.0:

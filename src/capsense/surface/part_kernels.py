@@ -23,7 +23,8 @@ def add_parts(bodies, cut, leaves, out):
         out: Added to [1/m], shape (l, l).
     """
     n = cut.leaves.shape[0]
-    start, first = 0, -1  # first leaf of the body, and the first one that is a part
+    # first leaf of the body, and the first one that is a part; literals would be types of their own
+    start, first = np.int64(0), np.int64(-1)
     for i in range(n):
         body = bodies[leaves.owner[i]]
         if first < 0 and cut.node[cut.leaves[i]] >= body.stored:
@@ -44,7 +45,7 @@ def _add_of_body(body, cut, leaves, span, out):
     points, extent = leaves.true[start:stop], leaves.extent[start:stop]
     known, wanted, means = np.full((n, 2), -1), np.ones(n), np.zeros((n, n), np.float32)
     tables = cluster_moments(points, extent), rectangles(points, wanted), known
-    add_means(points, extent, (0, first - start, n, 1.0), wanted, tables, means)
+    add_means(points, extent, (np.int64(0), first - start, n, 1.0), wanted, tables, means)
     parts, off = stop - first, first - start
     single, double = np.zeros((groups, n), np.float32), np.zeros((groups, groups), np.float32)
     for i in range(parts):

@@ -65,7 +65,9 @@ def score(bodies, first, green, threshold, weight, scores, entry):
         looks = looks_of(all_looks, first[b], first[b + 1])
         of, enter = scores[first[b] : first[b + 1]], entry[first[b] : first[b + 1]]
         _score_panels(bodies[b], green, seen[b], looks, weight, of)
-        _raise_scores(bodies[b], looks_of(looks, 0, seen[b]), weight, of[: seen[b]], counts)
+        _raise_scores(
+            bodies[b], looks_of(looks, np.int64(0), seen[b]), weight, of[: seen[b]], counts
+        )
         _score_parts(bodies[b], green, seen[b], looks, (threshold, weight), of, enter)
     return seen
 
