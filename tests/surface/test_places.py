@@ -66,6 +66,16 @@ def test_places_of_many_terminals() -> None:
             np.testing.assert_array_equal(table[:rows, lead : lead + columns], modes)
 
 
+def test_sensors_of_one_design_share_what_is_packed() -> None:
+    """Unit: copies hold the same tables; another design, or Green's function, its own."""
+    sim = cs.Simulator("six_patch_bare")
+    green, design = sim.background.green, sim.design
+    assert pack_green(green, design) is pack_green(green, design)
+    assert sim.copy()._solver.green is sim._solver.green
+    assert pack_green(replace(green), design) is not pack_green(green, design)
+    assert pack_green(green, replace(design)) is not pack_green(green, design)
+
+
 def test_shares_of_levels_add_to_one() -> None:
     """Twin, and invariant: at each distance there are at most two, that add to one."""
     green = cs.Simulator("six_patch_bare").background.green

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +106,18 @@ def cover_of(design: Design) -> float:
     return top - float(heights.max())
 
 
+_PACKED: WeakKeyDictionary[GreenFunction, tuple[Design, Green]] = WeakKeyDictionary()
+
+
 def pack_green(green: GreenFunction, design: Design) -> Green:
-    """Lay the Green's function of a design out for the kernels."""
+    """Lay the Green's function of a design out for the kernels, once for all its sensors."""
+    known = _PACKED.get(green)
+    if known is None or known[0] is not design:
+        known = _PACKED[green] = design, _packed(green, design)
+    return known[1]
+
+
+def _packed(green: GreenFunction, design: Design) -> Green:
     walls = np.array([design.domain.lower, design.domain.upper])
     room = walls + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
     terminals = green.near_phi.shape[1]
