@@ -8,7 +8,19 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import kernel
-from capsense._simd import at, madd, put_span, span, splat, vadd, wide_span, wide_splat
+from capsense._simd import (
+    at,
+    horizontal_sum,
+    madd,
+    put_span,
+    span,
+    splat,
+    vadd,
+    vmadd,
+    vsub,
+    wide_span,
+    wide_splat,
+)
 
 WIDTH = 32
 """Tables have a multiple of so many columns."""
@@ -82,6 +94,49 @@ def multiply_simd(left, table, out):
             put_span(out, o + w, b)
             put_span(out, o + 2 * w, c)
             put_span(out, o + 3 * w, d)
+
+
+@kernel
+def square(rows, f):
+    """Square of row f of some, whose length is a multiple of 8."""
+    width, total = rows.shape[1], splat(np.float32(0.0))
+    for k in range(f * width, (f + 1) * width, 8):
+        total = vmadd(span(rows, k), span(rows, k), total)
+    return float(horizontal_sum(total))
+
+
+@kernel
+def subtract_product(left, f, right, out, row):
+    """Take row f of ``left @ right`` off a row of ``out``, shapes (k, n), (n, m) and (l, m).
+
+    Columns go eight at a time; m is a multiple of 8.
+    """
+    n, m = left.shape[1], right.shape[1]
+    o, whole = f * n, n - n % 4
+    for c in range(0, m, 8):
+        s0 = s1 = s2 = s3 = splat(0.0)
+        for e in range(0, whole, 4):
+            p = e * m + c
+            s0 = madd(at(left, o + e), span(right, p), s0)
+            s1 = madd(at(left, o + e + 1), span(right, p + m), s1)
+            s2 = madd(at(left, o + e + 2), span(right, p + 2 * m), s2)
+            s3 = madd(at(left, o + e + 3), span(right, p + 3 * m), s3)
+        for e in range(whole, n):
+            s0 = madd(at(left, o + e), span(right, e * m + c), s0)
+        p = row * m + c
+        put_span(out, p, vsub(span(out, p), vadd(vadd(s0, s1), vadd(s2, s3))))
+
+
+@kernel
+def add_products(left, right, out):
+    """``out += left.T @ right``, shapes (n, m), (n, m) and (m, m); m a multiple of 8."""
+    n, m = left.shape
+    for i in range(m):
+        for c in range(0, m, 8):
+            total = span(out, i * m + c)
+            for f in range(n):
+                total = madd(at(left, f * m + i), span(right, f * m + c), total)
+            put_span(out, i * m + c, total)
 
 
 @kernel

@@ -19,7 +19,17 @@ from scipy.spatial.transform import Rotation
 from surface_twin import Piece
 
 import capsense as cs
-from capsense._dense import cholesky, multiply, multiply_simd, substitute, whole_lines
+from capsense._dense import (
+    add_products,
+    cholesky,
+    mirror,
+    multiply,
+    multiply_simd,
+    square,
+    substitute,
+    subtract_product,
+    whole_lines,
+)
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block
 from capsense.elements.matter import CONDUCTING, UNIT
@@ -32,7 +42,7 @@ from capsense.field.green_kernels import Green, pack_green, point_potentials, so
 from capsense.surface.choose_kernels import Cut, choose
 from capsense.surface.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
 from capsense.surface.score_kernels import score
-from capsense.surface.solve_kernels import Reduced, _add_products, _products, factorise, reduced
+from capsense.surface.solve_kernels import Reduced, _products, factorise, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import (
     Solution,
@@ -676,6 +686,31 @@ def test_multiply_lanes(rows: int, width: int) -> None:
     assert (room[[0, -1]] == 7.0).all()
 
 
+@pytest.mark.parametrize("n", [1, 3, 4, 15, 16, 17, 50])
+def test_products_of_rows_and_their_squares(n: int) -> None:
+    """Differential: any length of a row for products, multiples of eight for squares."""
+    rng = np.random.default_rng(n)
+    left, right = rng.normal(size=(5, n)), rng.normal(size=(n, 16))
+    before = rng.normal(size=(7, 16))
+    out = before.copy()
+    for f in range(5):
+        subtract_product(left, f, right, out, f + 1)
+    np.testing.assert_allclose(out[1:-1], before[1:-1] - left @ right, rtol=0, atol=1e-12 * n)
+    np.testing.assert_array_equal(out[[0, -1]], before[[0, -1]])
+    rows = rng.normal(size=(3, 8 * n)).astype(np.float32)
+    found = [square(rows, f) for f in range(3)]
+    np.testing.assert_allclose(found, (rows.astype(float) ** 2).sum(axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("n", [1, 15, 16, 17, 40])
+def test_matrices_are_mirrored(n: int) -> None:
+    """Invariant: what is not above the diagonal stays, the rest follows from it."""
+    matrix = np.random.default_rng(n).normal(size=(n, n))
+    wanted = np.tril(matrix) + np.tril(matrix, -1).T
+    mirror(matrix)
+    np.testing.assert_array_equal(matrix, wanted)
+
+
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 8, 9, 31, 66])
 def test_cholesky_and_substitute(n: int) -> None:
     """Differential: factor and solution; what is below the diagonal counts for nothing."""
@@ -1253,7 +1288,7 @@ def test_products_of_wide_matrices(m: int) -> None:
     """Differential: designs of more than eight terminals, eight columns at a time."""
     left, right = np.random.default_rng(m).normal(size=(2, 5, m))
     out = np.ones((m, m))
-    _add_products(left, right, out)
+    add_products(left, right, out)
     np.testing.assert_allclose(out, 1.0 + left.T @ right, rtol=1e-13, atol=1e-13)
 
 

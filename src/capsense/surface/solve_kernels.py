@@ -8,18 +8,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._dense import WIDTH, cholesky, mirror, multiply_part, substitute, whole_lines
+from capsense._dense import (
+    WIDTH,
+    add_products,
+    cholesky,
+    mirror,
+    multiply_part,
+    square,
+    substitute,
+    subtract_product,
+    whole_lines,
+)
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
     at,
-    horizontal_sum,
     madd,
     put_span,
     span,
-    splat,
-    vadd,
-    vmadd,
     vsub,
     wide_span,
     wide_splat,
@@ -122,7 +128,7 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
             phi[f, i] = wide[f, i]
         for k in range(modes):
             psi[f, k] = wide[f, lead + k]
-        own[f] = -_square(psi, f)
+        own[f] = -square(psi, f)
     response = _products(psi, solved)
     matrix, rest = np.empty((solved, solved)), np.empty((total - solved, solved))
     for f in range(total):
@@ -142,15 +148,6 @@ def assembled(bodies, cut, functions, rows, pairs, lead):
     for f in range(solved):
         own[f] = matrix[f, f]
     return System(phi, matrix, rest, own)
-
-
-@kernel
-def _square(rows, f):
-    """Square of row f of some, whose length is a multiple of 8."""
-    width, total = rows.shape[1], splat(np.float32(0.0))
-    for k in range(f * width, (f + 1) * width, 8):
-        total = vmadd(span(rows, k), span(rows, k), total)
-    return float(horizontal_sum(total))
 
 
 @compiled
@@ -271,17 +268,17 @@ def reduced(functions, system, adjoint):
     for f in range(solved):
         for i in range(m):
             x[f, i] *= root[f]
-    _add_products(phi[:solved], x[:solved], delta)
+    add_products(phi[:solved], x[:solved], delta)
     for f in range(total):
-        if lack[f] > 0.0:
-            for c in range(0, m, 8):
-                met = _met(matrix, f, x, c) if f < solved else _met(rest, f - solved, x, c)
-                put_span(phi, f * m + c, vsub(span(phi, f * m + c), met))
+        if lack[f] > 0.0 and f < solved:
+            subtract_product(matrix, f, x, phi, f)
+        elif lack[f] > 0.0:
+            subtract_product(rest, f - solved, x, phi, f)
     charge = np.zeros((total, m))
     for f in range(total):
         for i in range(m):
             charge[f, i] = lack[f] * phi[f, i]
-    _add_products(phi, charge, left)
+    add_products(phi, charge, left)
     coarse = np.zeros(m)
     for f in range(solved):
         for i in range(m):
@@ -298,23 +295,6 @@ def reduced(functions, system, adjoint):
         for j in range(i):
             delta[i, j] = delta[j, i] = 0.5 * (delta[i, j] + delta[j, i])
     return Reduced(delta, left, coarse, x, shift)
-
-
-@kernel
-def _met(energies, f, charge, c):
-    """Potential of charges (n, m) for a function, by its row of energies; columns c to c + 7."""
-    n, m = energies.shape[1], charge.shape[1]
-    o, whole = f * n, n - n % 4
-    s0 = s1 = s2 = s3 = splat(0.0)
-    for e in range(0, whole, 4):
-        p = e * m + c
-        s0 = madd(at(energies, o + e), span(charge, p), s0)
-        s1 = madd(at(energies, o + e + 1), span(charge, p + m), s1)
-        s2 = madd(at(energies, o + e + 2), span(charge, p + 2 * m), s2)
-        s3 = madd(at(energies, o + e + 3), span(charge, p + 3 * m), s3)
-    for e in range(whole, n):
-        s0 = madd(at(energies, o + e), span(charge, e * m + c), s0)
-    return vadd(vadd(s0, s1), vadd(s2, s3))
 
 
 @kernel
@@ -343,18 +323,6 @@ def factorise(matrix, root, own, factor):
             return shift
         shift = max(_RAISE, (_AMPLE if definite else 2.0) * shift)
     return -1.0
-
-
-@kernel
-def _add_products(left, right, out):
-    """``out += left.T @ right``, shapes (n, m), (n, m) and (m, m); m a multiple of 8."""
-    n, m = left.shape
-    for i in range(m):
-        for c in range(0, m, 8):
-            total = span(out, i * m + c)
-            for f in range(n):
-                total = madd(at(left, f * m + i), span(right, f * m + c), total)
-            put_span(out, i * m + c, total)
 
 
 @compiled
