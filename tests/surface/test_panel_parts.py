@@ -218,6 +218,27 @@ def share_of(cut: Cut, leaf: int) -> float:
     return share
 
 
+def halvings_of(shape: RefinedShape, gap: float) -> int:
+    """How often panels are halved that a step uses the parts of."""
+    cut = cut_of(pack(shape, gap))[0]
+    depth = np.full(len(cut.node), -1)
+    for a in range(len(cut.node)):
+        if cut.kids[a, 0] >= 0:
+            is_panel = cut.node[cut.kids[a, 0]] >= 2 * len(shape.panels) - 1 and depth[a] < 0
+            depth[a] = 0 if is_panel else depth[a]
+            depth[cut.kids[a]] = depth[a] + 1 if depth[a] >= 0 else -1
+    return int(depth.max(initial=0))
+
+
+def test_nearer_bodies_have_smaller_parts() -> None:
+    """Invariant: none far away, then parts, then parts of parts."""
+    shape = shape_of(LIMB)
+    found = [halvings_of(shape, gap) for gap in (0.06, 2e-3, 2e-4)]
+    assert found[0] == 0 or ON  # panels are wide then
+    assert found == sorted(found)
+    assert found[-1] > 1
+
+
 def test_wholes_have_the_energies_that_are_stored() -> None:
     """Invariant: parts change nothing of the energies that functions of whole panels have within
     the body, but for single precision."""
