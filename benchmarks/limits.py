@@ -43,6 +43,8 @@ AT = (0.003, 0.026)
 """Over the middle of an electrode's edge [m]."""
 NEAR = 0.002
 """Gaps up to this are near contact [m]."""
+STEP = 5e-5
+"""A step towards the sensor [m]."""
 PRESETS: tuple[PresetName, ...] = ("learning", "standard", "fine")
 BODIES: dict[str, tuple[cs.Shape, tuple[float, float, float]]] = {
     "ball of 20 mm radius": (cs.Sphere(0.02), (0, 0, 0)),
@@ -165,6 +167,22 @@ def falls(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
         yield "box " + " x ".join(f"{1e3 * s:g}" for s in size) + " mm", out
 
 
+def growth(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
+    """Growth of the largest entry in a step of 0.05 mm, and of the same from many pieces."""
+    finer = InPieces(sim.background.green, sim.design, preset=FINER)
+    for name, shape, turn in (
+        ("ball of 30 mm radius", cs.Sphere(0.03), (0, 0, 0)),
+        ("forearm, a capsule of 40 mm radius", cs.Capsule(0.04, 0.25), (0, np.pi / 2, 0)),
+    ):
+        out = []
+        for gap in (0.005, 0.002, 0.001, 0.0005):
+            scenes = [cs.Scene([low(shape, g, AT, turn)]) for g in (gap, gap - STEP)]
+            for solve in (lambda scene: sim.step(scene).delta, lambda s: finer.solve(s).matrix):
+                before, after = (np.diag(solve(scene))[:6] for scene in scenes)
+                out.append(float(np.log(after / before)[before.argmax()]))
+        yield name, out
+
+
 def images(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     """Errors of depth images of dielectrics at 5, 10, 20, 50 mm."""
     for name, shape in (("ball", cs.Sphere(0.03)), ("box", cs.Box((0.08, 0.06, 0.04)))):
@@ -239,6 +257,7 @@ PARTS = {
     "wide boxes: median and largest error, and median estimate, of each preset": wide,
     "narrow electrodes: gaps of 2, 5, 10, 30 mm": narrow,
     "falls in a step: 3 to 1, 1 to 0.3, 0.3 to 0.02 mm, of each preset": falls,
+    "growth in a step of 0.05 mm at 5, 2, 1, 0.5 mm, standard and many pieces": growth,
     "a person's arm: rms and largest error, presets learning and standard": person,
     "a figure of one skin: presets learning, standard, fine": skin,
     "depth images of dielectrics, gaps of 5, 10, 20, 50 mm": images,

@@ -874,13 +874,14 @@ def test_pairs_of_one_surface_are_the_same_in_any_frame(distance: float) -> None
     np.testing.assert_allclose(found, found[0], rtol=1e-5)
 
 
+@pytest.mark.parametrize("side", [1.0, 0.01])
 @pytest.mark.parametrize("gap", [1e-4, 1e-3, 1e-2, 3e-2])
-def test_pairs_that_all_but_coincide(gap: float) -> None:
-    """Analytic: unit squares one above the other, and what charge of opposite signs on them costs;
-    that is 2π times the gap where it is small."""
-    one = (np.zeros(3), Rotation.identity(), (1.0, 1.0))
-    other = (np.array([0.0, 0.0, gap]), Rotation.identity(), (1.0, 1.0))
-    found = pairs([one, other], [0, 0], True, -1e9)
+def test_pairs_that_all_but_coincide(gap: float, side: float) -> None:
+    """Analytic: squares one above the other, and what charge of opposite signs on them costs;
+    that is 2π times the gap where it is small, for sides of one."""
+    one = (np.zeros(3), Rotation.identity(), (side, side))
+    other = (np.array([0.0, 0.0, gap * side]), Rotation.identity(), (side, side))
+    found = side * pairs([one, other], [0, 0], True, -1e9)
     own = 4 * math.log(1 + math.sqrt(2)) - 4 * (math.sqrt(2) - 1) / 3
     assert found[0, 0] == pytest.approx(own, rel=1e-5)
     assert found[0, 1] == pytest.approx(_mirror_mean(gap), rel=3e-3)
