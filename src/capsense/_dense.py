@@ -29,6 +29,19 @@ _TILE = 16
 
 
 @kernel
+def padded(count, width):
+    """The least multiple of ``width`` that is not below ``count``."""
+    return width * ((count + width - 1) // width)
+
+
+@kernel
+def three(table, place, width):
+    """Sixteen elements from a place on, those ``width`` behind, and those twice as far behind."""
+    x, y = wide_span(table, place), wide_span(table, place + width)
+    return x, y, wide_span(table, place + 2 * width)
+
+
+@kernel
 def multiply(left, table, out):
     """``out = left @ table``, shapes (k, s), (s, w) and (k, w); w a multiple of 32."""
     multiply_part(left, table, left.shape[1], table.shape[1], out)

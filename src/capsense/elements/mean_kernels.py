@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from capsense._dense import WIDTH, mirror
+from capsense._dense import WIDTH, mirror, padded, three
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
@@ -118,15 +118,15 @@ def add_means(points, extent, body, weight, tables, out):
     """
     start, first, stop, size = body
     shapes, frames, known = tables
-    line = np.full(shapes.shape[1] + WIDE, np.float32(0.0))
+    line = np.zeros(shapes.shape[1] + WIDE, np.float32)
     near, room = np.empty((2, _TOGETHER), np.int64), np.empty((53, _TOGETHER), np.float32)
     count = np.int64(0)
     for i in range(first, stop):
         far_means(shapes, i, shapes, i, line)
-        row = known[i, 0]
-        own = singles(known[i, 1]) if row >= 0 else singles(np.int64(0))
+        row, table = known[i, 0], singles(known[i, 1])
+        o = row * (row + 1) // 2
         if row >= 0:
-            line[i] = own[row * (row + 1) // 2 + row] / size
+            line[i] = table[o + row] / size
         else:
             line[i] = _self_mean(arm(points[i, 0], points[i, 1]), arm(points[i, 0], points[i, 2]))
         for j in range(start, i + 1, WIDE):
@@ -136,7 +136,7 @@ def add_means(points, extent, body, weight, tables, out):
                 continue
             for k in range(j, end):
                 if line[k] < 0.0 and row >= 0 and known[k, 0] >= 0:
-                    line[k] = own[row * (row + 1) // 2 + known[k, 0]] / size
+                    line[k] = table[o + known[k, 0]] / size
                 if line[k] < 0.0:
                     near[0, count], near[1, count] = i, k
                     count += 1
@@ -184,9 +184,9 @@ def means_between(points):
 def cluster_moments(points, extent):
     """Centre, the two arms and the reach of each cluster, a column each, shape (10, w).
 
-    There are as many columns as :func:`room_for` says; the last are no clusters', and far away.
+    There are a multiple of ``WIDTH`` columns; the last are no clusters', and far away.
     """
-    out = np.zeros((10, room_for(points.shape[0])), np.float32)
+    out = np.zeros((10, padded(points.shape[0], WIDTH)), np.float32)
     for j in range(points.shape[0], out.shape[1]):
         out[0, j] = _AWAY
     for j in range(points.shape[0]):
@@ -199,12 +199,6 @@ def cluster_moments(points, extent):
 
 
 @kernel
-def room_for(clusters):
-    """Columns of a table of so many clusters."""
-    return WIDTH * ((clusters + WIDTH - 1) // WIDTH)
-
-
-@kernel
 def far_means(shapes, i, others, count, out):
     """Means of 1/r between cluster i and the first others, by second moments; -1 for near ones.
 
@@ -213,31 +207,16 @@ def far_means(shapes, i, others, count, out):
     """
     some = wide_splat(np.float32(0.0))
     width, zero, near = shapes.shape[1], wide_splat(np.float32(0.0)), wide_splat(np.float32(-1.0))
-    x, y, z = (
-        wide_splat(at(shapes, i)),
-        wide_splat(at(shapes, width + i)),
-        wide_splat(at(shapes, 2 * width + i)),
-    )
+    x, y, z = wide_splat(shapes[0, i]), wide_splat(shapes[1, i]), wide_splat(shapes[2, i])
     ax, ay, az = shapes[3, i], shapes[4, i], shapes[5, i]
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
     own = wide_splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
     reach = wide_splat(shapes[9, i])
     for j in range(0, count, WIDE):
-        dx, dy, dz = (
-            vsub(x, wide_span(others, j)),
-            vsub(y, wide_span(others, width + j)),
-            vsub(z, wide_span(others, 2 * width + j)),
-        )
-        cx, cy, cz = (
-            wide_span(others, 3 * width + j),
-            wide_span(others, 4 * width + j),
-            wide_span(others, 5 * width + j),
-        )
-        ex, ey, ez = (
-            wide_span(others, 6 * width + j),
-            wide_span(others, 7 * width + j),
-            wide_span(others, 8 * width + j),
-        )
+        ox, oy, oz = three(others, j, width)
+        dx, dy, dz = vsub(x, ox), vsub(y, oy), vsub(z, oz)
+        cx, cy, cz = three(others, 3 * width + j, width)
+        ex, ey, ez = three(others, 6 * width + j, width)
         square = dot(dx, dy, dz, dx, dy, dz, wide_splat(np.float32(1e-12)))
         inverse = rsqrt(square)
         second = vmul(inverse, inverse)

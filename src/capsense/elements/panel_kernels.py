@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 
+from capsense._dense import three
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     dot,
@@ -212,38 +213,15 @@ def rectangle_potential(frames, o, points, p):
         p: Where the first coordinate of these stands.
     """
     n, w, zero = points.shape[1], frames.shape[1], wide_splat(np.float32(0.0))
-    dx = vsub(wide_span(points, p), wide_span(frames, o))
-    dy = vsub(wide_span(points, p + n), wide_span(frames, o + w))
-    dz = vsub(wide_span(points, p + 2 * n), wide_span(frames, o + 2 * w))
-    u, v, z = (
-        dot(
-            dx,
-            dy,
-            dz,
-            wide_span(frames, o + 3 * w),
-            wide_span(frames, o + 4 * w),
-            wide_span(frames, o + 5 * w),
-            zero,
-        ),
-        dot(
-            dx,
-            dy,
-            dz,
-            wide_span(frames, o + 6 * w),
-            wide_span(frames, o + 7 * w),
-            wide_span(frames, o + 8 * w),
-            zero,
-        ),
-        dot(
-            dx,
-            dy,
-            dz,
-            wide_span(frames, o + 9 * w),
-            wide_span(frames, o + 10 * w),
-            wide_span(frames, o + 11 * w),
-            zero,
-        ),
-    )
+    px, py, pz = three(points, p, n)
+    cx, cy, cz = three(frames, o, w)
+    dx, dy, dz = vsub(px, cx), vsub(py, cy), vsub(pz, cz)
+    x, y, z = three(frames, o + 3 * w, w)
+    u = dot(dx, dy, dz, x, y, z, zero)
+    x, y, z = three(frames, o + 6 * w, w)
+    v = dot(dx, dy, dz, x, y, z, zero)
+    x, y, z = three(frames, o + 9 * w, w)
+    z = dot(dx, dy, dz, x, y, z, zero)
     a, b = wide_span(frames, o + 12 * w), wide_span(frames, o + 13 * w)
     z = vadd(where_above(z, zero, z, vsub(zero, z)), wide_splat(np.float32(1e-9)))
     x, left, y, below = vsub(a, u), vsub(vsub(zero, a), u), vsub(b, v), vsub(vsub(zero, b), v)

@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._dense import WIDTH
+from capsense._dense import WIDTH, three
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
@@ -26,7 +26,6 @@ from capsense._simd import (
     vmul,
     vsub,
     where_above,
-    wide_span,
     wide_splat,
 )
 from capsense.design.model import Design
@@ -171,27 +170,13 @@ def source_potentials(points, sources, floor, least, out):
     width, quarter, zero = sources.shape[1], np.float32(0.25), wide_splat(np.float32(0.0))
     for i in range(points.shape[0]):
         for s in range(0, width, WIDE):
-            x, y, up = (
-                wide_span(sources, s),
-                wide_span(sources, width + s),
-                wide_span(sources, 2 * width + s),
-            )
+            x, y, up = three(sources, s, width)
             down, value = vsub(wide_splat(np.float32(2.0) * floor), up), zero
             for q in range(4):
                 o = 12 * i + 3 * q
-                value = vadd(
-                    value,
-                    _potential(
-                        wide_splat(at(points, o)),
-                        wide_splat(at(points, o + 1)),
-                        wide_splat(at(points, o + 2)),
-                        x,
-                        y,
-                        up,
-                        down,
-                        wide_splat(least * least),
-                    ),
-                )
+                px, py = wide_splat(at(points, o)), wide_splat(at(points, o + 1))
+                pz, bound = wide_splat(at(points, o + 2)), wide_splat(least * least)
+                value = vadd(value, _potential(px, py, pz, x, y, up, down, bound))
             put_span(out, i * width + s, madd(quarter, value, zero))
 
 
@@ -211,24 +196,13 @@ def point_potentials(points, sources, table, limits, out):
     twice, bound = np.float32(2.0) * floor, wide_splat(least * least)
     for c in range(0, columns, 8):
         for i in range(0, count, WIDE):
-            x, y, z = (
-                wide_span(points, i),
-                wide_span(points, count + i),
-                wide_span(points, 2 * count + i),
-            )
+            x, y, z = three(points, i, count)
             a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = wide_splat(np.float32(0.0))
             for s in range(width):
+                sx, sy = wide_splat(at(sources, s)), wide_splat(at(sources, width + s))
                 up = at(sources, 2 * width + s)
-                value = _potential(
-                    x,
-                    y,
-                    z,
-                    wide_splat(at(sources, s)),
-                    wide_splat(at(sources, width + s)),
-                    wide_splat(up),
-                    wide_splat(twice - up),
-                    bound,
-                )
+                down = wide_splat(twice - up)
+                value = _potential(x, y, z, sx, sy, wide_splat(up), down, bound)
                 o = s * columns + c
                 a0, a1 = madd(at(table, o), value, a0), madd(at(table, o + 1), value, a1)
                 a2, a3 = madd(at(table, o + 2), value, a2), madd(at(table, o + 3), value, a3)

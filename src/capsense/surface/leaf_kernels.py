@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._dense import multiply
+from capsense._dense import multiply, three
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
@@ -169,11 +169,7 @@ def source_lines(points, sources, floor, least, out):
     two, bound = wide_splat(np.float32(2.0) * floor), wide_splat(least * least)
     for i in range(points.shape[0]):
         for s in range(0, width, WIDE):
-            sx, sy, high = (
-                wide_span(sources, s),
-                wide_span(sources, width + s),
-                wide_span(sources, 2 * width + s),
-            )
+            sx, sy, high = three(sources, s, width)
             low = vsub(two, high)
             value = fx = fy = fz = gx = gy = zero
             for q in range(4):
@@ -219,19 +215,10 @@ def pair_line(shapes, i, others, weight, out, row):
     bx, by, bz = shapes[6, i], shapes[7, i], shapes[8, i]
     own = wide_splat(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz)
     for j in range(0, width, WIDE):
-        dx = vsub(wide_splat(x), wide_span(others, j))
-        dy = vsub(wide_splat(y), wide_span(others, width + j))
-        dz = vsub(wide_splat(z), wide_span(others, 2 * width + j))
-        cx, cy, cz = (
-            wide_span(others, 3 * width + j),
-            wide_span(others, 4 * width + j),
-            wide_span(others, 5 * width + j),
-        )
-        ex, ey, ez = (
-            wide_span(others, 6 * width + j),
-            wide_span(others, 7 * width + j),
-            wide_span(others, 8 * width + j),
-        )
+        ox, oy, oz = three(others, j, width)
+        dx, dy, dz = vsub(wide_splat(x), ox), vsub(wide_splat(y), oy), vsub(wide_splat(z), oz)
+        cx, cy, cz = three(others, 3 * width + j, width)
+        ex, ey, ez = three(others, 6 * width + j, width)
         inverse = rsqrt(dot(dx, dy, dz, dx, dy, dz, wide_splat(np.float32(1e-12))))
         second = vmul(inverse, inverse)
         a = madd(ax, dx, madd(ay, dy, madd(az, dz, zero)))
@@ -301,9 +288,9 @@ def near_pairs(points, others, soft, i, own, weight, near, line):
             fx = fy = fz = zero
             for q in range(4):
                 o = 3 * q * width + k
-                dx = vsub(wide_splat(x), wide_span(near, o))
-                dy = vsub(wide_splat(y), wide_span(near, o + width))
-                dz = vsub(wide_splat(z), wide_span(near, o + 2 * width))
+                ox, oy, oz = three(near, o, width)
+                dx, dy = vsub(wide_splat(x), ox), vsub(wide_splat(y), oy)
+                dz = vsub(wide_splat(z), oz)
                 s = dot(dx, dy, dz, dx, dy, dz, zero)
                 u = rsqrt(vmadd(s, s, bound))
                 # s / (s s + bound)^(5/4)

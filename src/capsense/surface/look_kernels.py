@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._dense import padded
 from capsense._jit import compiled, kernel
 from capsense._simd import WIDE, doubles, integers
 from capsense.field.green_kernels import (
@@ -166,16 +167,14 @@ def far_potentials(points, places, share, green, means):
     """
     found = points.shape[0]
     near, close, rest = np.arange(found), np.empty(found), np.empty(found)
-    columns = np.empty((3, WIDE * ((found + WIDE - 1) // WIDE)), np.float32)
-    _put_columns(points, near, columns)
+    columns = _columns(points, near)
     to_grid(columns, green.grid)
     count = _close(points, share, green, near, close, rest)
     grid_values(columns, green.grid, rest, places, means)
     if count == 0:
         return
-    columns = np.empty((3, WIDE * ((count + WIDE - 1) // WIDE)), np.float32)
+    columns = _columns(points, near[:count])
     phi = np.empty((green.lead, columns.shape[1]), np.float32)
-    _put_columns(points, near[:count], columns)
     limits = np.float32(green.floor), np.float32(green.levels[-1].least)
     point_potentials(columns, green.levels[-1].sources, green.score_table, limits, phi)
     for j in range(count):
@@ -210,13 +209,15 @@ def _close(points, share, green, near, close, rest):
     return count
 
 
-@kernel
-def _put_columns(points, some, out):
-    """Fill ``out`` (3, p) with some of the points (k, 3), the last one of them repeated."""
+@compiled
+def _columns(points, some):
+    """Some of the points (k, 3) as (3, p), p a multiple of 16; the last one of them is repeated."""
+    out = np.empty((3, padded(some.shape[0], WIDE)), np.float32)
     for j in range(out.shape[1]):
         k = some[min(j, some.shape[0] - 1)]
         for i in range(3):
             out[i, j] = points[k, i]
+    return out
 
 
 @kernel

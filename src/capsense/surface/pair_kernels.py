@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from capsense._dense import mirror
+from capsense._dense import mirror, three
 from capsense._jit import compiled, kernel
 from capsense._simd import (
     WIDE,
@@ -192,11 +192,7 @@ def _near_means(flat, i, others, length, out, room):
         total, bound = zero, wide_span(room, 12 * width + k)
         for q in range(4):
             o = 3 * q * width + k
-            ux, uy, uz = (
-                wide_span(room, o),
-                wide_span(room, o + width),
-                wide_span(room, o + 2 * width),
-            )
+            ux, uy, uz = three(room, o, width)
             for p in range(4):
                 o = 3 * p * n + i
                 dx = vsub(wide_splat(at(flat, o)), ux)

@@ -14,6 +14,7 @@ from capsense._dense import (
     cholesky,
     mirror,
     multiply_part,
+    padded,
     square,
     substitute,
     subtract_product,
@@ -165,8 +166,8 @@ def _integrals(cut, functions, rows, pairs):
             means[cut.leaves[j], i] = rows[j, i]
     _climb(cut, means)
     _differences(cut, functions, means, wide, np.int64(0))
-    most = _whole_spans(max(_CACHED // clusters, 4 * WIDE))
-    many = min(most, _whole_spans(leaves))
+    most = padded(max(_CACHED // clusters, 4 * WIDE), WIDE)
+    many = min(most, max(WIDE, padded(leaves, WIDE)))
     half = np.empty((solved, many * ((leaves + many - 1) // many)), np.float32)
     part = np.zeros((clusters, many), np.float32)
     for start in range(0, leaves, many):
@@ -176,7 +177,7 @@ def _integrals(cut, functions, rows, pairs):
                 line[i] = at(pairs, o + i)
         _climb(cut, part)
         _differences(cut, functions, part, half, start)
-    many = min(most, _whole_spans(solved))
+    many = min(most, max(WIDE, padded(solved, WIDE)))
     outer = np.empty((total, many * ((solved + many - 1) // many)), np.float32)
     part = np.zeros((clusters, many), np.float32)
     for start in range(0, solved, many):
@@ -189,23 +190,18 @@ def _integrals(cut, functions, rows, pairs):
     return wide, outer
 
 
-@kernel
-def _whole_spans(columns):
-    return WIDE * max(1, (columns + WIDE - 1) // WIDE)
-
-
 @compiled
 def _products(psi, solved):
     """Products of all rows of ψ with the first ``solved`` ones, up to the row's own."""
     total, modes = psi.shape
-    turned = np.zeros((modes, WIDTH * ((solved + WIDTH - 1) // WIDTH)), np.float32)
+    turned = np.zeros((modes, padded(solved, WIDTH)), np.float32)
     for f in range(solved):
         for k in range(modes):
             turned[k, f] = psi[f, k]
     out = np.empty((total, turned.shape[1]), np.float32)
     for f in range(0, total, _ROWS):
         end = min(f + _ROWS, total)
-        width = min(WIDTH * ((end + WIDTH - 1) // WIDTH), turned.shape[1])
+        width = min(padded(end, WIDTH), turned.shape[1])
         multiply_part(psi[f:end], turned, _depth(psi[f:end]), width, out[f:end])
     return out
 
