@@ -2,8 +2,10 @@
 
 - contact: grounded bodies 2 to 0.5 mm above an electrode, each preset, and one with 2,800 panels,
   against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels do not
-  help there.
-- wide boxes in parallel with the sensor, against 80,000 pieces, and what their readings tell of it.
+  help at 0.5 mm, and many pieces read up to 30 % too much there: Green's function is fitted from
+  2 mm on.
+- wide boxes in parallel with the sensor, from 2 mm on, against 80,000 pieces, and what their
+  readings tell of it.
 - a forearm and a palm near the sensor, against the same.
 - a ball, a limb and a box over the narrow electrodes of ``stripe``, against as many.
 - boxes that come down in steps of 0.02 mm: by how much a large entry falls in a step, at most.
@@ -27,7 +29,7 @@ from step_scenes import PIXELS, WIDE, low, sheet
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
-from field_cases import arm_scenes, bar, delta_reference
+from field_cases import arm_scenes
 from layered_views import view
 from one_skin import person as one_skin
 from reference_scenes import MORE, diagonal_errors, reference_scenes
@@ -75,14 +77,13 @@ def contact(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     """Errors with each preset."""
     sims = [cs.Simulator(DESIGN, preset=p, background=sim.background) for p in PRESETS]
     finer = SurfaceSolver(sim.background.green, sim.design, preset=FINER)
-    cases = [(c.name, c.scene, c.delta) for c in reference_scenes(MORE) if c.gap <= NEAR]
-    for gap in (1, 2):
-        known = delta_reference(DESIGN, f"bar {gap}")
-        cases.append((f"bar 150 x 150 x 20 mm {gap} mm", cs.Scene([bar(1e-3 * gap)]), known))
-    for name, scene, truth in cases:
-        found = [s.step(scene).delta for s in sims]
-        found.append(finer.solve(scene).matrix[: len(truth), : len(truth)])
-        yield name, [float(np.abs(diagonal_errors(f, truth)).max()) for f in found]
+    for case in (c for c in reference_scenes(MORE) if c.gap <= NEAR):
+        found = [s.step(case.scene).delta for s in sims]
+        found.append(finer.solve(case.scene).matrix[:6, :6])
+        name = case.name
+        if case.category == "near plate":
+            name += f", {case.scene[0].shape!r}"
+        yield name, [float(np.abs(diagonal_errors(f, case.delta)).max()) for f in found]
 
 
 def wide(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
@@ -94,7 +95,7 @@ def wide(sim: cs.Simulator) -> Iterator[tuple[str, list[float]]]:
     finer = InPieces(sim.background.green, sim.design, preset=FINER)
     random = np.random.default_rng(5)
     sizes = np.round(random.uniform([0.03, 0.03, 0.01], [0.3, 0.3, 0.1], (8, 3)), 2)
-    for gap in (0.0005, 0.001, 0.002, 0.004, 0.008):
+    for gap in (0.002, 0.004, 0.008):
         off, told = [], []
         for size in sizes:
             place = (*random.uniform(-0.06, 0.06, 2), gap + size[2] / 2)

@@ -40,8 +40,14 @@ WALL_GAP = 0.5e-3
 """Panels nearer than this to the box, or beyond it, are left out [m]."""
 PATCHES = (0.053, 0.040)
 """Half of the region of the electrodes [m]."""
-MOST = 4500
+MOST = 6000
 """Panels of a scene's bodies."""
+PLATES = {
+    (0.25, 0.25, 0.06): (0.02, 0.01), (0.14, 0.04, 0.01): (0.0, 0.026),
+    (0.1, 0.27, 0.02): (-0.01, 0.02), (0.3, 0.21, 0.03): (0.03, -0.02),
+    (0.15, 0.15, 0.02): (0.0, 0.0),
+}  # fmt: skip
+"""Boxes that lie on electrodes, all but touching them, and where [m]."""
 
 
 # -- meshes ---------------------------------------------------------------------------------------
@@ -300,6 +306,8 @@ def scenes() -> list[dict[str, Any]]:
         add("near box", gap, placed(body("box", (0.04, 0.04, 0.02)), gap, 0.001, 0.0255))
         slant = Rotation.from_euler("ZY", (0.4, 0.6))
         add("near finger", gap, placed(body("capsule", [0.008, 0.06], turn=slant), gap, x, y))
+        for size, (x, y) in PLATES.items():
+            add("near plate", gap, placed(body("box", size), gap, x, y))
     over = Rotation.from_euler("ZY", (0.3, math.pi / 2))
     for gap in (5, 10, 20, 50):
         add("wide box", gap, placed(body("box", (0.3, 0.26, 0.1)), gap, 0.01, -0.005))

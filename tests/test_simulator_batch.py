@@ -64,6 +64,8 @@ def test_layouts_of_bodies_are_kept_and_stay_few(tiny: cs.Simulator) -> None:
         np.testing.assert_array_equal(tiny.step(view).delta, tiny.copy().step(view).delta)
     kept = tiny._solver._laid
     assert len(kept) == 3
+    tiny.step(cs.Scene([cs.Body(cs.Sphere(0.005), cs.Pose((0.0, 0.0, 0.04)))]))
+    assert len(kept) == 3, "a shape made anew is the same shape"
     for view in views:
         tiny.step(view)
         assert 0 < len(kept) <= solver._LAYOUTS

@@ -1,7 +1,7 @@
 """Scenes over ``six_patch_bare`` whose ΔC is known from boundary elements.
 
 ``tests/data/reference_map.json`` holds the map of 89 scenes, carried over from elsewhere;
-``tests/data/reference_more.json``, if there, those of ``benchmarks/reference_scenes_bem.py``.
+``tests/data/reference_more.json`` those of ``benchmarks/reference_more.py``.
 Both state their own errors.
 """
 

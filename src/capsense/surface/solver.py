@@ -121,7 +121,7 @@ class SurfaceSolver:
         self._sight = self.green.room + SHORE * np.array([[-1.0], [1.0]])
         """Corners of the box beyond which no charge is [m], shape (2, 3)."""
         self._last: tuple[View, Solution] | None = None
-        self._laid: dict[tuple[int, ...], Laid] = {}
+        self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
         coarsest = self.preset.coarsest
@@ -291,7 +291,7 @@ class SurfaceSolver:
         matter, packed = self._joined(view), view.packed
         bodies = [packed.shapes[k] for k in view.met.tolist()]
         offsets: list[tuple[int, Array]] = []
-        key = (id(matter), *map(id, bodies))
+        key = matter, *bodies
         laid = self._laid.get(key)
         if laid is None or not laid.everywhere:
             laid, offsets = self._lay_out(view, matter, bodies, laid)
@@ -299,7 +299,7 @@ class SurfaceSolver:
             if len(self._laid) >= _LAYOUTS or not rigid:  # what changes at each step is not kept
                 self._laid.clear()
             self._laid[key] = laid
-        records, chosen = laid.records.copy(), view.met[laid.places]
+        records, chosen = laid.copied(), view.met[laid.places]
         records["rotation"] = rotation = packed.rotation[chosen]
         records["position"] = packed.position[chosen]
         shift = np.zeros((len(chosen), 3))
@@ -329,7 +329,7 @@ class SurfaceSolver:
                 solved.append(part)
                 places.append(place)
         if laid is None or (laid.places, laid.found) != (places, found):
-            laid = laid_out(matter, bodies, places, found)
+            laid = laid_out(matter, places, found)
         return replace(laid, everywhere=same(solved, bodies)), offsets
 
     def _joined(self, view: View) -> Matter:
