@@ -98,6 +98,14 @@ def test_thickness(folder):
     assert thickness(parts[2].facets) == pytest.approx(0.002, rel=0.1)
 
 
+@pytest.mark.parametrize("angle", range(2, 30))
+def test_thickness_of_tilted_boxes(folder, angle):
+    """Regression: rays from the middle of a face met the edge between two triangles, and missed."""
+    tilted = {"shape": "box", "size": [0.03, 0.02, 0.004], "tilt": [angle, 0, 0]}
+    (part,) = design(folder, {**tilted, "center": [0, 0, 0.1]}).layers
+    assert thickness(part.facets) == pytest.approx(0.004, rel=1e-9)
+
+
 def test_turned_box_has_its_corners_there():
     box = design(None, {**BOX, "center": [0.01, 0.02, 0.05], "tilt": [90, 0, 0]}).layers[0]
     assert box.lower == pytest.approx([-0.01, 0.019, 0.035])

@@ -207,6 +207,20 @@ def test_bits_do_not_depend_on_the_size_met_first(
     assert_same(store.rigid(shape(second), 100)[0], met)
 
 
+@pytest.mark.parametrize("shape", SIZES)
+def test_stored_panels_times_the_size_bound_the_shape(
+    folder: Path, shape: Callable[[float], Shape]
+) -> None:
+    """Analytic: those of a box have its very corners, those of round shapes come near theirs."""
+    body = shape(0.3)
+    made, size = store.rigid(body, 400)
+    corners = size * made.panels.corners.reshape(-1, 3)
+    limit = 1e-9 if isinstance(body, Box) else 0.003
+    np.testing.assert_allclose(
+        [corners.min(axis=0), corners.max(axis=0)], body.bounds(), atol=limit
+    )
+
+
 def test_a_mesh_is_found_in_the_cache(folder, monkeypatch):
     made = found()
     assert len(list(folder.glob("*.npz"))) == 1

@@ -83,6 +83,19 @@ def test_areas(shape, area):
     assert panels_of(shape).areas.sum() == pytest.approx(area, rel=6e-3)
 
 
+@pytest.mark.parametrize(
+    ("shape", "thickness", "limit"),
+    [(Box((0.1, 0.06, 0.03)), 1 / (1 / 0.1 + 1 / 0.06 + 1 / 0.03), 1e-12),
+     (Sphere(0.05), 2 * 0.05 / 3, 6e-3)],
+)  # fmt: skip
+def test_thickness(shape, thickness, limit):
+    """Analytic: twice the volume over the area, also of a shape twice as large; none if open."""
+    panels = panels_of(shape)
+    assert panels.thickness == pytest.approx(thickness, rel=limit)
+    assert panels.scaled(2.0).thickness == pytest.approx(2 * thickness, rel=limit)
+    assert panels_of(SQUARE, 20).thickness == np.inf
+
+
 def test_no_slivers_at_the_poles():
     """No panel of a ball is longer than four times its width."""
     panels = panels_of(Sphere(1.0), 600)

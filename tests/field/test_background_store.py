@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_field import arrays, digest
+from tiny_field import SETTINGS, arrays, digest, tiny_design
 
 from capsense.errors import FieldError
 from capsense.field import cache
 from capsense.field.background import BackgroundField
-from capsense.field.cache import load_background, read_arrays, save_background, write_arrays
+from capsense.field.cache import (
+    cache_key,
+    exclusive,
+    load_background,
+    load_or_build,
+    read_arrays,
+    save_background,
+    write_arrays,
+)
 
 
 def test_a_field_comes_back_to_the_last_bit(built: BackgroundField, tmp_path: Path) -> None:
@@ -120,3 +130,34 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(
     monkeypatch.undo()
     assert os.listdir(tmp_path) == ["a.npz"]
     assert not read_arrays(path, kind="old")[0]["values"].any()
+
+
+@pytest.mark.parametrize("mended", [False, True])
+def test_an_unusable_field_is_told_once_by_who_builds_it_again(
+    built: BackgroundField,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    mended: bool,
+) -> None:
+    """Invariant: one warning, and none where another process has built it meanwhile."""
+    monkeypatch.setattr(cache, "build_background", lambda *_: built)
+    key = cache_key(tiny_design(), SETTINGS)
+    path = tmp_path / f"{key}.npz"
+    path.write_bytes(b"not a field")
+    with ExitStack() as other:
+        other.enter_context(exclusive(tmp_path / f"{key}.lock"))
+        waits: list[int] = []
+
+        def waiting(*_: object) -> None:
+            """While this process waits for the other, which ends then."""
+            waits.append(len(caplog.records))
+            if mended:
+                save_background(built, path, key)
+            other.close()
+
+        field = load_or_build(tiny_design(), SETTINGS, cache_dir=tmp_path, progress=waiting)
+    assert waits == [0]
+    assert digest(field) == digest(built)
+    assert [r.levelno for r in caplog.records] == ([] if mended else [logging.WARNING])
+    assert digest(load_background(path, key)) == digest(built)

@@ -9,6 +9,7 @@ import pytest
 import shapely
 from field_cases import sheet
 from scipy.integrate import dblquad
+from scipy.spatial.transform import Rotation
 
 from capsense.design.geometry import Facet
 from capsense.field import bem_kernels as kernels
@@ -87,6 +88,30 @@ def test_triangle_by_numerical_quadrature(seed):
     assert kernels.polygon_potential(edges, UP, x, y, z) == pytest.approx(expected, rel=1e-7)
     slopes = [integrand(3, lambda d, k=k: -d[k]) for k in range(3)]
     np.testing.assert_allclose(gradient(edges, x, y, z), slopes, rtol=1e-6, atol=1e-9)
+
+
+QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+TURNS = [
+    QUARTER,
+    np.eye(3)[[2, 0, 1]],
+    *Rotation.random(4, random_state=np.random.default_rng(3)).as_matrix(),
+]
+
+
+@pytest.mark.parametrize("turn", TURNS, ids=["upright", "aside", *"abcd"])
+def test_polygons_turned_and_moved_with_their_points(turn):
+    """Invariant: same potential and solid angle, and the gradient turns with them."""
+    flat = loop([(0.0, 0.0), (0.03, 0.0), (0.025, 0.02), (0.0, 0.01)])
+    shift, normal = np.array([0.05, -0.02, 0.07]), turn @ UP
+    edges = flat @ turn.T + shift
+    for point in ((0.012, 0.006, 0.004), (0.05, -0.01, -0.02), (-0.01, 0.03, 0.0)):
+        moved, out = turn @ point + shift, np.empty(3)
+        expected = kernels.polygon_potential(flat, UP, *point)
+        assert kernels.polygon_potential(edges, normal, *moved) == pytest.approx(expected, rel=1e-9)
+        kernels.polygon_gradient(edges, normal, *moved, out)
+        np.testing.assert_allclose(out, turn @ gradient(flat, *point), rtol=0, atol=1e-9)
+        angles = kernels.solid_angle(edges, normal, *moved), kernels.solid_angle(flat, UP, *point)
+        assert angles[0] == pytest.approx(angles[1], abs=1e-9)
 
 
 def test_holes_subtract():

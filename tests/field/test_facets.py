@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from field_cases import rectangle
 
-from capsense.design.geometry import Facet
-from capsense.field.panels import FAR_PLANE, plane_spacings, smallest_gaps
+from capsense.design.geometry import Facet, box_facets
+from capsense.design.model import Design, Domain, Layer
+from capsense.field.panels import FAR_PLANE, interfaces, plane_spacings, smallest_gaps
 
 MM = 1e-3
 TURNS = {
@@ -73,3 +74,26 @@ def test_facets_of_one_terminal_have_no_gap() -> None:
     )  # fmt: skip
     np.testing.assert_allclose(smallest_gaps([(hole, -1), (pad(0, 8), 0)]), 0.5 * MM)
     np.testing.assert_allclose(smallest_gaps([(pad(0, 4), 0), (pad(4, 4), 1)]), 1e-5)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_face_where_two_parts_touch_is_there_once(turn: str) -> None:
+    """Analytic: areas of two boxes of which one stands on the other, under a pad, by hand."""
+
+    def part(lower: tuple[int, ...], upper: tuple[int, ...]) -> Layer:
+        low, high = np.array(lower) * MM, np.array(upper) * MM
+        turned = (
+            Facet(f.polygon, f.origin @ TURNS[turn], f.axes @ TURNS[turn])
+            for f in box_facets(low, high)
+        )
+        return Layer("part", "matter", 3.0, low, high, tuple(turned))
+
+    parts = part((-15, -10, -4), (15, 10, 0)), part((-5, -10, 0), (5, 10, 6))
+    design = Design("two", Domain((0.5, 0.5, 0.5), 0.25, open=True), (), layers=parts)
+    lid = Facet(pad(0, 8).polygon, np.array([0.0, 0.0, 6.0]) * MM @ TURNS[turn], TURNS[turn])
+    found = sorted(face.polygon.area / MM**2 for face, _ in interfaces(design, [lid]))
+    # of the wide part: below, sides, top on either side of the other and under it
+    wide = [600, 120, 120, 80, 80, 200, 200, 200]
+    # of the other: sides, and what the pad leaves of its top
+    high = [60, 60, 120, 120, 120]
+    np.testing.assert_allclose(found, sorted(wide + high), rtol=1e-9)

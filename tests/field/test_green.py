@@ -317,6 +317,24 @@ def test_openness_of_plates_and_housings() -> None:
     assert aside > 0.7
 
 
+def test_things_are_coarser_away_from_electrodes() -> None:
+    """Differential: a step for each 15 mm to the nearest point of an electrode, from 1 to 5."""
+    plate = {"shape": "rectangle", "size": [0.18, 0.01], "center": [0.0, 0.05]}
+    design = flat(
+        conductor=[{"name": "guard", "role": "shield", **plate}],
+        layer=[{"name": "board", "eps_r": 4.0, "size": [0.19, 0.03], "z": [-0.002, 0.0]}],
+    )
+    surface = Surroundings(design, build_model(design, Accuracy(4.0, fitted=False)))
+    x, y, z = surface.points.T
+    on = (np.abs(np.abs(x) - 0.016) < 0.012) & (np.abs(y) < 0.012) & (z == 0.0)
+    assert 0 < on.sum() < len(on)
+    away = np.linalg.norm(surface.points[:, None] - surface.points[on], axis=2).min(axis=1)
+    expected = np.minimum(np.maximum(away / 0.015, 1.0), 5.0)
+    np.testing.assert_allclose(surface.coarseness, expected, rtol=1e-12)
+    assert (expected.min(), expected.max()) == (1.0, 5.0)
+    assert ((expected > 1.0) & (expected < 5.0)).any()
+
+
 @pytest.mark.parametrize(("backplane", "slope"), [(0.002, 0), (0.01, 0), (0.01, 12)])
 def test_charges_behind_a_plate_stay_above_the_floor(backplane: float, slope: int) -> None:
     """Analytic: as deep as asked for, and at most six tenths of the way to the floor."""

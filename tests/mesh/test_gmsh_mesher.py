@@ -77,6 +77,25 @@ def test_layers_are_unions_of_elements(patches):
     assert corners[..., 2].max() == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("thickness", "across", "wanted"),
+    [(0.008, 1.0, 8e-3), (0.008, 2.0, 4e-3), (0.008, 8.0, 2e-3), (0.004, 0.2, 0.016)],
+)
+def test_elements_within_a_layer_are_its_thickness_over_layers_across(thickness, across, wanted):
+    """Analytic: that long, though no shorter than at rims nor longer than far away."""
+    low, high = np.array([-0.02, -0.02, 0.03]), np.array([0.02, 0.02, 0.03 + thickness])
+    design = Design(
+        "slab", Domain((0.1, 0.1, 0.1), 0.03), (Electrode("E1", rectangle(0, 0.01)),),
+        (Layer("slab", "glass", 5.0, low, high),),
+    )  # fmt: skip
+    mesh = mesh_design(design, size_at_edges=2e-3, size_far=0.016, growth=2.0, layers_across=across)
+    at = mesh.points[mesh.edges]
+    inside = (np.abs(at[..., :2]) < 0.02001).all(axis=(1, 2))
+    level = (np.abs(at[..., 2] - high[2]) < 1e-9).all(axis=1)  # of its top face
+    lengths = np.linalg.norm(np.diff(at[inside & level], axis=1)[:, 0], axis=1)
+    assert np.median(lengths) == pytest.approx(wanted, rel=0.2)
+
+
 def test_element_sizes_grow_from_the_rims():
     design = Design("one", Domain((0.2, 0.2, 0.2), 0.1), (Electrode("E1", rectangle(0, 0.04)),))
     mesh = mesh_design(design, size_at_edges=2e-3, size_far=0.03, growth=0.4)

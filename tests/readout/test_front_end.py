@@ -10,7 +10,7 @@ from relative import near
 
 from capsense.errors import ReadoutError
 from capsense.readout.channels import Wiring
-from capsense.readout.laws import ShuntFrontEnd, demodulate, demodulated
+from capsense.readout.laws import ShuntFrontEnd, ShuntLaw, demodulate, demodulated
 
 PAPER = ShuntFrontEnd(1e6, 1e3, 20.0, 2.0)
 
@@ -59,6 +59,19 @@ def test_recovery_from_magnitudes_is_too_large():
     c = np.array([1e-15, 1e-13, 1e-12])
     excess = PAPER.recover(np.abs(PAPER.output(c))) / c - 1
     assert excess == near(PAPER.omega * PAPER.shunt * c, rel=0.01)
+
+
+@pytest.mark.parametrize(("bits", "codes"), [(4, [1, 7]), (12, [1, 300, 2047]), (16, [1, 30000])])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_codes_of_a_radio_by_hand(bits, codes, sign):
+    """Analytic: a code's voltage v makes v / (ω R_S (A V − v)), whose own output is smaller."""
+    law, most = ShuntLaw(PAPER, full_scale=0.5, bits=bits), 20.0 * 2.0
+    volts = np.array(codes) * 0.5 / 2.0 ** (bits - 1)
+    c = law.capacitance(sign * np.array(codes))
+    assert c == near(sign * volts / (2 * math.pi * 1e6 * 1e3 * (most - volts)), rel=1e-9)
+    smaller = most / np.hypot(most - volts, volts)
+    assert law.level(c) == near(sign * smaller * codes, rel=1e-9)
+    assert law.capacitance(np.array(0)) == 0.0
 
 
 def test_parasitics_and_bandwidth_are_gain_errors():

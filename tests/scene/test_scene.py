@@ -99,6 +99,21 @@ def test_scenes_in_millimetres_are_told(sizes, told):
     assert [str(w.message).startswith("b0 is 180 × 180 × 180 m") for w in caught] == [True] * told
 
 
+@pytest.mark.parametrize(
+    ("distances", "told"),
+    [((28.9,), False), ((29.1,), True), ((29.1, 40.0), True), ((29.1, 1.0), False)],
+)
+def test_scenes_far_beyond_the_sensor_are_told(distances, told):
+    """Analytic: only where every body is farther off than 50 times what the sensor sees and its own
+    size together."""
+    poses = [Pose((0.0, 0.6 * far, 0.8 * far)) for far in distances]
+    scene = Scene([Body(Sphere(2.0), pose, name=f"b{k}") for k, pose in enumerate(poses)])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene.warn_of_units(0.5)
+    assert [str(w.message).startswith("b0 is at (0, 17.46, ") for w in caught] == [True] * told
+
+
 def test_an_empty_scene_packs():
     packed = Scene().pack()
     assert packed.params.shape == (0, 3)

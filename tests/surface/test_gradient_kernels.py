@@ -95,6 +95,17 @@ def test_bodies_within_a_sensor_feel_no_source_that_their_potential_is_bounded_b
         assert np.abs(miss).max() < 0.03 * np.abs(found).max()
 
 
+def test_a_ball_around_a_source_feels_no_force_of_it() -> None:
+    """Differential: against energies of moved charges, none of which is 1 mm from the source."""
+    green = green_of("arm_segment")
+    sources, middle = green.levels[0].sources.T, green.box.mean(axis=0)
+    place = sources[np.argmin(np.linalg.norm(sources - middle, axis=1))]
+    bodies = pack(Placed(cs.Sphere(0.5 * green.levels[0].least), tuple(place.tolist())))
+    solution = solve(bodies, green, 0.015, 2.5, True)
+    wanted = gradient_twin.jacobian(solution, bodies["position"], green)
+    assert _apart(jacobian(solution, bodies, green), wanted) < 1e-5
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_coarse_solutions_have_nearly_the_jacobian_of_fine_ones(name: str) -> None:
     bodies, _, found = _solved(name, 0.015)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from plain_leaves import plain_leaves
-from surface_scenes import Placed, green_of, pack
+from surface_scenes import Placed, green_of, pack, shape_of
 
 import capsense as cs
 from capsense.field.green import LEVELS
@@ -22,6 +22,7 @@ from capsense.field.green_kernels import (
 )
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import placed
+from capsense.surface.look_kernels import Looks, place
 from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
 
 Array = np.ndarray
@@ -174,6 +175,25 @@ def test_curved_designs_lift_nothing() -> None:
     leaves = placed(bodies, chosen(bodies, green, 0.015, 2.5), green)
     np.testing.assert_array_equal(leaves.points, leaves.true)
     assert beyond(np.array([(0.0, 0.0, -0.009)] * 4), green) == 0.0
+
+
+@pytest.mark.parametrize("cover", [0.0, 3e-4, np.inf])
+def test_clusters_are_looked_at_where_they_are_lifted_to(cover: float) -> None:
+    """Analytic: a distance d below 2 m becomes m + d² / 4 m; of a curved design it stays d."""
+    shape, green = cs.Capsule(0.008, 0.06), green_of()._replace(cover=cover)
+    top, none = float(green.box[1, 2]), np.zeros(1)
+    bodies = pack(Placed(shape, (0.0, 0.0, top + 0.0081), (0.0, math.pi / 2, 0.0)))
+    tree, raised, point = shape_of(shape).tree, 0, np.zeros((1, 3), np.float32)
+    for k in range(bodies[0]["stored"]):
+        looks = Looks(none, none, none, none, none, np.zeros(k + 1))
+        square, _, _ = place(bodies[0], green, k, point, 0, looks)
+        wanted = bodies["rotation"][0] @ tree.center[k] + bodies["position"][0]
+        d, m = wanted[2] - top, least_gap(tree.extent[k], cover)
+        assert square == pytest.approx(d * d, rel=1e-4)
+        if d < 2 * m and cover < 1.0:
+            wanted[2], raised = top + m + d * d / (4 * m), raised + 1
+        np.testing.assert_allclose(point[0], wanted, rtol=0, atol=1e-8)
+    assert (raised > 0) == (cover < 1.0)
 
 
 def test_what_crosses_a_wall_is_split_there() -> None:
