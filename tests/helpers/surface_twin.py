@@ -359,7 +359,7 @@ def scores(
         for k in means:
             if own[k] > 0:
                 x, y = kids[k]
-                value = weight @ (means[x] - means[y]) ** 2 / (own[k] * looks[k].stiff ** 2.5)
+                value = weight @ (means[x] - means[y]) ** 2 / (own[k] * looks[k].stiff ** 3)
                 for below in (score[x], score[y]):
                     value = max(value, below) + 0.5 * min(value, below)
                 score[k] = (1 - linear[k]) * value

@@ -61,7 +61,7 @@ class GreenSettings:
     """How many more there are all over the domain, where potentials are small."""
     far_training: int = 3000
     """Points that the middle and the far representation are fitted at, to the near one."""
-    clearance: float = 2e-3
+    clearance: float = 1.2e-3
     """Smallest distance of these points from the design [m]."""
     blends: tuple[tuple[float, float], ...] = ((0.0035, 0.005), (0.012, 0.018))
     """Distances where the middle representation starts and the near one ends [m], and where the far

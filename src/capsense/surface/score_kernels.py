@@ -111,7 +111,7 @@ def _own_score(body, looks, k, weight):
     for i in range(weight.shape[0]):
         d = float(looks.means[x, i] - looks.means[x + 1, i])
         value += weight[i] * d * d
-    return value / (_energy(body, k) * looks.stiff[k] ** 2.5)
+    return value / (_energy(body, k) * looks.stiff[k] ** 3)
 
 
 @kernel
