@@ -141,7 +141,7 @@ def somewhere(case: Case, n: int = 200) -> Array:
     """Points that bodies can reach, none of which the modes were fitted at."""
     surface = Surroundings(case.design, case.solution.model)
     sources = case.green.near_sources.astype(float)
-    points = training_points(surface, sources, replace(FEW, clearance=3e-3, training=0))[0]
+    points = training_points(surface, sources, replace(FEW, clearance=(3e-3, 3e-3), training=0))[0]
     distance = surface.tree.query(points)[0]
     behind = np.linalg.norm(points[:, None] - sources, axis=2).min(axis=1) < distance + 1e-3
     box = case.green.box
@@ -282,12 +282,14 @@ def test_points_of_the_fit_are_all_over_the_domain() -> None:
 
 
 def test_misfit_is_that_of_the_points_of_the_fit() -> None:
-    """Analytic, but for the weights of distances, which it counts and this does not."""
+    """Analytic, of every fourth point, weighted by its distance d: d^¾ / (1 + d / 50 mm)."""
     it = case("flat")
     sources = it.green.near_sources.astype(float)
-    points = training_points(Surroundings(it.design, it.solution.model), sources, FEW)[0][::4]
+    surface = Surroundings(it.design, it.solution.model)
+    points, d = (values[::4] for values in training_points(surface, sources, FEW))
     exact, psi = it.answer(points), basis(points, sources, it.green.floor) @ it.green.near_modes
-    misfit = np.linalg.norm(psi @ psi.T - exact) / np.linalg.norm(exact)
+    weight = np.outer(d**0.75 / (1 + d / 0.05), d**0.75 / (1 + d / 0.05))
+    misfit = np.linalg.norm(weight * (psi @ psi.T - exact)) / np.linalg.norm(weight * exact)
     assert it.green.misfit == pytest.approx(misfit, rel=0.3)
 
 

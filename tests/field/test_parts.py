@@ -157,7 +157,7 @@ def test_no_body_is_sought_in_a_part():
     design, settings = solution.design, GreenSettings()
     surface = Surroundings(design, solution.model)
     sources = surface.sources(100, settings.near_spacing, settings.depth)
-    points = reachable_points(surface, sources, settings.clearance, 400)
+    points = reachable_points(surface, sources, surface.clearance(settings), 400)
     part = design.layers[0]
     assert ((points > part.lower) & (points < part.upper)).all(axis=1).any()
     assert not part.contains(points).any()

@@ -192,7 +192,7 @@ def build_green(
     response = -solution.potential(points, answer)
     phi = solution.potential(points, densities)
     progress("response to charges: fit")
-    weight = _weight(distances)
+    weight = _near_weight(distances)
     wanted = 0.5 * (response + response.T) * weight * weight.T
     fit = _Fit(basis(points, near, floor) * weight, settings.regularisation)
     modes = fit.factor(wanted, settings.modes)
@@ -217,7 +217,7 @@ def build_green(
         raise FieldError(f"the Green's function of design {design.name!r} is not finite")
     numbers = {
         "floor": floor, "box": design_box(design), "blends": np.array(settings.blends),
-        "clearance": settings.clearance, "misfit": misfit,
+        "clearance": surface.clearance(settings), "misfit": misfit,
     }  # fmt: skip
     return from_arrays({**dict(zip(TABLES, tables, strict=True)), **numbers})
 
@@ -246,6 +246,11 @@ def from_arrays(arrays: Mapping[str, Any]) -> GreenFunction:
 def _weight(distances: Array) -> Array:
     """What errors count at distances from the design, shape (n, 1)."""
     return (np.sqrt(distances + 2e-3) / (1 + distances / _MIDDLE))[:, None]
+
+
+def _near_weight(distances: Array) -> Array:
+    """The same of the near representation, (n, 1): ψ·ψ goes up steeply near the design."""
+    return (distances**0.75 / (1 + distances / _MIDDLE))[:, None]
 
 
 def _rounded(table: Array) -> Table:

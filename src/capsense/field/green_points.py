@@ -61,8 +61,9 @@ class GreenSettings:
     """How many more there are all over the domain, where potentials are small."""
     far_training: int = 3000
     """Points that the middle and the far representation are fitted at, to the near one."""
-    clearance: float = 1.2e-3
-    """Smallest distance of these points from the design [m]."""
+    clearance: tuple[float, float] = (1.2e-3, 2e-3)
+    """Smallest distance of these points from the design [m]: half the spacing of the near charges,
+    or a quarter of an electrode's widest panel if that is more, between these bounds."""
     blends: tuple[tuple[float, float], ...] = ((0.0035, 0.005), (0.012, 0.018))
     """Distances where the middle representation starts and the near one ends [m], and where the far
     one starts and the middle one ends."""
@@ -93,18 +94,28 @@ class Surroundings:
         self.normals *= np.repeat(np.where(up_front, 1.0, -1.0), used.sum(axis=1))[:, None]
         """Unit normals towards the side from which bodies come, shape (points, 3)."""
         self.areas = panels.weights[inner][used]
-        owner = np.repeat(model.owner[inner], used.sum(axis=1))
-        electrodes = (owner >= 0) & (owner < len(design.electrodes))
+        on = (model.owner >= 0) & (model.owner < len(design.electrodes))
+        electrodes = np.repeat(on[inner], used.sum(axis=1))
+        self.widest = float(np.sqrt(panels.areas[on].max()))
+        """Width of the widest panel of an electrode [m]."""
         self.tree = cKDTree(self.points)
         away = cKDTree(self.points[electrodes]).query(self.points)[0]
         self.coarseness = np.clip(away / 0.015, 1.0, 5.0)
         """How much coarser than at the electrodes things may be, shape (points,)."""
 
+    def spacing(self, count: int, least: float) -> float:
+        """Distance of neighbours among up to ``count`` points near electrodes [m]."""
+        return max(least, float(np.sqrt((self.areas / self.coarseness**2).sum() / count)))
+
+    def clearance(self, settings: GreenSettings) -> float:
+        """Smallest distance of points of the fit from the design [m]."""
+        spacing = self.spacing(settings.near_sources, settings.near_spacing)
+        return float(np.clip(max(0.5 * spacing, 0.25 * self.widest), *settings.clearance))
+
     def sources(self, count: int, spacing: float, depth: float) -> Array:
         """Up to ``count`` points evenly spread behind the surfaces [m], shape (s, 3)."""
-        weight = self.areas / self.coarseness**2
-        spacing = max(spacing, float(np.sqrt(weight.sum() / count)))
-        count = min(count, max(8, int(weight.sum() / spacing**2)))
+        spacing = self.spacing(count, spacing)
+        count = min(count, max(8, int((self.areas / self.coarseness**2).sum() / spacing**2)))
         chosen = spread(self.points, self.coarseness, count)
         return self.behind(chosen, depth * spacing * self.coarseness[chosen])
 
@@ -143,7 +154,7 @@ def training_points(
     Their spacing goes with the distance from the design.
     """
     count = settings.training + 3 * len(sources)
-    points = reachable_points(surface, sources, settings.clearance, count)
+    points = reachable_points(surface, sources, surface.clearance(settings), count)
     distance, nearest = surface.tree.query(points)
     scale = distance * surface.coarseness[nearest]
     kept = spread(points, scale, min(count, len(points)))
