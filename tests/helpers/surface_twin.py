@@ -350,11 +350,12 @@ def scores(
         if not piece.neutral:
             net = means[0] ** 2 / (share[:, 0] @ block @ share[:, 0] + piece.tie)
             energy += net
-        seen.append((means, linear, looks, net))
+        seen.append((means, linear, looks, net, piece.neutral and piece.group is None))
         stiff.append(own)
     weight = 1 / (energy + 0.01 * np.linalg.norm(energy))
     out = []
-    for (means, linear, looks, net), own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
+    for (*found, net, neutral), own, (kids, _, _) in zip(seen, stiff, trees, strict=True):
+        means, linear, looks = found
         score = np.zeros(len(kids))
         for k in means:
             if own[k] > 0:
@@ -372,10 +373,12 @@ def scores(
                     told[part] = told[k] * (1 - linear.get(k, 1.0))
                     rest = 1 - told[part] * (1 - linear.get(part, 1.0))
                     score[part] = told[part] * score[part] + rest * DECAY * score[k]
+        whole = score[0]
         for k in reversed(range(len(kids))):
             if k in looks:
                 large = _smooth((looks[k].size - LARGE[0]) / (LARGE[1] - LARGE[0]))
-                least = max(score[0] * looks[k].size / looks[0].size, CROSSED * large)
+                forced = min(CROSSED, 2.5 * whole) if neutral else CROSSED
+                least = max(whole * looks[k].size / looks[0].size, forced * large)
                 score[k] = max(score[k], seen[k] * looks[k].crossing * least)
             score[k] = max([score[k], *(score[p] for p in kids[k] if p >= 0)])
         out.append(score)

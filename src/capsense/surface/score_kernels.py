@@ -19,6 +19,8 @@ _CROSSED = 0.3
 """Least score of large clusters that cross a wall: so much that functions are fully faded in. Their
 points lie among the sources that stand for the wall, 40 mm behind it, and would attract themselves
 so much that no definite matrix were left."""
+_FULLY = 2.5
+"""Functions are fully faded in from so many times the threshold on, with all presets."""
 _SEEN = 0.1
 """Part of a cluster that does not see a linear potential from which on what crosses a wall within
 it counts in full."""
@@ -185,11 +187,13 @@ def _raise_scores(body, looks, weight, scores, counts):
                 _pass_on(part, scores[k], looks, scores)
                 counts[part] = counts[k] * smooth((1.0 - looks.linear[k]) / _SEEN)
     whole = scores[0]
+    # what has no net charge carries none where no function of it counts
+    forced = min(_CROSSED, _FULLY * whole) if body.neutral else _CROSSED
     for k in range(count - 1, -1, -1):
         if not met[k]:
             continue
         wide = smooth((body.scale * extent[k] - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
-        least = max(_CROSSED * wide, whole * extent[k] / extent[0])
+        least = max(forced * wide, whole * extent[k] / extent[0])
         scores[k] = max(scores[k], counts[k] * crossing[k] * least)
         if 0 <= kids[2 * k] < count:
             scores[k] = max(scores[k], scores[kids[2 * k]], scores[kids[2 * k + 1]])
