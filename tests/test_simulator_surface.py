@@ -49,7 +49,7 @@ def test_the_map_of_references(sim):
 
 
 def test_more_references(sim):
-    """Measured against boundary elements of another make: 105 scenes, also near contact."""
+    """Measured against boundary elements of another make: 120 scenes, also near contact."""
     readings = [(s, sim.step(s.scene)) for s in reference_scenes(MORE)]
     diagonal = np.array([diagonal_errors(r.delta, s.delta) for s, r in readings])
     assert np.sqrt((diagonal**2).mean()) <= 0.02

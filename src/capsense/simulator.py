@@ -259,10 +259,13 @@ class Simulator:
     def _of(self, found: Change, scene: Scene, seconds: float) -> Reading:
         """The reading that a solver's result makes, which took some time [s]."""
         terminals = self._terminals
-        if math.isinf(found.error) and not self._contact_told:
-            self._contact_told = True
-            warn_of_contact(scene, {e.name: e.surface.triangles for e in self.design.electrodes})
         change: NDArray[Any] = terminals.screened(found.matrix)
+        if math.isinf(found.error):
+            change = terminals.grounded(change)
+            if not self._contact_told:
+                self._contact_told = True
+                surfaces = {e.name: e.surface.triangles for e in self.design.electrodes}
+                warn_of_contact(scene, surfaces)
         error = max(found.error, float((found.matrix - change).max()))
         if found.loss is not None:
             change = change - 1j * found.loss

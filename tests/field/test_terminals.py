@@ -102,3 +102,17 @@ def test_screened_terminals_do_not_couple() -> None:
     np.testing.assert_array_equal(large[off], np.maximum(-rest, 0.0)[off])
     small = np.full((ALL, ALL), -1e-12)
     np.testing.assert_array_equal(Terminals(design(), rest).screened(small), small)
+
+
+def test_capacitances_to_ground_are_raised_to_zero() -> None:
+    """Analytic: diagonals of rows whose sum is negative make up for it, others stay."""
+    rng = np.random.default_rng(6)
+    rest = maxwell(rng)
+    change = np.zeros((ALL, ALL))
+    np.fill_diagonal(change, rng.uniform(-2, 1, ALL) * 1e-12)
+    found = Terminals(design(), rest).grounded(change)
+    sums = (rest + change).sum(axis=1)
+    assert (sums < 0).any() and (sums > 0).any()
+    np.testing.assert_allclose((rest + found).sum(axis=1), np.maximum(sums, 0.0), atol=1e-26)
+    off = ~np.eye(ALL, dtype=bool)
+    np.testing.assert_array_equal(found[off], change[off])

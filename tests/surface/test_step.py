@@ -972,7 +972,9 @@ def test_scores_of_a_body_on_a_capacitance_across_a_wall(scale: float) -> None:
 
 
 @pytest.mark.parametrize(("height", "scale"), [(0.05, 2.5), (0.25, 2.5), (0.25, 4.0)])
-def test_scores_of_a_wide_body_without_net_charge_across_a_wall(height: float, scale: float) -> None:
+def test_scores_of_a_wide_body_without_net_charge_across_a_wall(
+    height: float, scale: float
+) -> None:
     """Differential: its large clusters are split only where it counts itself."""
     wall = float(packed_green().room[1, 0])
     wide = body(BOX, (wall - 0.01, 0.0, height), scale=scale, tie=NONE)

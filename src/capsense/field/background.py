@@ -174,6 +174,11 @@ class Terminals:
         """Bound a change, shape (..., t, t)."""
         return np.minimum(change, self.bound)
 
+    def grounded(self, change: Array) -> Array:
+        """Raise diagonals of a change so far that no capacitance to ground is negative, (t, t)."""
+        lack = np.minimum((self.rest + change).sum(axis=1), 0.0)
+        return change - np.diag(lack)
+
     def change(self, change: NDArray[Any]) -> NDArray[Any]:
         """Change of the driven terminals' matrix by that of all, (..., t, t) -> (..., k, k)."""
         if self.driven == len(self.rest):

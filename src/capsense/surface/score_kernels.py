@@ -106,8 +106,8 @@ def _net_energy(body):
 def _own_score(body, looks, k, weight):
     """Score of the function of a cluster, from the potentials of its two parts.
 
-    It counts for more where the design leaves the function less of its energy: twice over, and a
-    little more, as the errors of all functions that are left out there go the same way.
+    It counts for more where the design leaves the function less of its energy: twice over for
+    that, and once more as the errors of all that is left out there go the same way.
     """
     x, value = integers(body.kids)[2 * k], 0.0
     for i in range(weight.shape[0]):
