@@ -157,7 +157,7 @@ def test_the_potential_is_drawn(page: Any) -> None:
     """The picture holds a colour of the potential, until it is not wanted."""
     press(page, "|<")
     wait_for_sample(page, 0)
-    assert painted(page, lambda count: count > 12) > 12
+    assert painted(page, lambda count: count > 15) > 15
     page.get_by_role("checkbox").nth(-2).click()
     assert painted(page, lambda count: count < 10) < 10
 
@@ -181,7 +181,7 @@ def painted(page: Any, enough: Callable[[int], bool]) -> int:
         picture = Image.open(io.BytesIO(page.locator("canvas").first.screenshot()))
         pixels = np.asarray(picture.convert("RGB")).astype(int)
         away = [np.abs(pixels - colour).max(axis=-1) for colour in colours]
-        count = int((np.min(away, axis=0) < 20).sum())
+        count = int((np.min(away, axis=0) < 40).sum())  # thin lines fade into what is behind
         if enough(count):
             break
         page.wait_for_timeout(500)
