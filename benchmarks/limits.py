@@ -1,9 +1,8 @@
 """Where readings are least certain, over ``six_patch_bare``: ``python benchmarks/limits.py``.
 
 - contact: grounded bodies 2 to 0.5 mm above an electrode, each preset, and one with 2,800 panels,
-  against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels do not
-  help at 0.5 mm, and many pieces read up to 30 % too much there: Green's function is fitted from
-  2 mm on.
+  against boundary elements (``tests/data``). The largest error of the diagonal. Finer panels help
+  little more at 0.5 mm: Green's function is fitted from 1.3 mm on.
 - wide boxes in parallel with the sensor, from 2 mm on, against 80,000 pieces, and what their
   readings tell of it.
 - a forearm and a palm near the sensor, against the same.

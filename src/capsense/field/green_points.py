@@ -102,10 +102,12 @@ class Surroundings:
         away = cKDTree(self.points[electrodes]).query(self.points)[0]
         self.coarseness = np.clip(away / 0.015, 1.0, 5.0)
         """How much coarser than at the electrodes things may be, shape (points,)."""
+        self.weights = self.areas / self.coarseness**2
+        """Areas that count less where things may be coarser [m²], shape (points,)."""
 
     def spacing(self, count: int, least: float) -> float:
         """Distance of neighbours among up to ``count`` points near electrodes [m]."""
-        return max(least, float(np.sqrt((self.areas / self.coarseness**2).sum() / count)))
+        return max(least, float(np.sqrt(self.weights.sum() / count)))
 
     def clearance(self, settings: GreenSettings) -> float:
         """Smallest distance of points of the fit from the design [m]."""
@@ -115,7 +117,7 @@ class Surroundings:
     def sources(self, count: int, spacing: float, depth: float) -> Array:
         """Up to ``count`` points evenly spread behind the surfaces [m], shape (s, 3)."""
         spacing = self.spacing(count, spacing)
-        count = min(count, max(8, int((self.areas / self.coarseness**2).sum() / spacing**2)))
+        count = min(count, max(8, int(self.weights.sum() / spacing**2)))
         chosen = spread(self.points, self.coarseness, count)
         return self.behind(chosen, depth * spacing * self.coarseness[chosen])
 
@@ -188,8 +190,8 @@ def reachable_points(surface: Surroundings, sources: Array, clearance: float, co
         lengths = clearance * span ** random.uniform(0, 0.95, len(directions))
         return directions * (lengths / np.linalg.norm(directions, axis=1))[:, None]
 
-    chance = surface.areas / surface.coarseness**2
-    chosen = random.choice(len(chance), 4 * count, p=chance / chance.sum())
+    chance = surface.weights / surface.weights.sum()
+    chosen = random.choice(len(chance), 4 * count, p=chance)
     front = surface.normals[chosen] + 0.5 * random.normal(size=(4 * count, 3))
     rims = np.concatenate([body.surface.rims for body in design.sheets])
     length = np.linalg.norm(rims[:, 1] - rims[:, 0], axis=1)
