@@ -157,7 +157,7 @@ def _shadow(triangles: Sequence[Any], place: Any, normal: Any, size: int = 1400)
 
 @numba.njit(cache=True)
 def _reached(seen, near):  # type: ignore[no-untyped-def]
-    """Which of 16 rays towards the lamp pass: columns, rows and heights (m, n, 3) in its image."""
+    """Share of 16 rays that reach the lamp, from columns, rows, heights (m, n, 3) in its image."""
     size = len(near)
     out = np.empty(seen.shape[:2])
     for row in range(seen.shape[0]):
@@ -167,8 +167,8 @@ def _reached(seen, near):  # type: ignore[no-untyped-def]
             for dx in (-3.0, -1.0, 1.0, 3.0):
                 for dy in (-3.0, -1.0, 1.0, 3.0):
                     i, j = round(x + dx), round(y + dy)
-                    inside = i >= 0 and j >= 0 and i < size and j < size
-                    if not inside or near[int(j), int(i)] < height + 0.002:
+                    inside = 0 <= i < size and 0 <= j < size
+                    if not inside or near[j, i] < height + 0.002:
                         free += 1
             out[row, column] = free / 16
     return out
