@@ -179,7 +179,7 @@ _NOTHING = nullcontext()
 def _told() -> Iterator[None]:
     global _done
     often = "once, and is then kept" if _kernel_cache.kept else "in each process"
-    told = f"compiling the solver for this processor; it takes about 15 seconds {often}"
+    told = f"compiling the solver for this processor; it takes 15 to 25 seconds {often}"
     timer = threading.Timer(WAIT, _log.warning, [told])
     timer.daemon = True
     timer.start()
