@@ -53,6 +53,7 @@ def pack(*bodies: Placed) -> Array:
         if np.isfinite(body.eps_r):
             out["impedance"][k] = shape.impedance.ctypes.data
             out["softness"][k] = 1.0 / (body.eps_r - 1.0)
+            out["stiffer"][k] = 2.0 / (body.eps_r - 1.0)
     return out
 
 

@@ -342,6 +342,8 @@ def scores(
             if x >= 0 and x in means:
                 function = share[:, x] - share[:, y]
                 own[k] = function @ block @ function
+                if np.isfinite(piece.eps_r):  # about Z = 2 F
+                    own[k] *= 1.0 + 2.0 * abs(1.0 / (piece.eps_r - 1.0))
                 p = share[members_of(share, x), k].sum()
                 below = p * means[x] + (1 - p) * means[y]
                 means[k] = linear[k] * value + (1 - linear[k]) * below

@@ -116,6 +116,7 @@ class Scene(tuple[tuple[Piece, RigidShape], ...]):
             if np.isfinite(piece.eps_r):
                 out["impedance"][k] = shape.impedance.ctypes.data
                 out["softness"][k] = (1 / (piece.eps_r - 1)).real
+                out["stiffer"][k] = 2.0 * abs(1 / (piece.eps_r - 1))
         return out
 
     def solved(self, threshold: float = ALL) -> Solution:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from capsense.constants import EPS0
 from capsense.elements.pieces import ChangingBody
-from capsense.elements.rigid import RigidShape
+from capsense.elements.rigid import HALF_SPACE, RigidShape
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
 from capsense.scene.materials import Grounding, Material
 from capsense.scene.scene import PackedScene
@@ -146,6 +146,7 @@ class Matter:
         records["neutral"] = none & ~shared
         records["tie"] = np.where(shared, SHUT, np.where(none, 0.0, ties.real))
         records["group"], records["softness"] = self.group, softness.real
+        records["stiffer"] = HALF_SPACE * np.abs(softness)
         for k in np.flatnonzero(softness).tolist():
             shape = shapes[k]
             block = shape.impedance

@@ -67,6 +67,7 @@ BODY = np.dtype(
         ("inside", np.float64),  # impedance of its inside, over its energy; 0 for a sheet
         ("sheet", np.float64),  # thickness of a changing sheet of a dielectric [m]; else 0
         ("softness", np.float64),  # 1 / (eps - 1), 0 for a conductor
+        ("stiffer", np.float64),  # about what its inside adds to energies, over them, as it scores
     ]
 )  # fmt: skip
 """One body, as the kernels take it."""

@@ -21,7 +21,7 @@ from capsense.elements.panels import panels_of, polygon_panels
 from capsense.elements.parts import refined
 from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces
 from capsense.elements.rigid import Clusters, RigidShape, charged_tree, rigid_shape
-from capsense.elements.wide import COARSE, FACES, WideBody, wide_pieces
+from capsense.elements.wide import FACES, WideBody, wide_body, wide_pieces
 from capsense.errors import FieldError
 from capsense.field.cache import default_cache_dir, read_arrays, write_arrays
 from capsense.scene import (
@@ -38,6 +38,7 @@ from capsense.scene import (
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 
 _GRID = 1e-5
 """Vertices are rounded to about this part of the longest extent, so that single precision makes no
@@ -188,8 +189,23 @@ def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:
     return _kept(shape, count, "_wide", _wide_of)
 
 
-def _wide_of(whole: Shape, count: int, _: str) -> WideBody:
-    return WideBody(panels_of(whole, count, merge=False), lambda: panels_of(whole, COARSE))
+def _wide_of(whole: Shape, count: int, name: str) -> WideBody:
+    made = wide_body(whole, count)
+    if isinstance(whole, TriMesh):
+        made.keep = lambda block: _inside_of(f"{name}-inside", block)
+    return made
+
+
+def _inside_of(key: str, make: Callable[[], Array32]) -> Array32:
+    """The impedance of a wide mesh, from a file if there is one."""
+
+    def packed() -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        block = make()
+        lower = {"block": block[np.tril_indices(len(block))]}
+        return lower, {"kind": "shape", "key": key, "size": len(block)}
+
+    arrays, meta = _stored(key, packed)
+    return _from_lower(arrays["block"], int(meta["size"]))
 
 
 def _rigid_of(whole: Shape, count: int, name: str) -> RigidShape:
@@ -251,25 +267,36 @@ def _form(shape: Shape, count: int) -> tuple[float, tuple[Hashable, ...], Shape]
 # -- meshes ---------------------------------------------------------------------------------------
 
 
-def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
+def _stored(
+    key: str, make: Callable[[], tuple[dict[str, NDArray[Any]], dict[str, Any]]]
+) -> tuple[Mapping[str, NDArray[Any]], Mapping[str, Any]]:
+    """Arrays and what is said of them, from a file if there is one; else they are made and kept."""
     file = default_cache_dir() / "shapes" / f"{key}.npz"
     try:
-        return _unpacked(*read_arrays(file, kind="shape", key=key))
+        return read_arrays(file, kind="shape", key=key)
     except FileNotFoundError:
         pass
     except FieldError as error:
         _log.warning("a stored shape is not used, it is made again: %s", error)
-    wanted = count * min(_MOST, max(_TRIANGLES, _EACH * shape.parts))
-    own = standing(shape.vertices, shape.faces)
-    made = _turned(rigid_shape(panels_of(own.corners, round(wanted))), own.axes, own.middle)
-    arrays, meta = _packed(made, key)
+    arrays, meta = make()
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(file, arrays, meta)
         _make_room(file.parent)
     except OSError as error:
         _log.info("a shape cannot be kept in %s: %s", file.parent, error)
-    return _unpacked(arrays, meta)  # as processes that read the file have it, to the last bit
+    return arrays, meta
+
+
+def _mesh_shape(shape: TriMesh, count: int, key: str) -> RigidShape:
+    def made() -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        wanted = count * min(_MOST, max(_TRIANGLES, _EACH * shape.parts))
+        own = standing(shape.vertices, shape.faces)
+        form = rigid_shape(panels_of(own.corners, round(wanted)))
+        return _packed(_turned(form, own.axes, own.middle), key)
+
+    # as processes that read the file have it, to the last bit
+    return _unpacked(*_stored(key, made))
 
 
 def _turned(shape: RigidShape, axes: Array, middle: Array) -> RigidShape:
@@ -302,16 +329,19 @@ def _packed(shape: RigidShape, key: str) -> tuple[dict[str, NDArray[Any]], dict[
     }  # fmt: skip
 
 
+def _from_lower(values: Array32, n: int) -> Array32:
+    """A symmetric matrix from its lower triangle, row by row, (n, n)."""
+    out = np.zeros((n, n), np.float32)
+    out[np.tril_indices(n)] = values
+    out += np.tril(out, -1).T
+    return out
+
+
 def _unpacked(arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> RigidShape:
     corners = arrays["corners"][:, [0, 1, 2, 2]]
     panels = polygon_panels(corners, arrays["parts"].astype(np.int64), bool(meta["closed"]))
     clusters = Clusters(*(arrays[k].astype(np.int64) for k in ("kids", "function", "panel")))
-    energy = np.zeros((len(panels),) * 2, np.float32)
-    start = 0
-    for k in range(len(panels)):
-        energy[k, : k + 1] = arrays["energy"][start : start + k + 1]
-        start += k + 1
-    energy += np.tril(energy, -1).T
+    energy = _from_lower(arrays["energy"], len(panels))
     return RigidShape(
         panels, charged_tree(panels, clusters, arrays["charge"]), energy,
         float(meta["capacitance"]),

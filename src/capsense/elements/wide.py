@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.mean_kernels import means_between, points_of_each
-from capsense.elements.panels import SurfacePanels
+from capsense.elements.panels import SurfacePanels, panels_of
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import (
     HALF_SPACE,
@@ -30,6 +31,7 @@ from capsense.elements.rigid import (
 from capsense.errors import SolveError
 from capsense.scene import TriMesh
 from capsense.scene.shapes import Shape, ShapeKind
+from capsense.scene.surface import enclosed_volume
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -51,9 +53,12 @@ _PIECE = 4e-3
 """Edges of the pieces of wide bodies [m]: what can be told apart at gaps of some millimetres."""
 _FEWEST, _DOUBLINGS = 5000, 3
 """Pieces of wide bodies are so many, doubled at most so often."""
-COARSE, _THICK = 1000, 2.0
+_COARSE, _THICK = 1000, 2.0
 """Panels from which the impedance of the inside of wide shapes is found, and how many times as
-thick as these are wide a shape must be: what goes on between two near faces takes finer ones."""
+thick as these are wide a shape must be: what goes on between two near faces takes finer ones …"""
+_FINER, _THIN, _THINNER, _BROAD = 2000, 1.2, 0.6, 0.02
+"""… which are so many, and do not do for shapes less than 1.2 times as thick as these are wide, or
+0.6 times where they are wider than the last [m]: other panels would then be much too wide."""
 _FOIL = 5e-5
 """Primitives thinner than this part of their width have no energies: their faces would be one."""
 FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
@@ -66,34 +71,70 @@ _CLUSTERS, _SQUARE = 1000, 2.97
 the mean of 1/r in a square, times its side."""
 
 
+class _Wide(NamedTuple):
+    """What a shape comes to as a wide one."""
+
+    conductor: float
+    """Surface that counts [m²], infinite where the shape is wide whatever is in front of it …"""
+    dielectric: float
+    """… and as a dielectric; 0 where it cannot be a wide one."""
+    pieces: int
+    """About how many pieces it is cut into."""
+    coarse: int
+    """Panels from which the impedance of its inside is found."""
+
+
+def _wide(shape: Shape) -> _Wide:
+    held: _Wide | None = shape.__dict__.get("_as_wide")
+    if held is None:
+        counts = 1.0 if shape.kind is ShapeKind.BOX else _BENT
+        low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
+        part, area = (
+            2 * (low * middle + (low + middle) * length) * _ROUND.get(shape.kind, 1.0)
+            for length in (min(high, _SLENDER * middle), high)
+        )
+        wide, thickness = middle > WIDE or low < _FOIL * middle, low
+        if isinstance(shape, TriMesh):
+            wide, thickness = middle > WIDE, _mean_thickness(shape)
+        doublings = math.ceil(math.log2(max(area / _PIECE**2 / _FEWEST, 1.0)))
+        pieces = _FEWEST * 2 ** min(doublings, _DOUBLINGS)
+        conductor, filled = (math.inf if wide else part * x for x in (counts, _FILLED))
+        width = math.sqrt(area / _FINER)
+        solid = thickness >= width * (_THIN if width < _BROAD else _THINNER)
+        coarse = _COARSE if thickness >= _THICK * math.sqrt(area / _COARSE) else _FINER
+        held = _Wide(conductor, filled if solid else 0.0, pieces, coarse)
+        shape.__dict__["_as_wide"] = held
+    return held
+
+
+def _mean_thickness(mesh: TriMesh) -> float:
+    """Twice the volume of a closed mesh over its surface, which of a plate is its thickness [m]."""
+    if not mesh.closed:
+        return 0.0
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    return 2.0 * abs(enclosed_volume(mesh.vertices, mesh.faces)) / area
+
+
 def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
     """About how many pieces a shape is cut into; 0 where it is neither wide nor a foil.
 
-    Nor are dielectrics that are thin, or meshes.
+    Nor are dielectrics that are very thin for their size, or open.
 
     Args:
         shape: A primitive or a mesh.
         conducting: Whether it holds no field inside.
         largest: Shapes of so much surface or more [m²] are wide too; not all of long ones counts.
     """
-    held = shape.__dict__.get("_pieces")
-    if held is None:
-        counts = 1.0 if shape.kind is ShapeKind.BOX else _BENT
-        low, middle, high = np.sort(np.ptp(shape.bounds(), axis=0)).tolist()
-        mesh = isinstance(shape, TriMesh)
-        part, area = (
-            2 * (low * middle + (low + middle) * length) * _ROUND.get(shape.kind, 1.0)
-            for length in (min(high, _SLENDER * middle), high)
-        )
-        wide = middle > WIDE or (low < _FOIL * middle and not mesh)
-        doublings = math.ceil(math.log2(max(area / _PIECE**2 / _FEWEST, 1.0)))
-        solid = not mesh and low >= _THICK * math.sqrt(area / COARSE)
-        pieces = _FEWEST * 2 ** min(doublings, _DOUBLINGS)
-        conductor, filled = (math.inf if wide else part * x for x in (counts, _FILLED))
-        held = conductor, filled if solid else 0.0, pieces
-        shape.__dict__["_pieces"] = held
-    conductor, dielectric, pieces = held
-    return pieces if (conductor if conducting else dielectric) >= largest else 0
+    as_wide = _wide(shape)
+    enough = (as_wide.conductor if conducting else as_wide.dielectric) >= largest
+    return as_wide.pieces if enough else 0
+
+
+def wide_body(shape: Shape, pieces: int) -> WideBody:
+    """A wide shape, of about so many pieces."""
+    panels, coarse = panels_of(shape, pieces, merge=False), _wide(shape).coarse
+    return WideBody(panels, lambda: panels_of(shape, coarse))
 
 
 def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
@@ -152,11 +193,13 @@ class WideBody(ChangingBody):
     Attributes:
         most: How far apart opposite normals count, see :func:`features` [m].
         weights: Charges of the panels that functions are weighted with, shape (n,).
+        keep: Returns the impedance from where it is kept, or from what makes it.
     """
 
     def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
         thickness, flat = _thickness(panels)
         self.most, self._coarse = thickness * (FACES if flat else _LIMBS), coarse
+        self.keep: Callable[[Callable[[], Array32]], Array32] = lambda make: make()
         self._at = features(panels.centers, panels.normals, self.most)
         tree = split(self._at, panels.areas)
         kids, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)
@@ -199,7 +242,7 @@ class WideBody(ChangingBody):
         Z − 2F is smooth: charges within a small place that add to zero have none of it. So it is
         that of a few panels, for the charge functions of clusters as large as these and larger.
         """
-        return once(self, "_impedance", self._inside)
+        return once(self, "_impedance", lambda: self.keep(self._inside))
 
     def _inside(self) -> Array32:
         panels = self._coarse()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled, first_use, kernel
 from capsense._thread_pool import in_parts
 from capsense.elements.matter import SHUT, UNIT
-from capsense.elements.rigid import BODY
+from capsense.elements.rigid import BODY, HALF_SPACE
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
 from capsense.field.green_kernels import SHORE, Green
@@ -198,6 +198,7 @@ def _placed(
             return False
     body.scale, body.tie = scale, bodies.tie[e, b].real
     body.neutral, body.softness = bodies.neutral[e, b], bodies.softness[e, b].real
+    body.stiffer = HALF_SPACE * abs(bodies.softness[e, b])
     if bodies.softness[e, b] == 0.0:
         body.impedance = 0
     return True

@@ -92,8 +92,9 @@ def _add_energies(body, looks, seen, energy):
 
 @kernel
 def _energy(body, k):
-    """Energy of the function of a cluster in free space [1/m]."""
-    return doubles(body.own)[integers(body.function)[k]] / body.scale
+    """Energy of the function of a cluster [1/m]; of a dielectric about that on a half-space."""
+    own = doubles(body.own)[integers(body.function)[k]]
+    return (1.0 + body.stiffer) * own / body.scale
 
 
 @kernel
