@@ -83,38 +83,49 @@ def test_table_top(simulators, gap, as_mesh):
     assert np.diag(found).min() > {0.01: 160e-15, 0.02: 50e-15, 0.05: 5.3e-15}[gap]
 
 
-def test_metal_behind_a_wooden_board_counts(simulators):
-    """Regression: scores took a dielectric for a conductor, so that what stood beside it counted
-    too little: a steel cabinet beside a wooden board lost a third of what it changes."""
-    board = cs.Body(cs.Box((0.5, 0.8, 0.03)), cs.Pose((-0.26, 0.0, 0.03)), "wood")
-    steel = cs.Body(cs.Box((0.3, 0.3, 0.3)), cs.Pose((0.21, 0.0, 0.18)), "steel")
-    scene = cs.Scene([board, steel])
+@pytest.mark.parametrize(
+    ("board", "steel"),
+    [
+        ((-0.1787, 0.0862, 0.0355), (0.0863, 0.0433, 0.0959)),
+        ((-0.035, -0.0118, 0.0414), (-0.099, 0.0777, 0.0641)),
+        ((-0.0686, 0.0602, 0.0413), (0.0802, -0.0744, 0.0952)),
+    ],
+)
+def test_metal_beside_a_wide_dielectric_counts(simulators, board, steel):
+    """Regression, against the fine preset: scores took the board for a conductor, so that metal
+    beside it had too few functions, and readings were 14 to 16 % off."""
+    foam = cs.Body(cs.Box((0.5, 0.6, 0.03)), cs.Pose(board), cs.Material("foam", 1.5))
+    metal = cs.Body(cs.Box((0.05, 0.05, 0.1)), cs.Pose(steel), "steel")
+    scene = cs.Scene([foam, metal])
     found, fine = (
         simulators("six_patch", preset=preset).step(scene).delta for preset in ("standard", "fine")
     )
-    np.testing.assert_allclose(np.diag(found), np.diag(fine), rtol=0.05)
+    assert np.abs(found - fine).max() < 0.04 * np.abs(fine).max()
 
 
 def test_impedances_of_wide_meshes_are_kept_in_files(tmp_path, monkeypatch):
-    """Unit: another process reads what the first worked out, to the last bit."""
+    """Unit: another process reads what the first worked out; what is damaged is made again."""
     monkeypatch.setattr(store, "default_cache_dir", lambda: tmp_path)
     box = BLOCK.to_trimesh()
-    first, second = (
-        store.functions_of(cs.TriMesh(box.vertices, box.faces), 700, conducting=False, largest=0.1)[
-            0
-        ]
-        for _ in range(2)
-        if not store._SHAPES.clear()
-    )
-    assert first is not second
-    np.testing.assert_array_equal(first.impedance, wide_impedance := second.impedance)
+    made: list[WideBody] = []
+    worked_out: list[int] = []
+    inside = WideBody._inside
+    monkeypatch.setattr(WideBody, "_inside", lambda self: worked_out.append(1) or inside(self))
+
+    def anew() -> np.ndarray:
+        store._SHAPES.clear()
+        shape = cs.TriMesh(box.vertices, box.faces)
+        made.append(store.functions_of(shape, 700, conducting=False, largest=0.1)[0])
+        return made[-1].impedance
+
+    first, second = anew(), anew()
+    assert made[0] is not made[1]
+    assert len(worked_out) == 1
+    np.testing.assert_array_equal(first, second)
     (file,) = (tmp_path / "shapes").glob("*-inside.npz")
     file.write_bytes(b"damaged")
-    store._SHAPES.clear()
-    third = store.functions_of(
-        cs.TriMesh(box.vertices, box.faces), 700, conducting=False, largest=0.1
-    )[0]
-    np.testing.assert_array_equal(third.impedance, wide_impedance)
+    np.testing.assert_array_equal(anew(), first)
+    assert len(worked_out) == 2
 
 
 @pytest.mark.parametrize("grounding", ["grounded", "floating", 1e-12])
