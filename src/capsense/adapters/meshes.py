@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +18,11 @@ from capsense.scene.surface import Faces, connected_parts, read_triangles
 
 Array = NDArray[np.float64]
 
-_TILE = 0.6
-"""Tiles are about so wide [m], or a cell of the terrain if that is wider."""
+_TILE = 0.3
+"""Tiles of a terrain, from one to the next of which another part of it is seen, are about so wide
+[m], or a cell if that is wider."""
+_KEPT = 8
+"""So many parts of a terrain are kept, with all that was worked out for them."""
 
 
 class UnusableShape(SceneError):
@@ -133,7 +138,7 @@ def height_field(heights: ArrayLike, size: ArrayLike, base: float) -> tuple[Arra
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """A height field, given out in tiles."""
+    """A height field, of which a part around the sensor is given out."""
 
     heights: Array
     """Heights [m] over z = 0 of its frame, rows along y and columns along x, (rows, columns)."""
@@ -142,10 +147,12 @@ class Terrain:
     base: float
     """Depth of its floor below z = 0 [m]."""
     solid: bool
-    """Whether tiles have walls and a floor, as matter that does not conduct must have."""
+    """Whether parts have walls and a floor, as matter that does not conduct must have."""
     label: str
     """What it is called, for messages."""
-    _tiles: dict[tuple[int, int], TriMesh] = field(default_factory=dict, repr=False)
+    _parts: OrderedDict[tuple[int, int, int, int], TriMesh] = field(
+        default_factory=OrderedDict, repr=False
+    )
 
     def bounds(self) -> Array:
         """Lower and upper corner of the bounding box [m] in its frame, shape (2, 3)."""
@@ -153,37 +160,39 @@ class Terrain:
         low, high = float(self.heights.min()), float(self.heights.max())
         return np.array([[-x, -y, min(low, -self.base)], [x, y, high]])
 
-    def near(self, centre: Array, reach: float) -> list[TriMesh]:
-        """The tiles within a distance [m] along x and y of a point in its frame, shape (3,)."""
-        along = [self._range(axis, centre[axis], reach) for axis in (0, 1)]
-        return [self._tile(row, column) for row in along[1] for column in along[0]]
+    def near(self, centre: Array, reach: float) -> TriMesh:
+        """The part within a distance [m] along x and y of the tile that a point (3,) is over.
 
-    def _cells(self, axis: int) -> tuple[int, int, float]:
-        """Cells along x (0) or y (1), those of a tile, and the width of a cell [m]."""
-        cells = self.heights.shape[1 - axis] - 1
-        width = 2 * self.half[axis] / cells
-        return cells, max(1, round(_TILE / width)), width
+        It is the same mesh for all points over a tile: its charge functions are made once.
+        """
+        columns, rows = (self._nodes(axis, centre[axis], reach) for axis in (0, 1))
+        key = rows.start, rows.stop, columns.start, columns.stop
+        if key in self._parts:
+            self._parts.move_to_end(key)
+            return self._parts[key]
+        part = self.heights[rows, columns]
+        half = [0.5 * self._cell(axis) * (n - 1) for axis, n in enumerate(part.shape[::-1])]
+        vertices, faces = height_field(part, half, self.base)
+        for axis, nodes in enumerate((columns, rows)):
+            vertices[:, axis] += nodes.start * self._cell(axis) - self.half[axis] + half[axis]
+        if not self.solid:
+            faces = faces[: 2 * (part.shape[0] - 1) * (part.shape[1] - 1)]
+        mesh = self._parts[key] = solid_mesh(vertices, faces, self.label)
+        if len(self._parts) > _KEPT:
+            self._parts.popitem(last=False)
+        return mesh
 
-    def _range(self, axis: int, at: float, reach: float) -> range:
-        cells, many, width = self._cells(axis)
-        low, high = ((at + side * reach + self.half[axis]) / (many * width) for side in (-1, 1))
-        last = -(-cells // many)
-        return range(max(0, int(np.floor(low))), min(last, int(np.floor(high)) + 1))
+    def _cell(self, axis: int) -> float:
+        """Width of a cell along x (0) or y (1) [m]."""
+        return 2.0 * self.half[axis] / (self.heights.shape[1 - axis] - 1)
 
-    def _tile(self, row: int, column: int) -> TriMesh:
-        if (row, column) not in self._tiles:
-            (nx, mx, dx), (ny, my, dy) = self._cells(0), self._cells(1)
-            rows = slice(row * my, min((row + 1) * my, ny) + 1)
-            columns = slice(column * mx, min((column + 1) * mx, nx) + 1)
-            part = self.heights[rows, columns]
-            half = 0.5 * dx * (part.shape[1] - 1), 0.5 * dy * (part.shape[0] - 1)
-            vertices, faces = height_field(part, half, self.base)
-            vertices[:, 0] += columns.start * dx - self.half[0] + half[0]
-            vertices[:, 1] += rows.start * dy - self.half[1] + half[1]
-            if not self.solid:
-                faces = faces[: 2 * (part.shape[0] - 1) * (part.shape[1] - 1)]
-            self._tiles[row, column] = solid_mesh(vertices, faces, self.label)
-        return self._tiles[row, column]
+    def _nodes(self, axis: int, at: float, reach: float) -> slice:
+        """Rows or columns of the part that is seen from a place [m] along an axis."""
+        width, cells = self._cell(axis), self.heights.shape[1 - axis] - 1
+        many, more = max(1, round(_TILE / width)), math.ceil(reach / width)
+        place = min(max(at + self.half[axis], 0.0), (cells - 0.5) * width)
+        first = int(place / (many * width)) * many
+        return slice(max(0, first - more), min(cells, first + many + more) + 1)
 
 
 def joined_hulls(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Array, Array]:

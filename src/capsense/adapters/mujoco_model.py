@@ -27,7 +27,7 @@ MATERIAL_KEY = "capsense.material:"
 GROUNDING_KEY = "capsense.grounding:"
 
 _WIDE = 0.4
-"""Terrains of larger half extents [m] are given out in tiles."""
+"""Of terrains of larger half extents [m], the part around the sensor is given out."""
 _HEIGHT_FIELD = 1
 """Type of height fields, mjGEOM_HFIELD."""
 _THINNEST = 1e-4

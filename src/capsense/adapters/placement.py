@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.design.model import Design
+from capsense.elements.wide import wide_pieces
 from capsense.errors import CapSenseError, listed
 from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import Contacts, distances, find_contacts, points_on
@@ -38,11 +39,10 @@ _NOTHING = "nothing is in view, so that every change is exactly 0"
 
 def placement(scene: Scene, simulator: Simulator) -> list[str]:
     """What is wrong with the bodies of a scene, given in the sensor frame."""
-    panels = PRESETS[simulator.preset].panels
     contacts, met = _contacts(scene, _points(simulator.design))
     others = [body for body in scene if str(body.name) not in met]
     behind = _behind(others, simulator.design)
-    return contacts + behind + [text for body in scene for text in _coarse(body, panels)]
+    return contacts + behind + [text for body in scene for text in _coarse(body, simulator)]
 
 
 def buried(link: Scene, design: Design) -> list[str]:
@@ -191,14 +191,16 @@ def _leave_out(found: Contacts) -> str:
     return f"leave it out with exclude=[{', '.join(map(repr, met[:4]))}{more}]"
 
 
-def _coarse(body: Body, panels: int) -> list[str]:
+def _coarse(body: Body, simulator: Simulator) -> list[str]:
     """A large mesh, whose panels are shared out over all of it."""
     if not isinstance(body.shape, TriMesh):
         return []
     corners = body.shape.vertices[body.shape.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * float(np.linalg.norm(normals, axis=1).sum())
-    width = math.sqrt(area / panels)
+    conducting = body.material.is_conductor(simulator.excitation_frequency)
+    pieces = wide_pieces(body.shape, conducting, 0.1 * area)
+    width = math.sqrt(area / (pieces or PRESETS[simulator.preset].panels))
     if width < _COARSE or body.shape.parts > 1:
         return []
     return [

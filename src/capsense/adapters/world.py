@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -177,9 +177,8 @@ class World:
                 bodies[k] = self._share(int(seen[k]), int(count[k]))
         poses = zip(placed.position[seen].tolist(), placed.quaternion[seen].tolist(), strict=True)
         parts = [
-            part
+            self._near(i, b.moved(Pose(*p)))
             for i, b, p in zip(seen.tolist(), bodies, poses, strict=True)
-            for part in self._parts(i, b.moved(Pose(*p)))
         ]
         return Scene(parts + self._soft_bodies(frames) if self.soft else parts)
 
@@ -188,19 +187,13 @@ class World:
         pairs = zip(self.solids, self._bodies, strict=True)
         return {body.name for solid, body in pairs if solid.frame in frames}
 
-    def _parts(self, index: int, body: Body) -> list[Body]:
-        """A body that is placed; of a terrain, the tiles that reach into the domain."""
+    def _near(self, index: int, body: Body) -> Body:
+        """A body that is placed; of a terrain, the part that reaches into the domain."""
         terrain = self.solids[index].shape
         if not isinstance(terrain, Terrain):
-            return [body]
+            return body
         middle = body.pose.inverse().apply(0.5 * (self._lower + self._upper))
-        tiles = terrain.near(middle, 0.5 * self._reach)
-        ground = body.grounding
-        tie = ground if isinstance(ground, str) else ground / max(1, len(tiles))
-        return [
-            Body(tile, body.pose, body.material, tie, body.name if k == 0 else f"{body.name}/{k}")
-            for k, tile in enumerate(tiles)
-        ]
+        return replace(body, shape=terrain.near(middle, 0.5 * max(self.domain.size)))
 
     def _soft_bodies(self, frames: Frames) -> list[Body]:
         """The deformables that reach into the domain, as they are now."""

@@ -191,13 +191,12 @@ def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:
 
 def _wide_of(whole: Shape, count: int, name: str) -> WideBody:
     made = wide_body(whole, count)
-    if isinstance(whole, TriMesh):
-        made.keep = lambda block: _inside_of(f"{name}-inside", block)
+    made.keep = lambda block: _inside_of(f"{name}-inside", block)
     return made
 
 
 def _inside_of(key: str, make: Callable[[], Array32]) -> Array32:
-    """The impedance of a wide mesh, from a file if there is one."""
+    """The impedance of a wide body, from a file if there is one."""
 
     def packed() -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         block = make()
@@ -228,7 +227,8 @@ def _kept(
         if found is not None:
             _SHAPES.move_to_end(key)
     if found is None:
-        made = make(whole, count, str(form[0]))
+        digest = hashlib.sha256(repr((VERSION, form)).encode())
+        made = make(whole, count, digest.hexdigest()[:32])
         with _LOCK:
             found = _SHAPES.setdefault(key, made)
             while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:
@@ -240,10 +240,10 @@ def _kept(
 def _form(shape: Shape, count: int) -> tuple[float, tuple[Hashable, ...], Shape]:
     """A shape's size [m], what tells its form from others, and its form, of size 1."""
     if isinstance(shape, TriMesh):
-        digest = hashlib.sha256(repr((VERSION, count, shape.vertices.shape)).encode())
+        digest = hashlib.sha256(repr((count, shape.vertices.shape)).encode())
         for values in (shape.vertices, shape.faces):
             digest.update(np.ascontiguousarray(values).tobytes())
-        return 1.0, (digest.hexdigest()[:32],), shape
+        return 1.0, (digest.hexdigest(),), shape
     size = float(shape.params.max())
     first, second, third = (max(round(x, _DIGITS), _LEAST) for x in (shape.params / size).tolist())
     # made from the rounded form, so that bits do not hang on which of its sizes was met first

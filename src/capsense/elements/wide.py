@@ -44,6 +44,7 @@ _ROUND = {
     ShapeKind.CAPSULE: math.pi / 4, ShapeKind.CYLINDER: math.pi / 4,
 }  # fmt: skip
 """About how much of the surface of its bounding box that of a shape is."""
+_EDGELESS = (ShapeKind.SPHERE, ShapeKind.ELLIPSOID, ShapeKind.CAPSULE)
 _BENT, _FILLED = 0.4, 0.36
 """How much of the surface of what is no box counts, as less of it is near a sensor at a time; and
 how much of that of dielectrics, of whose inside few panels tell."""
@@ -54,8 +55,8 @@ _PIECE = 4e-3
 _FEWEST, _DOUBLINGS = 5000, 3
 """Pieces of wide bodies are so many, doubled at most so often."""
 _COARSE, _THICK = 1000, 2.0
-"""Panels from which the impedance of the inside of wide shapes is found, and how many times as
-thick as these are wide a shape must be: what goes on between two near faces takes finer ones …"""
+"""Panels from which the impedance of the inside of wide shapes is found, if they are round and at
+least so many times as thick as these are wide: edges and two near faces take finer ones …"""
 _FINER, _THIN, _THINNER, _BROAD = 2000, 1.2, 0.6, 0.02
 """… which are so many, and do not do for shapes less than 1.2 times as thick as these are wide, or
 0.6 times where they are wider than the last [m]: other panels would then be much too wide."""
@@ -101,7 +102,8 @@ def _wide(shape: Shape) -> _Wide:
         conductor, filled = (math.inf if wide else part * x for x in (counts, _FILLED))
         width = math.sqrt(area / _FINER)
         solid = thickness >= width * (_THIN if width < _BROAD else _THINNER)
-        coarse = _COARSE if thickness >= _THICK * math.sqrt(area / _COARSE) else _FINER
+        thick = thickness >= _THICK * math.sqrt(area / _COARSE)
+        coarse = _COARSE if thick and shape.kind in _EDGELESS else _FINER
         held = _Wide(conductor, filled if solid else 0.0, pieces, coarse)
         shape.__dict__["_as_wide"] = held
     return held
