@@ -64,7 +64,7 @@ class InPieces(SurfaceSolver):
     def functions_of(
         self, shape: cs.Shape, conducting: bool, share: float = 1.0
     ) -> tuple[ChangingBody, float]:
-        return in_pieces(shape, 80_000)
+        return in_pieces(shape, 80_000, conducting)
 
 
 def apart(found: np.ndarray, truth: np.ndarray) -> float:

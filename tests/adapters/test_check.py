@@ -272,7 +272,8 @@ def test_a_mesh_too_large_for_its_panels(tiny_simulator: cs.Simulator) -> None:
     pane = cs.Body(cs.TriMesh(mesh.vertices, mesh.faces), cs.Pose((0, 0, 0.1)), "glass", name="x")
     (found,) = placement(cs.Scene([pane]), tiny_simulator)
     assert "'x' is a mesh of 18 m², solved with panels of some 161 mm; cut it" in found
-    assert placement(cs.Scene([replace(pane, material=cs.MATERIALS["steel"])]), tiny_simulator) == []
+    steel = replace(pane, material=cs.MATERIALS["steel"])
+    assert placement(cs.Scene([steel]), tiny_simulator) == []
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ Profile = tuple[Array, Array, NDArray[np.int64]]
 
 _EDGE = 1.8
 """Power of the distance to an edge by which the cells of a flat face shrink."""
+_GROWTH, _INNER = 0.8, 0.4
+"""Tiles grow by so much of their distance from an edge, and so many of all would cover a face
+evenly."""
 _LEAST = 12
 """Fewest panels round the widest ring."""
 _LEAST_INNER = 5
@@ -40,11 +44,77 @@ def box_polygons(size: tuple[float, float, float], count: int) -> Array:
 
     k = cells(_best_cell(max(size), count, lambda cell: total(cells(cell))))
     lines = [0.5 * s * _graded(n) for s, n in zip(size, k, strict=True)]
+
+    def rectangles(axis: int) -> Array:
+        u, v = lines[(axis + 1) % 3], lines[(axis + 2) % 3]
+        return np.stack([_corners(u[:-1], v[:-1]), _corners(u[1:], v[1:])], axis=1)
+
+    return _on_faces(size, rectangles)
+
+
+class Tiles(NamedTuple):
+    """How large tiles of a box are: the smaller, the nearer they are to an edge."""
+
+    size: tuple[float, float, float]
+    """Full edge lengths of the box [m]."""
+    least: float
+    """Side of those at an edge [m], about."""
+    most: float
+    """Side of those far from all edges [m]."""
+
+    def side(self, points: Array) -> Array:
+        """Sides of tiles at points on the box [m], shape (n, 3) -> (n,)."""
+        off = np.sort(0.5 * np.array(self.size) - np.abs(points), axis=1)[:, 1]
+        return np.minimum(self.least + _GROWTH * off, self.most)
+
+    def polygons(self) -> Array:
+        """The tiles, shape (n, 4, 3)."""
+        return _on_faces(self.size, self._rectangles)
+
+    def _rectangles(self, axis: int) -> Array:
+        """Lower and upper corner of tiles of a face, shape (n, 2, 2)."""
+        size = np.array([self.size[(axis + k) % 3] for k in (1, 2)])
+        u, v = (np.linspace(-0.5, 0.5, max(1, round(s / self.most)) + 1) * s for s in size.tolist())
+        out, left = [], np.stack([_corners(u[:-1], v[:-1]), _corners(u[1:], v[1:])], axis=1)
+        while len(left):
+            off = (0.5 * size - np.abs(left.mean(axis=1))).min(axis=1)
+            sides = left[:, 1] - left[:, 0]
+            large = sides.max(axis=1) > 1.42 * np.minimum(self.least + _GROWTH * off, self.most)
+            out.append(left[~large])
+            left, sides = left[large], sides[large]
+            along = np.eye(2)[sides.argmax(axis=1)] * sides / 2
+            left = np.concatenate(
+                [np.stack([left[:, 0] + k * along, left[:, 1] - (1 - k) * along], axis=1)
+                 for k in (0, 1)]
+            )  # fmt: skip
+        return np.concatenate(out)
+
+
+def box_tiles(size: tuple[float, float, float], count: int) -> Tiles:
+    """About ``count`` tiles of a box of full edge lengths ``size`` [m]."""
+    x, y, z = size
+    most = math.sqrt(2 * (x * y + y * z + x * z) / (_INNER * count))
+
+    def total(least: float) -> int:
+        return len(Tiles(size, least, most).polygons())
+
+    low, high = 0.05 * most, most
+    for _ in range(12):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if total(middle) > count else (low, middle)
+    return Tiles(size, high, most)
+
+
+def _corners(u: Array, v: Array) -> Array:
+    return np.stack([x.ravel() for x in np.meshgrid(u, v)], axis=1)
+
+
+def _on_faces(size: tuple[float, float, float], rectangles: Callable[[int], Array]) -> Array:
+    """Rectangles on all faces of a box, from those of the face across an axis, (n, 4, 3)."""
     faces = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
-        low_u, low_v = (x.ravel() for x in np.meshgrid(lines[u][:-1], lines[v][:-1]))
-        top_u, top_v = (x.ravel() for x in np.meshgrid(lines[u][1:], lines[v][1:]))
+        (low_u, low_v), (top_u, top_v) = rectangles(axis).transpose(1, 2, 0)
         for side in (-0.5, 0.5):
             face = np.empty((len(low_u), 4, 3))
             face[..., axis] = side * size[axis]

@@ -91,7 +91,7 @@ def standing(vertices: Array, faces: NDArray[np.int64]) -> Standing:
     return Standing(grid * own[order][place[np.lexsort(place.T[::-1])]], axes, middle)
 
 
-VERSION = 7
+VERSION = 8
 """Of stored shapes: to be raised when the same mesh would get other panels or functions."""
 
 _log = logging.getLogger(__name__)
@@ -145,7 +145,7 @@ def functions_of(
         sheet = 0.0 if shape.closed else shape.rest.thickness
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
     if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
-        return in_pieces(shape, pieces)
+        return in_pieces(shape, pieces, conducting)
     if not conducting:
         finest = None
     if shape.kind in (ShapeKind.BOX, ShapeKind.CYLINDER):
@@ -184,13 +184,15 @@ def _conductor_of(whole: Shape, count: int, _: str) -> RigidShape:
     return rigid_shape(panels, apart=True, most=FACES * panels.thickness)
 
 
-def in_pieces(shape: Shape, count: int) -> tuple[ChangingBody, float]:
+def in_pieces(shape: Shape, count: int, conducting: bool) -> tuple[ChangingBody, float]:
     """The same of a wide shape, of so many pieces without energies of their own."""
-    return _kept(shape, count, "_wide", _wide_of)
+    if conducting:
+        return _kept(shape, count, "_wide", lambda whole, *_: wide_body(whole, count, True))
+    return _kept(shape, count, "_filled", _filled_of)
 
 
-def _wide_of(whole: Shape, count: int, name: str) -> WideBody:
-    made = wide_body(whole, count)
+def _filled_of(whole: Shape, count: int, name: str) -> WideBody:
+    made = wide_body(whole, count, False)
     made.keep = lambda block: _inside_of(f"{name}-inside", block)
     return made
 

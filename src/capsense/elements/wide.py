@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from heapq import heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +18,14 @@ from threadpoolctl import threadpool_limits
 
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
+from capsense.elements.grids import box_tiles
 from capsense.elements.mean_kernels import means_between, points_of_each
-from capsense.elements.panels import SurfacePanels, panels_of
+from capsense.elements.panels import SurfacePanels, panels_of, polygon_panels
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import (
     HALF_SPACE,
     LEAST_CHARGE,
+    Clusters,
     equilibrium,
     features,
     once,
@@ -30,7 +33,7 @@ from capsense.elements.rigid import (
 )
 from capsense.errors import SolveError
 from capsense.scene import TriMesh
-from capsense.scene.shapes import Shape, ShapeKind
+from capsense.scene.shapes import Box, Shape, ShapeKind
 from capsense.scene.surface import enclosed_volume
 
 Array = NDArray[np.float64]
@@ -133,10 +136,43 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
     return as_wide.pieces if enough else 0
 
 
-def wide_body(shape: Shape, pieces: int) -> WideBody:
+def wide_body(shape: Shape, pieces: int, conducting: bool) -> WideBody:
     """A wide shape, of about so many pieces."""
     panels, coarse = panels_of(shape, pieces, merge=False), _wide(shape).coarse
+    if isinstance(shape, Box) and not conducting:
+        tiles = box_tiles(shape.size, coarse)
+        parts = panels.areas / tiles.side(panels.centers) ** 2
+        return WideBody(panels, lambda: polygon_panels(tiles.polygons()), parts)
     return WideBody(panels, lambda: panels_of(shape, coarse))
+
+
+def _ahead(tree: Clusters, parts: Array, count: int) -> Clusters:
+    """The same clusters, those first that are split to get ``count`` with equal sums of parts.
+
+    Args:
+        tree: Clusters, breadth first.
+        parts: What each panel counts, shape (n,).
+        count: So many are not split among those that come first.
+    """
+    total = np.zeros(len(tree.kids))
+    single = tree.panel >= 0
+    total[single] = parts[tree.panel[single]]
+    for k in np.flatnonzero(~single)[::-1].tolist():
+        total[k] = total[tree.kids[k]].sum()
+    heap, order = [(-total[0], 0)], [0]
+    while heap and len(order) < 2 * count - 1:
+        kids = tree.kids[heappop(heap)[1]].tolist()
+        if kids[0] >= 0:
+            order += kids
+            for k in kids:
+                heappush(heap, (-total[k], k))
+    late = np.ones(len(total), np.bool_)
+    late[order] = False
+    old = np.concatenate([order, np.flatnonzero(late)])
+    new = np.empty_like(old)
+    new[old] = np.arange(len(old))
+    kids = np.where(tree.kids < 0, -1, new[tree.kids])[old]
+    return Clusters(kids, (kids[:, 0] + 1) // 2 - (kids[:, 0] < 0), tree.panel[old])
 
 
 def _thickness(panels: SurfacePanels) -> tuple[float, bool]:
@@ -191,6 +227,8 @@ class WideBody(ChangingBody):
         panels: The many panels.
         coarse: Makes some hundred panels of the same shape, from which the impedance of the inside
             is found.
+        parts: What each panel counts in the order of clusters, shape (n,); by default they are
+            breadth first.
 
     Attributes:
         most: How far apart opposite normals count, see :func:`features` [m].
@@ -198,12 +236,19 @@ class WideBody(ChangingBody):
         keep: Returns the impedance from where it is kept, or from what makes it.
     """
 
-    def __init__(self, panels: SurfacePanels, coarse: Callable[[], SurfacePanels]) -> None:
+    def __init__(
+        self,
+        panels: SurfacePanels,
+        coarse: Callable[[], SurfacePanels],
+        parts: Array | None = None,
+    ) -> None:
         thickness, flat = _thickness(panels)
         self.most, self._coarse = thickness * (FACES if flat else _LIMBS), coarse
         self.keep: Callable[[Callable[[], Array32]], Array32] = lambda make: make()
         self._at = features(panels.centers, panels.normals, self.most)
         tree = split(self._at, panels.areas)
+        if parts is not None:
+            tree = _ahead(tree, parts, _FINER)
         kids, number, above = _coarsest(tree.kids, tree.panel, _CLUSTERS)
         cluster = np.empty(len(panels), np.int64)
         cluster[tree.panel[tree.panel >= 0]] = number[above]
