@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
 import capsense as cs
-from capsense.elements.matter import segment_distance, touch
+from capsense.elements.matter import matter_of, segment_distance, touch
+from capsense.scene.geometry_kernels import parted
 
 
 def test_distance_of_segments() -> None:
@@ -49,3 +51,57 @@ def test_bodies_one_above_the_other(one: cs.Shape, other: cs.Shape, reach: float
         second = cs.Body(other, turn @ cs.Pose((0, 0, reach + gap)))
         assert touch(first, second) is expected
         assert touch(second, first) is expected
+
+
+def _floating(rng: np.random.Generator, count: int, spread: float) -> cs.Scene:
+    """Floating conductors of all kinds of primitives, anywhere."""
+    shapes = [
+        BALL,
+        CAPSULE,
+        BOX,
+        CYLINDER,
+        cs.Ellipsoid((0.03, 0.02, 0.01)),
+        cs.Box((0.1, 0.02, 0.01)),
+    ]
+    poses = (
+        cs.Pose(*np.split(rng.normal(size=7) * [*[spread] * 3, 1, 1, 1, 1], [3]))
+        for _ in range(count)
+    )
+    return cs.Scene(
+        [cs.Body(shapes[rng.integers(len(shapes))], p, "steel", "floating") for p in poses]
+    )
+
+
+def test_conductors_that_touch_are_one() -> None:
+    """Differential: groups of random scenes, against all pairs, one by one."""
+    rng = np.random.default_rng(2)
+    joined = 0
+    for _ in range(40):
+        scene = _floating(rng, 12, 0.05)
+        group = list(range(len(scene)))
+        for a, b in combinations(range(len(scene)), 2):
+            if touch(scene[a], scene[b]):
+                group = [min(group[a], group[b]) if g in (group[a], group[b]) else g for g in group]
+        found = matter_of(list(scene), 1e5).joined(scene, scene.pack(), np.arange(len(scene)))
+        assert found.group.tolist() == group
+        joined += len(scene) - len(set(group))
+    assert 50 < joined < 400
+
+
+def test_bodies_that_are_parted() -> None:
+    """Analytic: distances of projections onto the axes of both, from points of surfaces."""
+    rng = np.random.default_rng(3)
+    scene = _floating(rng, 60, 0.03)
+    pairs = np.array(list(combinations(range(len(scene)), 2)))
+    packed = scene.pack()
+    found = parted(pairs, packed.kinds, packed.params, packed.rotation, packed.position, 0.002)
+    points = [b.pose.apply(b.shape.to_trimesh().vertices) for b in scene]
+    wide = np.full(len(pairs), -np.inf)
+    for p, (a, b) in enumerate(pairs.tolist()):
+        for axis in np.concatenate([packed.rotation[a].T, packed.rotation[b].T]):
+            x, y = points[a] @ axis, points[b] @ axis
+            wide[p] = max(wide[p], x.min() - y.max(), y.min() - x.max())
+    known = np.abs(wide - 0.002) > 1e-3  # meshes of round shapes lie within them
+    np.testing.assert_array_equal(found[known], wide[known] > 0.002)
+    assert 0.1 < found.mean() < 0.9
+    assert known.mean() > 0.9

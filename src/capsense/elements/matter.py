@@ -14,6 +14,7 @@ from capsense.constants import EPS0
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import HALF_SPACE, RigidShape
 from capsense.scene import Body, Capsule, Layers, Scene, Sphere, SurfaceMesh, TriMesh
+from capsense.scene.geometry_kernels import parted
 from capsense.scene.materials import Grounding, Material
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import ShapeKind
@@ -109,14 +110,20 @@ class Matter:
         """
         if not self.free.any():
             return self
+        seen = self.conducting & (packed.kinds[chosen] < ShapeKind.MESH)
         low, high = packed.bounds[chosen, 0] - 0.5 * _TOUCH, packed.bounds[chosen, 1] + 0.5 * _TOUCH
         near = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2)
-        near &= self.conducting[:, None] & self.conducting & (self.free[:, None] | self.free)
+        near &= seen[:, None] & seen & (self.free[:, None] | self.free)
         first, second = np.nonzero(np.triu(near, 1))
+        apart = parted(
+            chosen[np.stack([first, second], axis=1)],
+            packed.kinds, packed.params, packed.rotation, packed.position, _TOUCH,
+        )  # fmt: skip
+        first, second = first[~apart], second[~apart]
         ends, radius = _axes(packed, chosen)
-        apart = segment_distance(ends[first], ends[second]) - radius[first] - radius[second]
+        gaps = segment_distance(ends[first], ends[second]) - radius[first] - radius[second]
         group = np.arange(len(chosen))
-        for a, b, gap in zip(first.tolist(), second.tolist(), apart.tolist(), strict=True):
+        for a, b, gap in zip(first.tolist(), second.tolist(), gaps.tolist(), strict=True):
             if group[a] == group[b]:
                 continue
             if math.isnan(gap):

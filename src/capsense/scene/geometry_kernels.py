@@ -235,6 +235,23 @@ _CYLINDER = int(ShapeKind.CYLINDER)
 _ELLIPSOID = int(ShapeKind.ELLIPSOID)
 
 
+@kernel
+def _half_width(kind: float, size: Array, r: Array, nx: float, ny: float, nz: float) -> float:
+    """Half the width of a turned shape [m] along a unit vector; of a mesh, that of its box."""
+    x = r[0, 0] * nx + r[1, 0] * ny + r[2, 0] * nz
+    y = r[0, 1] * nx + r[1, 1] * ny + r[2, 1] * nz
+    z = r[0, 2] * nx + r[1, 2] * ny + r[2, 2] * nz
+    if kind == _SPHERE:
+        return size[0]
+    if kind == _CAPSULE:
+        return size[0] + size[1] * abs(z)
+    if kind == _CYLINDER:
+        return size[1] * abs(z) + size[0] * math.sqrt(max(0.0, 1.0 - z * z))
+    if kind == _ELLIPSOID:
+        return math.sqrt((size[0] * x) ** 2 + (size[1] * y) ** 2 + (size[2] * z) ** 2)
+    return size[0] * abs(x) + size[1] * abs(y) + size[2] * abs(z)
+
+
 @njit(cache=True, error_model="numpy")  # too short to let other threads in
 def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
     """Fill rotation matrices and sensor-frame bounding boxes of all bodies.
@@ -245,6 +262,7 @@ def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
         rotation: Receives the rotation matrices, shape (n, 3, 3).
         bounds: Receives lower and upper corners [m], shape (n, 2, 3).
     """
+    axes = np.eye(3)
     for i in range(table.shape[0]):
         kind, centre, position = table[i, 0], table[i, 4:7], table[i, 11:14]
         x, y, z, w = table[i, 7], table[i, 8], table[i, 9], table[i, 10]
@@ -258,21 +276,42 @@ def place_bodies(table: Array, rotation: Array, bounds: Array) -> None:
         r[2, 0] = 2 * (x * z - y * w)
         r[2, 1] = 2 * (y * z + x * w)
         r[2, 2] = 1 - 2 * (x * x + y * y)
-        a, b, c = table[i, 1], table[i, 2], table[i, 3]
         for k in range(3):
-            if kind == _SPHERE:
-                half = a
-            elif kind == _CAPSULE:
-                half = a + b * abs(r[k, 2])
-            elif kind == _CYLINDER:
-                half = b * abs(r[k, 2]) + a * math.sqrt(max(0.0, 1.0 - r[k, 2] * r[k, 2]))
-            elif kind == _ELLIPSOID:
-                half = math.sqrt((a * r[k, 0]) ** 2 + (b * r[k, 1]) ** 2 + (c * r[k, 2]) ** 2)
-            else:
-                half = a * abs(r[k, 0]) + b * abs(r[k, 1]) + c * abs(r[k, 2])
+            half = _half_width(kind, table[i, 1:4], r, axes[k, 0], axes[k, 1], axes[k, 2])
             middle = position[k] + r[k, 0] * centre[0] + r[k, 1] * centre[1] + r[k, 2] * centre[2]
             bounds[i, 0, k] = middle - half
             bounds[i, 1, k] = middle + half
+
+
+@compiled
+def parted(
+    pairs: NDArray[np.int64],
+    kinds: NDArray[np.int64],
+    sizes: Array,
+    rotation: Array,
+    position: Array,
+    gap: float,
+) -> NDArray[np.bool_]:
+    """Which pairs of bodies lie more than a gap [m] apart along an axis of one of them, shape (p,).
+
+    Others may lie apart too.
+
+    Args:
+        pairs: Indices of bodies without meshes, which have other origins, shape (p, 2).
+        kinds, sizes, rotation, position: See :class:`~capsense.scene.scene.PackedScene`.
+        gap: The gap.
+    """
+    out = np.zeros(pairs.shape[0], np.bool_)
+    for p in range(pairs.shape[0]):
+        for side in range(2):
+            i, j = pairs[p, side], pairs[p, 1 - side]
+            r, s, arm = rotation[i], rotation[j], position[j] - position[i]
+            for k in range(3):
+                x, y, z = r[0, k], r[1, k], r[2, k]
+                reach = _half_width(float(kinds[i]), sizes[i], r, x, y, z)
+                reach += _half_width(float(kinds[j]), sizes[j], s, x, y, z)
+                out[p] = out[p] or abs(arm[0] * x + arm[1] * y + arm[2] * z) > reach + gap
+    return out
 
 
 @njit(cache=True, error_model="numpy")
