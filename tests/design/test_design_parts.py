@@ -174,6 +174,18 @@ def test_solids_that_touch_by_a_face():
         assert (place is not None) == refused
 
 
+def test_a_rod_through_a_sheet_away_from_its_edges():
+    """A point of the sheet inside of the rod, which no edge of the sheet meets."""
+    low, high = np.array([0.275, -0.125, -0.025]), np.array([0.325, -0.075, 0.025])
+    rod = trimesh.creation.box(bounds=[low, high]).triangles
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    place = crossing(corners[[[0, 1, 2], [0, 2, 3]]], np.array(rod))
+    assert place is not None
+    assert (low[:2] < place[:2]).all()
+    assert (place[:2] < high[:2]).all()
+    assert place[2] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_sheet_that_touches_an_edge_is_on_one_side():
     """A sheet that stands on a face, or ends at an edge, does not cross the surface."""
     box = design(None, {**BOX, "z": 0.1}).layers[0].surface

@@ -38,7 +38,7 @@ def reframed(mesh: cs.TriMesh, seed: int) -> tuple[cs.TriMesh, cs.Pose]:
     return cs.TriMesh(vertices, np.take_along_axis(faces, turn, axis=1)), frame
 
 
-@pytest.mark.parametrize("mesh", [PRISM, hull(0), hull(1)])
+@pytest.mark.parametrize("mesh", [PRISM, *map(hull, range(8))])
 def test_the_corners_are_those_given(mesh: cs.TriMesh) -> None:
     """Invariant: a rigid motion, to half of the grid; normals stay out."""
     found = standing(mesh.vertices, mesh.faces)

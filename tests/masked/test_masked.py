@@ -171,6 +171,7 @@ def test_wrong_input_is_refused(mesh, bar):
         MaskedSolver(MeshSensor(mesh, STRIPES), tolerance=0.0)
     with pytest.raises(SolveError, match="max_iterations"):
         MaskedSolver(MeshSensor(mesh, STRIPES), max_iterations=0)
+    MaskedSolver(MeshSensor(mesh, STRIPES), max_iterations=1)
 
 
 def test_no_convergence_is_an_error(mesh, bar):

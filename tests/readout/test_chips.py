@@ -147,6 +147,8 @@ def test_charge_set_up():
         law = CHIPS["mpr121"].law.set_for(capacitance)
         code = float(law.level(np.array(capacitance)))
         assert law.low <= code <= law.high
+        assert 1e-6 <= law.current <= 63e-6  # what the chip's registers hold
+        assert 0.5e-6 <= law.time <= 32e-6
         if 10e-12 < capacitance < 800e-12:
             assert code == near(law.low + 0.9 * (law.high - law.low), rel=0.05)
     with pytest.raises(ReadoutError, match="outside of what an MPR121 can charge"):

@@ -1,6 +1,7 @@
 """Triangle meshes: exact distances against slow twins, winding, refusals."""
 
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -297,3 +298,15 @@ def test_pieces_are_the_large_parts_and_the_others_together():
     high = np.maximum(boxes[3].bounds[1], boxes[4].bounds[1])
     wanted.append(np.concatenate([low, high]))
     np.testing.assert_allclose(found, sorted(map(tuple, np.round(wanted, 9))), atol=1e-8)
+
+
+def test_many_faces_that_repeat_a_vertex_are_told_of():
+    """One in 320 is dropped without a word, one in twelve with one."""
+    for rounds, told in ((2, False), (0, True)):
+        ball = trimesh.creation.icosphere(rounds)
+        faces = np.concatenate([ball.faces, [[0, 0, 1]]])
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = TriMesh(ball.vertices, faces)
+        assert len(found.faces) == len(ball.faces)
+        assert ["dropped 1 of" in str(w.message) for w in caught] == [True] * told

@@ -156,9 +156,9 @@ def _own_block(body, table, inside, cut, span, functions, of):
             count += 1
     rows = np.zeros((count, count))
     for i in range(1 if inside else 0, count):
-        for j in range(1 if inside else 0, count):
+        for j in range(1 if inside else 0, i + 1):
             if number[i] < body.known and number[j] < body.known:
-                rows[i, j] = table[number[i] * body.known + number[j]]
+                rows[i, j] = rows[j, i] = table[number[i] * body.known + number[j]]
     half = _within_reach(cut, span, index, functions, of, rows)
     return _within_reach(cut, span, index, functions, of, half.T.copy())
 
