@@ -241,11 +241,16 @@ def test_charge_out_of_reach_has_a_large_energy() -> None:
 
 
 @pytest.mark.parametrize("height", [3e-4, 1e-3, 3e-3, 8e-3])
-def test_no_image_attracts_more_than_a_mirror(height: float) -> None:
-    """Differential: wide squares meet themselves in a flat face as by the mean over all of them."""
+@pytest.mark.parametrize("stretch", [1.0, 1.4])
+def test_no_image_attracts_more_than_a_mirror(height: float, stretch: float) -> None:
+    """Differential: wide squares meet themselves in a flat face as by the mean over all of them.
+
+    Oblongs do as squares of the same area.
+    """
     side, green = 0.02, green_of()
     arm = side / math.sqrt(12.0)
     points = np.array([[[x, y, height] for x in (arm, -arm) for y in (arm, -arm)]])
+    points[..., :2] *= [stretch, 1.0 / stretch]
     points[..., 2] += green.box[1, 2]
     one, none = np.ones(1), np.zeros(1)
     leaves = plain_leaves(points, points, side * one, one, none, np.zeros(1, int), none)
