@@ -24,6 +24,8 @@ _EDGE = 1.8
 _GROWTH, _INNER = 0.8, 0.4
 """Tiles grow by so much of their distance from an edge, and so many of all would cover a face
 evenly."""
+_LONGEST = 1.42
+"""Tiles longer than so many times their side are halved."""
 _LEAST = 12
 """Fewest panels round the widest ring."""
 _LEAST_INNER = 5
@@ -65,6 +67,10 @@ class Tiles(NamedTuple):
     def side(self, points: Array) -> Array:
         """Sides of tiles at points on the box [m], shape (n, 3) -> (n,)."""
         off = np.sort(0.5 * np.array(self.size) - np.abs(points), axis=1)[:, 1]
+        return self._side(off)
+
+    def _side(self, off: Array) -> Array:
+        """Sides at distances from the nearest edge [m], shape (n,) -> (n,)."""
         return np.minimum(self.least + _GROWTH * off, self.most)
 
     def polygons(self) -> Array:
@@ -79,7 +85,7 @@ class Tiles(NamedTuple):
         while len(left):
             off = (0.5 * size - np.abs(left.mean(axis=1))).min(axis=1)
             sides = left[:, 1] - left[:, 0]
-            large = sides.max(axis=1) > 1.42 * np.minimum(self.least + _GROWTH * off, self.most)
+            large = sides.max(axis=1) > _LONGEST * self._side(off)
             out.append(left[~large])
             left, sides = left[large], sides[large]
             along = np.eye(2)[sides.argmax(axis=1)] * sides / 2

@@ -186,15 +186,13 @@ def _conductor_of(whole: Shape, count: int, _: str) -> RigidShape:
 
 def in_pieces(shape: Shape, count: int, conducting: bool) -> tuple[ChangingBody, float]:
     """The same of a wide shape, of so many pieces without energies of their own."""
-    if conducting:
-        return _kept(shape, count, "_wide", lambda whole, *_: wide_body(whole, count, True))
-    return _kept(shape, count, "_filled", _filled_of)
 
+    def make(whole: Shape, count: int, name: str) -> WideBody:
+        made = wide_body(whole, count, conducting)
+        made.keep = lambda block: _inside_of(f"{name}-inside", block)
+        return made
 
-def _filled_of(whole: Shape, count: int, name: str) -> WideBody:
-    made = wide_body(whole, count, False)
-    made.keep = lambda block: _inside_of(f"{name}-inside", block)
-    return made
+    return _kept(shape, count, "_wide" if conducting else "_filled", make)
 
 
 def _inside_of(key: str, make: Callable[[], Array32]) -> Array32:
