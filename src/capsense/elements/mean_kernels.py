@@ -124,9 +124,8 @@ def add_means(points, extent, body, weight, tables, out):
     for i in range(first, stop):
         far_means(shapes, i, shapes, i, line)
         row, table = known[i, 0], singles(known[i, 1])
-        o = row * (row + 1) // 2
         if row >= 0:
-            line[i] = table[o + row] / size
+            line[i] = table[row * (row + 3) // 2] / size
         else:
             line[i] = _self_mean(arm(points[i, 0], points[i, 1]), arm(points[i, 0], points[i, 2]))
         for j in range(start, i + 1, WIDE):
@@ -136,7 +135,8 @@ def add_means(points, extent, body, weight, tables, out):
                 continue
             for k in range(j, end):
                 if line[k] < 0.0 and row >= 0 and known[k, 0] >= 0:
-                    line[k] = table[o + known[k, 0]] / size
+                    high, low = max(row, known[k, 0]), min(row, known[k, 0])
+                    line[k] = table[high * (high + 1) // 2 + low] / size
                 if line[k] < 0.0:
                     near[0, count], near[1, count] = i, k
                     count += 1

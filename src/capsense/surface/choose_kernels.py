@@ -11,19 +11,17 @@ from numpy.typing import NDArray
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
 from capsense.field.green_kernels import smooth
-from capsense.surface.score_kernels import DECAY, INHERITED, score
+from capsense.surface.score_kernels import DECAY, score
 
 _FULL = 0.1
 """How far something of a cluster within reach has to be represented for its function to be whole:
 what only fine clusters reach comes with them, not at once."""
 _PARTED = 0.1
 """Fade of a function from which on its two clusters are represented by their parts alone."""
-USED, FRONTIER, LEAF = 2, 1, 0
-"""State of a cluster: its function is used; it is split for an estimate only; it is not split."""
 
 
 class Cut(NamedTuple):
-    """The clusters that a scene needs, parts behind wholes, body after body."""
+    """The clusters that a scene needs, parts behind wholes, body after body; those of panels last."""
 
     body: NDArray[Any]
     """Body of a cluster, shape (k,)."""
@@ -72,56 +70,100 @@ class Functions(NamedTuple):
 @compiled
 def chosen(bodies, green, threshold, width):
     """Return the cut of a scene: see :func:`score` and :func:`choose`."""
-    first = np.zeros(bodies.shape[0] + 1, np.int64)
-    for b in range(bodies.shape[0]):
-        first[b + 1] = first[b] + 2 * bodies[b].n - 1
-    weight, scores, entry = np.empty(green.terminals), np.empty(first[-1]), np.empty(first[-1])
-    seen = score(bodies, first, green, threshold, weight, scores, entry)
-    return choose(bodies, first, seen, (scores, entry), threshold, width)
+    found = score(bodies, green, threshold, np.empty(green.terminals))
+    return choose(bodies, found, threshold, width)
+
+
+class _Queue(NamedTuple):
+    """The clusters of a cut while it is made; there is room for n."""
+
+    body: NDArray[Any]
+    node: NDArray[Any]
+    first: NDArray[Any]
+    """Its first part in this list, which the second follows; -1 for what is not split, (n,)."""
+    row: NDArray[Any]
+    """Its row among the clusters that were looked at, -1 for others, shape (n,)."""
+    score: NDArray[Any]
+    fade: NDArray[Any]
+    above: NDArray[Any]
 
 
 @compiled
-def choose(bodies, first, seen, found, threshold, width):
+def choose(bodies, found, threshold, width):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
-    A function fades in while its score grows from ``threshold`` to ``width`` times that. Scores
-    that are inherited are written where they are used. A panel that was looked into is left to its
-    parts as far as the function above it would be there if it were one of parts.
+    A function fades in while its score grows from ``threshold`` to ``width`` times that. A panel
+    that was looked into is left to its parts as far as the function above it would be there if it
+    were one of parts.
     """
-    total, (scores, entry) = first[-1], found
-    state, place = np.full(total, np.int8(-1)), np.empty(total, np.int64)
-    fades, above, met = np.empty(total), np.empty(total), np.empty(total, np.int64)
+    room = 0
+    for b in range(bodies.shape[0]):
+        room += 2 * bodies[b].n - 1
+    queue = _Queue(
+        np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64),
+        np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room),
+    )  # fmt: skip
     count = leaves = np.int64(0)  # not the literal, for which Numba would compile another version
     for b in range(bodies.shape[0]):
-        kids, stored = integers(bodies[b].kids), bodies[b].stored
-        o, k, last = first[b], -1, 0
-        state[o], above[o] = FRONTIER, 1.0
-        while k < last:
-            k += 1
-            if state[o + k] < 0:
+        count, more = _split(bodies[b], b, found, queue, count, (threshold, width))
+        leaves += more
+    return _collect(bodies, queue, count, leaves)
+
+
+@kernel
+def _split(body, b, found, queue, start, limits):
+    """Put the clusters of a body that a scene needs in the queue, parts of panels last.
+
+    Returns:
+        The place behind the last one, and how many of them are leaves.
+    """
+    kids, leaves = integers(body.kids), 0
+    stop = _put(queue, start, b, (np.int64(0), found.first[b]), found.own[found.first[b]], 1.0)
+    for parts in range(2):
+        i = start - 1
+        while i + 1 < stop:
+            i += 1
+            if (max(queue.node[i], kids[2 * queue.node[i]]) >= body.stored) != (parts == 1):
                 continue
-            place[o + k], met[count] = count, o + k
-            count += 1
-            fades[o + k] = 0.0
-            if kids[2 * k] < 0:
-                state[o + k] = LEAF
-            leaves += _whole(state[o + k], above[o + k]) > 0.0
-            if state[o + k] == LEAF:
-                continue
-            fades[o + k] = min(_faded(scores[o + k], threshold, width), above[o + k])
-            state[o + k] = USED if fades[o + k] > 0.0 else FRONTIER
-            for c in range(2):
-                part, below = o + kids[2 * k + c], kids[2 * kids[2 * k + c]]
-                above[part] = fades[o + k]
-                inherits = part - o < stored and (part - o >= seen[b] or scores[part] == INHERITED)
-                if part - o < stored <= below:
-                    share = 0.0 if inherits else _faded(entry[part], threshold, width)
-                    above[part] = min(above[part], share)
-                state[part] = FRONTIER if above[part] > 0.0 else LEAF
-                if inherits:
-                    scores[part] = DECAY * scores[o + k]
-                last = max(last, part - o)
-    return _collect(bodies, first, state, place, fades, above, met[:count], leaves)
+            queue.first[i], queue.fade[i] = -1, 0.0
+            if queue.above[i] > 0.0 and kids[2 * queue.node[i]] >= 0:
+                queue.first[i] = stop
+                stop = _put_parts(body, b, found, queue, (i, stop), limits)
+            leaves += _whole(queue.first[i], queue.above[i]) > 0.0
+    return stop, leaves
+
+
+@kernel
+def _put_parts(body, b, found, queue, places, limits):
+    """Put the two parts of the cluster at places[0] in the queue, from places[1] on.
+
+    Returns:
+        The place behind them.
+    """
+    kids, (i, stop), (threshold, width) = integers(body.kids), places, limits
+    queue.fade[i] = min(_faded(queue.score[i], threshold, width), queue.above[i])
+    row = queue.row[i]
+    for c in range(2):
+        part, above = kids[2 * queue.node[i] + c], queue.fade[i]
+        seen = found.looks.kids[row] + c if row >= 0 and found.looks.kids[row] >= 0 else -1
+        if part < body.stored <= kids[2 * part]:  # a panel that has parts
+            share = _faded(found.entry[seen], threshold, width) if seen >= 0 else 0.0
+            above = min(above, share)
+        value = found.own[seen] if seen >= 0 else DECAY * queue.score[i]
+        stop = _put(queue, stop, b, (part, seen), value, above)
+    return stop
+
+
+@kernel
+def _put(queue, place, b, cluster, score, above):
+    """Put a cluster, given by its place in the tree and its row, at a place in the queue.
+
+    Returns:
+        The place behind it.
+    """
+    queue.body[place], queue.score[place], queue.above[place] = b, score, above
+    queue.node[place], queue.row[place] = cluster
+    return place + 1
 
 
 @kernel
@@ -131,35 +173,29 @@ def _faded(score, threshold, width):
 
 
 @kernel
-def _whole(state, above):
+def _whole(first, above):
     """How far a cluster is represented by itself: it gives way to its parts as it is entered."""
-    return 1.0 if state == LEAF else 1.0 - smooth(above / _PARTED)
+    return 1.0 if first < 0 else 1.0 - smooth(above / _PARTED)
 
 
 @compiled
-def _collect(bodies, first, state, place, fades, above, met, leaves):
-    count = met.shape[0]
+def _collect(bodies, queue, count, leaves):
     cut = Cut(
-        np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, 2), np.int64),
-        np.zeros(count), np.zeros((count, 2)), np.empty(count, np.int64), np.empty(count),
-        np.empty(count), np.empty(count), np.ones(count), np.empty(leaves, np.int64),
+        queue.body[:count], queue.node[:count], np.empty((count, 2), np.int64), np.zeros(count),
+        np.zeros((count, 2)), np.empty(count, np.int64), np.empty(count), queue.fade[:count],
+        queue.above[:count], np.ones(count), np.empty(leaves, np.int64),
     )  # fmt: skip
-    leaf = b = 0
+    leaf = 0
     for a in range(count):
-        at = met[a]
-        while at >= first[b + 1]:
-            b += 1
-        k, kids, charge = at - first[b], integers(bodies[b].kids), doubles(bodies[b].charge)
-        cut.body[a], cut.node[a] = b, k
-        cut.fade[a], cut.above[a] = fades[at], above[at]
-        cut.whole[a] = _whole(state[at], above[at])
+        body, k, first = bodies[cut.body[a]], cut.node[a], queue.first[a]
+        kids, charge = integers(body.kids), doubles(body.charge)
+        cut.whole[a] = _whole(first, cut.above[a])
         cut.leaf[a] = cut.kids[a, 0] = cut.kids[a, 1] = -1
         if cut.whole[a] > 0.0:
             cut.leaf[a], cut.leaves[leaf] = leaf, a
             leaf += 1
-        if state[at] != LEAF:
-            for c in range(2):
-                cut.kids[a, c] = place[first[b] + kids[2 * k + c]]
+        if first >= 0:
+            cut.kids[a, 0], cut.kids[a, 1] = first, first + 1
             cut.share[a] = charge[kids[2 * k]] / charge[k]
             cut.parts[a, 0] = (1.0 - cut.whole[a]) * cut.share[a]
             cut.parts[a, 1] = (1.0 - cut.whole[a]) - cut.parts[a, 0]

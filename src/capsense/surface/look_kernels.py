@@ -42,42 +42,38 @@ second those of the table."""
 
 
 class Looks(NamedTuple):
-    """What was found out of the clusters of a body that were looked at; shapes (n,)."""
+    """The clusters that were looked at: those of each body, wholes first; then parts of panels.
 
-    met: NDArray[Any]
-    """Which these are."""
+    There is room for n, of which only so many are filled as were looked at.
+    """
+
+    node: NDArray[Any]
+    """Place of each in its body's tree, shape (n,)."""
+    kids: NDArray[Any]
+    """Row of its first part, which the second follows; -1 where none was looked at, (n,)."""
     means: NDArray[Any]
     """Mean of φ⁰ [V], shape (n, lead)."""
     linear: NDArray[Any]
-    """How linear φ⁰ is there, 0 to 1."""
+    """How linear φ⁰ is there, 0 to 1, shape (n,)."""
     told: NDArray[Any]
-    """How much it is not in all clusters above."""
+    """How much it is not in all clusters above, shape (n,)."""
     crossing: NDArray[Any]
-    """How much it crosses a wall."""
+    """How much it crosses a wall, shape (n,)."""
     stiff: NDArray[Any]
-    """Energy of its charge function in front of a flat design, over that in free space."""
-
-
-@compiled
-def looks_of(looks, start, stop):
-    """Those of some clusters."""
-    return Looks(
-        looks.met[start:stop], looks.means[start:stop], looks.linear[start:stop],
-        looks.told[start:stop], looks.crossing[start:stop], looks.stiff[start:stop],
-    )  # fmt: skip
+    """Energy of its charge function in front of a flat design, over that in free space, (n,)."""
 
 
 @kernel
-def place(body, green, k, points, found, looks):
+def place(body, green, k, points, found):
     """Place the middle of cluster k in row ``found`` of ``points`` (n, 3).
 
     Returns:
-        Square of its distance from the design [m²], how far it is from the next wall, negative
-        beyond it, and how far it is beyond all of them [m].
+        Square of its distance from the design [m²]; how far it is from the next wall, negative
+        beyond it, and how far it is beyond all of them [m]; and :attr:`Looks.stiff`.
     """
     center, size = doubles(body.center), body.scale * doubles(body.extent)[k]
     square = out = 0.0
-    room = 1.0
+    room, stiff = 1.0, 1.0
     for i in range(3):
         x = body.position[i]
         for q in range(3):
@@ -87,19 +83,18 @@ def place(body, green, k, points, found, looks):
         square += off * off
         room = min(room, x - green.room[0, i], green.room[1, i] - x)
         out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
-    looks.stiff[k] = 1.0
     if green.cover < 1.0:  # a plane, and in front of it; the box of other designs is no surface
         front = smooth(1.0 + (points[found, 2] - green.box[1, 2]) / _BEHIND)
         far = _SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING)
         if far < _FREED * size:
-            looks.stiff[k] -= front * math.exp(-far / size)
+            stiff -= front * math.exp(-far / size)
     if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
         lift(points[found : found + 1], least_gap(size, green.cover), green.box)
-    return square, room, math.sqrt(out)
+    return square, room, math.sqrt(out), stiff
 
 
 @compiled
-def look(body, green, looks):
+def look(body, green, looks, start):
     """Look at a body's clusters, and into those that do not see a linear potential.
 
     φ⁰ is that in their middle, from the far sources, or is made up from their parts. Panels are not
@@ -108,55 +103,57 @@ def look(body, green, looks):
     Args:
         body: The body.
         green: Green's function of the design.
-        looks: Filled.
+        looks: Filled from a row on.
+        start: That row.
 
     Returns:
-        The cluster behind the last one that was looked at.
+        The row behind the last one that was filled.
     """
     places, inner = np.empty(body.stored, np.int64), np.empty(body.stored)
     points = np.empty((body.stored, 3), np.float32)
-    seen, found = _look_into(body, green, looks, points, places, inner)
+    stop, found = _look_into(body, green, looks, start, (points, places, inner))
     far_potentials(points[:found], places[:found], inner, green, looks.means)
-    _make_up(body, seen, looks)
-    return seen
+    _make_up(body, start, stop, looks)
+    return stop
 
 
 @kernel
-def _look_into(body, green, looks, points, places, inner):
-    """The same but for potentials, which are wanted at points, times a part of each, in places.
+def _look_into(body, green, looks, start, wanted):
+    """The same but for potentials, which are wanted at points, in rows, times a part of each.
 
     Returns:
-        The cluster behind the last one that was looked at, and how many points there are.
+        The row behind the last one that was filled, and how many points there are.
     """
-    kids, extent, stop = integers(body.kids), doubles(body.extent), body.stored
-    looks.met[0], looks.told[0] = True, 1.0
-    k, seen, found = np.int64(-1), np.int64(1), np.int64(0)
-    while k + 1 < seen:
-        k += 1
-        if not looks.met[k]:
-            continue
-        square, room, out = place(body, green, k, points, found, looks)
+    kids, extent, (points, rows, inner) = integers(body.kids), doubles(body.extent), wanted
+    looks.node[start], looks.told[start] = 0, 1.0
+    row, stop, found = start - 1, start + 1, np.int64(0)
+    while row + 1 < stop:
+        row += 1
+        k = looks.node[row]
+        square, room, out, looks.stiff[row] = place(body, green, k, points, found)
         size, share = body.scale * extent[k], 1.0 - smooth(out / SHORE)
-        looks.crossing[k] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
+        looks.crossing[row] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
             (size - LONG[0]) / (LONG[1] - LONG[0])
         )
-        looks.linear[k] = 0.0
+        looks.linear[row] = 0.0
         if k >= _COARSE:
             part = size / math.sqrt(square + 1e-12)
             even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
-            looks.linear[k] = (1.0 - share * (1.0 - even)) * (1.0 - looks.crossing[k])
+            looks.linear[row] = (1.0 - share * (1.0 - even)) * (1.0 - looks.crossing[row])
         for i in range(green.lead):
-            looks.means[k, i] = 0.0
-        whole = not 0 <= kids[2 * k] < stop
-        if share > 0.0 and (looks.linear[k] > 0.0 or whole):
-            places[found], inner[found] = k, share
+            looks.means[row, i] = 0.0
+        whole = not 0 <= kids[2 * k] < body.stored
+        if share > 0.0 and (looks.linear[row] > 0.0 or whole):
+            rows[found], inner[found] = row, share
             found += 1
-        if looks.linear[k] < 1.0 and not whole:
+        looks.kids[row] = -1
+        if looks.linear[row] < 1.0 and not whole:
+            looks.kids[row] = stop
             for c in range(2):
-                part = kids[2 * k + c]
-                looks.met[part], looks.told[part] = True, looks.told[k] * (1.0 - looks.linear[k])
-            seen = max(seen, kids[2 * k + 1] + 1)
-    return seen, found
+                looks.node[stop] = kids[2 * k + c]
+                looks.told[stop] = looks.told[row] * (1.0 - looks.linear[row])
+                stop += 1
+    return stop, found
 
 
 @compiled
@@ -221,17 +218,15 @@ def _columns(points, some):
 
 
 @kernel
-def _make_up(body, seen, looks):
+def _make_up(body, start, stop, looks):
     """Mean potentials of clusters from those of their parts, where they do not see a linear one."""
-    kids, charge, one = integers(body.kids), doubles(body.charge), np.float32(1.0)
-    means = looks.means
-    for k in range(seen - 1, -1, -1):
-        if not looks.met[k]:
-            continue
-        x, y = kids[2 * k], kids[2 * k + 1]
-        if 0 <= x < seen and looks.met[x]:
-            p, t = np.float32(charge[x] / charge[k]), np.float32(looks.linear[k])
+    charge, means, one = doubles(body.charge), looks.means, np.float32(1.0)
+    for row in range(stop - 1, start - 1, -1):
+        x = looks.kids[row]
+        if x >= 0:
+            p = np.float32(charge[looks.node[x]] / charge[looks.node[row]])
+            t = np.float32(looks.linear[row])
             q, r = (one - t) * p, (one - t) * (one - p)
             for i in range(means.shape[1]):
-                whole = t * means[k, i] if t > 0.0 else np.float32(0.0)
-                means[k, i] = whole + q * means[x, i] + r * means[y, i]
+                whole = t * means[row, i] if t > 0.0 else np.float32(0.0)
+                means[row, i] = whole + q * means[x, i] + r * means[x + 1, i]
