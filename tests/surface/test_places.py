@@ -22,7 +22,7 @@ from capsense.field.green_kernels import (
 )
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import placed
-from capsense.surface.look_kernels import Looks, place
+from capsense.surface.look_kernels import place
 from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
 
 Array = np.ndarray
@@ -181,12 +181,11 @@ def test_curved_designs_lift_nothing() -> None:
 def test_clusters_are_looked_at_where_they_are_lifted_to(cover: float) -> None:
     """Analytic: a distance d below 2 m becomes m + d² / 4 m; of a curved design it stays d."""
     shape, green = cs.Capsule(0.008, 0.06), green_of()._replace(cover=cover)
-    top, none = float(green.box[1, 2]), np.zeros(1)
+    top = float(green.box[1, 2])
     bodies = pack(Placed(shape, (0.0, 0.0, top + 0.0081), (0.0, math.pi / 2, 0.0)))
     tree, raised, point = shape_of(shape).tree, 0, np.zeros((1, 3), np.float32)
     for k in range(bodies[0]["stored"]):
-        looks = Looks(none, none, none, none, none, np.zeros(k + 1))
-        square, _, _ = place(bodies[0], green, k, point, 0, looks)
+        square, _, _, _ = place(bodies[0], green, k, point, 0)
         wanted = bodies["rotation"][0] @ tree.center[k] + bodies["position"][0]
         d, m = wanted[2] - top, least_gap(tree.extent[k], cover)
         assert square == pytest.approx(d * d, rel=1e-4)

@@ -41,7 +41,7 @@ from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.surface.choose_kernels import Cut, choose
 from capsense.surface.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
-from capsense.surface.score_kernels import score
+from capsense.surface.score_kernels import Scores, score
 from capsense.surface.solve_kernels import Reduced, _products, factorise, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import (
@@ -941,15 +941,26 @@ def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold
 # ---- which functions ----
 
 
+def fill_scores(found: Scores, row: int, scores: Array) -> None:
+    """Fill in what was found, from the row of a body's first cluster on; else leave what is there."""
+    rows = [row]
+    while rows:
+        row = rows.pop()
+        scores[found.looks.node[row]] = found.own[row]
+        if found.looks.kids[row] >= 0:
+            rows += [found.looks.kids[row], found.looks.kids[row] + 1]
+
+
 def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     """The cut, the scores with those that are inherited, and each body's first cluster."""
     bodies = scene.packed()
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
-    entry = np.full(first[-1], math.nan)
-    seen = score(bodies, first, green, threshold, np.empty(green.terminals), scores, entry)
-    cut = choose(bodies, first, seen, (scores.copy(), entry), threshold, WIDTH)
+    found = score(bodies, green, threshold, np.empty(green.terminals))
+    cut = choose(bodies, found, threshold, WIDTH)
+    for b, row in enumerate(found.first):
+        fill_scores(found, row, scores[first[b] : first[b + 1]])
     for o, (_, shape) in zip(first, scene, strict=False):
         kids = shape.tree.kids
         for k in np.flatnonzero(kids[:, 0] >= 0):
