@@ -942,7 +942,7 @@ def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold
 
 
 def fill_scores(found: Scores, row: int, scores: Array) -> None:
-    """Fill in what was found, from the row of a body's first cluster on; else leave what is there."""
+    """Fill in what was found from a row on, that of a body's first cluster."""
     rows = [row]
     while rows:
         row = rows.pop()

@@ -21,7 +21,7 @@ _PARTED = 0.1
 
 
 class Cut(NamedTuple):
-    """The clusters that a scene needs, parts behind wholes, body after body; those of panels last."""
+    """The clusters that a scene needs, body after body: parts behind wholes, of panels last."""
 
     body: NDArray[Any]
     """Body of a cluster, shape (k,)."""
