@@ -95,6 +95,17 @@ class Green(NamedTuple):
     """Thickness of what covers the electrodes of a flat design [m]; infinite for other designs."""
 
 
+class Space(NamedTuple):
+    """What single points need of a :class:`Green`: kernels that are called for each take this.
+
+    All of its arrays, handed on, take longer than what such a kernel works out.
+    """
+
+    box: NDArray[Any]
+    room: NDArray[Any]
+    cover: float
+
+
 def cover_of(design: Design) -> float:
     """Thickness of what covers the sheets of a flat design [m]; infinite for other designs."""
     heights = np.concatenate([body.surface.bounds[:, 2] for body in design.sheets])
@@ -240,18 +251,18 @@ def smooth(x):
 
 
 @kernel
-def beyond(points, green):
+def beyond(points, space):
     """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face."""
     out, depth = 0.0, 1.0
     for i in range(3):
         c = 0.5 * (points[0, i] + points[3, i])
-        off = max(green.room[0, i] - c, c - green.room[1, i], 0.0)
+        off = max(space.room[0, i] - c, c - space.room[1, i], 0.0)
         out += off * off
         if i < 2:
-            depth = min(depth, STEEP * (c - green.box[0, i]), STEEP * (green.box[1, i] - c))
+            depth = min(depth, STEEP * (c - space.box[0, i]), STEEP * (space.box[1, i] - c))
         else:
-            depth = min(depth, green.box[1, 2] - c)
-    deep = depth - DEEP if green.cover < 1.0 else 0.0
+            depth = min(depth, space.box[1, 2] - c)
+    deep = depth - DEEP if space.cover < 1.0 else 0.0
     return smooth(max(math.sqrt(out), deep) / SHORE)
 
 

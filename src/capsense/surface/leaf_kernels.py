@@ -32,6 +32,7 @@ from capsense._simd import (
 )
 from capsense.elements.mean_kernels import extent_of, four_points
 from capsense.field.green_kernels import (
+    Space,
     beyond,
     distances,
     least_gap,
@@ -81,6 +82,7 @@ def placed(bodies, cut, green):
 def _fill_leaves(bodies, cut, green, leaves, room):
     """The same; ``room`` is room to work in: two matrices and a vector of three."""
     moments, turn, middle = room
+    space = Space(green.box, green.room, green.cover)
     for j in range(cut.leaves.shape[0]):
         a, corners, points = cut.leaves[j], leaves.true[j], leaves.points[j]
         body, k = bodies[cut.body[a]], cut.node[a]
@@ -112,9 +114,9 @@ def _fill_leaves(bodies, cut, green, leaves, room):
         for q in range(4):
             for i in range(3):
                 corners[q, i] = points[q, i]  # before it is lifted
-        leaves.beyond[j] = beyond(points, green)
-        if green.cover < 1.0:
-            lift(points, least_gap(extent, green.cover), green.box)
+        leaves.beyond[j] = beyond(points, space)
+        if space.cover < 1.0:
+            lift(points, least_gap(extent, space.cover), space.box)
 
 
 @compiled

@@ -14,6 +14,7 @@ from capsense._simd import WIDE, doubles, integers
 from capsense.field.green_kernels import (
     NEAR_FACE,
     SHORE,
+    Space,
     least_gap,
     lift,
     point_potentials,
@@ -60,41 +61,51 @@ class Looks(NamedTuple):
     crossing: NDArray[Any]
     """How much it crosses a wall, shape (n,)."""
     stiff: NDArray[Any]
-    """Energy of its charge function in front of a flat design, over that in free space, (n,)."""
+    """Energy of its charge function in front of a flat design, over that in free space, (n,); not
+    filled where that is not looked into."""
 
 
 @kernel
-def place(body, green, k, points, found):
+def place(body, space, k, points, found):
     """Place the middle of cluster k in row ``found`` of ``points`` (n, 3).
 
     Returns:
-        Square of its distance from the design [m²]; how far it is from the next wall, negative
-        beyond it, and how far it is beyond all of them [m]; and :attr:`Looks.stiff`.
+        Square of its distance from the design [m²]; how high above its box it is [m]; how far it is
+        from the next wall, negative beyond it, and how far it is beyond all of them [m].
     """
-    center, size = doubles(body.center), body.scale * doubles(body.extent)[k]
-    square = out = 0.0
-    room, stiff = 1.0, 1.0
+    center, square, out, room = doubles(body.center), 0.0, 0.0, 1.0
     for i in range(3):
         x = body.position[i]
         for q in range(3):
             x += body.scale * body.rotation[i, q] * center[3 * k + q]
         points[found, i] = x
-        off = max(green.box[0, i] - x, x - green.box[1, i], 0.0)
+        off = max(space.box[0, i] - x, x - space.box[1, i], 0.0)
         square += off * off
-        room = min(room, x - green.room[0, i], green.room[1, i] - x)
-        out += max(green.room[0, i] - x, x - green.room[1, i], 0.0) ** 2
-    if green.cover < 1.0:  # a plane, and in front of it; the box of other designs is no surface
-        front = smooth(1.0 + (points[found, 2] - green.box[1, 2]) / _BEHIND)
-        far = _SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING)
-        if far < _FREED * size:
-            stiff -= front * math.exp(-far / size)
-    if square < NEAR_FACE * NEAR_FACE and green.cover < 1.0:
-        lift(points[found : found + 1], least_gap(size, green.cover), green.box)
-    return square, room, math.sqrt(out), stiff
+        room = min(room, x - space.room[0, i], space.room[1, i] - x)
+        out += max(space.room[0, i] - x, x - space.room[1, i], 0.0) ** 2
+    height = points[found, 2] - space.box[1, 2]
+    if square < NEAR_FACE * NEAR_FACE and space.cover < 1.0:
+        size = body.scale * doubles(body.extent)[k]
+        lift(points[found : found + 1], least_gap(size, space.cover), space.box)
+    return square, height, room, math.sqrt(out) if out > 0.0 else 0.0
+
+
+@kernel
+def stiffness(cover, size, square, height):
+    """:attr:`Looks.stiff` of a cluster of some size [m], from what :func:`place` returns.
+
+    ``cover`` is :attr:`Space.cover`.
+    """
+    if cover > 1.0:  # the box of such designs is no surface
+        return 1.0
+    far = _SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING)
+    if far >= _FREED * size:
+        return 1.0
+    return 1.0 - smooth(1.0 + height / _BEHIND) * math.exp(-far / size)
 
 
 @compiled
-def look(body, green, looks, start):
+def look(body, green, coarser, looks, start):
     """Look at a body's clusters, and into those that do not see a linear potential.
 
     φ⁰ is that in their middle, from the far sources, or is made up from their parts. Panels are not
@@ -103,6 +114,8 @@ def look(body, green, looks, start):
     Args:
         body: The body.
         green: Green's function of the design.
+        coarser: Clusters may be so many times as large as they usually are. Functions count for
+            less by the third power of their size.
         looks: Filled from a row on.
         start: That row.
 
@@ -111,33 +124,37 @@ def look(body, green, looks, start):
     """
     places, inner = np.empty(body.stored, np.int64), np.empty(body.stored)
     points = np.empty((body.stored, 3), np.float32)
-    stop, found = _look_into(body, green, looks, start, (points, places, inner))
+    stop, found = _look_into(body, green, coarser, looks, start, (points, places, inner))
     far_potentials(points[:found], places[:found], inner, green, looks.means)
     _make_up(body, start, stop, looks)
     return stop
 
 
 @kernel
-def _look_into(body, green, looks, start, wanted):
+def _look_into(body, green, coarser, looks, start, wanted):
     """The same but for potentials, which are wanted at points, in rows, times a part of each.
 
     Returns:
         The row behind the last one that was filled, and how many points there are.
     """
     kids, extent, (points, rows, inner) = integers(body.kids), doubles(body.extent), wanted
+    space = Space(green.box, green.room, green.cover)
     looks.node[start], looks.told[start] = 0, 1.0
     row, stop, found = start - 1, start + 1, np.int64(0)
     while row + 1 < stop:
         row += 1
         k = looks.node[row]
-        square, room, out, looks.stiff[row] = place(body, green, k, points, found)
-        size, share = body.scale * extent[k], 1.0 - smooth(out / SHORE)
-        looks.crossing[row] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
-            (size - LONG[0]) / (LONG[1] - LONG[0])
-        )
-        looks.linear[row] = 0.0
+        size, (square, height, room, out) = (
+            body.scale * extent[k], place(body, space, k, points, found),
+        )  # fmt: skip
+        share = 1.0 - smooth(out / SHORE) if out > 0.0 else 1.0
+        looks.crossing[row] = looks.linear[row] = 0.0
+        if size > max(LONG[0], 2.0 * abs(room)):
+            looks.crossing[row] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
+                (size - LONG[0]) / (LONG[1] - LONG[0])
+            )
         if k >= _COARSE:
-            part = size / math.sqrt(square + 1e-12)
+            part = size / (coarser * math.sqrt(square + 1e-12))
             even = smooth((_LINEAR[1] - part) / (_LINEAR[1] - _LINEAR[0]))
             looks.linear[row] = (1.0 - share * (1.0 - even)) * (1.0 - looks.crossing[row])
         for i in range(green.lead):
@@ -147,6 +164,8 @@ def _look_into(body, green, looks, start, wanted):
             rows[found], inner[found] = row, share
             found += 1
         looks.kids[row] = -1
+        if whole or looks.linear[row] < 1.0:
+            looks.stiff[row] = stiffness(green.cover, size, square, height)
         if looks.linear[row] < 1.0 and not whole:
             looks.kids[row] = stop
             for c in range(2):

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
-from capsense.field.green_kernels import SHORE, smooth
-from capsense.surface.look_kernels import Looks, far_potentials, look, place
+from capsense.field.green_kernels import SHORE, Space, smooth
+from capsense.surface.look_kernels import Looks, far_potentials, look, place, stiffness
 
 DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
@@ -29,6 +29,10 @@ _FREE = 0.01, 0.1
 functions' energy."""
 _WIDE = 0.08, 0.12
 """Clusters come to be large between these extents [m]."""
+
+
+_USUAL = 0.015
+"""Threshold up to which clusters are looked into as far as they usually are."""
 
 
 class Scores(NamedTuple):
@@ -63,8 +67,9 @@ def score(bodies, green, threshold, weight):
         np.empty(room),
     )  # fmt: skip
     energy, first = np.zeros(terminals), np.zeros(bodies.shape[0] + 1, np.int64)
+    coarser = max(1.0, (threshold / _USUAL) ** (1.0 / 3.0))
     for b in range(bodies.shape[0]):
-        first[b + 1] = look(bodies[b], green, looks, first[b])
+        first[b + 1] = look(bodies[b], green, coarser, looks, first[b])
         _add_energies(bodies[b], looks, (first[b], first[b + 1]), energy)
     whole = 0.0
     for i in range(terminals):
@@ -296,12 +301,15 @@ def _score_nodes(body, green, nodes, looks, last, weight, scores):
     """
     kids, many = integers(body.kids), 2 * nodes.shape[0]
     points, rows, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
+    space = Space(green.box, green.room, green.cover)
     for j in range(many):
         k, rows[j] = nodes[j // 2], last + j
         if j % 2 == 0:
             looks.kids[k] = rows[j]
         looks.node[rows[j]], looks.kids[rows[j]] = kids[2 * looks.node[k]] + j % 2, -1
-        _, _, out, looks.stiff[rows[j]] = place(body, green, looks.node[rows[j]], points, j)
+        square, height, _, out = place(body, space, looks.node[rows[j]], points, j)
+        size = body.scale * doubles(body.extent)[looks.node[rows[j]]]
+        looks.stiff[rows[j]] = stiffness(green.cover, size, square, height)
         inner[j] = 1.0 - smooth(out / SHORE)
     far_potentials(points, rows, inner, green, looks.means)
     for k in nodes:
