@@ -36,6 +36,8 @@ _AWAY = 1e3
 """Where columns are that are no clusters' [m]."""
 _TOGETHER = 64
 """Pairs of rectangles that are met at a time."""
+_SQUARE = 2.97
+"""Mean of 1/r in a square, times its side."""
 _UPON = 0.1
 """Rectangles nearer to each other than so many of their shorter side lie upon each other."""
 
@@ -177,6 +179,28 @@ def means_between(points):
     tables = cluster_moments(points, extent), rectangles(points, weight), known
     add_means(points, extent, (np.int64(0), np.int64(0), n, 1.0), weight, tables, out)
     mirror(out)
+    return out
+
+
+@compiled
+def patch_means(center, area):
+    """About the means of 1/r between patches of a surface, and of each with itself.
+
+    Args:
+        center: Their middles [m], shape (3, n).
+        area: Their areas [m²], shape (n,).
+
+    Returns:
+        Shape (n, n) [1/m]; bounded as in a square as large as the larger one.
+    """
+    n = area.shape[0]
+    out = np.empty((n, n))
+    for i in range(n):
+        line, x, y, z, own = out[i], center[0, i], center[1, i], center[2, i], area[i]
+        for j in range(n):
+            square = (center[0, j] - x) ** 2 + (center[1, j] - y) ** 2 + (center[2, j] - z) ** 2
+            bound = max(area[j], own) / (_SQUARE * _SQUARE)
+            line[j] = 1.0 / math.sqrt(math.sqrt(square * square + bound * bound))
     return out
 
 

@@ -176,6 +176,42 @@ def to_functions(values, kids, panel, charge, function, out):
 
 
 @compiled
+def means_of_clusters(means, last, kids, charge):
+    """Means between clusters from those between the smallest ones.
+
+    Args:
+        means: Of a symmetric function, between clusters without parts here, shape (k, k).
+        last: Which clusters these are, shape (k,).
+        kids: Parts of the clusters, behind them; -1 for none, shape (t, 2).
+        charge: Charges of the clusters, shape (t,).
+
+    Returns:
+        Row by row up to the diagonal, shape (t (t + 1) / 2,).
+    """
+    count, many = kids.shape[0], last.shape[0]
+    rows, share = np.empty((count, many), np.float32), np.empty(count, np.float32)
+    for j in range(many):
+        rows[last[j]] = means[j]
+    for a in range(count - 1, -1, -1):
+        if kids[a, 0] >= 0:
+            first, second, mean = rows[kids[a, 0]], rows[kids[a, 1]], rows[a]
+            share[a] = charge[kids[a, 0]] / charge[a]
+            for j in range(many):
+                mean[j] = second[j] + share[a] * (first[j] - second[j])
+    out, line = np.empty(count * (count + 1) // 2, np.float32), np.empty(count, np.float32)
+    for a in range(count):
+        for j in range(many):
+            line[last[j]] = rows[a, j]
+        for k in range(count - 1, -1, -1):
+            x, y = kids[k]
+            if x >= 0:
+                line[k] = line[y] + share[k] * (line[x] - line[y])
+        for k in range(a + 1):
+            out[a * (a + 1) // 2 + k] = line[k]
+    return out
+
+
+@compiled
 def energies_of_functions(rows, kids, panel, charge, function, out):
     """Integrate rows of panel values with every charge function, to a symmetric table.
 

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
 from capsense.elements.grids import box_tiles
-from capsense.elements.mean_kernels import means_between, points_of_each
+from capsense.elements.mean_kernels import means_between, patch_means, points_of_each
 from capsense.elements.panels import SurfacePanels, panels_of, polygon_panels
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import (
@@ -70,9 +70,8 @@ FACES, _LIMBS, _FLAT = 12.0, 0.1, 0.5
 of its faces: the first of those with flat sides, of which four points do not tell the faces apart
 there; the second of others, whose limbs are told apart first. Those with flat sides are thicker
 than the third of their least extent."""
-_CLUSTERS, _SQUARE = 1000, 2.97
-"""Clusters from which the charges of wide bodies are found, and the energies of larger ones; and
-the mean of 1/r in a square, times its side."""
+_CLUSTERS = 1000
+"""Clusters from which the charges of wide bodies are found, and the energies of larger ones."""
 
 
 class _Wide(NamedTuple):
@@ -209,10 +208,8 @@ def _equilibrium(panels: SurfacePanels, cluster: Ints) -> Array:
     """
     area = np.bincount(cluster, panels.areas)
     center = np.stack([np.bincount(cluster, panels.areas * x) / area for x in panels.centers.T])
-    square = ((center[:, :, None] - center[:, None]) ** 2).sum(axis=0)
-    soft = np.maximum.outer(area, area) / _SQUARE**2
     try:
-        charge = equilibrium((square**2 + soft**2) ** -0.25)
+        charge = equilibrium(patch_means(center, area))
     except SolveError:  # of faces that coincide
         return panels.areas
     return (
@@ -257,30 +254,13 @@ class WideBody(ChangingBody):
         self._points, self._soft = points_of_each(self._center, self._spread)
         for name in ("points", "soft"):  # the body is rigid: they are needed at every step
             self.record[name] = getattr(self, f"_{name}").ctypes.data
-        self._means = self._means_of(kids, np.flatnonzero(number >= 0))
+        last = np.flatnonzero(number >= 0)
+        # of rectangles: these stand badly for larger clusters, which may be bent or have limbs
+        near = means_between(self._points[last])
+        self._means = tree_kernels.means_of_clusters(near, last, kids, self._charge)
+        """Means of 1/r within the body's first clusters, row by row up to the diagonal [1/m]."""
         self.record["inside"] = HALF_SPACE
         self.record["means"], self.record["top"] = self._means.ctypes.data, len(kids)
-
-    def _means_of(self, kids: Ints, last: Ints) -> Array32:
-        """Means of 1/r within the body's first clusters, row by row up to the diagonal [1/m].
-
-        Those of the smaller ones are of rectangles, those of larger ones are made up from them: a
-        rectangle stands badly for what is bent or has limbs.
-
-        Args:
-            kids: Parts of the clusters, -1 where they are not split among these, shape (t, 2).
-            last: Those that are not.
-        """
-        shares = (self._charge[kids[:, 0]] / self._charge[: len(kids)]).tolist()
-        out: Array32 = means_between(self._points[last])
-        for _ in range(2):  # rows of larger clusters, then columns
-            rows = np.empty((len(kids), out.shape[1]), np.float32)
-            rows[last] = out
-            for a in np.flatnonzero(kids[:, 0] >= 0)[::-1].tolist():
-                first, second = kids[a]
-                rows[a] = rows[second] + shares[a] * (rows[first] - rows[second])
-            out = rows.T
-        return np.concatenate([row[: k + 1] for k, row in enumerate(rows)])
 
     @property
     def impedance(self) -> Array32:
