@@ -40,8 +40,9 @@ from capsense.elements.rigid import BODY, Clusters, RigidShape, rigid_shape, spl
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.surface.choose_kernels import Cut, choose
+from capsense.surface.look_kernels import Looks
 from capsense.surface.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
-from capsense.surface.score_kernels import Scores, score
+from capsense.surface.score_kernels import score
 from capsense.surface.solve_kernels import Reduced, _products, factorise, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import (
@@ -941,14 +942,14 @@ def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold
 # ---- which functions ----
 
 
-def fill_scores(found: Scores, row: int, scores: Array) -> None:
+def fill_scores(looks: Looks, row: int, scores: Array) -> None:
     """Fill in what was found from a row on, that of a body's first cluster."""
     rows = [row]
     while rows:
         row = rows.pop()
-        scores[found.looks.node[row]] = found.own[row]
-        if found.looks.kids[row] >= 0:
-            rows += [found.looks.kids[row], found.looks.kids[row] + 1]
+        scores[looks.node[row]] = looks.score[row]
+        if looks.kids[row] >= 0:
+            rows += [looks.kids[row], looks.kids[row] + 1]
 
 
 def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
@@ -957,10 +958,10 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     first = np.concatenate([[0], np.cumsum(2 * bodies["n"] - 1)])
     green = packed_green()
     scores = np.full(first[-1], math.nan)
-    found = score(bodies, green, threshold, np.empty(green.terminals))
-    cut = choose(bodies, found, threshold, WIDTH)
-    for b, row in enumerate(found.first):
-        fill_scores(found, row, scores[first[b] : first[b + 1]])
+    looks, rows = score(bodies, green, threshold, np.empty(green.terminals))
+    cut = choose(bodies, looks, rows, threshold, WIDTH)
+    for b, row in enumerate(rows[:-1]):
+        fill_scores(looks, row, scores[first[b] : first[b + 1]])
     for o, (_, shape) in zip(first, scene, strict=False):
         kids = shape.tree.kids
         for k in np.flatnonzero(kids[:, 0] >= 0):

@@ -70,8 +70,8 @@ class Functions(NamedTuple):
 @compiled
 def chosen(bodies, green, threshold, width):
     """Return the cut of a scene: see :func:`score` and :func:`choose`."""
-    found = score(bodies, green, threshold, np.empty(green.terminals))
-    return choose(bodies, found, threshold, width)
+    looks, first = score(bodies, green, threshold, np.empty(green.terminals))
+    return choose(bodies, looks, first, threshold, width)
 
 
 class _Queue(NamedTuple):
@@ -89,36 +89,53 @@ class _Queue(NamedTuple):
 
 
 @compiled
-def choose(bodies, found, threshold, width):
+def _with_room(queue, filled, more):
+    """The same, with room for some more behind those that are filled; as :func:`with_room`."""
+    if filled + more <= queue.body.shape[0]:
+        return queue
+    n = 2 * filled + more
+    out = _Queue(
+        np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64),
+        np.empty(n), np.empty(n), np.empty(n),
+    )  # fmt: skip
+    for k in range(filled):
+        out.body[k], out.node[k] = queue.body[k], queue.node[k]
+        out.first[k], out.row[k] = queue.first[k], queue.row[k]
+        out.score[k], out.fade[k], out.above[k] = queue.score[k], queue.fade[k], queue.above[k]
+    return out
+
+
+@compiled
+def choose(bodies, looks, first, threshold, width):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
     A function fades in while its score grows from ``threshold`` to ``width`` times that. A panel
     that was looked into is left to its parts as far as the function above it would be there if it
     were one of parts.
     """
-    room = 0
-    for b in range(bodies.shape[0]):
-        room += 2 * bodies[b].n - 1
     queue = _Queue(
-        np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64),
-        np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room),
+        np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64),
+        np.empty(0), np.empty(0), np.empty(0),
     )  # fmt: skip
     count = leaves = np.int64(0)  # not the literal, for which Numba would compile another version
     for b in range(bodies.shape[0]):
-        count, more = _split(bodies[b], b, found, queue, count, (threshold, width))
+        queue = _with_room(queue, count, 2 * bodies[b].n - 1)
+        _put(queue, count, b, (np.int64(0), first[b]), looks.score[first[b]], 1.0)
+        count, more = _split(bodies[b], looks, queue, count, (threshold, width))
         leaves += more
     return _collect(bodies, queue, count, leaves)
 
 
 @kernel
-def _split(body, b, found, queue, start, limits):
+def _split(body, looks, queue, start, limits):
     """Put the clusters of a body that a scene needs in the queue, parts of panels last.
+
+    The whole is there, at ``start``.
 
     Returns:
         The place behind the last one, and how many of them are leaves.
     """
-    kids, leaves = integers(body.kids), 0
-    stop = _put(queue, start, b, (np.int64(0), found.first[b]), found.own[found.first[b]], 1.0)
+    kids, stop, leaves = integers(body.kids), start + 1, 0
     for parts in range(2):
         i = start - 1
         while i + 1 < stop:
@@ -128,13 +145,13 @@ def _split(body, b, found, queue, start, limits):
             queue.first[i], queue.fade[i] = -1, 0.0
             if queue.above[i] > 0.0 and kids[2 * queue.node[i]] >= 0:
                 queue.first[i] = stop
-                stop = _put_parts(body, b, found, queue, (i, stop), limits)
+                stop = _put_parts(body, looks, queue, (i, stop), limits)
             leaves += _whole(queue.first[i], queue.above[i]) > 0.0
     return stop, leaves
 
 
 @kernel
-def _put_parts(body, b, found, queue, places, limits):
+def _put_parts(body, looks, queue, places, limits):
     """Put the two parts of the cluster at places[0] in the queue, from places[1] on.
 
     Returns:
@@ -145,12 +162,12 @@ def _put_parts(body, b, found, queue, places, limits):
     row = queue.row[i]
     for c in range(2):
         part, above = kids[2 * queue.node[i] + c], queue.fade[i]
-        seen = found.looks.kids[row] + c if row >= 0 and found.looks.kids[row] >= 0 else -1
+        seen = looks.kids[row] + c if row >= 0 and looks.kids[row] >= 0 else -1
         if part < body.stored <= kids[2 * part]:  # a panel that has parts
-            share = _faded(found.entry[seen], threshold, width) if seen >= 0 else 0.0
+            share = _faded(looks.entry[seen], threshold, width) if seen >= 0 else 0.0
             above = min(above, share)
-        value = found.own[seen] if seen >= 0 else DECAY * queue.score[i]
-        stop = _put(queue, stop, b, (part, seen), value, above)
+        value = looks.score[seen] if seen >= 0 else DECAY * queue.score[i]
+        stop = _put(queue, stop, queue.body[i], (part, seen), value, above)
     return stop
 
 

@@ -63,6 +63,41 @@ class Looks(NamedTuple):
     stiff: NDArray[Any]
     """Energy of its charge function in front of a flat design, over that in free space, (n,); not
     filled where that is not looked into."""
+    score: NDArray[Any]
+    """Share of the electrodes' energies that its function takes up alone, raised by those of its
+    parts, shape (n,)."""
+    entry: NDArray[Any]
+    """Of panels, the score from which on they have parts, shape (n,)."""
+
+
+@compiled
+def room_for(count, lead):
+    """Room for so many clusters."""
+    return Looks(
+        np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, lead), np.float32),
+        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count),
+        np.empty(count),
+    )  # fmt: skip
+
+
+@compiled
+def with_room(looks, filled, more):
+    """The same, with room for some more behind the rows that are filled.
+
+    Room for all clusters of a scene may take a hundred megabytes, which the system would hand out
+    anew at each step.
+    """
+    if filled + more <= looks.node.shape[0]:
+        return looks
+    out = room_for(2 * filled + more, looks.means.shape[1])
+    for k in range(filled):
+        out.node[k], out.kids[k] = looks.node[k], looks.kids[k]
+        for i in range(looks.means.shape[1]):
+            out.means[k, i] = looks.means[k, i]
+        out.linear[k], out.told[k] = looks.linear[k], looks.told[k]
+        out.crossing[k], out.stiff[k] = looks.crossing[k], looks.stiff[k]
+        out.score[k], out.entry[k] = looks.score[k], looks.entry[k]
+    return out
 
 
 @kernel

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
 from capsense.field.green_kernels import SHORE, Space, smooth
-from capsense.surface.look_kernels import Looks, far_potentials, look, place, stiffness
+from capsense.surface.look_kernels import (
+    far_potentials,
+    look,
+    place,
+    room_for,
+    stiffness,
+    with_room,
+)
 
 DECAY = 0.35
 """Score of a part over that of the whole, 2 ** -1.5, in a linear potential."""
@@ -35,20 +40,6 @@ _USUAL = 0.015
 """Threshold up to which clusters are looked into as far as they usually are."""
 
 
-class Scores(NamedTuple):
-    """What the charge functions of a scene are worth, of the clusters that were looked at."""
-
-    looks: Looks
-    """These clusters."""
-    first: NDArray[Any]
-    """Row of each body's first cluster there, shape (b,)."""
-    own: NDArray[Any]
-    """Share of the electrodes' energies that each function takes up alone, raised by those of the
-    parts of its cluster, shape (n,)."""
-    entry: NDArray[Any]
-    """Of panels, the score from which on they have parts, shape (n,)."""
-
-
 @compiled
 def score(bodies, green, threshold, weight):
     """Share of the electrodes' energies that each charge function takes up alone.
@@ -57,18 +48,15 @@ def score(bodies, green, threshold, weight):
     from the design, and cross no wall, are not looked into: φ⁰ is linear there, and parts have
     :data:`DECAY` times the score of the cluster above. Panels are looked into where functions above
     them count, see :func:`_score_parts`.
+
+    Returns:
+        The clusters that were looked at, and the row of each body's first one, shape (b + 1,).
     """
-    terminals, room = green.terminals, 0
-    for b in range(bodies.shape[0]):
-        room += 2 * bodies[b].n - 1
-    looks = Looks(
-        np.empty(room, np.int64), np.empty(room, np.int64),
-        np.empty((room, green.lead), np.float32), np.empty(room), np.empty(room), np.empty(room),
-        np.empty(room),
-    )  # fmt: skip
+    terminals, looks = green.terminals, room_for(0, green.lead)
     energy, first = np.zeros(terminals), np.zeros(bodies.shape[0] + 1, np.int64)
     coarser = max(1.0, (threshold / _USUAL) ** (1.0 / 3.0))
     for b in range(bodies.shape[0]):
+        looks = with_room(looks, first[b], 2 * bodies[b].n - 1)
         first[b + 1] = look(bodies[b], green, coarser, looks, first[b])
         _add_energies(bodies[b], looks, (first[b], first[b + 1]), energy)
     whole = 0.0
@@ -76,14 +64,14 @@ def score(bodies, green, threshold, weight):
         whole += energy[i] ** 2
     for i in range(terminals):
         weight[i] = 1.0 / (energy[i] + 0.01 * math.sqrt(whole) + 1e-300)
-    own, entry, counts = np.empty(room), np.empty(room), np.empty(room)
     last = first[-1]
     for b in range(bodies.shape[0]):
         rows = first[b], first[b + 1]
-        last = _score_panels(bodies[b], green, looks, (*rows, last), weight, own)
-        _raise_scores(bodies[b], looks, rows, weight, own, counts)
-        last = _score_parts(bodies[b], green, looks, (*rows, last), (threshold, weight), own, entry)
-    return Scores(looks, first[:-1], own, entry)
+        looks = with_room(looks, last, 2 * bodies[b].n - 1)
+        last = _score_panels(bodies[b], green, looks, (*rows, last), weight)
+        _raise_scores(bodies[b], looks, rows, weight, np.empty(rows[1] - rows[0]))
+        last = _score_parts(bodies[b], green, looks, (*rows, last), (threshold, weight))
+    return looks, first
 
 
 @kernel
@@ -141,10 +129,10 @@ def _raised(value, first, second):
 
 
 @kernel
-def _pass_on(part, above, looks, scores):
+def _pass_on(part, above, looks):
     """Let a cluster have a part of the score above it as far as that sees a linear potential."""
     rest = 1.0 - looks.told[part] * (1.0 - looks.linear[part])
-    scores[part] = looks.told[part] * scores[part] + rest * DECAY * above
+    looks.score[part] = looks.told[part] * looks.score[part] + rest * DECAY * above
 
 
 @kernel
@@ -161,7 +149,7 @@ def _has_parts(body, looks, row):
 
 
 @compiled
-def _score_panels(body, green, looks, rows, weight, scores):
+def _score_panels(body, green, looks, rows, weight):
     """Score panels that have parts, if near; others have no score of their own.
 
     ``rows`` are the first of the body, the one behind its last, and the first one that is free.
@@ -171,32 +159,32 @@ def _score_panels(body, green, looks, rows, weight, scores):
     """
     nodes, count = np.empty(rows[1] - rows[0], np.int64), 0
     for k in range(rows[0], rows[1]):
-        scores[k] = 0.0
+        looks.score[k] = 0.0
         if _has_parts(body, looks, k) and _share(looks, k) > 0.0:
             nodes[count] = k
             count += 1
-    last = _score_nodes(body, green, nodes[:count], looks, rows[2], weight, scores)
-    return _raise_nodes(body, green, nodes[:count], looks, last, weight, scores)
+    last = _score_nodes(body, green, nodes[:count], looks, rows[2], weight)
+    return _raise_nodes(body, green, nodes[:count], looks, last, weight)
 
 
 @kernel
-def _raise_scores(body, looks, rows, weight, scores, counts):
+def _raise_scores(body, looks, rows, weight, counts):
     """Score a body's clusters from the mean potentials of those that were looked at.
 
     What was looked at below a cluster that sees a linear potential does not count.
 
     No charge is beyond a wall. A part that crosses one can carry charge where it is inside only if
     it is split too, which its own score does not tell. So that is at least the score of the body,
-    times the part's share of its length. ``counts`` (n,) is room to work in.
+    times the part's share of its length. ``counts``, one for each, is room to work in.
     """
     kids, extent, (start, stop) = integers(body.kids), doubles(body.extent), rows
-    crossing = looks.crossing
+    scores, crossing = looks.score, looks.crossing
     for k in range(stop - 1, start - 1, -1):
         x = looks.kids[k]
         if 0 <= x < stop:
             own = _own_score(body, looks, k, weight)
             scores[k] = (1.0 - looks.linear[k]) * _raised(own, scores[x], scores[x + 1])
-        counts[k] = 1.0
+        counts[k - start] = 1.0
     if not body.neutral:
         net = 0.0
         for i in range(weight.shape[0]):
@@ -208,8 +196,8 @@ def _raise_scores(body, looks, rows, weight, scores, counts):
             continue
         for part in range(x, x + 2):
             if 0 <= kids[2 * looks.node[part]] < body.stored:
-                _pass_on(part, scores[k], looks, scores)
-                counts[part] = counts[k] * smooth((1.0 - looks.linear[k]) / _SEEN)
+                _pass_on(part, scores[k], looks)
+                counts[part - start] = counts[k - start] * smooth((1.0 - looks.linear[k]) / _SEEN)
     whole = scores[start]
     # what has no net charge carries none where no function of it counts
     forced = min(_CROSSED, _FULLY * whole) if body.neutral else _CROSSED
@@ -217,13 +205,13 @@ def _raise_scores(body, looks, rows, weight, scores, counts):
         size, x = extent[looks.node[k]], looks.kids[k]
         wide = smooth((body.scale * size - _WIDE[0]) / (_WIDE[1] - _WIDE[0]))
         least = max(forced * wide, whole * size / extent[0])
-        scores[k] = max(scores[k], counts[k] * crossing[k] * least)
+        scores[k] = max(scores[k], counts[k - start] * crossing[k] * least)
         if 0 <= x < stop:
             scores[k] = max(scores[k], scores[x], scores[x + 1])
 
 
 @compiled
-def _score_parts(body, green, looks, rows, limits, scores, entry):
+def _score_parts(body, green, looks, rows, limits):
     """Score the parts of panels where the cluster above the panel needs them.
 
     Scores of panels and parts are raised by those directly below them alone, so that parts are
@@ -232,11 +220,9 @@ def _score_parts(body, green, looks, rows, limits, scores, entry):
     Args:
         body: The body.
         green: Green's function of the design.
-        looks: What was found; extended.
+        looks: What was found; extended. Scores of parts are filled, those of their panels raised.
         rows: As of :func:`_score_panels`.
         limits: The threshold, and the weights of the terminals.
-        scores: Those of parts are filled, those of their panels raised.
-        entry: Filled for panels: score from which on they have parts.
 
     Returns:
         The first row that is free then.
@@ -251,8 +237,8 @@ def _score_parts(body, green, looks, rows, limits, scores, entry):
             continue
         for panel in range(x, x + 2):
             if _has_parts(body, looks, panel):
-                entry[panel] = _share(looks, panel) * scores[k]
-                if entry[panel] > threshold:
+                looks.entry[panel] = _share(looks, panel) * looks.score[k]
+                if looks.entry[panel] > threshold:
                     nodes[count] = panel
                     count += 1
     kids = integers(body.kids)
@@ -260,16 +246,16 @@ def _score_parts(body, green, looks, rows, limits, scores, entry):
         below, many = np.empty(2 * count, np.int64), 0
         for k in nodes[:count]:
             for part in range(looks.kids[k], looks.kids[k] + 2):
-                if scores[k] > threshold and kids[2 * looks.node[part]] >= 0:
+                if looks.score[k] > threshold and kids[2 * looks.node[part]] >= 0:
                     below[many] = part
                     many += 1
-        last = _raise_nodes(body, green, below[:many], looks, last, weight, scores)
+        last = _raise_nodes(body, green, below[:many], looks, last, weight)
         nodes, count = below, many
     return last
 
 
 @compiled
-def _raise_nodes(body, green, nodes, looks, last, weight, scores):
+def _raise_nodes(body, green, nodes, looks, last, weight):
     """Raise the scores of panels or parts, which are known, by those of their parts.
 
     Returns:
@@ -278,19 +264,19 @@ def _raise_nodes(body, green, nodes, looks, last, weight, scores):
     kids, below, count = integers(body.kids), np.empty(2 * nodes.shape[0], np.int64), 0
     for k in nodes:
         for part in range(looks.kids[k], looks.kids[k] + 2):
-            scores[part] = 0.0
+            looks.score[part] = 0.0
             if kids[2 * looks.node[part]] >= 0:
                 below[count] = part
                 count += 1
-    last = _score_nodes(body, green, below[:count], looks, last, weight, scores)
+    last = _score_nodes(body, green, below[:count], looks, last, weight)
     for k in nodes:
         x = looks.kids[k]
-        scores[k] = _raised(scores[k], scores[x], scores[x + 1])
+        looks.score[k] = _raised(looks.score[k], looks.score[x], looks.score[x + 1])
     return last
 
 
 @compiled
-def _score_nodes(body, green, nodes, looks, last, weight, scores):
+def _score_nodes(body, green, nodes, looks, last, weight):
     """Score panels and parts by themselves, whatever the potential is like.
 
     Where a cluster is far from the design, charge within its panels does nothing: scores count in
@@ -313,5 +299,5 @@ def _score_nodes(body, green, nodes, looks, last, weight, scores):
         inner[j] = 1.0 - smooth(out / SHORE)
     far_potentials(points, rows, inner, green, looks.means)
     for k in nodes:
-        scores[k] = _share(looks, k) * _own_score(body, looks, k, weight)
+        looks.score[k] = _share(looks, k) * _own_score(body, looks, k, weight)
     return last + many
