@@ -311,7 +311,7 @@ def reduced(
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
 LONG, SHORE, TOUCHING, BEHIND = (0.03, 0.06), 5e-3, 8e-4, 4e-3
-CLOSE, GROWTH = (8e-3, 12e-3), 0.2
+CLOSE, GROWTH, USUAL = (8e-3, 12e-3), 0.2, 0.015
 
 
 def scores(
@@ -319,18 +319,21 @@ def scores(
     trees: list[tuple[Array, Array, Array]],
     green: GreenFunction,
     packed: Green,
+    threshold: float,
 ) -> list[Array]:
     """Share of the electrodes' energies that each split takes up alone, raised from below.
 
     Of the packed Green's function, its table and room are taken. Parts that cross a wall have at
-    least their share of that of their body, by length.
+    least their share of that of their body, by length. The larger the threshold, the larger are the
+    clusters whose parts are not looked at.
     """
+    linear_from = np.array(LINEAR) * max(1.0, (threshold / USUAL) ** (1 / 3))
     seen, stiff = [], []
     energy = np.zeros(green.far_phi.shape[1])
     for piece, (kids, panel, charge) in zip(pieces, trees, strict=True):
         share = shares(kids, panel, charge)
         block = free_block(piece.panels) / piece.scale
-        means, looks = _means(piece, kids, share, green, packed)
+        means, looks = _means(piece, kids, share, green, packed, linear_from)
         linear = {k: look.linear for k, look in looks.items()}
         net = 0.0
         own, told = np.zeros(len(kids)), np.ones(len(kids))
@@ -425,7 +428,12 @@ def _smooth(x: float) -> float:
 
 
 def _means(
-    piece: Piece, kids: Array, share: Array, green: GreenFunction, packed: Green
+    piece: Piece,
+    kids: Array,
+    share: Array,
+    green: GreenFunction,
+    packed: Green,
+    linear_from: Array,
 ) -> tuple[dict[int, Array], dict[int, Look]]:
     """Potentials in the centres of the clusters that are looked at, finest first, and the looks."""
     room = packed.room
@@ -447,7 +455,7 @@ def _means(
         out[k] *= within
         crossing = _smooth(2 - 4 * abs(inside) / size)
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
-        even = (LINEAR[1] - size / green.distance(point[None])[0]) / (LINEAR[1] - LINEAR[0])
+        even = (linear_from[1] - size / green.distance(point[None])[0]) / np.diff(linear_from)[0]
         even = 1 - within * (1 - _smooth(even))
         off = math.hypot(green.distance(point[None])[0], TOUCHING)
         front = _smooth(1 + (point[2] - green.box[1, 2]) / BEHIND)

@@ -995,11 +995,12 @@ def test_scores_of_a_wide_body_without_net_charge_across_a_wall(
 
 
 def check_scores(scene: Scene) -> None:
-    _, found, first = cut_of(scene, 0.1)
-    wanted = twin.scores(scene.pieces, scene.trees, exact(), packed_green())
-    for b, each in enumerate(wanted):
-        mine = found[first[b] : first[b + 1]]
-        np.testing.assert_allclose(mine, each, rtol=2e-3, atol=2e-6 * found.max())
+    for threshold in (0.015, 0.1):
+        _, found, first = cut_of(scene, threshold)
+        wanted = twin.scores(scene.pieces, scene.trees, exact(), packed_green(), threshold)
+        for b, each in enumerate(wanted):
+            mine = found[first[b] : first[b + 1]]
+            np.testing.assert_allclose(mine, each, rtol=2e-3, atol=2e-6 * found.max())
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -1075,7 +1076,7 @@ def test_converges_as_the_threshold_falls(name: str) -> None:
     assert left == sorted(left, reverse=True)
     at_wall = "across" in name
     assert errors[1] < (0.65 if at_wall else 0.45) * errors[0]
-    assert errors[2] < (0.75 if at_wall else 0.5) * errors[1]
+    assert errors[2] < (0.75 if at_wall else 0.55) * errors[1]
     assert errors[3] < 8e-4
     assert left[3] < 1e-3
 
