@@ -110,6 +110,13 @@ def test_ring_encloses_a_disc_without_contact() -> None:
         design(ring, {"shape": "disc", "radius": 0.0121})
 
 
+@pytest.mark.parametrize("outer", [0.012, 0.01199])
+def test_ring_without_width_is_refused(outer: float) -> None:
+    """Limits: the radii of a ring must differ."""
+    with pytest.raises(DesignError, match=r"inner_radius = 0.012 must be smaller than outer_rad"):
+        surface("ring", inner_radius=0.012, outer_radius=outer)
+
+
 def test_comb_sides_put_the_spine_where_they_say() -> None:
     """The spine of a comb lies at −y, +y, −x or +x."""
     spots = {"bottom": (0, -1), "top": (0, 1), "left": (-1, 0), "right": (1, 0)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
 import capsense as cs
 from capsense.elements import rigid
@@ -45,6 +46,17 @@ def test_the_inside_of_an_open_surface() -> None:
     np.testing.assert_allclose(shape.impedance[1:, 1:], 2.5 * shape.energy[1:, 1:], rtol=1e-6)
     assert not shape.impedance[0].any()
     assert not shape.impedance[:, 0].any()
+
+
+def test_rigid_shape_with_screened_panels() -> None:
+    """Limits: a ball within a ball has no charge, yet its panels count for a millionth each."""
+    balls = [trimesh.creation.icosphere(2, radius).triangles for radius in (0.02, 0.008)]
+    shape = rigid.rigid_shape(panels_of(np.concatenate(balls), 60))
+    assert shape.capacitance == pytest.approx(0.02, rel=0.01)
+    share = shape.tree.charge[shape.tree.panel >= 0]
+    assert share.min() == pytest.approx(rigid.LEAST_CHARGE * share.max(), rel=1e-3)
+    for values in (shape.tree.points, shape.energy, shape.own):
+        assert np.isfinite(values).all()
 
 
 def test_what_does_not_converge_is_told() -> None:
