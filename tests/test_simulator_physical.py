@@ -182,16 +182,18 @@ def test_thin_bodies_are_seen(simulators):
 
 def test_mirrored_scenes_read_mirrored(simulators):
     """Invariant: x → −x exchanges E1 with E3 and E4 with E6 on a symmetric sensor."""
-    sim = simulators("six_patch_bare")
+    sim, rng, off = simulators("six_patch_bare"), np.random.default_rng(1), []
     swap = [2, 1, 0, 5, 4, 3]
-    for x, y, z, r in ((0.03, 0.02, 0.03, 0.02), (0.05, -0.03, 0.06, 0.04)):
+    for _ in range(20):
+        r, (x, y) = rng.uniform(0.01, 0.04), rng.uniform(-0.1, 0.1, 2)
+        z = r + rng.uniform(0.01, 0.04)
         left, right = (
             sim.step(cs.Scene([cs.Body(cs.Sphere(r), cs.Pose((s * x, y, z)))])).delta
             for s in (-1.0, 1.0)
         )
-        np.testing.assert_allclose(
-            left[np.ix_(swap, swap)], right, rtol=0, atol=2e-3 * np.abs(right).max()
-        )
+        off.append(np.abs(left[np.ix_(swap, swap)] - right).max() / np.abs(right).max())
+    assert np.median(off) < 1.5e-3
+    assert max(off) < 6e-3
 
 
 def test_more_permittivity_draws_more_charge(simulators):

@@ -13,8 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from capsense.elements import panel_kernels as kernels
 from capsense.elements import reference
-from capsense.elements.blocks import flux_block, free_block, impedance, panel_frames
-from capsense.elements.panels import SurfacePanels, panels_of, polygon_panels
+from capsense.elements.blocks import (
+    _packed,
+    flux_block,
+    free_block,
+    impedance,
+    panel_frames,
+)
+from capsense.elements.panels import Mirrors, SurfacePanels, panels_of, polygon_panels
 from capsense.errors import SceneError
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere
 
@@ -226,8 +232,9 @@ def test_two_balls_at_one_potential():
 
 
 def test_scaling_and_rotation():
-    triangles = ball(2)
+    triangles = ball(2) @ np.array([[1.0, 0.3, 0.1], [0.0, 0.8, 0.2], [0.0, 0.0, 1.1]])
     panels = panels_of(triangles, 320)
+    assert len(panels.mirrors.image) == 1
     free = free_block(panels)
     scaled = panels.scaled(0.01)
     np.testing.assert_allclose(free_block(scaled), 100 * free, rtol=1e-9)
@@ -239,6 +246,47 @@ def test_scaling_and_rotation():
         turned.centers, panels.centers @ turn.T + [0.1, 0.2, -0.3], atol=1e-9
     )
     np.testing.assert_allclose(free_block(turned), free, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "maps"),
+    [
+        (Box((0.1, 0.08, 0.02)), 8), (Sphere(0.03), 4), (Capsule(0.008, 0.05), 8),
+        (Cylinder(0.05, 0.01), 8), (Ellipsoid((0.03, 0.02, 0.05)), 4), (None, 1),
+    ],
+)  # fmt: skip
+def test_mirror_images(shape: Shape | None, maps: int) -> None:
+    """Differential: the block of mirrored panels against one that does not know of mirrors."""
+    some = np.random.default_rng(1).normal(size=(40, 3, 3))
+    panels = panels_of(some if shape is None else shape, 300)
+    image, first, by = panels.mirrors
+    n = np.arange(len(panels))
+    assert len(image) == maps
+    for row in image:
+        np.testing.assert_array_equal(row[row], n)
+        sign = np.sign((panels.centers * panels.centers[row]).sum(axis=0))
+        np.testing.assert_allclose(panels.centers[row], sign * panels.centers, atol=1e-9)
+    np.testing.assert_array_equal(image[by, first], n)
+    free = free_block(panels)
+    np.testing.assert_array_equal(free, free.T)
+    for row in image:
+        np.testing.assert_array_equal(free[row][:, row], free)
+    alone, bare = np.empty_like(free), Mirrors(n[None], n, np.zeros_like(n))
+    kernels.fill_free(_packed(panels), bare, alone)
+    np.testing.assert_allclose(free, alone, rtol=2e-3)
+    if maps == 1:
+        np.testing.assert_array_equal(free, alone)
+
+
+def test_nearly_mirrored_panels_are_none() -> None:
+    """Limits: a panel that lies, or is turned, a little otherwise."""
+    corners = panels_of(Box((0.1, 0.08, 0.02)), 100).corners
+    moved, turned = corners.copy(), corners.copy()
+    moved[3, :, 1] += 1e-6
+    turned[3] = turned[3].mean(axis=0) + 1.01 * (turned[3] - turned[3].mean(axis=0))
+    assert len(polygon_panels(corners + np.array([0.0, 0.0, 0.01])).mirrors.image) == 4
+    for other in (moved, turned):
+        assert len(polygon_panels(other).mirrors.image) < 8
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def test_conjugate_gradients_solve(n: int) -> None:
     """Differential: to the eighth digit, in units of the diagonal."""
     for seed in range(5):
         matrix, x = definite(seed, n), np.zeros(n)
-        assert rigid._conjugate_gradients(matrix, x)
+        assert rigid._conjugate_gradients(matrix, np.ones(n), x, 1e-8)
         scale = np.sqrt(np.diag(matrix))
         np.testing.assert_allclose(
             scale * x,
@@ -60,7 +60,7 @@ def test_rigid_shape_with_screened_panels() -> None:
 
 
 def test_what_does_not_converge_is_told() -> None:
-    assert not rigid._conjugate_gradients(np.full((2, 2), np.nan), np.zeros(2))
+    assert not rigid._conjugate_gradients(np.full((2, 2), np.nan), np.ones(2), np.zeros(2), 1e-8)
     with pytest.raises(SolveError, match="the charges of 2 panels do not converge"):
         rigid.equilibrium(np.full((2, 2), np.nan))
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from field_cases import assert_physical
-from interpreted import ON, fewer
+from interpreted import ON, fewer, limit
 from scipy.spatial.transform import Rotation
 from surface_scenes import green_of
 
@@ -104,7 +104,7 @@ def test_parts_of_round_shapes_lie_on_them(shape: cs.Shape) -> None:
     stored, points = 2 * len(made.panels) - 1, made._parts["points"]
     corners = made.panels.corners.reshape(-1, 3)
     off = np.abs(shape.signed_distance(points[stored:].reshape(-1, 3))).max()
-    assert off < 0.05 * np.abs(shape.signed_distance(corners)).max()
+    assert off < limit(0.05, 0.15) * np.abs(shape.signed_distance(corners)).max()
     centers = made._parts["center"][stored:]
     np.testing.assert_allclose(centers, points[stored:].mean(axis=1), atol=1e-15)
 

@@ -378,8 +378,9 @@ def test_haar_functions(shape: cs.Shape) -> None:
     np.testing.assert_array_equal(tree.function[tree.kids[:, 0] >= 0], np.arange(1, n))
     np.testing.assert_allclose(haar.sum(axis=0), np.eye(n)[0], atol=1e-12)
     assert np.linalg.matrix_rank(haar) == n
-    rows = np.random.default_rng(1).normal(size=(5, n))
-    np.testing.assert_allclose(tree.to_functions(rows.T), (rows @ haar).T, rtol=0, atol=1e-12)
+    rows, out = np.random.default_rng(1).normal(size=(n, 300)), np.empty((n, 300))
+    tree_kernels.to_functions(rows, tree.kids, tree.panel, tree.charge, tree.function, out)
+    np.testing.assert_allclose(out, haar.T @ rows, rtol=0, atol=1e-12)
     energy = haar.T @ free_block(found.panels) @ haar
     np.testing.assert_allclose(found.energy, energy, rtol=0, atol=1e-6 * energy.max())
     np.testing.assert_allclose(found.own, np.diag(energy), rtol=1e-6)

@@ -36,9 +36,8 @@ def free_block(panels: SurfacePanels) -> Array:
         F [1/m], shape (n, n), symmetric and positive definite: F_kl is the mean over panel k of
         the potential of unit charge spread evenly on panel l.
     """
-    p = _packed(panels)
     out = np.empty((len(panels), len(panels)))
-    kernels.fill_free(p, out)
+    kernels.fill_free(_packed(panels), panels.mirrors, out)
     return out
 
 

@@ -323,7 +323,7 @@ def _ring_factors(
     heights = np.sort(polygons[..., 2], axis=1)
     weight, sums = np.zeros(len(z)), np.zeros(len(z))
     for end in (heights[:, 0], heights[:, -1]):
-        ring = np.abs(end[:, None] - z).argmin(axis=1)
+        ring = np.searchsorted(0.5 * (z[1:] + z[:-1]), end)
         weight += np.bincount(ring, area, len(z))
         sums += np.bincount(ring, area * wanted, len(z))
     return sums / weight

@@ -118,39 +118,54 @@ def _mean_potential(points, frame):
 
 
 @kernel
-def fill_free(panels, out):
+def fill_free(panels, mirrors, out):
     """Write the free-space block: F_kl [1/m], mean over panel k of the potential of panel l.
 
     Far pairs: point charges and second moments. Near pairs: closed form of one panel, averaged
     over points of the other, both ways, weighted with the fourth power of the other's reach. The
-    diagonal stays as it is.
+    mirror images of a pair are copied.
     """
     flat, frames, areas = panels.flat, panels.frames, panels.areas
     coarse, fine, rim = panels.coarse, panels.fine, panels.rim
+    image, first, by = mirrors
     n = areas.shape[0]
     for i in range(n):
+        line = out[i]
+        if first[i] < i:
+            turned, other = image[by[i]], out[first[i]]
+            for j in range(n):
+                line[j] = other[turned[j]]
+            continue
         x0, y0, z0 = flat[0, i], flat[1, i], flat[2, i]
         xx, yy, zz = flat[3, i], flat[4, i], flat[5, i]
         xy, xz, yz = flat[6, i], flat[7, i], flat[8, i]
-        for j in range(i):
+        for j in range(i + 1, n):
             x, y, z = flat[0, j] - x0, flat[1, j] - y0, flat[2, j] - z0
             r2 = x * x + y * y + z * z + _TINY
             axx, ayy, azz = flat[3, j] + xx, flat[4, j] + yy, flat[5, j] + zz
             mix = x * y * (flat[6, j] + xy) + x * z * (flat[7, j] + xz) + y * z * (flat[8, j] + yz)
             second = 3.0 * (x * x * axx + y * y * ayy + z * z * azz + 2.0 * mix) / r2
-            out[i, j] = (1.0 + (second - axx - ayy - azz) / (2.0 * r2)) / math.sqrt(r2)
+            line[j] = (1.0 + (second - axx - ayy - azz) / (2.0 * r2)) / math.sqrt(r2)
         reach = flat[9, i]
-        for j in range(i):
-            x, y, z = flat[0, j] - x0, flat[1, j] - y0, flat[2, j] - z0
-            span = reach + flat[9, j]
-            r2 = x * x + y * y + z * z
-            if r2 < NEAR * NEAR * span * span:
-                small, large = (i, j) if reach < (1.0 + 1e-6) * flat[9, j] else (j, i)
-                rule = fine if r2 < TOUCHING * TOUCHING * span * span else coarse
-                out[i, j] = _mean_potential(rule[small], frames[large]) / areas[large]
-        out[i, i] = _mean_potential(rim[i], frames[i]) / areas[i]
-        for j in range(i):
-            out[j, i] = out[i, j]
+        line[i] = _mean_potential(rim[i], frames[i]) / areas[i]
+        for j in range(n):
+            if first[j] < i:  # an image of a pair of that row
+                line[j] = out[first[j], image[by[j], i]]
+            elif j > i:
+                like = j  # the first that j is mapped to by what maps panel i to itself
+                for g in range(1, image.shape[0]):
+                    if image[g, i] == i:
+                        like = min(like, image[g, j])
+                if like < j:
+                    line[j] = line[like]
+                    continue
+                x, y, z = flat[0, j] - x0, flat[1, j] - y0, flat[2, j] - z0
+                span = reach + flat[9, j]
+                r2 = x * x + y * y + z * z
+                if r2 < NEAR * NEAR * span * span:
+                    small, large = (j, i) if flat[9, j] < (1.0 + 1e-6) * reach else (i, j)
+                    rule = fine if r2 < TOUCHING * TOUCHING * span * span else coarse
+                    line[j] = _mean_potential(rule[small], frames[large]) / areas[large]
 
 
 @kernel

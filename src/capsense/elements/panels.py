@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,21 @@ from capsense.scene.mesh_shape import TriMesh
 from capsense.scene.shapes import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere
 
 Array = NDArray[np.float64]
+
+
+_SAME = 1e-7
+"""Panels and mirror images that lie apart by less than this part of a surface are the same."""
+
+
+class Mirrors(NamedTuple):
+    """How the coordinate planes that map a surface to itself map its panels."""
+
+    image: NDArray[np.int64]
+    """The panel that each of g maps takes each panel to, and that panel back, shape (g, n)."""
+    first: NDArray[np.int64]
+    """The first of the panels that are each other's images, shape (n,)."""
+    by: NDArray[np.int64]
+    """Which map takes that one to each panel, shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +68,16 @@ class SurfacePanels:
         if not self.closed:
             return np.inf
         return float(2.0 * abs(self.volumes.sum()) / self.areas.sum())
+
+    @cached_property
+    def mirrors(self) -> Mirrors:
+        """Mirror images of panels; there is the identity at least."""
+        image = np.arange(len(self))[None]
+        for axis in range(3):
+            found = _mirrored(self, axis)
+            if found is not None:
+                image = np.concatenate([image, found[image]])
+        return Mirrors(image, image.min(axis=0), image.argmin(axis=0))
 
     def scaled(self, factor: float) -> SurfacePanels:
         """The panels of the body made ``factor`` times as large. F and Z go with 1/factor."""
@@ -115,32 +142,54 @@ def polygon_panels(
     corners: Array, parts: NDArray[np.int64] | None = None, closed: bool = True
 ) -> SurfacePanels:
     """Panels that are planar polygons, corners [m] of shape (n, 4, 3), seen from the outside."""
-    origin = corners[:, 0]
-    u, v, w = (corners[:, k] - origin for k in (1, 2, 3))
-    first, second = np.cross(u, v), np.cross(v, w)
+    at = np.ascontiguousarray(corners.transpose(1, 2, 0))
+    u, v, w = at[1:] - at[0]
+    first, second = _cross(u, v), _cross(v, w)
     total = first + second
-    double = np.linalg.norm(total, axis=1)
-    share = np.stack([np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)])
+    double = np.sqrt((total * total).sum(axis=0))
+    share = np.sqrt([(first * first).sum(axis=0), (second * second).sum(axis=0)])
     share /= share.sum(axis=0)
-    center = share[0, :, None] * (u + v) / 3 + share[1, :, None] * (v + w) / 3
-    moments = np.zeros((len(corners), 3, 3))
-    for part, (a, b) in zip(share, ((u, v), (v, w)), strict=True):
-        # of a triangle with one corner at the origin
-        middle = a + b
-        square = sum(x[:, :, None] * x[:, None, :] for x in (a, b, middle)) / 12
-        moments += part[:, None, None] * square
-    moments -= center[:, :, None] * center[:, None, :]
+    center = (share[0] * (u + v) + share[1] * (v + w)) / 3
+    # of triangles with one corner at the origin, from two sides and their sum
+    sides = np.stack([u, v, u + v, v, w, v + w])
+    moments = np.empty((len(corners), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            square = (sides[:, i] * sides[:, j]).reshape(2, 3, -1).sum(axis=1)
+            both = (share * square).sum(axis=0) / 12 - center[i] * center[j]
+            moments[:, i, j] = moments[:, j, i] = both
     labels = np.zeros(len(corners), dtype=np.int64) if parts is None else parts
     labels.setflags(write=False)
     return SurfacePanels(
         _read_only(corners),
-        _read_only(origin + center),
-        _read_only(total / double[:, None]),
+        _read_only((at[0] + center).T),
+        _read_only((total / double).T),
         _read_only(0.5 * double),
         _read_only(moments),
         labels,
         closed,
     )
+
+
+def _cross(u: Array, v: Array) -> Array:
+    """Products of vectors, shape (3, n)."""
+    return np.stack([u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2] for k in range(3)])
+
+
+def _mirrored(panels: SurfacePanels, axis: int) -> NDArray[np.int64] | None:
+    """The panels that the plane across an axis takes panels to, (n,), or None."""
+    sign = np.ones(3)
+    sign[axis] = -1.0
+    grain = _SAME * float(np.abs(panels.centers).max())
+    own = np.round(panels.centers / grain)
+    order, there = np.lexsort(own.T), np.lexsort((sign * own).T)
+    if not np.array_equal(own[order], sign * own[there]):
+        return None
+    out = np.empty_like(order)
+    out[order] = there
+    moments = sign[:, None] * panels.moments[out] * sign
+    same = np.allclose(moments, panels.moments, rtol=0.0, atol=_SAME * panels.moments.max())
+    return out if same else None
 
 
 def _lengths(shape: Shape) -> tuple[float, float, float]:

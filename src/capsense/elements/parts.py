@@ -61,7 +61,11 @@ class RefinedShape(RigidShape):
     @property
     def nbytes(self) -> int:
         """Room that the matrices and the parts take up [bytes]."""
-        return self.whole.nbytes + sum(a.nbytes for a in self._parts.values())
+        return self.whole.nbytes + self._more
+
+    @cached_property
+    def _more(self) -> int:
+        return sum(a.nbytes for a in self._parts.values())
 
 
 def refined(shape: RigidShape, finest: float, surface: Shape) -> RigidShape:
@@ -161,7 +165,7 @@ def _with_parts(shape: RefinedShape) -> dict[str, NDArray[Any]]:
     points = np.empty((len(area), 4, 3))
     for q, (p, r) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         points[:, q] = centers + p * first + r * second
-    if shape.surface.kind is not ShapeKind.MESH:
+    if shape.surface.kind not in (ShapeKind.BOX, ShapeKind.MESH):
         normals = panels.normals[panel[m:]]
         for q in range(4):
             points[:, q] -= shape.surface.signed_distance(points[:, q])[:, None] * normals

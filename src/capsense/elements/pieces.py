@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -306,4 +306,11 @@ class ChangingBody:
     @property
     def nbytes(self) -> int:
         """Room that the arrays take up [bytes]."""
-        return sum(a.nbytes for a in self.__dict__.values() if isinstance(a, np.ndarray))
+        z = self.__dict__.get("_impedance")
+        return self._made + (0 if z is None else z.nbytes)
+
+    @cached_property
+    def _made(self) -> int:
+        """That of all but the impedance, which may come later."""
+        held = (a for name, a in self.__dict__.items() if name != "_impedance")
+        return sum(a.nbytes for a in held if isinstance(a, np.ndarray))

@@ -21,7 +21,7 @@ from capsense._frozen import Frozen
 from capsense._jit import compiled
 from capsense.elements import tree_kernels
 from capsense.elements.blocks import free_block, impedance
-from capsense.elements.panels import SurfacePanels
+from capsense.elements.panels import Mirrors, SurfacePanels
 from capsense.errors import SolveError
 
 Array = NDArray[np.float64]
@@ -100,13 +100,6 @@ class Tree(Clusters):
     """Length of a uniform rod with the cluster's largest second moment [m], shape (2 n - 1,)."""
     soft: Array
     """Distance below which 1/r from the points is bounded [m], shape (2 n - 1,)."""
-
-    def to_functions(self, values: Array) -> Array:
-        """Integrate columns of panel values with every charge function, shape (n, k) -> (n, k)."""
-        values = np.ascontiguousarray(values)
-        out = np.empty(values.shape)
-        tree_kernels.to_functions(values, self.kids, self.panel, self.charge, self.function, out)
-        return out
 
 
 def once(shape: object, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
@@ -188,30 +181,40 @@ def rigid_shape(panels: SurfacePanels, *, apart: bool = False, most: float = np.
         SolveError: The panels lie within each other, so that their block is not definite.
     """
     free = free_block(panels)
-    charge = equilibrium(free) if apart else _made_definite(free)
+    charge = equilibrium(free, panels.mirrors) if apart else _made_definite(free)
     tree = build_tree(panels, np.maximum(charge, LEAST_CHARGE * charge.max()), most)
     return RigidShape(panels, tree, _of_functions(tree, free), float(charge.sum()))
 
 
-def equilibrium(free: Array) -> Array:
-    """Charges that put all panels at 1 V, by conjugate gradients, free (n, n) -> (n,)."""
-    charge = np.zeros(len(free))
-    if not _conjugate_gradients(free, charge):
+def equilibrium(free: Array, mirrors: Mirrors | None = None, left: float = _LEFT) -> Array:
+    """Charges that put all panels at 1 V, by conjugate gradients, free (n, n) -> (n,).
+
+    Mirror images carry the same charge, so that only the first of them is an unknown. The energy
+    of what the potentials lack falls to ``left`` squared of the whole.
+    """
+    matrix, sides, number = free, np.ones(len(free)), np.arange(len(free))
+    if mirrors is not None:
+        firsts, number = np.unique(mirrors.first, return_inverse=True)
+        sides = np.bincount(number).astype(float)
+        matrix = sides[:, None] * np.stack([np.bincount(number, free[i]) for i in firsts])
+    charge = np.zeros(len(matrix))
+    if not _conjugate_gradients(matrix, sides, charge, left):
         raise SolveError(
             f"the charges of {len(free)} panels do not converge; make bodies thicker that are less "
             "than 1/20,000 as thick as they are wide, or leave out dielectric films"
         )
-    return charge
+    return charge[number]
 
 
 @compiled
-def _conjugate_gradients(matrix: Array, x: Array) -> bool:
-    """Solve ``matrix @ x = 1``, its diagonal for a preconditioner; False without convergence.
+def _conjugate_gradients(matrix: Array, residual: Array, x: Array, left: float) -> bool:
+    """Solve ``matrix @ x = residual``, its diagonal for a preconditioner; False without convergence.
 
-    Compiled, so that bits do not depend on where arrays lie, as those of a BLAS may.
+    The residual is overwritten. Compiled, so that bits do not depend on where arrays lie, as those
+    of a BLAS may.
     """
     n = x.shape[0]
-    residual, way, product = np.ones(n), np.empty(n), np.empty(n)
+    way, product = np.empty(n), np.empty(n)
     first = before = 0.0
     for step in range(_MOST_STEPS):
         energy = 0.0
@@ -219,7 +222,7 @@ def _conjugate_gradients(matrix: Array, x: Array) -> bool:
             energy += residual[i] * residual[i] / matrix[i, i]
         if step == 0:
             first = energy
-        elif energy <= _LEFT * _LEFT * first:
+        elif energy <= left * left * first:
             return True
         share = energy / before if step > 0 else 0.0
         for i in range(n):
@@ -319,9 +322,5 @@ def split(features: Array, charge: Array) -> Clusters:
 
 
 def _of_functions(tree: Tree, block: Array) -> Array32:
-    """Change a symmetric block of panels to one of charge functions, symmetric to the last bit."""
-    out = np.empty(block.shape, np.float32)
-    tree_kernels.energies_of_functions(
-        tree.to_functions(block), tree.kids, tree.panel, tree.charge, tree.function, out
-    )
-    return out
+    """Change a symmetric block of panels, which is lost, to one of charge functions."""
+    return tree_kernels.table_of_functions(block, tree.kids, tree.panel, tree.charge, tree.function)

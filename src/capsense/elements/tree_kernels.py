@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from capsense._jit import compiled, kernel
+from capsense._simd import WIDE
 
-_COLUMNS = 64
+_COLUMNS = 256
 """Columns of a matrix that are taken at a time."""
 _BLOCK = 64
 """Rows and columns of a table that are turned at a time."""
@@ -38,23 +39,28 @@ def split(features, charges, order, first, last, kids):
         order[i] = i
     first[0], last[0] = 0, n
     made, k = 1, 0
-    values = np.empty(n)
+    values, room, ends = np.empty(n), np.empty(n, np.int64), np.empty((2, 6))
     while k < made:
         a, b = first[k], last[k]
         kids[k, 0] = kids[k, 1] = -1
         if b - a > 1:
-            axis, best = 0, -1.0
-            for d in range(6):
-                low, high = np.inf, -np.inf
-                for i in range(a, b):
-                    low = min(low, features[order[i], d])
-                    high = max(high, features[order[i], d])
-                if high - low > best:
-                    axis, best = d, high - low
+            ends[0], ends[1] = np.inf, -np.inf
+            for i in range(a, b):
+                line = features[order[i]]
+                for d in range(6):
+                    ends[0, d], ends[1, d] = min(ends[0, d], line[d]), max(ends[1, d], line[d])
+            axis = 0
+            for d in range(1, 6):
+                if ends[1, d] - ends[0, d] > ends[1, axis] - ends[0, axis]:
+                    axis = d
+            low, high = ends[0, axis], ends[1, axis]
             for i in range(a, b):
                 values[i] = features[order[i], axis]
-            _sort(values[a:b], order[a:b])
-            cut = _cut(values[a:b], order[a:b], charges, axis >= 3, k % 2 == 1)
+            if axis < 3 and low < high:
+                cut = _parted(values[a:b], order[a:b], (low, high), k % 2 == 1, room)
+            else:
+                _sort(values[a:b], order[a:b])
+                cut = _cut(values[a:b], order[a:b], charges, k % 2 == 1)
             kids[k, 0], kids[k, 1] = made, made + 1
             first[made], last[made] = a, a + cut
             first[made + 1], last[made + 1] = a + cut, b
@@ -89,31 +95,66 @@ def _sort(values, members):
 
 
 @kernel
-def _cut(values, members, charges, of_normals, last):
-    """How many of the sorted members the first part gets; of equal cuts, the first or the last."""
+def _parted(values, members, ends, last, room):
+    """Bring members below the middle of their values to the front; returns how many these are.
+
+    The cut is half-way between two values; of equally good ones it is the first or the last.
+    """
+    (low, high), n = ends, values.shape[0]
+    below, above = low, high  # about the middle, and the next ones
+    further, beyond = -np.inf, np.inf
+    for i in range(n):
+        v = values[i]
+        if v + v <= low + high:
+            if v > below:
+                further, below = below, v
+            elif further < v < below:
+                further = v
+        elif v < above:
+            above, beyond = v, above
+        elif above < v < beyond:
+            beyond = v
+    best, cut, tie = np.inf, below, _TIE * (high - low)
+    for one, other in ((further, below), (below, above), (above, beyond)):
+        off = abs(one + other - low - high)
+        if off < best - tie or (last and off < best + tie):
+            best, cut = off, one
+    front, behind = 0, 0
+    for i in range(n):
+        if values[i] <= cut:
+            members[front] = members[i]
+            front += 1
+        else:
+            room[behind] = members[i]
+            behind += 1
+    for i in range(behind):
+        members[front + i] = room[i]
+    return front
+
+
+@kernel
+def _cut(values, members, charges, last):
+    """How many of the members, sorted by a normal, the first part gets.
+
+    Of equally good cuts it is the first or the last.
+    """
     n = values.shape[0]
     spread = values[n - 1] - values[0]
-    if of_normals:
-        jump, at = 0.0, -1
-        for i in range(n - 1):
-            if values[i + 1] - values[i] > jump:
-                jump, at = values[i + 1] - values[i], i + 1
-        if jump > _SHARP * spread:
-            return at
+    jump, at = 0.0, -1
+    for i in range(n - 1):
+        if values[i + 1] - values[i] > jump:
+            jump, at = values[i + 1] - values[i], i + 1
+    if jump > _SHARP * spread:
+        return at
     total = 0.0
     for i in range(n):
         total += charges[members[i]]
     best, cut, half = np.inf, n // 2, 0.0
-    tie = _TIE * (total if of_normals else spread)
     for i in range(n - 1):
         half += charges[members[i]]
         if values[i + 1] > values[i]:
-            off = (
-                abs(2.0 * half - total)
-                if of_normals
-                else (abs(values[i] + values[i + 1] - values[0] - values[n - 1]))
-            )
-            if off < best - tie or (last and off < best + tie):
+            off = abs(2.0 * half - total)
+            if off < best - _TIE * total or (last and off < best + _TIE * total):
                 best, cut = off, i + 1
     return cut
 
@@ -143,6 +184,34 @@ def moments(kids, panel, charge, center, spread):
                 )
 
 
+@kernel
+def _upwards(kids, order):
+    """Clusters such that parts come before their cluster, and no others between.
+
+    Args:
+        kids: Parts of the clusters, shape (t, 2).
+        order: Filled with the clusters, shape (t,).
+
+    Returns:
+        How many clusters at most wait for the other part of theirs.
+    """
+    count = kids.shape[0]
+    order[0], waiting = 0, 1
+    for place in range(count - 1, -1, -1):  # clusters that wait stand first, done ones last
+        waiting -= 1
+        k = order[waiting]
+        if kids[k, 0] >= 0:
+            for c in range(2):
+                order[waiting] = kids[k, c]
+                waiting += 1
+        order[place] = k
+    most = 0
+    for k in order:
+        waiting += 1 if kids[k, 0] < 0 else -1
+        most = max(most, waiting)
+    return most
+
+
 @compiled
 def to_functions(values, kids, panel, charge, function, out):
     """Integrate columns of panel values with every charge function, some columns at a time.
@@ -155,24 +224,54 @@ def to_functions(values, kids, panel, charge, function, out):
         function: Number of a cluster's function, -1 for a single panel, shape (2 n - 1,).
         out: Filled, function 0 with the mean over the body, shape (n, k).
     """
-    means = np.empty((kids.shape[0], _COLUMNS))
+    order = np.empty(kids.shape[0], np.int64)
+    means = np.empty((_upwards(kids, order), _COLUMNS))
     for start in range(0, values.shape[1], _COLUMNS):
-        width = min(_COLUMNS, values.shape[1] - start)
-        for k in range(kids.shape[0] - 1, -1, -1):
-            a, b = kids[k, 0], kids[k, 1]
-            mean = means[k]
-            if a < 0:
-                line = values[panel[k]]
+        width, top = min(_COLUMNS, values.shape[1] - start), 0
+        for k in order:
+            if kids[k, 0] < 0:
+                line, mean = values[panel[k]], means[top]
                 for c in range(width):
                     mean[c] = line[start + c]
-            else:
-                first, second, line = means[a], means[b], out[function[k]]
-                share = charge[a] / charge[k]
-                for c in range(width):
-                    mean[c] = share * first[c] + (1.0 - share) * second[c]
-                    line[start + c] = first[c] - second[c]
+                top += 1
+                continue
+            top -= 1
+            first, second, line = means[top - 1], means[top], out[function[k]]
+            share = charge[kids[k, 0]] / charge[k]
+            for c in range(width):
+                line[start + c] = first[c] - second[c]
+            for c in range(width):
+                first[c] = share * first[c] + (1.0 - share) * second[c]
         for c in range(width):
             out[0, start + c] = means[0, c]
+
+
+@compiled
+def table_of_functions(block, kids, panel, charge, function):
+    """Integrate a symmetric table of panel values with every charge function, both ways.
+
+    Args:
+        block: Mean values between panels, shape (n, n); lost.
+        kids, panel, charge, function: As in :func:`to_functions`.
+
+    Returns:
+        Symmetric to the last bit, shape (n, n), single precision.
+    """
+    n = block.shape[0]
+    rows, out = np.empty((n, n)), np.empty((n, n), np.float32)
+    to_functions(block, kids, panel, charge, function, rows)
+    for start in range(0, n, _BLOCK):  # blocks stay in the cache while they are turned
+        for low in range(0, start + 1, _BLOCK):
+            for i in range(start, min(start + _BLOCK, n)):
+                for j in range(low, min(low + _BLOCK, i)):
+                    rows[i, j], rows[j, i] = rows[j, i], rows[i, j]
+    to_functions(rows, kids, panel, charge, function, block)
+    for start in range(0, n, _BLOCK):
+        for low in range(0, start + 1, _BLOCK):
+            for i in range(start, min(start + _BLOCK, n)):
+                for j in range(low, min(low + _BLOCK, i + 1)):
+                    out[i, j] = out[j, i] = block[i, j]
+    return out
 
 
 @compiled
@@ -198,46 +297,24 @@ def means_of_clusters(means, last, kids, charge):
             share[a] = charge[kids[a, 0]] / charge[a]
             for j in range(many):
                 mean[j] = second[j] + share[a] * (first[j] - second[j])
-    out, line = np.empty(count * (count + 1) // 2, np.float32), np.empty(count, np.float32)
-    for a in range(count):
+    out = np.empty(count * (count + 1) // 2, np.float32)
+    lines = np.empty((count, WIDE), np.float32)  # so many rows at a time, turned
+    for start in range(0, count, WIDE):
+        width = min(WIDE, count - start)
         for j in range(many):
-            line[last[j]] = rows[a, j]
+            line = lines[last[j]]
+            for c in range(width):
+                line[c] = rows[start + c, j]
         for k in range(count - 1, -1, -1):
-            x, y = kids[k]
-            if x >= 0:
-                line[k] = line[y] + share[k] * (line[x] - line[y])
-        for k in range(a + 1):
-            out[a * (a + 1) // 2 + k] = line[k]
+            if kids[k, 0] >= 0:
+                first, second, line = lines[kids[k, 0]], lines[kids[k, 1]], lines[k]
+                for c in range(WIDE):
+                    line[c] = second[c] + share[k] * (first[c] - second[c])
+        for c in range(width):
+            a = start + c
+            for k in range(a + 1):
+                out[a * (a + 1) // 2 + k] = lines[k, c]
     return out
-
-
-@compiled
-def energies_of_functions(rows, kids, panel, charge, function, out):
-    """Integrate rows of panel values with every charge function, to a symmetric table.
-
-    Args:
-        rows: What :func:`to_functions` makes of a symmetric table of panels, shape (n, n).
-        kids, panel, charge, function: As there.
-        out: Filled, symmetric to the last bit, single precision, shape (n, n).
-    """
-    n = rows.shape[0]
-    mean = np.empty(kids.shape[0])
-    for f in range(n):
-        line = out[f]
-        for k in range(kids.shape[0] - 1, -1, -1):
-            a, b = kids[k, 0], kids[k, 1]
-            if a < 0:
-                mean[k] = rows[f, panel[k]]
-            else:
-                share = charge[a] / charge[k]
-                mean[k] = share * mean[a] + (1.0 - share) * mean[b]
-                line[function[k]] = mean[a] - mean[b]
-        line[0] = mean[0]
-    for start in range(0, n, _BLOCK):  # blocks stay in the cache while they are turned
-        for low in range(0, start + 1, _BLOCK):
-            for i in range(start, min(start + _BLOCK, n)):
-                for j in range(low, min(low + _BLOCK, i)):
-                    out[i, j] = out[j, i]
 
 
 @kernel

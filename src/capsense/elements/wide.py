@@ -72,6 +72,8 @@ there; the second of others, whose limbs are told apart first. Those with flat s
 than the third of their least extent."""
 _CLUSTERS = 1000
 """Clusters from which the charges of wide bodies are found, and the energies of larger ones."""
+_LEFT = 1e-5
+"""How exactly these charges are found, see :func:`equilibrium`."""
 
 
 class _Wide(NamedTuple):
@@ -209,7 +211,7 @@ def _equilibrium(panels: SurfacePanels, cluster: Ints) -> Array:
     area = np.bincount(cluster, panels.areas)
     center = np.stack([np.bincount(cluster, panels.areas * x) / area for x in panels.centers.T])
     try:
-        charge = equilibrium(patch_means(center, area))
+        charge = equilibrium(patch_means(center, area), left=_LEFT)
     except SolveError:  # of faces that coincide
         return panels.areas
     return (
@@ -284,7 +286,4 @@ class WideBody(ChangingBody):
         shares = csr_array((share, places), (number.max() + 1, len(panels)))
         block = np.ascontiguousarray(shares @ (shares @ more).T)
         tree = kids, number, self._charge[: len(kids)], self._function[: len(kids)]
-        rows, out = np.empty(block.shape), np.empty(block.shape, np.float32)
-        tree_kernels.to_functions(block, *tree, rows)
-        tree_kernels.energies_of_functions(rows, *tree, out)
-        return out
+        return tree_kernels.table_of_functions(block, *tree)
