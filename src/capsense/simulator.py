@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Method = Literal["surface", "fem_masked"]
 PresetName = Literal["standard", "learning", "fine"]
 
-_TURNS = 4
+_TURNS = 6
 """Parts of a batch, for each thread, at least: no thread then waits long for another."""
 
 
@@ -201,7 +201,8 @@ class Simulator:
     @property
     def empty(self) -> Reading:
         """The reading of an empty scene, which no chip has seen."""
-        return self._reading(np.zeros_like(self._terminals.empty), StepStats(0.0, 0.0))
+        empty = self._terminals.empty
+        return self._reading(np.zeros_like(empty), empty, StepStats(0.0, 0.0))
 
     def use_readout(self, readout: Readout | str | Path | None, *, start: float = 0.0) -> None:
         """Read through a chip from now on.
@@ -271,9 +272,10 @@ class Simulator:
             change = change - 1j * found.loss
         slope = None if found.jacobian is None else terminals.slope(change, found.jacobian)
         change = terminals.change(change)
-        error = min(error, float(np.abs(terminals.empty + change).max()))
+        total = terminals.empty + change
+        error = min(error, float(np.abs(total).max()))
         stats = StepStats(error, seconds, found.unknowns, found.iterations)
-        reading = self._reading(change.real, stats, slope)
+        reading = self._reading(change.real, total.real, stats, slope)
         if not reading.delta.any():
             scene.warn_of_units(max(self.design.domain.size))
         if found.loss is None:
@@ -283,9 +285,11 @@ class Simulator:
             reading, conductance=-2 * np.pi * self.excitation_frequency * change.imag[:n, :n]
         )
 
-    def _reading(self, change: Array, stats: StepStats, slope: Array | None = None) -> Reading:
-        """A reading by the change of the matrix of electrodes and shields [F]."""
-        n, total = self._terminals.electrodes, self._terminals.empty + change
+    def _reading(
+        self, change: Array, total: Array, stats: StepStats, slope: Array | None = None
+    ) -> Reading:
+        """A reading by the matrix of electrodes and shields and its change [F]."""
+        n = self._terminals.electrodes
         delta = change[:n, :n]
         return Reading(
             self.baseline + delta,

@@ -63,6 +63,11 @@ class Matter:
         return self.conducting & np.isfinite(self.ground)
 
     @cached_property
+    def some_free(self) -> bool:
+        """Whether there are such."""
+        return bool(self.free.any())
+
+    @cached_property
     def lossy(self) -> bool:
         """Whether a body is neither a conductor nor free of losses."""
         return bool(((self.eps.imag != 0) & ~self.conducting).any())
@@ -108,7 +113,7 @@ class Matter:
 
         Meshes and depth images are not looked at, nor are bodies that are all at ground.
         """
-        if not self.free.any():
+        if not self.some_free:
             return self
         seen = self.conducting & (packed.kinds[chosen] < ShapeKind.MESH)
         low, high = packed.bounds[chosen, 0] - 0.5 * _TOUCH, packed.bounds[chosen, 1] + 0.5 * _TOUCH

@@ -208,9 +208,9 @@ def equilibrium(free: Array, mirrors: Mirrors | None = None, left: float = _LEFT
 
 @compiled
 def _conjugate_gradients(matrix: Array, residual: Array, x: Array, left: float) -> bool:
-    """Solve ``matrix @ x = residual``, its diagonal for a preconditioner; False without convergence.
+    """Solve ``matrix @ x = residual``, the latter lost; False without convergence.
 
-    The residual is overwritten. Compiled, so that bits do not depend on where arrays lie, as those
+    The diagonal is the preconditioner. Compiled, so that bits do not depend on where arrays lie, as those
     of a BLAS may.
     """
     n = x.shape[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from operator import is_
 
 import numpy as np
@@ -62,8 +63,12 @@ class Laid:
     """Whether each body is solved for as a whole wherever it stands."""
 
     def copied(self) -> NDArray[np.void]:
-        """The records anew, as bytes: NumPy takes ten times as long for their fields."""
-        return self.records.view(np.uint8).copy().view(BODY)
+        """The records anew, from bytes: NumPy takes ten times as long to copy their fields."""
+        return np.frombuffer(bytearray(self._bytes), BODY)
+
+    @cached_property
+    def _bytes(self) -> bytes:
+        return self.records.tobytes()
 
 
 def laid_out(

@@ -337,7 +337,7 @@ class SurfaceSolver:
 
         Those that are not at ground count outside of the domain too: a person's other limbs.
         """
-        if not view.matter.free.any():
+        if not view.matter.some_free:
             return view.matter
         whole = matter_of(list(view.scene), self.excitation_frequency)
         used = np.union1d(view.met, np.flatnonzero(whole.free))

@@ -147,11 +147,15 @@ def solve_each(
     delta, error, size = np.zeros((k, m, m)), np.zeros(k), np.zeros(k, np.int64)
     for scene in range(k):
         if first[scene] < first[scene + 1]:
-            found = solve(bodies[first[scene] : first[scene + 1]], green, threshold, width, False)
-            size[scene], error[scene] = found.size, found.error
+            part = bodies[first[scene] : first[scene + 1]]
+            _, _, functions, system = prepared(part, green, threshold, width)
+            found = reduced(functions, system, False)
+            change, left, coarse, shift = found.delta, found.left, found.coarse[:m], found.shift
+            size[scene] = functions.solved
+            error[scene] = estimate(change, left, coarse, shift, green.electrodes)
             for i in range(m):
                 for j in range(m):
-                    delta[scene, i, j] = found.delta[i, j]
+                    delta[scene, i, j] = change[i, j]
     return delta, error, size
 
 
