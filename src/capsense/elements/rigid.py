@@ -210,8 +210,8 @@ def equilibrium(free: Array, mirrors: Mirrors | None = None, left: float = _LEFT
 def _conjugate_gradients(matrix: Array, residual: Array, x: Array, left: float) -> bool:
     """Solve ``matrix @ x = residual``, the latter lost; False without convergence.
 
-    The diagonal is the preconditioner. Compiled, so that bits do not depend on where arrays lie, as those
-    of a BLAS may.
+    The diagonal is the preconditioner. Compiled, so that bits do not depend on where arrays lie, as
+    those of a BLAS may.
     """
     n = x.shape[0]
     way, product = np.empty(n), np.empty(n)
