@@ -180,7 +180,7 @@ def _mirrored(panels: SurfacePanels, axis: int) -> NDArray[np.int64] | None:
     """The panels that the plane across an axis takes panels to, (n,), or None."""
     sign = np.ones(3)
     sign[axis] = -1.0
-    grain = _SAME * float(np.abs(panels.centers).max())
+    grain = _SAME * float(np.abs(panels.corners).max())
     own = np.round(panels.centers / grain)
     order, there = np.lexsort(own.T), np.lexsort((sign * own).T)
     if not np.array_equal(own[order], sign * own[there]):

@@ -91,7 +91,7 @@ def standing(vertices: Array, faces: NDArray[np.int64]) -> Standing:
     return Standing(grid * own[order][place[np.lexsort(place.T[::-1])]], axes, middle)
 
 
-VERSION = 8
+VERSION = 9
 """Of stored shapes: to be raised when the same mesh would get other panels or functions."""
 
 _log = logging.getLogger(__name__)
