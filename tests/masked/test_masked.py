@@ -51,6 +51,15 @@ def assert_physical(matrix: NDArray[np.float64]) -> None:
 
 
 @pytest.mark.parametrize("solver", ["cg", "lu"])
+def test_domain_without_a_free_node(mesh, solver):
+    """Limits: with a conductor everywhere there is nothing to solve, and nothing is left."""
+    masked = MaskedSolver(MeshSensor(mesh, STRIPES), solver=solver)
+    assert_physical(masked.step(np.zeros(mesh.n_tets, int), [GROUNDED]))
+    assert (masked.stats.iterations, masked.stats.residual) == (0, 0.0)
+    assert set(np.unique(masked.potentials())) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("solver", ["cg", "lu"])
 def test_empty_domain_is_the_reference(mesh, solver):
     masked = MaskedSolver(MeshSensor(mesh, STRIPES), solver=solver)
     got = masked.step(np.full(mesh.n_tets, -1), [])
