@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from capsense._dense import mirror
 from capsense._jit import compiled, kernel
 from capsense._simd import WIDE
 
@@ -266,11 +267,10 @@ def table_of_functions(block, kids, panel, charge, function):
                 for j in range(low, min(low + _BLOCK, i)):
                     rows[i, j], rows[j, i] = rows[j, i], rows[i, j]
     to_functions(rows, kids, panel, charge, function, block)
-    for start in range(0, n, _BLOCK):
-        for low in range(0, start + 1, _BLOCK):
-            for i in range(start, min(start + _BLOCK, n)):
-                for j in range(low, min(low + _BLOCK, i + 1)):
-                    out[i, j] = out[j, i] = block[i, j]
+    for i in range(n):
+        for j in range(i + 1):
+            out[i, j] = block[i, j]
+    mirror(out)
     return out
 
 
