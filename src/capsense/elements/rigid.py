@@ -59,6 +59,10 @@ BODY = np.dtype(
         ("known", np.int64),  # functions that have energies and impedances there, the first ones
         ("spread", np.int64),  # second moments of a changing surface, which has no points, else 0
         ("means", np.int64), ("top", np.int64),  # means of 1/r within its first so many clusters
+        ("outline", np.int64), ("closed", np.int64),  # code of the outline; whether it is closed
+        ("sizes", np.float64, 3),  # of a primitive, as its ``params``
+        ("triangles", np.int64), ("boxes", np.int64),  # of a mesh: addresses of its tree
+        ("triangle_count", np.int64), ("levels", np.int64),
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
         ("neutral", np.int64),  # whether it carries no net charge

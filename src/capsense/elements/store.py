@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
+from capsense.elements.outline import write_outline
 from capsense.elements.panels import panels_of, polygon_panels
 from capsense.elements.parts import refined
 from capsense.elements.pieces import ChangingBody, layer_pieces, mesh_pieces
@@ -229,6 +230,8 @@ def _kept(
     if found is None:
         digest = hashlib.sha256(repr((VERSION, form)).encode())
         made = make(whole, count, digest.hexdigest()[:32])
+        write_outline(made.record, whole)
+        made.__dict__["_outline"] = whole  # which the record points to
         with _LOCK:
             found = _SHAPES.setdefault(key, made)
             while len(_SHAPES) > 1 and sum(s.nbytes for s in _SHAPES.values()) > _KEPT:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
+from capsense.field.gap_table import build_gap_table, is_flat
 from capsense.field.green import GreenFunction, build_green
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 12
+NUMERICS = 13
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 
@@ -112,6 +113,8 @@ def build_background(
     if not (np.isfinite(densities).all() and np.isfinite(capacitance).all()):
         raise FieldError(f"the background field of design {design.name!r} is not finite")
     green = build_green(solution, densities, begin)
+    if is_flat(design):
+        green = replace(green, gap=build_gap_table(solution, densities, green.clearance, begin))
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)
 

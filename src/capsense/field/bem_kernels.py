@@ -273,23 +273,33 @@ def system_matrix(kind: NDArray[np.int64], contrast: Array, floor: float, panels
     ``2π σ + contrast · 4π eps0 E_n = 0`` with contrast = (e1 − e2) / (e1 + e2), where the normal
     points from medium 2 into medium 1 and E_n is the principal value.
     """
-    out = np.empty((len(panels.centers),) * 2)
-    return filled(_fill_system, out, kind, contrast, floor, panels)
+    n = len(panels.centers)
+    return system_block(kind, contrast, floor, panels, (0, n), (0, n))
+
+
+def system_block(
+    kind: NDArray[np.int64], contrast: Array, floor: float, panels: Panels,
+    rows: tuple[int, int], columns: tuple[int, int],
+) -> Array:  # fmt: skip
+    """Return the block of :func:`system_matrix` with rows and columns from … to …."""
+    out = np.empty((rows[1] - rows[0], columns[1] - columns[0]))
+    return filled(_fill_system, out, rows[0], columns[0], kind, contrast, floor, panels)
 
 
 @compiled
-def _fill_system(start, stop, kind, contrast, floor, p, out):
+def _fill_system(start, stop, row, column, kind, contrast, floor, p, out):
     grad = np.empty(3)
-    for i in range(start, stop):
-        for j in range(out.shape[1]):
+    for i in range(row + start, row + stop):
+        line = out[i - row]
+        for j in range(column, column + out.shape[1]):
             if kind[i] == 2:
-                out[i, j] = -contrast[i] * _flux_mean(p, i, j, floor)
+                line[j - column] = -contrast[i] * _flux_mean(p, i, j, floor)
             elif kind[i] == 1:
-                out[i, j] = -contrast[i] * _mean_normal_gradient(p, i, j, floor, grad)
+                line[j - column] = -contrast[i] * _mean_normal_gradient(p, i, j, floor, grad)
             else:
-                out[i, j] = _mean_potential(p, i, j, floor)
-        if kind[i]:
-            out[i, i] += 2.0 * math.pi
+                line[j - column] = _mean_potential(p, i, j, floor)
+        if kind[i] and 0 <= i - column < out.shape[1]:
+            line[i - column] += 2.0 * math.pi
 
 
 @kernel

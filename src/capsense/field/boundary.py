@@ -74,6 +74,10 @@ class BoundaryModel:
     floor: float
     """Height of the grounded floor [m]."""
     n_terminals: int
+    sheets: tuple[tuple[tuple[Facet, int], Grading], ...]
+    """Facets of all sheets with their owners, and how finely they are cut."""
+    sheet_panels: int
+    """Panels of sheets, which come first."""
 
 
 def eps_at(design: Design, points: Array) -> Array:
@@ -164,12 +168,11 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
         owners.append(np.full(panels.size, owner, dtype=np.int64))
 
     reach = 2.5 * thin if math.isfinite(thin) else 0.0
+    gradings: list[Grading] = []
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
-        width = 2 * facet.polygon.area / facet.polygon.length
-        coarse = max(5e-5, 5e-4 * _extent(facet))
-        edge = scale * max(min(0.01 * width, 0.075 * gap, coarse), 5e-6)
-        largest = scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
-        add(facet, owner, _grading(facet, edge, largest, scale), 2.5 * spacing)
+        gradings.append(sheet_grading(facet, gap, spacing, scale))
+        add(facet, owner, gradings[-1], 2.5 * spacing)
+    sheet_panels = sum(p.size for p in parts)
     for facet, thickness in interfaces(design, [facet for facet, _ in sheets]):
         edge = scale * min(3e-4, 0.3 * thickness)
         largest = scale * min(0.006, max(1.25 * thickness, 0.001))
@@ -181,7 +184,20 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
     panels = concatenate(parts)
     step = 1e-7 * panels.normals
     front, back = (eps_at(design, panels.centers + side * step) for side in (1, -1))
-    return BoundaryModel(panels, np.concatenate(owners), front, back, floor, len(names))
+    return BoundaryModel(
+        panels, np.concatenate(owners), front, back, floor, len(names),
+        tuple(zip(sheets, gradings, strict=True)), sheet_panels,
+    )  # fmt: skip
+
+
+def sheet_grading(facet: Facet, gap: float, spacing: float, scale: float) -> Grading:
+    """How finely a conducting sheet is cut, by its distance from others in its plane, and from
+    parallel ones [m]."""
+    width = 2 * facet.polygon.area / facet.polygon.length
+    coarse = max(5e-5, 5e-4 * _extent(facet))
+    edge = scale * max(min(0.01 * width, 0.075 * gap, coarse), 5e-6)
+    largest = scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
+    return _grading(facet, edge, largest, scale)
 
 
 def _grading(facet: Facet, edge: float, largest: float, scale: float) -> Grading:
@@ -210,11 +226,11 @@ class BoundarySolution:
         self.model = build_model(design, accuracy)
         panels, owner = self.model.panels, self.model.owner
         progress(f"boundary elements: {panels.size} panels")
-        self._contrast = (self.model.eps_front - self.model.eps_back) / (
+        self.contrast = (self.model.eps_front - self.model.eps_back) / (
             self.model.eps_front + self.model.eps_back
         )
-        kind = np.where(owner == INTERFACE, 1 + any(k.facets != () for k in design.layers), 0)
-        matrix = kernels.system_matrix(kind, self._contrast, self.model.floor, panels)
+        self.kind = np.where(owner == INTERFACE, 1 + any(k.facets != () for k in design.layers), 0)
+        matrix = kernels.system_matrix(self.kind, self.contrast, self.model.floor, panels)
         progress("boundary elements: factorising")
         self._lu = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=True)
 
@@ -232,6 +248,10 @@ class BoundarySolution:
             rhs += self._source_terms(sources)
         return 4 * math.pi * EPS0 * scipy.linalg.lu_solve(self._lu, rhs)
 
+    def solve(self, sides: Array) -> Array:
+        """Charge densities over 4π eps0 of right-hand sides, rows as the matrix has them, (n, k)."""
+        return scipy.linalg.lu_solve(self._lu, sides)
+
     def _source_terms(self, sources: Array) -> Array:
         """Right-hand sides of unit 1/r sources and their images, means over panels, (panels, k)."""
         panels, floor = self.model.panels, self.model.floor
@@ -241,7 +261,7 @@ class BoundarySolution:
         if len(rows):
             # sigma / (2 eps0) + contrast E_n = 0 with E_n of the source moved to the right
             flux = kernels.flux_matrix(points, rows, floor, panels)
-            rhs[rows] = self._contrast[rows, None] * flux.T
+            rhs[rows] = self.contrast[rows, None] * flux.T
         return rhs / panels.areas[:, None]
 
     def terminal_charges(self, densities: Array) -> Array:

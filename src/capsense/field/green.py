@@ -24,7 +24,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from capsense.errors import FieldError
+from capsense.field import gap_table
 from capsense.field.boundary import BoundarySolution
+from capsense.field.gap_table import GapTable
 from capsense.field.green_points import (
     GreenSettings,
     Surroundings,
@@ -87,6 +89,8 @@ class GreenFunction:
 
     It overstates by far what it costs a capacitance, which sees averages over bodies.
     """
+    gap: GapTable | None = None
+    """What bodies in the first millimetres add, of a flat design."""
 
     @property
     def n_modes(self) -> int:
@@ -224,7 +228,8 @@ def build_green(
 
 def to_arrays(green: GreenFunction) -> dict[str, NDArray[Any]]:
     """All of a Green's function by the names of its fields."""
-    return {name: np.asarray(value) for name, value in vars(green).items()}
+    out = {name: np.asarray(value) for name, value in vars(green).items() if name != "gap"}
+    return out if green.gap is None else out | gap_table.to_arrays(green.gap)
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> GreenFunction:
@@ -240,7 +245,8 @@ def from_arrays(arrays: Mapping[str, Any]) -> GreenFunction:
         given = np.array(arrays[name], dtype=float)
         return given if given.ndim else float(given)
 
-    return GreenFunction(**{f.name: value(f.name) for f in fields(GreenFunction)})
+    own = {f.name: value(f.name) for f in fields(GreenFunction) if f.name != "gap"}
+    return GreenFunction(**own, gap=gap_table.from_arrays(arrays))
 
 
 def _weight(distances: Array) -> Array:

@@ -29,6 +29,7 @@ from capsense._simd import (
     wide_splat,
 )
 from capsense.design.model import Design
+from capsense.field.gap_table import GapTable, is_flat
 from capsense.field.green import LEVELS, GreenFunction
 from capsense.field.grid_kernels import Grid, grid_over
 
@@ -37,16 +38,9 @@ LEAST = 1e-3, 2e-3, 3e-3
 lie deeper than that under the surfaces of the design."""
 SHORE = 5e-3
 """Bodies fade out over this distance beyond the room, and behind the face of a flat design [m]."""
-NEAR_FACE = 2e-3
-"""Clusters farther from the design [m] keep their gap to it."""
 DEEP, STEEP = 3e-3, 4.0
 """What is deeper behind the face of a flat design [m] comes to be screened by it; depth from the
 sides counts so many times."""
-GAP = 1.5e-4, 7e-4, 0.18, 2e-5
-"""Least gap to a flat design [m]: the square of a cluster's extent over the third, at least the
-first, at most the second; less by the thickness of a cover, but not less than the fourth."""
-_FLAT = 1e-4
-"""Sheets of a flat design rise by less than this [m]."""
 _AWAY = 1e3
 """Coordinates of sources without charge [m]."""
 MARGIN = 0.015
@@ -66,6 +60,60 @@ class Level(NamedTuple):
     """What each adds to φ⁰ and ψ, shape (s, w); fewer columns where fewer modes count."""
     least: float
     """No point counts as nearer to one than this [m]."""
+
+
+class Gap(NamedTuple):
+    """A :class:`~capsense.field.gap_table.GapTable`, as the kernels take it; without cells if the
+    design has none."""
+
+    validity: float
+    """Distance h0 from a flat design [m] down to which its Green's function is valid."""
+    top: float
+    """Height of the face of the design [m]."""
+    heights: NDArray[Any]
+    log_ratio: float
+    """Logarithm of the ratio of two heights."""
+    points: NDArray[Any]
+    areas: NDArray[Any]
+    terminal: NDArray[Any]
+    series: NDArray[Any]
+    columns: NDArray[Any]
+    change: NDArray[Any]
+    blocks: NDArray[Any]
+    """First cell of each block, and their number, shape (q + 1,)."""
+    block_center: NDArray[Any]
+    """Middle of each block [m], shape (q, 2)."""
+    block_radius: NDArray[Any]
+    """Radius of a circle about it that holds its cells [m], shape (q,)."""
+
+
+def pack_gap(table: GapTable | None, clearance: float) -> Gap:
+    """Lay a table out for the kernels."""
+    if table is None:
+        none = np.zeros(0)
+        few = np.zeros((0, 2), np.float32)
+        return Gap(
+            clearance, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
+            np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros(0, np.float32),
+            np.zeros((0, 0), np.int64), np.zeros((0, 2, 1), np.float32), np.zeros(1, np.int64),
+            np.zeros((0, 2)), none,
+        )  # fmt: skip
+    count = len(table.areas)
+    blocks = np.append(table.blocks, count)
+    number = np.repeat(np.arange(len(table.blocks)), np.diff(blocks))
+    points = np.asarray(table.points[:, :2], float)
+    size = np.diff(blocks)
+    center = np.stack([np.bincount(number, x) / size for x in points.T], axis=1)
+    radius = np.zeros(len(size))
+    np.maximum.at(radius, number, np.linalg.norm(points - center[number], axis=1))
+    return Gap(
+        table.validity, table.top, table.heights, math.log(table.heights[1] / table.heights[0]),
+        np.ascontiguousarray(points, np.float32), np.ascontiguousarray(table.areas, np.float32),
+        np.ascontiguousarray(table.terminal, np.int64),
+        np.ascontiguousarray(table.series, np.float32),
+        np.ascontiguousarray(table.columns, np.int64),
+        np.ascontiguousarray(table.change, np.float32), blocks.astype(np.int64), center, radius,
+    )  # fmt: skip
 
 
 class Green(NamedTuple):
@@ -93,6 +141,8 @@ class Green(NamedTuple):
     """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
     cover: float
     """Thickness of what covers the electrodes of a flat design [m]; infinite for other designs."""
+    gap: Gap
+    """The first millimetres in front of a flat design."""
 
 
 class Space(NamedTuple):
@@ -104,14 +154,14 @@ class Space(NamedTuple):
     box: NDArray[Any]
     room: NDArray[Any]
     cover: float
+    validity: float
 
 
 def cover_of(design: Design) -> float:
     """Thickness of what covers the sheets of a flat design [m]; infinite for other designs."""
-    heights = np.concatenate([body.surface.bounds[:, 2] for body in design.sheets])
-    floors = [np.ptp(body.surface.bounds[:, 2]) for body in design.sheets]
-    if max(floors) > _FLAT:
+    if not is_flat(design):
         return math.inf
+    heights = np.concatenate([body.surface.bounds[:, 2] for body in design.sheets])
     top = max([float(heights.max()), *(float(layer.upper[2]) for layer in design.layers)])
     return top - float(heights.max())
 
@@ -159,6 +209,7 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         (near, middle, far), score_table, grid_over(np.asarray(green.box, float), walls, phi),
         lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
         np.asarray(green.blends, float), room, cover_of(design),
+        pack_gap(green.gap, green.clearance),
     )  # fmt: skip
 
 
@@ -264,12 +315,6 @@ def beyond(points, space):
             depth = min(depth, space.box[1, 2] - c)
     deep = depth - DEEP if space.cover < 1.0 else 0.0
     return smooth(max(math.sqrt(out), deep) / SHORE)
-
-
-@kernel
-def least_gap(extent, cover):
-    """Least gap [m] between a cluster and a flat design, see :data:`GAP`."""
-    return max(GAP[3], min(GAP[1], max(GAP[0], extent * extent / GAP[2])) - cover)
 
 
 @kernel

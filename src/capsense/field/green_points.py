@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 _OPEN = 0.3
 """Bodies can be where the openness is larger."""
+_PER_WIDTH = 0.5
+"""Largest spacing of near point charges, over the width of the narrowest electrode."""
+_SPACING = 2.4e-3
 _RIM = 0.45
 """Behind free rims, which bodies can pass, the openness is larger."""
 
@@ -33,7 +36,7 @@ class GreenSettings:
 
     near_sources: int = 800
     """Largest number of point charges behind the sensor, near representation."""
-    near_spacing: float = 2.4e-3
+    near_spacing: float = _SPACING
     """Smallest distance of neighbouring point charges, near representation [m]."""
     middle_sources: int = 440
     """As ``near_sources``, middle representation."""
@@ -96,6 +99,14 @@ class Surroundings:
         self.areas = panels.weights[inner][used]
         on = (model.owner >= 0) & (model.owner < len(design.electrodes))
         electrodes = np.repeat(on[inner], used.sum(axis=1))
+        self.narrowest = min(
+            (
+                2 * e.surface.area / float(np.linalg.norm(np.diff(e.surface.rims, axis=1), axis=2).sum())
+                for e in design.electrodes if len(e.surface.rims)
+            ),
+            default=math.inf,
+        )  # fmt: skip
+        """Width of the narrowest electrode [m]: twice its area over the length of its rims."""
         self.widest = float(np.sqrt(panels.areas[on].max()))
         """Width of the widest panel of an electrode [m]."""
         self.tree = cKDTree(self.points)
@@ -107,6 +118,7 @@ class Surroundings:
 
     def spacing(self, count: int, least: float) -> float:
         """Distance of neighbours among up to ``count`` points near electrodes [m]."""
+        least = min(least, _PER_WIDTH * least / _SPACING * self.narrowest)
         return max(least, float(np.sqrt(self.weights.sum() / count)))
 
     def clearance(self, settings: GreenSettings) -> float:

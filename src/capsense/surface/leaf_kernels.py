@@ -35,7 +35,6 @@ from capsense.field.green_kernels import (
     Space,
     beyond,
     distances,
-    least_gap,
     level_share,
     lift,
     source_potentials,
@@ -82,7 +81,7 @@ def placed(bodies, cut, green):
 def _fill_leaves(bodies, cut, green, leaves, room):
     """The same; ``room`` is room to work in: two matrices and a vector of three."""
     moments, turn, middle = room
-    space = Space(green.box, green.room, green.cover)
+    space = Space(green.box, green.room, green.cover, green.gap.validity)
     for j in range(cut.leaves.shape[0]):
         a, corners, points = cut.leaves[j], leaves.true[j], leaves.points[j]
         body, k = bodies[cut.body[a]], cut.node[a]
@@ -116,7 +115,7 @@ def _fill_leaves(bodies, cut, green, leaves, room):
                 corners[q, i] = points[q, i]  # before it is lifted
         leaves.beyond[j] = beyond(points, space)
         if space.cover < 1.0:
-            lift(points, least_gap(extent, space.cover), space.box)
+            lift(points, space.validity, space.box)
 
 
 @compiled

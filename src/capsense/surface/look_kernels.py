@@ -12,10 +12,8 @@ from capsense._dense import padded
 from capsense._jit import compiled, kernel
 from capsense._simd import WIDE, doubles, integers
 from capsense.field.green_kernels import (
-    NEAR_FACE,
     SHORE,
     Space,
-    least_gap,
     lift,
     point_potentials,
     smooth,
@@ -119,9 +117,8 @@ def place(body, space, k, points, found):
         room = min(room, x - space.room[0, i], space.room[1, i] - x)
         out += max(space.room[0, i] - x, x - space.room[1, i], 0.0) ** 2
     height = points[found, 2] - space.box[1, 2]
-    if square < NEAR_FACE * NEAR_FACE and space.cover < 1.0:
-        size = body.scale * doubles(body.extent)[k]
-        lift(points[found : found + 1], least_gap(size, space.cover), space.box)
+    if square < 4.0 * space.validity * space.validity and space.cover < 1.0:
+        lift(points[found : found + 1], space.validity, space.box)
     return square, height, room, math.sqrt(out) if out > 0.0 else 0.0
 
 
@@ -173,7 +170,7 @@ def _look_into(body, green, coarser, looks, start, wanted):
         The row behind the last one that was filled, and how many points there are.
     """
     kids, extent, (points, rows, inner) = integers(body.kids), doubles(body.extent), wanted
-    space = Space(green.box, green.room, green.cover)
+    space = Space(green.box, green.room, green.cover, green.gap.validity)
     looks.node[start], looks.told[start] = 0, 1.0
     row, stop, found = start - 1, start + 1, np.int64(0)
     while row + 1 < stop:

@@ -287,7 +287,7 @@ def _score_nodes(body, green, nodes, looks, last, weight):
     """
     kids, many = integers(body.kids), 2 * nodes.shape[0]
     points, rows, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
-    space = Space(green.box, green.room, green.cover)
+    space = Space(green.box, green.room, green.cover, green.gap.validity)
     for j in range(many):
         k, rows[j] = nodes[j // 2], last + j
         if j % 2 == 0:

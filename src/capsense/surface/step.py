@@ -15,7 +15,16 @@ from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
+from capsense.surface.gap_kernels import local_change, near_bodies
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
+from capsense.surface.network_kernels import (
+    as_nodes,
+    coarse_of,
+    congruent,
+    mixed,
+    potentials_of,
+    with_nodes,
+)
 from capsense.surface.pair_kernels import bound_images, leaf_pairs
 from capsense.surface.part_kernels import add_parts
 from capsense.surface.reach_kernels import reached
@@ -56,6 +65,12 @@ class Solution(NamedTuple):
     -1 where there is no solution, and ``delta`` is not finite."""
     error: float
     """See :func:`estimate` [m]."""
+    near: NDArray[Any]
+    """Bodies that the gap law applies to, shape (b,)."""
+    node: NDArray[Any]
+    """Row of each body that is a node of the network, -1 for others, shape (b,)."""
+    weights: NDArray[Any]
+    """Potentials of terminals and nodes for each terminal at 1 V, (t, m); zero if none is near."""
 
 
 @compiled
@@ -117,14 +132,24 @@ def solve(
     ``adjoint`` asks for charges that the derivatives of the result follow from; else as
     :func:`prepared`.
     """
+    near = near_bodies(bodies, green)
+    m, nodes, node, capacitance = as_nodes(bodies, near, green)
     cut, leaves, functions, system = prepared(bodies, green, threshold, width)
+    if nodes > 0:
+        system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
-    m = green.terminals
+    weights = np.zeros((m, m))
+    if near.any():
+        local_change(bodies, near, node, green, delta)
+        weights = potentials_of(delta, m, nodes, capacitance)
+        delta, left = congruent(weights, delta, capacitance), congruent(weights, left, np.zeros(0))
+        charge, coarse = mixed(charge, weights, green.lead), coarse_of(coarse, weights)
     error = estimate(delta, left, coarse[:m], shift, green.electrodes)
     return Solution(
         delta[:m, :m], left[:m, :m], coarse[:m], charge,
         leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift, error,
+        near, node, weights,
     )  # fmt: skip
 
 
@@ -148,14 +173,11 @@ def solve_each(
     for scene in range(k):
         if first[scene] < first[scene + 1]:
             part = bodies[first[scene] : first[scene + 1]]
-            _, _, functions, system = prepared(part, green, threshold, width)
-            found = reduced(functions, system, False)
-            change, left, coarse, shift = found.delta, found.left, found.coarse[:m], found.shift
-            size[scene] = functions.solved
-            error[scene] = estimate(change, left, coarse, shift, green.electrodes)
+            found = solve(part, green, threshold, width, False)
+            size[scene], error[scene] = found.size, found.error
             for i in range(m):
                 for j in range(m):
-                    delta[scene, i, j] = change[i, j]
+                    delta[scene, i, j] = found.delta[i, j]
     return delta, error, size
 
 
@@ -246,6 +268,7 @@ def solve_lossy(
     return Solution(
         delta, left, coarse, charge,
         leaves.points, leaves.extent, leaves.soft, leaves.owner, n, shift, error,
+        np.zeros(len(records), np.bool_), np.full(len(records), -1), np.zeros((m, m)),
     )  # fmt: skip
 
 

@@ -1,0 +1,243 @@
+"""Outlines of bodies as the kernels take them: distances to a shape of size one, in its own frame.
+
+Primitives have closed forms; meshes are searched by their tree of boxes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense._jit import kernel
+from capsense._simd import doubles
+from capsense.scene.geometry_kernels import nearest_on_triangle
+from capsense.scene.mesh_shape import TriangleShape
+from capsense.scene.shapes import Shape, ShapeKind
+
+BOX, SPHERE, CAPSULE, CYLINDER, ELLIPSOID, MESH = (1 + int(kind) for kind in ShapeKind if kind < 6)
+"""Codes of ``BODY["outline"]``; 0 where a body has none."""
+_DEPTH = 64
+"""Levels of a tree of boxes, at most; its size grows by two with each."""
+_STEPS = 30
+"""Newton steps towards the nearest point of an ellipsoid, at most."""
+
+
+def write_outline(record: np.void, shape: Shape) -> None:
+    """Enter the outline of a shape in a record of ``BODY`` that stands for it at its size.
+
+    Arrays of the shape are pointed to, so that it has to be kept.
+    """
+    if isinstance(shape, TriangleShape):
+        boxes = shape._boxes
+        record["outline"], record["closed"] = MESH, shape.closed
+        record["triangles"] = boxes.triangles.ctypes.data
+        record["boxes"] = boxes.corners.ctypes.data
+        record["triangle_count"], record["levels"] = len(boxes.triangles), boxes.levels
+    elif int(shape.kind) < MESH - 1:
+        record["outline"], record["closed"] = 1 + int(shape.kind), True
+        record["sizes"] = shape.params
+
+
+@kernel
+def reach_down(body):
+    """How far the outline of a body reaches below its position [m]; for meshes, its bounding box."""
+    r, kind = body.rotation, body.outline
+    x, y, z = abs(r[2, 0]), abs(r[2, 1]), abs(r[2, 2])
+    a, b, c = body.sizes[0], body.sizes[1], body.sizes[2]
+    if kind == SPHERE:
+        return body.scale * a
+    if kind == CAPSULE:
+        return body.scale * (a + b * z)
+    if kind == CYLINDER:
+        return body.scale * (b * z + a * math.sqrt(max(0.0, 1.0 - z * z)))
+    if kind == ELLIPSOID:
+        return body.scale * math.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2)
+    if kind == BOX:
+        return body.scale * (a * x + b * y + c * z)
+    corners, out = doubles(body.boxes), 0.0
+    for i in range(3):
+        out -= min(r[2, i] * corners[i], r[2, i] * corners[3 + i])
+    return body.scale * out
+
+
+@kernel
+def nearest(body, x, y, z, out, room):
+    """Nearest point of a body's outline to a point of the sensor frame [m].
+
+    Args:
+        body: A record with an outline.
+        x, y, z: The point [m].
+        out: Filled with the nearest point [m], shape (3,).
+        room: Room to work in, shape (140,).
+
+    Returns:
+        The distance [m], negative inside, and whether the surface may have an edge there.
+    """
+    dx, dy, dz = x - body.position[0], y - body.position[1], z - body.position[2]
+    r, inverse = body.rotation, 1.0 / body.scale
+    px = inverse * (r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz)
+    py = inverse * (r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz)
+    pz = inverse * (r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz)
+    kind, a, b, c = body.outline, body.sizes[0], body.sizes[1], body.sizes[2]
+    edge = kind == BOX or kind == CYLINDER or kind == MESH
+    if kind == SPHERE or kind == CAPSULE:
+        along = min(max(pz, -b), b) if kind == CAPSULE else 0.0
+        off = math.sqrt(px * px + py * py + (pz - along) ** 2)
+        distance, ratio = off - a, a / max(off, 1e-12)
+        qx, qy, qz = ratio * px, ratio * py, along + ratio * (pz - along)
+    elif kind == BOX:
+        qx, qy, qz = min(max(px, -a), a), min(max(py, -b), b), min(max(pz, -c), c)
+        distance = math.sqrt((px - qx) ** 2 + (py - qy) ** 2 + (pz - qz) ** 2)
+        if distance == 0.0:
+            distance = max(abs(px) - a, max(abs(py) - b, abs(pz) - c))
+            if distance == abs(px) - a:
+                qx = math.copysign(a, px)
+            elif distance == abs(py) - b:
+                qy = math.copysign(b, py)
+            else:
+                qz = math.copysign(c, pz)
+    elif kind == CYLINDER:
+        off = math.sqrt(px * px + py * py)
+        ratio, qz = min(off, a) / max(off, 1e-12), min(max(pz, -b), b)
+        qx, qy = ratio * px, ratio * py
+        distance = math.sqrt(max(off - a, 0.0) ** 2 + (pz - qz) ** 2)
+        if distance == 0.0:
+            distance = max(off - a, abs(pz) - b)
+            if distance == off - a:
+                ratio = a / max(off, 1e-12)
+                qx, qy = ratio * px, ratio * py
+            else:
+                qz = math.copysign(b, pz)
+    elif kind == ELLIPSOID:
+        t = _ellipsoid(px, py, pz, a, b, c)
+        qx, qy, qz = px / (1.0 + t / (a * a)), py / (1.0 + t / (b * b)), pz / (1.0 + t / (c * c))
+        distance = math.sqrt((px - qx) ** 2 + (py - qy) ** 2 + (pz - qz) ** 2)
+        distance = math.copysign(distance, t)
+    else:
+        distance = _on_mesh(body, px, py, pz, out, room)
+        qx, qy, qz = out[0], out[1], out[2]
+    for i in range(3):
+        out[i] = body.position[i] + body.scale * (r[i, 0] * qx + r[i, 1] * qy + r[i, 2] * qz)
+    return body.scale * distance, edge
+
+
+@kernel
+def _ellipsoid(x, y, z, a, b, c):
+    """The t for which (p_i / (1 + t / r_i²)) lies on an ellipsoid of radii r: by Newton's method.
+
+    From where the sum is at least one it is convex and falls, so that steps never pass the root.
+    """
+    least = min(a, min(b, c))
+    p, q, r = a * a, b * b, c * c
+    # the largest of these lower bounds of the root, each from one term alone
+    t = max(a * abs(x) - p, max(b * abs(y) - q, c * abs(z) - r))
+    t = max(t, -least * least * (1.0 - 1e-6))
+    for _ in range(_STEPS):
+        u, v, w = a * x / (p + t), b * y / (q + t), c * z / (r + t)
+        value = u * u + v * v + w * w - 1.0
+        slope = -2.0 * (u * u / (p + t) + v * v / (q + t) + w * w / (r + t))
+        if slope == 0.0 or abs(value) < 1e-13:
+            break
+        t -= value / slope
+        t = max(t, -least * least * (1.0 - 1e-6))
+    return t
+
+
+@kernel
+def _on_mesh(body, x, y, z, out, room):
+    """Nearest point on the triangles of a mesh, in its own frame, filled in ``out``.
+
+    Returns:
+        The distance, negative inside of a closed mesh.
+    """
+    triangles, corners = doubles(body.triangles), doubles(body.boxes)
+    count, leaves = body.triangle_count, np.int64(1) << (body.levels - 1)
+    best, top = math.inf, 1
+    room[0], room[1] = 0.0, 0.0
+    while top > 0:
+        top -= 1
+        k = int(room[2 * top])
+        if room[2 * top + 1] >= best:
+            continue
+        if k >= leaves - 1:
+            q = k - leaves + 1
+            first = (q * count) >> (body.levels - 1)
+            last = ((q + 1) * count) >> (body.levels - 1)
+            for m in range(first, last):
+                found = nearest_on_triangle(triangles, 9 * m, x, y, z)
+                if found[0] < best:
+                    best, out[0], out[1], out[2] = found
+            continue
+        near, far = 2 * k + 1, 2 * k + 2
+        to_near = _box2(corners, 6 * near, x, y, z)
+        to_far = _box2(corners, 6 * far, x, y, z)
+        if to_far < to_near:
+            near, far, to_near, to_far = far, near, to_far, to_near
+        room[2 * top], room[2 * top + 1] = far, to_far
+        room[2 * top + 2], room[2 * top + 3] = near, to_near
+        top += 2
+    distance = math.sqrt(best)
+    if body.closed and _inside(triangles, corners, count, body.levels, x, y, z, room):
+        distance = -distance
+    return distance
+
+
+@kernel
+def _box2(corners, o, x, y, z):
+    """Squared distance to the box whose corners begin at a place of an array."""
+    dx = max(0.0, max(corners[o] - x, x - corners[o + 3]))
+    dy = max(0.0, max(corners[o + 1] - y, y - corners[o + 4]))
+    dz = max(0.0, max(corners[o + 2] - z, z - corners[o + 5]))
+    return dx * dx + dy * dy + dz * dz
+
+
+@kernel
+def _inside(triangles, corners, count, levels, x, y, z, room):
+    """Whether a closed mesh winds around a point, by its crossings of a ray along z."""
+    total, top, leaves = 0, 1, np.int64(1) << (levels - 1)
+    room[0] = 0.0
+    while top > 0:
+        top -= 1
+        k = int(room[top])
+        o = 6 * k
+        if (
+            z > corners[o + 5] or x < corners[o] or x > corners[o + 3]
+            or y < corners[o + 1] or y > corners[o + 4]
+        ):  # fmt: skip
+            continue
+        if k < leaves - 1:
+            room[top], room[top + 1] = 2 * k + 1, 2 * k + 2
+            top += 2
+            continue
+        q = k - leaves + 1
+        for m in range((q * count) >> (levels - 1), ((q + 1) * count) >> (levels - 1)):
+            total += _crossing(triangles, 9 * m, x, y, z)
+    return total != 0
+
+
+@kernel
+def _crossing(t, o, x, y, z):
+    """How a ray upwards from a point crosses a triangle: 1, -1 from behind, else 0."""
+    around = 0
+    for e in range(3):
+        f = (e + 1) % 3
+        upward = t[o + 3 * e + 1] <= y
+        if upward == (t[o + 3 * f + 1] <= y):
+            continue
+        a, b = (e, f) if upward else (f, e)
+        s = (y - t[o + 3 * a + 1]) / (t[o + 3 * b + 1] - t[o + 3 * a + 1])
+        if t[o + 3 * a] + s * (t[o + 3 * b] - t[o + 3 * a]) > x:
+            around += 1 if upward else -1
+    if around == 0:
+        return 0
+    ux, uy, uz = t[o + 3] - t[o], t[o + 4] - t[o + 1], t[o + 5] - t[o + 2]
+    vx, vy, vz = t[o + 6] - t[o], t[o + 7] - t[o + 1], t[o + 8] - t[o + 2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    height = t[o + 2]
+    if nz != 0.0:
+        height -= (nx * (x - t[o]) + ny * (y - t[o + 1])) / nz
+    low = min(t[o + 2], min(t[o + 5], t[o + 8]))
+    height = min(max(height, low), max(t[o + 2], max(t[o + 5], t[o + 8])))
+    return around if height > z else 0

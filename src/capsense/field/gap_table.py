@@ -1,0 +1,338 @@
+"""The first millimetres in front of a flat design: where its Green's function holds, and a table.
+
+A compact Green's function does not resolve distances smaller than the spacing of its charges. The
+boundary elements of the design do. A grounded plane is put in front of them, at some distances z,
+by a Schur complement of their factorised system. From its charges follow
+
+* the validity distance h0: the least z from which the energies of a small and of a large grounded
+  plate by the Green's function are those by the boundary elements;
+* T_ij(p, z): what the plane changes in the charge density on terminal i at its point p, with
+  terminal j, or the plane itself, at 1 V.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from shapely.geometry import box
+
+from capsense.constants import EPS0
+from capsense.design.geometry import Facet
+from capsense.design.model import Design
+from capsense.field import bem_kernels as kernels
+from capsense.field.bem_kernels import Panels
+from capsense.field.boundary import INTERFACE, BoundaryModel, BoundarySolution
+from capsense.field.panels import Grading, concatenate, cut_facet, make_panels
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+UNIT = 4 * math.pi * EPS0
+_HEIGHTS = 0.03 * 2.0 ** np.arange(8)
+"""Distances of the plane, over the clearance of the Green's function."""
+_OFF = 3.0
+"""Panels of the plane beside the sheets, over the size of those above them."""
+_VALIDITY = 1.0
+"""The validity distance, over the clearance of the Green's function."""
+_FLAT = 3e-3
+"""Sheets of a flat design rise by less than this, over their width."""
+_BLOCK = 6
+"""Cells lie in blocks of so many in a row."""
+_DEEP = 1e3
+"""Longest series distance, over the largest height."""
+_MARGIN = 8.0
+"""How far the plane reaches beyond the terminals, over the clearance."""
+_VALID = 0.01
+"""Relative error of the energy of a plate up to which the Green's function is valid."""
+_CELL = 0.6
+"""Size of the cells of the table, over the validity distance."""
+_CELLS = 16_000
+"""At most about so many cells."""
+_LEAST = 0.003
+"""Columns that change less than this part of a terminal's own are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class GapTable:
+    """What a grounded plane near a flat design changes in the charges of its terminals."""
+
+    validity: float
+    """Distance h0 from the design [m] from which the Green's function holds."""
+    top: float
+    """Height of the face of the design [m], from which distances count."""
+    heights: Array
+    """Distances z of the plane from the face [m], ascending, shape (k,)."""
+    points: NDArray[np.float32]
+    """Centres of the cells [m], shape (c, 3)."""
+    areas: NDArray[np.float32]
+    """Their areas [m²], shape (c,)."""
+    terminal: NDArray[np.int64]
+    """Terminal of each cell, -1 for grounded sheets, ascending, shape (c,)."""
+    series: NDArray[np.float32]
+    """Distance that adds to z in series [m]: (z + series) T is nearly constant, shape (c,)."""
+    columns: NDArray[np.int64]
+    """Terminals j of the columns of each terminal (the last row: of grounded sheets), -1 for none,
+    shape (t + 1, n)."""
+    change: NDArray[np.float32]
+    """(z + series) T_ij / eps0, with the plane at 1 V in the last column, shape (c, k, n + 1)."""
+    blocks: NDArray[np.int64]
+    """First cell of each block of neighbouring cells of one terminal, ascending, shape (q,)."""
+
+
+_PREFIX = "gap_"
+
+
+def to_arrays(table: GapTable) -> dict[str, NDArray[Any]]:
+    """All of a table, each name after ``gap_``; changes in half precision."""
+    out = {_PREFIX + name: np.asarray(value) for name, value in vars(table).items()}
+    change = np.asarray(table.change).transpose(2, 1, 0)  # packs better
+    return out | {_PREFIX + "change": change.astype(np.float16)}
+
+
+def from_arrays(arrays: Mapping[str, Any]) -> GapTable | None:
+    """Undo :func:`to_arrays`; None where there is no table."""
+    if _PREFIX + "change" not in arrays:
+        return None
+    values = {f.name: np.asarray(arrays[_PREFIX + f.name]) for f in fields(GapTable)}
+    change = np.ascontiguousarray(values["change"].transpose(2, 1, 0), np.float32)
+    numbers = {name: float(values[name]) for name in ("validity", "top")}
+    return GapTable(**{**values, **numbers, "change": change})  # type: ignore[arg-type]
+
+
+def is_flat(design: Design) -> bool:
+    """Whether all sheets of a design are flat and level."""
+    return all(
+        np.ptp(body.surface.bounds[:, 2]) <= _FLAT * np.ptp(body.surface.bounds[:, :2], axis=0).max()
+        for body in design.sheets
+    )
+
+
+def top_of(solution: BoundarySolution) -> float:
+    """Height of the face of a flat design [m]: its highest sheet or layer."""
+    design = solution.design
+    heights = [float(body.surface.bounds[1, 2]) for body in design.sheets]
+    return max([*heights, *(float(layer.upper[2]) for layer in design.layers)])
+
+
+def plane_panels(solution: BoundarySolution, reach: float) -> Panels:
+    """Panels of a horizontal plane at height 0 that follow the outlines of the sheets below it.
+
+    Above the electrodes they are the electrodes' own, so that no panel lies across a rim.
+    ``reach`` is how far it goes beyond the electrodes [m].
+    """
+    design = solution.design
+    corners = np.array([e.surface.bounds for e in design.electrodes])
+    low, high = corners[:, 0].min(axis=0) - reach, corners[:, 1].max(axis=0) + reach
+    low = np.maximum(low, design.domain.lower + 1e-3 * (design.domain.upper - design.domain.lower))
+    high = np.minimum(high, design.domain.upper - 1e-3 * (design.domain.upper - design.domain.lower))
+    whole = rest = box(low[0], low[1], high[0], high[1])
+    flat = Facet(whole, np.zeros(3), np.eye(3))
+    sheets = sorted(solution.model.sheets, key=lambda sheet: -sheet[0][0].origin[2])
+    rims = np.concatenate([body.surface.rims for body in design.sheets]) * [1.0, 1.0, 0.0]
+    parts: list[Panels] = []
+
+    def add(region: shapely.Geometry, grading: Grading) -> None:
+        for piece in shapely.get_parts(region):
+            if piece.geom_type == "Polygon" and piece.area > 1e-6 * reach**2:
+                facet = Facet(piece, flat.origin, flat.axes)
+                pieces = cut_facet(facet, rims, grading)
+                if pieces:
+                    parts.append(make_panels(facet, pieces))
+
+    for (facet, _), grading in sheets:
+        outline = shapely.transform(facet.polygon, lambda uv, f=facet: f.to_sensor(uv)[:, :2])
+        if not rest.intersects(outline):
+            continue
+        add(rest.intersection(outline), grading)
+        rest = rest.difference(outline)
+    add(rest, replace(grading, edge=_OFF * grading.edge, smallest=_OFF * grading.smallest, largest=_OFF * grading.largest))
+    return concatenate(parts)
+
+
+def moved(panels: Panels, height: float) -> Panels:
+    """The same panels higher by ``height`` [m]."""
+    up = np.array([0.0, 0.0, height])
+    return panels._replace(
+        edges=panels.edges + up, centers=panels.centers + up, quad=panels.quad + up
+    )
+
+
+def _runs(wanted: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Where runs of true values begin and end."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
+
+
+class PlaneResponse:
+    """The boundary elements of a design with a plane in front of it at some height.
+
+    Args:
+        solution: The factorised boundary elements of the design, of n panels.
+        plane: Panels of the plane at height 0, m of them.
+        height: Height of the plane [m].
+    """
+
+    def __init__(self, solution: BoundarySolution, plane: Panels, height: float) -> None:
+        self.solution, self.plane = solution, moved(plane, height)
+        model = solution.model
+        n, m = model.panels.size, plane.size
+        self.both = concatenate([model.panels, self.plane])
+        kind = np.concatenate([solution.kind, np.zeros(m, np.int64)])
+        contrast = np.concatenate([solution.contrast, np.zeros(m)])
+        args = kind, contrast, model.floor, self.both
+        self.onto = kernels.system_block(*args, (n, n + m), (0, n))
+        """Mean potential on the plane of the design's charges, (m, n)."""
+        self.own = kernels.system_block(*args, (n, n + m), (n, n + m))
+        """Mean potential on the plane of its own charges without the design, (m, m)."""
+        # means of potentials are mutual; fluxes into interfaces are not
+        back = np.ascontiguousarray((self.onto * self.plane.areas[:, None]).T)
+        back /= model.panels.areas[:, None]
+        for first, last in _runs(solution.kind > 0):
+            back[first:last] = kernels.system_block(*args, (first, last), (n, n + m))
+        self.answer = solution.solve(back)
+        """Charges on the grounded design of those on the plane, with the opposite sign, (n, m)."""
+        self.schur = self.own - self.onto @ self.answer
+
+    def charges(self, densities: Array) -> Array:
+        """Charge densities on the plane [C/m²], (m, t + 1), for those of the design without it.
+
+        Args:
+            densities: With each of t terminals at 1 V [C/m²], shape (n, t). In the last column of
+                the result, the plane is at 1 V and they are grounded.
+        """
+        sides = np.concatenate([-self.onto @ densities, np.full((len(self.own), 1), UNIT)], axis=1)
+        return np.linalg.solve(self.schur, sides)
+
+
+def free_change(response: PlaneResponse, on_plane: Array) -> Array:
+    """What charges on the plane change in the free charge density on the design, (n, t + 1)."""
+    model = response.solution.model
+    total = -response.answer @ on_plane
+    out = 0.5 * (model.eps_front + model.eps_back)[:, None] * total
+    jump = model.eps_front - model.eps_back
+    rows = np.flatnonzero((model.owner != INTERFACE) & (np.abs(jump) > 1e-12))
+    if len(rows):
+        gradient = kernels.normal_gradient_matrix(rows, model.floor, response.both)
+        out[rows] -= jump[rows, None] * (gradient @ np.concatenate([total, on_plane])) / (4 * math.pi)
+    return out
+
+
+def build_gap_table(
+    solution: BoundarySolution,
+    densities: Array,
+    unit: float,
+    progress: Callable[[str], None] = lambda _: None,
+) -> GapTable:
+    """Work out what a plane near a flat design changes.
+
+    Args:
+        solution: The factorised boundary elements of the design.
+        densities: With each of its t terminals at 1 V [C/m²], shape (n, t).
+        unit: Smallest distance that its Green's function was fitted at [m].
+        progress: Called with what is being done.
+    """
+    model = solution.model
+    validity = _VALIDITY * unit
+    plane, top, heights = plane_panels(solution, _MARGIN * unit), top_of(solution), unit * _HEIGHTS
+    changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
+    for k, height in enumerate(heights):
+        progress(f"response to a plane: {k + 1} of {len(heights)}")
+        response = PlaneResponse(solution, plane, top + height)
+        free = free_change(response, response.charges(densities))
+        changes[k] = free[: model.sheet_panels]
+    return _cells_of(model, changes, heights, top, validity)
+
+
+def _cells_of(
+    model: BoundaryModel, changes: Array, heights: Array, top: float, validity: float
+) -> GapTable:
+    """Gather panels in cells of the table; ``changes`` [C/m²] has shape (k, p, t + 1)."""
+    areas = model.panels.areas[: model.sheet_panels]
+    size = max(_CELL * validity, math.sqrt(areas[model.owner[: len(areas)] >= 0].sum() / _CELLS))
+    panel, points, area = _samples(model.panels, model.sheet_panels, 0.5 * size)
+    owner = model.owner[panel]
+    place = np.floor((points - points.min(axis=0)) / size + 1e-6).astype(np.int64)
+    key = np.column_stack([owner % (model.n_terminals + 1), place // _BLOCK, place])
+    _, first, cell = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    _, blocks = np.unique(key[first, :4], axis=0, return_index=True)
+    cell = cell.ravel()
+    total = np.bincount(cell, area)
+    centers = np.stack([np.bincount(cell, area * x) / total for x in points.T], axis=1)
+    gather = csr_array((area / total[cell], (cell, panel)), (len(total), len(areas)))
+    k, _, columns = changes.shape
+    density = gather @ np.ascontiguousarray(changes.transpose(1, 0, 2)).reshape(len(areas), -1)
+    density = density.reshape(len(total), k, columns) / EPS0
+    terminal = owner[first]
+    chosen = _columns_of(density, terminal, total, model.n_terminals)
+    take = np.concatenate([chosen, np.full((len(chosen), 1), columns - 1)], axis=1)[terminal]
+    kept = np.take_along_axis(density, np.maximum(take, 0)[:, None], axis=2)
+    kept = np.where(take[:, None] >= 0, kept, 0.0)
+    own = np.where(terminal >= 0, terminal, columns - 1)
+    near = np.abs(density[np.arange(len(total)), :2, own])
+    fall = np.maximum(near[:, 0] - near[:, 1], 1e-6 * near[:, 0] + 1e-300)
+    series = (near[:, 1] * heights[1] - near[:, 0] * heights[0]) / fall
+    series = np.clip(series, 0.0, _DEEP * heights[-1])
+    scaled = kept * (heights[None, :] + series[:, None])[..., None]
+    return GapTable(
+        validity, top, heights, centers.astype(np.float32), total.astype(np.float32),
+        terminal, series.astype(np.float32), chosen,
+        scaled.astype(np.float16).astype(np.float32), np.sort(blocks),
+    )  # fmt: skip
+
+
+def _columns_of(density: Array, terminal: Ints, areas: Array, terminals: int) -> Ints:
+    """The terminals j whose T_ij count, -1 for none, shape (terminals + 1, n)."""
+    worth = np.zeros((terminals + 1, terminals))
+    for i in range(-1, terminals):
+        some = terminal == i
+        moved = np.abs(np.einsum("c,ckj->kj", areas[some], density[some][..., :-1]))
+        worth[i] = moved.max(axis=0, initial=0.0)
+    worth[:-1] = np.maximum(worth[:-1], worth[:-1].T)
+    worth[-1] = 0.0  # charge on grounded sheets is not read
+    own = np.diag(worth[:-1]).max()
+    wanted = worth > _LEAST * own
+    n = max(1, int(wanted.sum(axis=1).max()))
+    best = np.argsort(-worth, axis=1, kind="stable")[:, :n]
+    return np.where(np.take_along_axis(wanted, best, axis=1), best, -1)
+
+
+def _samples(panels: Panels, count: int, size: float) -> tuple[Ints, Array, Array]:
+    """Points no farther apart than ``size`` [m] all over the first panels, and their areas.
+
+    Returns:
+        Panel, position [m] and area [m²] of each, shapes (s,), (s, 3), (s,).
+    """
+    of, points, areas = [], [], []
+    for p in range(count):
+        ends = panels.edges[panels.first[p] : panels.first[p + 1]]
+        corners = np.concatenate([np.repeat(panels.centers[p][None, None], len(ends), 0), ends], 1)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = 0.5 * cross @ panels.normals[p]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        for triangle, a, longest in zip(corners, area, sides.max(axis=1), strict=True):
+            n = max(1, math.ceil(longest / size))
+            points.append(_split_points(n) @ triangle)
+            areas.append(np.full(n * n, a / (n * n)))
+            of.append(np.full(n * n, p))
+    return np.concatenate(of), np.concatenate(points), np.concatenate(areas)
+
+
+@cache
+def _split_points(n: int) -> Array:
+    """Barycentric coordinates of the centroids of n² equal parts of a triangle, (n², 3)."""
+    out = []
+    for i in range(n):
+        for j in range(n - i):
+            k = n - 1 - i - j
+            out.append([i + 1 / 3, j + 1 / 3, k + 1 / 3])
+            if k > 0:
+                out.append([i + 2 / 3, j + 2 / 3, k - 1 / 3])
+    return np.array(out) / n

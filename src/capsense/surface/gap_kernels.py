@@ -1,0 +1,242 @@
+"""The step, compiled: what bodies in the first millimetres in front of a flat design add.
+
+Bodies are solved for where the Green's function is valid: points nearer than twice the validity
+distance h0 are lifted, a distance z to h0 + z² / (4 h0). What that takes away is local. Each cell p
+of the electrodes adds T(p, l) - T(p, l_g), where T is the table of the design's own boundary
+elements (:mod:`capsense.field.gap_table`), l the length of the field line from p to the body, and
+l_g that to the lifted body.
+
+Conductors near the design that are not at ground are nodes of a network, like terminals: they are
+solved for at ground and at 1 V, the local changes are added, and the nodes are eliminated.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from capsense._jit import compiled, kernel
+from capsense.elements.outline import nearest, reach_down
+from capsense.field.green_kernels import lift, smooth
+
+REACH = 5.0, 8.0
+"""What is farther than this from a cell, over h0, comes to count for nothing, and does not."""
+LEAST = 0.025
+"""Least length of a field line, over h0: bodies do not come nearer than that."""
+_STEP = 1e-3
+"""Step of differences, over h0."""
+
+
+@compiled
+def near_bodies(bodies, green):
+    """Conductors with an outline within twice h0 of a flat design, (b,).
+
+    Not those of dielectrics, nor bodies far to the side.
+    """
+    out, gap = np.zeros(bodies.shape[0], np.bool_), green.gap
+    if gap.areas.shape[0] == 0:
+        return out
+    for b in range(bodies.shape[0]):
+        body = bodies[b]
+        if body.outline != 0 and body.softness == 0.0:
+            out[b] = body.position[2] - reach_down(body) < gap.top + 2.0 * gap.validity
+    return out
+
+
+@compiled
+def local_change(bodies, near, node, green, matrix):
+    """Add the local change of near bodies to the matrix of terminals and nodes [m], 4π eps0 = 1.
+
+    Args:
+        bodies: Records of :data:`~capsense.elements.rigid.BODY`, shape (b,).
+        near: Which are near, shape (b,).
+        node: Row of the matrix of each body that is a node, else -1, shape (b,).
+        green: Green's function of the design.
+        matrix: Added to, shape (t, t).
+    """
+    gap = green.gap
+    chosen, count = np.empty(bodies.shape[0], np.int64), 0
+    point, room, moved = np.empty(3), np.empty(140), np.empty((1, 3))
+    reach = REACH[1] * gap.validity
+    for k in range(gap.block_radius.shape[0]):
+        x, y, z = gap.block_center[k, 0], gap.block_center[k, 1], gap.top
+        count = 0
+        for b in range(bodies.shape[0]):
+            if near[b]:
+                off, _ = nearest(bodies[b], x, y, z, point, room)
+                if off < reach + gap.block_radius[k]:
+                    chosen[count] = b
+                    count += 1
+        if count == 0:
+            continue
+        for c in range(gap.blocks[k], gap.blocks[k + 1]):
+            _add_cell(bodies, chosen, count, node, green, c, (point, room, moved), matrix)
+
+
+@kernel
+def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
+    """Add what one cell changes."""
+    gap, (point, room, moved) = green.gap, work
+    x, y, z = float(gap.points[c, 0]), float(gap.points[c, 1]), gap.top
+    best, lifted, body = math.inf, math.inf, -1
+    for k in range(count):
+        off, edge = nearest(bodies[chosen[k]], x, y, z, point, room)
+        true, high = lengths(off, edge, point, x, y, green, moved)
+        if true < best:
+            best, lifted, body = true, high, chosen[k]
+    h0 = gap.validity
+    weight = 1.0 - smooth((best / h0 - REACH[0]) / (REACH[1] - REACH[0]))
+    if lifted <= best or weight <= 0.0:
+        return
+    i, n, depth = gap.terminal[c], gap.change.shape[2] - 1, float(gap.series[c])
+    weight *= float(gap.areas[c]) / (4.0 * math.pi)
+    k, p = _place(best, gap)
+    m, q = _place(lifted, gap)
+    a, b = weight / (best + depth), weight / (lifted + depth)
+    for col in range(n + 1):
+        one = a * ((1.0 - p) * float(gap.change[c, k, col]) + p * float(gap.change[c, k + 1, col]))
+        two = b * ((1.0 - q) * float(gap.change[c, m, col]) + q * float(gap.change[c, m + 1, col]))
+        value = one - two
+        if col < n:
+            j = gap.columns[i, col]  # the last row, of index -1, is that of grounded sheets
+            if i >= 0 and j >= 0:
+                matrix[i, j] += 0.5 * value
+                matrix[j, i] += 0.5 * value
+        elif node[body] >= 0:
+            j = node[body]
+            if i >= 0:
+                matrix[i, j] += value
+                matrix[j, i] += value
+            matrix[j, j] -= value
+
+
+@kernel
+def _place(length, gap):
+    """Place of a length among the heights of the table, and the share of the next one."""
+    last = gap.heights.shape[0] - 2
+    x = math.log(length / gap.heights[0]) / gap.log_ratio
+    k = min(max(int(math.floor(x)), 0), last)
+    return k, min(max(x - k, 0.0), 1.0)
+
+
+@kernel
+def lengths(off, edge, point, x, y, green, moved):
+    """Lengths of the field lines from (x, y) on the face to a body, and to the lifted body [m].
+
+    Args:
+        off: Distance of the body from there [m], negative inside.
+        edge: Whether the body may have an edge at its nearest point.
+        point: Its nearest point, shape (3,).
+        x, y: The place [m].
+        green: Green's function of the design.
+        moved: Room to work in, shape (1, 3).
+    """
+    gap = green.gap
+    h0, least = gap.validity, LEAST * gap.validity
+    if off <= 0.0:
+        return least, h0
+    dx, dy, dz = point[0] - x, point[1] - y, point[2] - gap.top
+    across, beside = math.sqrt(dx * dx + dy * dy), 0.0
+    true = _arc(math.sqrt(across * across + dz * dz), across, dz)
+    for i in range(2):
+        out = max(green.box[0, i] - point[i], point[i] - green.box[1, i], 0.0)
+        beside += out * out
+    height = max(dz, 0.0)
+    if beside + height * height >= 4.0 * h0 * h0:
+        return true, true
+    moved[0, 0], moved[0, 1], moved[0, 2] = point[0], point[1], max(point[2], gap.top)
+    lift(moved, h0, green.box)
+    ex, ey, ez = moved[0, 0] - x, moved[0, 1] - y, moved[0, 2] - gap.top
+    wide = math.sqrt(ex * ex + ey * ey)
+    lifted = _arc(math.sqrt(wide * wide + ez * ez), wide, ez)
+    if not edge:  # the lifted surface is flatter, so that another of its points is nearer
+        slope, up = across * height / (2.0 * h0), max(dz, 0.0)
+        size = math.sqrt(slope * slope + up * up)
+        if size > 0.0:
+            sine, cosine = slope / size, up / size
+            flat = ez * cosine + wide * sine
+            lower = _arc(flat, flat * sine, flat * cosine)
+            share = smooth(1.0 - math.sqrt(beside) / h0)
+            lifted += share * (min(lower, lifted) - lifted)
+    if true < 2.0 * least:
+        true = least + true * true / (4.0 * least)
+    return true, max(lifted, true)
+
+
+@kernel
+def _arc(distance, across, up):
+    """Length of an arc that leaves the face at a right angle, over a distance."""
+    angle = min(math.atan2(across, up), 2.5)
+    return distance * (angle / math.sin(angle) if angle > 1e-4 else 1.0)
+
+
+@compiled
+def local_slope(bodies, near, node, green, size, weights, out):
+    """Add how the local change, reduced by weights, changes with the poses of near bodies.
+
+    By central differences, of the table's own precision.
+
+    Args:
+        bodies, near, node, green: As :func:`local_change` takes them.
+        size: Rows of its matrix, t.
+        weights: Potentials of all rows for each of m terminals at 1 V, shape (t, m).
+        out: Added to, shape (b, m, m, 6).
+    """
+    step = _STEP * green.gap.validity
+    lone = np.zeros(bodies.shape[0], np.bool_)
+    for b in range(bodies.shape[0]):
+        lone[b] = near[b]
+    both = np.empty((2, size, size))
+    for b in range(bodies.shape[0]):
+        if not near[b]:
+            continue
+        arm = max(1e-9, _radius(bodies[b]))
+        place, turn = np.empty(3), np.empty((3, 3))
+        for i in range(3):
+            place[i] = bodies[b].position[i]
+            for j in range(3):
+                turn[i, j] = bodies[b].rotation[i, j]
+        for r in range(6):
+            delta = step if r < 3 else step / arm
+            for side in range(2):
+                change = delta * (1.0 - 2.0 * side)
+                if r < 3:
+                    bodies[b].position[r] = place[r] + change
+                else:
+                    _turn(bodies[b].rotation, turn, r - 3, change)
+                both[side, :, :] = 0.0
+                local_change(bodies, lone, node, green, both[side])
+                for i in range(3):
+                    bodies[b].position[i] = place[i]
+                    for j in range(3):
+                        bodies[b].rotation[i, j] = turn[i, j]
+            for i in range(weights.shape[1]):
+                for j in range(weights.shape[1]):
+                    value = 0.0
+                    for k in range(size):
+                        for m in range(size):
+                            value += (
+                                weights[k, i] * (both[0, k, m] - both[1, k, m]) * weights[m, j]
+                            )
+                    out[b, i, j, r] += value / (2.0 * delta)
+
+
+@kernel
+def _radius(body):
+    """About the radius of a body [m]."""
+    if body.sizes[0] == 0.0:
+        return 10.0 * body.scale * 1e-2
+    a, b, c = body.sizes[0], body.sizes[1], body.sizes[2]
+    return body.scale * math.sqrt(a * a + b * b + c * c)
+
+
+@kernel
+def _turn(out, turn, axis, angle):
+    """Turn a rotation matrix about an axis of the sensor frame by an angle [rad]."""
+    c, s = math.cos(angle), math.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    for k in range(3):
+        out[i, k] = c * turn[i, k] - s * turn[j, k]
+        out[j, k] = s * turn[i, k] + c * turn[j, k]
+        out[axis, k] = turn[axis, k]
