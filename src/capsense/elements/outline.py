@@ -69,11 +69,13 @@ def nearest(body, x, y, z, out, room):
     Args:
         body: A record with an outline.
         x, y, z: The point [m].
-        out: Filled with the nearest point [m], shape (3,).
+        out: Filled with the nearest point [m] and up to two normals of faces that meet there,
+            outwards, shape (9,).
         room: Room to work in, shape (140,).
 
     Returns:
-        The distance [m], negative inside, and whether the surface may have an edge there.
+        The distance [m], negative inside; and how many normals there are: one on a face, two at an
+        edge, none at corners and where it is not known.
     """
     dx, dy, dz = x - body.position[0], y - body.position[1], z - body.position[2]
     r, inverse = body.rotation, 1.0 / body.scale
@@ -81,7 +83,8 @@ def nearest(body, x, y, z, out, room):
     py = inverse * (r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz)
     pz = inverse * (r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz)
     kind, a, b, c = body.outline, body.sizes[0], body.sizes[1], body.sizes[2]
-    edge = kind == BOX or kind == CYLINDER or kind == MESH
+    faces = 1
+    ux = uy = uz = vx = vy = vz = 0.0  # normals of the faces in the body's own frame
     if kind == SPHERE or kind == CAPSULE:
         along = min(max(pz, -b), b) if kind == CAPSULE else 0.0
         off = math.sqrt(px * px + py * py + (pz - along) ** 2)
@@ -98,6 +101,21 @@ def nearest(body, x, y, z, out, room):
                 qy = math.copysign(b, py)
             else:
                 qz = math.copysign(c, pz)
+        faces = 0
+        if qx != px:
+            faces, ux = 1, math.copysign(1.0, px)
+        if qy != py:
+            if faces == 1:
+                vy = math.copysign(1.0, py)
+            else:
+                uy = math.copysign(1.0, py)
+            faces += 1
+        if qz != pz:
+            if faces == 1:
+                vz = math.copysign(1.0, pz)
+            else:
+                uz = math.copysign(1.0, pz)
+            faces += 1
     elif kind == CYLINDER:
         off = math.sqrt(px * px + py * py)
         ratio, qz = min(off, a) / max(off, 1e-12), min(max(pz, -b), b)
@@ -110,6 +128,15 @@ def nearest(body, x, y, z, out, room):
                 qx, qy = ratio * px, ratio * py
             else:
                 qz = math.copysign(b, pz)
+        faces = 0
+        if qz != pz:
+            faces, uz = 1, math.copysign(1.0, pz)
+        if off > a:
+            if faces == 1:
+                vx, vy = px / off, py / off
+            else:
+                ux, uy = px / off, py / off
+            faces += 1
     elif kind == ELLIPSOID:
         t = _ellipsoid(px, py, pz, a, b, c)
         qx, qy, qz = px / (1.0 + t / (a * a)), py / (1.0 + t / (b * b)), pz / (1.0 + t / (c * c))
@@ -118,9 +145,17 @@ def nearest(body, x, y, z, out, room):
     else:
         distance = _on_mesh(body, px, py, pz, out, room)
         qx, qy, qz = out[0], out[1], out[2]
+        faces = int(out[3])
+    if kind != BOX and kind != CYLINDER and faces == 1:
+        size = math.copysign(max(abs(distance), 1e-12), distance)
+        ux, uy, uz = (px - qx) / size, (py - qy) / size, (pz - qz) / size
+    if faces > 2:
+        faces = 0
     for i in range(3):
         out[i] = body.position[i] + body.scale * (r[i, 0] * qx + r[i, 1] * qy + r[i, 2] * qz)
-    return body.scale * distance, edge
+        out[3 + i] = r[i, 0] * ux + r[i, 1] * uy + r[i, 2] * uz
+        out[6 + i] = r[i, 0] * vx + r[i, 1] * vy + r[i, 2] * vz
+    return body.scale * distance, faces
 
 
 @kernel
@@ -168,7 +203,8 @@ def _on_mesh(body, x, y, z, out, room):
             for m in range(first, last):
                 found = nearest_on_triangle(triangles, 9 * m, x, y, z)
                 if found[0] < best:
-                    best, out[0], out[1], out[2] = found
+                    best, out[0], out[1], out[2], inner = found
+                    out[3] = 1.0 if inner else 0.0
             continue
         near, far = 2 * k + 1, 2 * k + 2
         to_near = _box2(corners, 6 * near, x, y, z)

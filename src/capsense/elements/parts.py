@@ -24,8 +24,8 @@ from capsense.scene.shapes import Shape, ShapeKind
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_MOST = 3
-"""Panels are halved at most so often: to eight parts."""
+_MOST = 5
+"""Panels are halved at most so often: to 32 parts."""
 
 
 @dataclass(frozen=True, eq=False)

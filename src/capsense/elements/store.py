@@ -145,7 +145,7 @@ def functions_of(
     if isinstance(shape, SurfaceMesh):
         sheet = 0.0 if shape.closed else shape.rest.thickness
         return ChangingBody(*mesh_pieces(shape), sheet=sheet), 1.0
-    if largest is not None and (pieces := wide_pieces(shape, conducting, largest)):
+    if largest is not None and (pieces := wide_pieces(shape, conducting, largest, finest)):
         return in_pieces(shape, pieces, conducting)
     if not conducting:
         finest = None

@@ -83,6 +83,8 @@ class _Wide(NamedTuple):
     """Surface that counts [m²], infinite where the shape is wide whatever is in front of it …"""
     dielectric: float
     """… and as a dielectric; 0 where it cannot be a wide one."""
+    area: float
+    """Its surface, roughly [m²]."""
     pieces: int
     """About how many pieces it is cut into."""
     coarse: int
@@ -108,7 +110,7 @@ def _wide(shape: Shape) -> _Wide:
         solid = thickness >= width * (_THIN if width < _BROAD else _THINNER)
         thick = thickness >= _THICK * math.sqrt(area / _COARSE)
         coarse = _COARSE if thick and shape.kind in _EDGELESS else _FINER
-        held = _Wide(conductor, filled if solid else 0.0, pieces, coarse)
+        held = _Wide(conductor, filled if solid else 0.0, area, pieces, coarse)
         shape.__dict__["_as_wide"] = held
     return held
 
@@ -122,7 +124,9 @@ def _mean_thickness(mesh: TriMesh) -> float:
     return 2.0 * abs(enclosed_volume(mesh.vertices, mesh.faces)) / area
 
 
-def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
+def wide_pieces(
+    shape: Shape, conducting: bool, largest: float, finest: float | None = None
+) -> int:
     """About how many pieces a shape is cut into; 0 where it is neither wide nor a foil.
 
     Nor are dielectrics that are very thin for their size, or open.
@@ -131,10 +135,16 @@ def wide_pieces(shape: Shape, conducting: bool, largest: float) -> int:
         shape: A primitive or a mesh.
         conducting: Whether it holds no field inside.
         largest: Shapes of so much surface or more [m²] are wide too; not all of long ones counts.
+        finest: Edges of the pieces of conductors [m], if smaller than usual.
     """
     as_wide = _wide(shape)
     enough = (as_wide.conductor if conducting else as_wide.dielectric) >= largest
-    return as_wide.pieces if enough else 0
+    if not enough:
+        return 0
+    if finest is None or not conducting or finest >= _PIECE:
+        return as_wide.pieces
+    doublings = math.ceil(math.log2(max(as_wide.area / finest**2 / _FEWEST, 1.0)))
+    return _FEWEST * 2 ** min(doublings, _DOUBLINGS + 1)
 
 
 def wide_body(shape: Shape, pieces: int, conducting: bool) -> WideBody:

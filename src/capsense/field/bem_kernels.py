@@ -324,16 +324,23 @@ def _mean_potential(p, i, j, floor):
 
 def normal_gradient_matrix(rows: NDArray[np.int64], floor: float, panels: Panels) -> Array:
     """Return n · ∇ of each panel's unit potential, averaged over the panels ``rows``."""
-    out = np.empty((len(rows), len(panels.centers)))
-    return filled(_fill_normal_gradients, out, rows, floor, panels)
+    return normal_gradient_block(rows, floor, panels, 0)
+
+
+def normal_gradient_block(
+    rows: NDArray[np.int64], floor: float, panels: Panels, first: int
+) -> Array:
+    """The same of the panels from ``first`` on."""
+    out = np.empty((len(rows), len(panels.centers) - first))
+    return filled(_fill_normal_gradients, out, rows, first, floor, panels)
 
 
 @compiled
-def _fill_normal_gradients(start, stop, rows, floor, p, out):
+def _fill_normal_gradients(start, stop, rows, first, floor, p, out):
     grad = np.empty(3)
     for k in range(start, stop):
         for j in range(out.shape[1]):
-            out[k, j] = _mean_normal_gradient(p, rows[k], j, floor, grad)
+            out[k, j] = _mean_normal_gradient(p, rows[k], first + j, floor, grad)
 
 
 def flux_matrix(points: Array, rows: NDArray[np.int64], floor: float, panels: Panels) -> Array:

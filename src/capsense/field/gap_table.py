@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 UNIT = 4 * math.pi * EPS0
-_HEIGHTS = 0.03 * 2.0 ** np.arange(8)
+_HEIGHTS = 0.03 * 2.1 ** np.arange(7)
 """Distances of the plane, over the clearance of the Green's function."""
 _OFF = 3.0
 """Panels of the plane beside the sheets, over the size of those above them."""
@@ -46,7 +46,7 @@ _FLAT = 3e-3
 """Sheets of a flat design rise by less than this, over their width."""
 _BLOCK = 6
 """Cells lie in blocks of so many in a row."""
-_DEEP = 1e3
+_DEEP = 3.0
 """Longest series distance, over the largest height."""
 _MARGIN = 8.0
 """How far the plane reaches beyond the terminals, over the clearance."""
@@ -171,58 +171,76 @@ def _runs(wanted: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
 
 
+_NO_FLOOR = 1e6
+"""Depth of a floor whose images count for nothing, over the width of the plane."""
+
+
 class PlaneResponse:
-    """The boundary elements of a design with a plane in front of it at some height.
+    """The boundary elements of a design with a plane in front of it.
 
     Args:
         solution: The factorised boundary elements of the design, of n panels.
         plane: Panels of the plane at height 0, m of them.
-        height: Height of the plane [m].
     """
 
-    def __init__(self, solution: BoundarySolution, plane: Panels, height: float) -> None:
-        self.solution, self.plane = solution, moved(plane, height)
-        model = solution.model
-        n, m = model.panels.size, plane.size
-        self.both = concatenate([model.panels, self.plane])
-        kind = np.concatenate([solution.kind, np.zeros(m, np.int64)])
-        contrast = np.concatenate([solution.contrast, np.zeros(m)])
-        args = kind, contrast, model.floor, self.both
-        self.onto = kernels.system_block(*args, (n, n + m), (0, n))
-        """Mean potential on the plane of the design's charges, (m, n)."""
-        self.own = kernels.system_block(*args, (n, n + m), (n, n + m))
-        """Mean potential on the plane of its own charges without the design, (m, m)."""
-        # means of potentials are mutual; fluxes into interfaces are not
-        back = np.ascontiguousarray((self.onto * self.plane.areas[:, None]).T)
-        back /= model.panels.areas[:, None]
-        for first, last in _runs(solution.kind > 0):
-            back[first:last] = kernels.system_block(*args, (first, last), (n, n + m))
-        self.answer = solution.solve(back)
-        """Charges on the grounded design of those on the plane, with the opposite sign, (n, m)."""
-        self.schur = self.own - self.onto @ self.answer
+    def __init__(self, solution: BoundarySolution, plane: Panels) -> None:
+        self.solution, self.plane, model = solution, plane, solution.model
+        below = -_NO_FLOOR * float(np.ptp(plane.centers[:, :2], axis=0).max())
+        none = np.zeros(2 * plane.size)
+        self._own = kernels.system_block(
+            none.astype(np.int64), none, below, plane, (0, plane.size), (0, plane.size)
+        )
+        """Mean potential on the plane of its own charges without anything else, (m, m)."""
+        jump = model.eps_front - model.eps_back
+        self._rows = np.flatnonzero((model.owner != INTERFACE) & (np.abs(jump) > 1e-12))
+        """Panels of sheets between two media."""
+        self._gradient = kernels.normal_gradient_matrix(self._rows, model.floor, model.panels)
 
-    def charges(self, densities: Array) -> Array:
-        """Charge densities on the plane [C/m²], (m, t + 1), for those of the design without it.
+    def at(self, height: float, densities: Array) -> Array:
+        """What the plane changes in the free charge density on the design [C/m²], (n, t + 1).
 
         Args:
-            densities: With each of t terminals at 1 V [C/m²], shape (n, t). In the last column of
-                the result, the plane is at 1 V and they are grounded.
+            height: Height of the plane [m].
+            densities: Densities of the design without it, with each of t terminals at 1 V [C/m²],
+                shape (n, t). In the last column of the result, the plane is at 1 V instead.
         """
-        sides = np.concatenate([-self.onto @ densities, np.full((len(self.own), 1), UNIT)], axis=1)
-        return np.linalg.solve(self.schur, sides)
+        solution, model = self.solution, self.solution.model
+        plane, n, m = moved(self.plane, height), model.panels.size, self.plane.size
+        both = concatenate([model.panels, plane])
+        kind = np.concatenate([solution.kind, np.zeros(m, np.int64)])
+        contrast = np.concatenate([solution.contrast, np.zeros(m)])
+        blocks = partial(kernels.system_block, kind, contrast, model.floor, both)
+        onto = blocks((n, n + m), (0, n))  # potentials on the plane of the design's charges
+        back = np.ascontiguousarray((onto * plane.areas[:, None]).T) / model.panels.areas[:, None]
+        for first, last in _runs(solution.kind > 0):  # fluxes are not mutual, as potentials are
+            back[first:last] = blocks((first, last), (n, n + m))
+        answer = solution.solve(back)
+        sides = np.concatenate([-onto @ densities, np.full((m, 1), UNIT)], axis=1)
+        on_plane = np.linalg.solve(self._own - self._images(plane) - onto @ answer, sides)
+        total = -answer @ on_plane
+        out = 0.5 * (model.eps_front + model.eps_back)[:, None] * total
+        if len(self._rows):
+            jump = (model.eps_front - model.eps_back)[self._rows, None]
+            gradient = self._gradient @ total + kernels.normal_gradient_block(
+                self._rows, model.floor, both, n
+            ) @ on_plane
+            out[self._rows] -= jump * gradient / (4 * math.pi)
+        return out
 
-
-def free_change(response: PlaneResponse, on_plane: Array) -> Array:
-    """What charges on the plane change in the free charge density on the design, (n, t + 1)."""
-    model = response.solution.model
-    total = -response.answer @ on_plane
-    out = 0.5 * (model.eps_front + model.eps_back)[:, None] * total
-    jump = model.eps_front - model.eps_back
-    rows = np.flatnonzero((model.owner != INTERFACE) & (np.abs(jump) > 1e-12))
-    if len(rows):
-        gradient = kernels.normal_gradient_matrix(rows, model.floor, response.both)
-        out[rows] -= jump[rows, None] * (gradient @ np.concatenate([total, on_plane])) / (4 * math.pi)
-    return out
+    def _images(self, plane: Panels) -> Array:
+        """Mean potential on the plane of its charges' images in the floor, sign left out, (m, m)."""
+        floor, m = self.solution.model.floor, plane.size
+        turn = np.array([1.0, 1.0, -1.0])
+        shift = np.array([0.0, 0.0, 2 * floor])
+        mirrored = plane._replace(
+            edges=plane.edges * turn + shift, centers=plane.centers * turn + shift,
+            quad=plane.quad * turn + shift,
+        )  # fmt: skip
+        none = np.zeros(2 * m)
+        below = floor - _NO_FLOOR * float(np.ptp(plane.centers[:, :2], axis=0).max())
+        return kernels.system_block(
+            none.astype(np.int64), none, below, concatenate([plane, mirrored]), (0, m), (m, 2 * m)
+        )
 
 
 def build_gap_table(
@@ -243,11 +261,10 @@ def build_gap_table(
     validity = _VALIDITY * unit
     plane, top, heights = plane_panels(solution, _MARGIN * unit), top_of(solution), unit * _HEIGHTS
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
+    response = PlaneResponse(solution, plane)
     for k, height in enumerate(heights):
         progress(f"response to a plane: {k + 1} of {len(heights)}")
-        response = PlaneResponse(solution, plane, top + height)
-        free = free_change(response, response.charges(densities))
-        changes[k] = free[: model.sheet_panels]
+        changes[k] = response.at(top + height, densities)[: model.sheet_panels]
     return _cells_of(model, changes, heights, top, validity)
 
 

@@ -122,7 +122,7 @@ def nearest_on_triangle(t, o, x, y, z):
     After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5.
 
     Returns:
-        The squared distance and the point.
+        The squared distance, the point, and whether it lies within the triangle's edges.
     """
     ax, ay, az = t[o], t[o + 1], t[o + 2]
     ux, uy, uz = t[o + 3] - ax, t[o + 4] - ay, t[o + 5] - az
@@ -131,7 +131,7 @@ def nearest_on_triangle(t, o, x, y, z):
     d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
     uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
     d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
-    s = w = 0.0
+    s, w, inner = 0.0, 0.0, False
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     if d1 <= 0.0 and d2 <= 0.0:
         pass
@@ -148,9 +148,9 @@ def nearest_on_triangle(t, o, x, y, z):
         s = 1.0 - w
     else:
         whole = va + vb + vc
-        s, w = vb / whole, vc / whole
+        s, w, inner = vb / whole, vc / whole, True
     qx, qy, qz = ax + s * ux + w * vx, ay + s * uy + w * vy, az + s * uz + w * vz
-    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz
+    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz, inner
 
 
 @compiled

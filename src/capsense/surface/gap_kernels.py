@@ -57,13 +57,13 @@ def local_change(bodies, near, node, green, matrix):
     """
     gap = green.gap
     chosen, count = np.empty(bodies.shape[0], np.int64), 0
-    point, room, moved = np.empty(3), np.empty(140), np.empty((1, 3))
+    point, room, moved = np.empty(9), np.empty(140), np.empty((1, 3))
     reach = REACH[1] * gap.validity
     for k in range(gap.block_radius.shape[0]):
         x, y, z = gap.block_center[k, 0], gap.block_center[k, 1], gap.top
-        count = 0
+        grounded, count = gap.terminal[gap.blocks[k]] < 0, 0
         for b in range(bodies.shape[0]):
-            if near[b]:
+            if near[b] and (node[b] >= 0 or not grounded):
                 off, _ = nearest(bodies[b], x, y, z, point, room)
                 if off < reach + gap.block_radius[k]:
                     chosen[count] = b
@@ -81,8 +81,8 @@ def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
     x, y, z = float(gap.points[c, 0]), float(gap.points[c, 1]), gap.top
     best, lifted, body = math.inf, math.inf, -1
     for k in range(count):
-        off, edge = nearest(bodies[chosen[k]], x, y, z, point, room)
-        true, high = lengths(off, edge, point, x, y, green, moved)
+        off, faces = nearest(bodies[chosen[k]], x, y, z, point, room)
+        true, high = lengths(off, faces, point, x, y, green, moved)
         if true < best:
             best, lifted, body = true, high, chosen[k]
     h0 = gap.validity
@@ -121,13 +121,12 @@ def _place(length, gap):
 
 
 @kernel
-def lengths(off, edge, point, x, y, green, moved):
+def lengths(off, faces, point, x, y, green, moved):
     """Lengths of the field lines from (x, y) on the face to a body, and to the lifted body [m].
 
     Args:
         off: Distance of the body from there [m], negative inside.
-        edge: Whether the body may have an edge at its nearest point.
-        point: Its nearest point, shape (3,).
+        faces, point: Its nearest point and the faces there, as of :func:`nearest`.
         x, y: The place [m].
         green: Green's function of the design.
         moved: Room to work in, shape (1, 3).
@@ -149,19 +148,51 @@ def lengths(off, edge, point, x, y, green, moved):
     lift(moved, h0, green.box)
     ex, ey, ez = moved[0, 0] - x, moved[0, 1] - y, moved[0, 2] - gap.top
     wide = math.sqrt(ex * ex + ey * ey)
-    lifted = _arc(math.sqrt(wide * wide + ez * ez), wide, ez)
-    if not edge:  # the lifted surface is flatter, so that another of its points is nearer
-        slope, up = across * height / (2.0 * h0), max(dz, 0.0)
-        size = math.sqrt(slope * slope + up * up)
-        if size > 0.0:
-            sine, cosine = slope / size, up / size
-            flat = ez * cosine + wide * sine
-            lower = _arc(flat, flat * sine, flat * cosine)
+    far = math.sqrt(wide * wide + ez * ez)
+    lifted = _arc(far, wide, ez)
+    if faces > 0:  # another point of the lifted surface, which is flatter, may be nearer
+        ratio = height / (2.0 * h0)
+        along, up = _support(point, faces, ratio, -ex, -ey, -ez, far)
+        if along < far:
+            lower = _arc(along, along * math.sqrt(max(0.0, 1.0 - up * up)), along * up)
             share = smooth(1.0 - math.sqrt(beside) / h0)
             lifted += share * (min(lower, lifted) - lifted)
     if true < 2.0 * least:
         true = least + true * true / (4.0 * least)
     return true, max(lifted, true)
+
+
+@kernel
+def _support(point, faces, ratio, x, y, z, far):
+    """Distance from a place to one or two lifted faces through a point.
+
+    Args:
+        point, faces: As of :func:`nearest`.
+        ratio: Slope of the lift: faces are flatter by it.
+        x, y, z: The place less the lifted point [m], ``far`` in length.
+
+    Returns:
+        The distance [m], and how far its direction points down, 0 to 1.
+    """
+    a, b, c = ratio * point[3], ratio * point[4], min(point[5], 0.0)
+    size = math.sqrt(a * a + b * b + c * c)
+    if size < 1e-9:
+        return far, 1.0
+    a, b, c = a / size, b / size, c / size
+    first = a * x + b * y + c * z
+    if faces == 1:
+        return max(first, 0.0), -c
+    d, e, f = ratio * point[6], ratio * point[7], min(point[8], 0.0)
+    size = math.sqrt(d * d + e * e + f * f)
+    if size < 1e-9:
+        return far, 1.0
+    d, e, f = d / size, e / size, f / size
+    second, both = d * x + e * y + f * z, a * d + b * e + c * f
+    if first < second * both:
+        return max(second, 0.0), -f
+    if second < first * both:
+        return max(first, 0.0), -c
+    return far, 1.0
 
 
 @kernel

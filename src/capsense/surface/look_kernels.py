@@ -119,6 +119,10 @@ def place(body, space, k, points, found):
     height = points[found, 2] - space.box[1, 2]
     if square < 4.0 * space.validity * space.validity and space.cover < 1.0:
         lift(points[found : found + 1], space.validity, space.box)
+        height, square = points[found, 2] - space.box[1, 2], 0.0
+        for i in range(3):
+            x = points[found, i]
+            square += max(space.box[0, i] - x, x - space.box[1, i], 0.0) ** 2
     return square, height, room, math.sqrt(out) if out > 0.0 else 0.0
 
 

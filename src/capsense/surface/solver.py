@@ -68,14 +68,19 @@ PRESETS = {
 """Presets by name."""
 
 
-def _electrode_width(design: Design) -> float:
+_RESOLVED, _SMOOTH = 0.6, 1.2
+"""Parts of panels are no longer than the first, over the width of the narrowest electrode; nor
+shorter than the second, over the validity distance: bodies come no nearer."""
+
+
+def electrode_width(design: Design, least: float = _NARROW) -> float:
     """Width of the narrowest electrode [m]: twice its area over the length of its rims."""
     widths = [
         2 * surface.area / float(np.linalg.norm(np.diff(surface.rims, axis=1), axis=2).sum())
         for surface in (e.surface for e in design.electrodes)
         if len(surface.rims)
     ]
-    return max(min(widths, default=math.inf), _NARROW)
+    return max(min(widths, default=math.inf), least)
 
 
 @cache
@@ -125,8 +130,14 @@ class SurfaceSolver:
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
         coarsest = self.preset.coarsest
-        self._largest = coarsest and self.preset.panels * (coarsest * _electrode_width(design)) ** 2
+        self._largest = coarsest and self.preset.panels * (coarsest * electrode_width(design)) ** 2
         """Bodies of so much surface or more [m²] get panels of a few millimetres; None for none."""
+        finest = self.preset.finest
+        if finest is not None:
+            finest = min(finest, _RESOLVED * electrode_width(design, 0.0))
+            finest = max(finest, _SMOOTH * self.green.gap.validity)
+        self._finest = finest
+        """Panels of other bodies have parts where they are longer than this [m]; None for none."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
@@ -384,5 +395,5 @@ class SurfaceSolver:
         """Charge functions of a body from a share of the usual panels, and its size."""
         panels = round(share * self.preset.panels)
         return functions_of(
-            shape, panels, conducting=conducting, largest=self._largest, finest=self.preset.finest
+            shape, panels, conducting=conducting, largest=self._largest, finest=self._finest
         )
