@@ -42,7 +42,7 @@ def write_outline(record: np.void, shape: Shape) -> None:
 
 @kernel
 def reach_down(body):
-    """How far the outline of a body reaches below its position [m]; for meshes, its bounding box."""
+    """How far the outline of a body reaches below its middle [m]; for meshes, its bounding box."""
     r, kind = body.rotation, body.outline
     x, y, z = abs(r[2, 0]), abs(r[2, 1]), abs(r[2, 2])
     a, b, c = body.sizes[0], body.sizes[1], body.sizes[2]
@@ -56,10 +56,22 @@ def reach_down(body):
         return body.scale * math.sqrt((a * x) ** 2 + (b * y) ** 2 + (c * z) ** 2)
     if kind == BOX:
         return body.scale * (a * x + b * y + c * z)
-    corners, out = doubles(body.boxes), 0.0
-    for i in range(3):
-        out -= min(r[2, i] * corners[i], r[2, i] * corners[3 + i])
-    return body.scale * out
+    corners = doubles(body.boxes)
+    return 0.5 * body.scale * (
+        x * (corners[3] - corners[0]) + y * (corners[4] - corners[1]) + z * (corners[5] - corners[2])
+    )
+
+
+@kernel
+def middle_height(body):
+    """Height of the middle of a body's outline [m]; for meshes, that of its bounding box."""
+    if body.outline != MESH:
+        return body.position[2]
+    corners, r = doubles(body.boxes), body.rotation
+    return body.position[2] + 0.5 * body.scale * (
+        r[2, 0] * (corners[0] + corners[3]) + r[2, 1] * (corners[1] + corners[4])
+        + r[2, 2] * (corners[2] + corners[5])
+    )  # fmt: skip
 
 
 @kernel

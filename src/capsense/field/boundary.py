@@ -90,8 +90,8 @@ def eps_at(design: Design, points: Array) -> Array:
 
 
 def room_scale(design: Design) -> float:
-    """How many times as large as one of 0.5 m the box is, at least 1; walls are so much coarser."""
-    return max(1.0, float(min(design.domain.size)) / 0.5)
+    """How many times as large as one of 0.5 m the box is: walls are so much coarser."""
+    return float(min(design.domain.size)) / 0.5
 
 
 def terminals(design: Design) -> list[str]:
@@ -179,7 +179,7 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
         largest = max(largest, scale * 0.01 * _extent(facet))
         add(facet, INTERFACE, _grading(facet, edge, largest, scale), reach)
     for facet in walls(design):
-        add(facet, GROUND, Grading(0.01, largest=scale * 0.04 * room_scale(design)), 0.0)
+        add(facet, GROUND, _wall_grading(design, scale), 0.0)
 
     panels = concatenate(parts)
     step = 1e-7 * panels.normals
@@ -198,6 +198,11 @@ def sheet_grading(facet: Facet, gap: float, spacing: float, scale: float) -> Gra
     edge = scale * max(min(0.01 * width, 0.075 * gap, coarse), 5e-6)
     largest = scale * min(max(0.005, 0.05 * width), max(2 * spacing, 0.001))
     return _grading(facet, edge, largest, scale)
+
+
+def _wall_grading(design: Design, scale: float) -> Grading:
+    size = room_scale(design)
+    return Grading(0.01 * size, largest=scale * 0.04 * size)
 
 
 def _grading(facet: Facet, edge: float, largest: float, scale: float) -> Grading:

@@ -36,16 +36,17 @@ from capsense.field.grid_kernels import Grid, grid_over
 LEAST = 1e-3, 2e-3, 3e-3
 """Distances from near, middle and far sources [m] below which their potential grows no more. They
 lie deeper than that under the surfaces of the design."""
-SHORE = 5e-3
-"""Bodies fade out over this distance beyond the room, and behind the face of a flat design [m]."""
-DEEP, STEEP = 3e-3, 4.0
-"""What is deeper behind the face of a flat design [m] comes to be screened by it; depth from the
-sides counts so many times."""
+SHORE = 0.01
+"""Bodies fade out over this distance beyond the room, and behind the face of a flat design, over
+the domain's shortest side."""
+DEEP, STEEP = (2.3, 3.8), 4.0
+"""What is deeper behind the face of a flat design than the first of these, over the validity
+distance, comes to be screened by it, over the second; depth from the sides counts so many times."""
 _AWAY = 1e3
 """Coordinates of sources without charge [m]."""
-MARGIN = 0.015
-"""What lies nearer than this [m] to the ceiling and the side walls is left out: at ground, the
-walls take nearly all of what would meet it."""
+MARGIN = 0.03
+"""What lies nearer than this to the ceiling and the side walls, over the domain's shortest side, is
+left out: at ground, the walls take nearly all of what would meet it. An open domain has none."""
 
 
 class Level(NamedTuple):
@@ -139,6 +140,8 @@ class Green(NamedTuple):
     """Distances [m] from ``box`` between which a level gives way to the next one, shape (2, 2)."""
     room: NDArray[Any]
     """Corners of the part of the domain where bodies count [m], shape (2, 3)."""
+    extent: float
+    """Shortest side of the domain [m]."""
     cover: float
     """Thickness of what covers the electrodes of a flat design [m]; infinite for other designs."""
     gap: Gap
@@ -153,6 +156,7 @@ class Space(NamedTuple):
 
     box: NDArray[Any]
     room: NDArray[Any]
+    extent: float
     cover: float
     validity: float
 
@@ -179,7 +183,9 @@ def pack_green(green: GreenFunction, design: Design) -> Green:
 
 def _packed(green: GreenFunction, design: Design) -> Green:
     walls = np.array([design.domain.lower, design.domain.upper])
-    room = walls + MARGIN * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
+    extent = float(min(design.domain.size))
+    margin = 0.0 if design.domain.open else MARGIN * extent
+    room = walls + margin * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
 
@@ -208,7 +214,7 @@ def _packed(green: GreenFunction, design: Design) -> Green:
     return Green(
         (near, middle, far), score_table, grid_over(np.asarray(green.box, float), walls, phi),
         lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blends, float), room, cover_of(design),
+        np.asarray(green.blends, float), room, extent, cover_of(design),
         pack_gap(green.gap, green.clearance),
     )  # fmt: skip
 
@@ -304,7 +310,7 @@ def smooth(x):
 @kernel
 def beyond(points, space):
     """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face."""
-    out, depth = 0.0, 1.0
+    out, depth = 0.0, math.inf
     for i in range(3):
         c = 0.5 * (points[0, i] + points[3, i])
         off = max(space.room[0, i] - c, c - space.room[1, i], 0.0)
@@ -313,8 +319,8 @@ def beyond(points, space):
             depth = min(depth, STEEP * (c - space.box[0, i]), STEEP * (space.box[1, i] - c))
         else:
             depth = min(depth, space.box[1, 2] - c)
-    deep = depth - DEEP if space.cover < 1.0 else 0.0
-    return smooth(max(math.sqrt(out), deep) / SHORE)
+    deep = (depth / space.validity - DEEP[0]) / DEEP[1] if space.cover < 1.0 else 0.0
+    return smooth(max(math.sqrt(out) / (SHORE * space.extent), deep))
 
 
 @kernel

@@ -73,7 +73,7 @@ def _step_rows(
     turn = np.empty((3, 3))
     for e in range(start, stop):
         for s in range(sensors):
-            count = _seen(bodies, poses, e, s, green.room, room, place)
+            count = _seen(bodies, poses, e, s, (green.room, SHORE * green.extent), room, place)
             for c in range(count):
                 b = place[c]
                 if bodies.softness[e, b].imag != 0.0 or bodies.tie[e, b].imag != 0.0:
@@ -96,9 +96,12 @@ def _step_rows(
 
 @compiled
 def _seen(
-    bodies: Bodies, poses: Poses, e: int, s: int, room: Array, records: Any, place: Any
-) -> int:
+    bodies: Bodies, poses: Poses, e: int, s: int, sight: tuple[Array, float], records: Any,
+    place: Any,
+) -> int:  # fmt: skip
     """Fill the records and places of what a sensor sees, (b,) each.
+
+    ``sight`` are the corners of where it sees, and how far beyond them bodies fade out [m].
 
     Returns:
         How many it sees.
@@ -109,7 +112,7 @@ def _seen(
     for b in range(bodies.choice.shape[1]):
         if bodies.choice[e, b] >= 0 and not bodies.hidden[s, b]:
             record = records[count : count + 1]
-            if _placed(bodies, e, b, poses, s, turns, room, record):
+            if _placed(bodies, e, b, poses, s, turns, sight, record):
                 place[count] = b
                 count += 1
     for c in range(count):
@@ -167,17 +170,17 @@ def _position(poses: Poses, e: int, b: int, s: int, turn: Array, body: Any) -> N
 
 @kernel
 def _placed(
-    bodies: Bodies, e: int, b: int, poses: Poses, s: int, turns: tuple[Array, Array], room: Array,
-    record: Any,
+    bodies: Bodies, e: int, b: int, poses: Poses, s: int, turns: tuple[Array, Array],
+    sight: tuple[Array, float],     record: Any,
 ) -> bool:  # fmt: skip
     """Fill the record of a body in a sensor's frame; False where it is out of its sight.
 
     ``turns`` are the sensor's rotation matrix, and room for that of the body.
     """
-    turn, own = turns
+    (turn, own), (room, shore) = turns, sight
     _matrix(poses.bodies[e, b], own)
     u, scale = bodies.choice[e, b], bodies.scale[e, b]
-    reach = scale * bodies.radius[u] + SHORE
+    reach = scale * bodies.radius[u] + shore
     record[0] = bodies.shapes[u]
     body = record[0]
     _position(poses, e, b, s, turn, body)
@@ -261,7 +264,9 @@ class CpuCore:
         loss = np.zeros_like(found.delta)
         records, place = np.empty(table.places, BODY), np.empty(table.places, np.int64)
         for e, s in np.argwhere(found.lossy).tolist():
-            count = _seen(bodies, where, e, s, solver.green.room, records, place)
+            count = _seen(
+                bodies, where, e, s, (solver.green.room, SHORE * solver.green.extent), records, place
+            )
             at = place[:count]
             soft, lone = bodies.softness[e, at], records["neutral"][:count] != 0
             ties = np.where(bodies.tie[e, at].imag != 0, bodies.tie[e, at], records["tie"][:count])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.field.green_kernels import DEEP, GAP, SHORE, STEEP
+from capsense.field.green_kernels import SHORE, STEEP
 from capsense.surface.look_kernels import LONG
 from capsense.surface.pair_kernels import BARRIER, LIFTED
 
@@ -33,9 +33,13 @@ _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
 _CROSSING = wp.constant(2.0)
 _LONG0, _LONG1 = (wp.constant(x) for x in LONG)
-_GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in GAP)
+_GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in (1.5e-4, 7e-4, 0.18, 2e-5))
+"""Least gap to a flat design [m]: the square of a cluster's extent over the third, at least the
+first, at most the second; less by the thickness of a cover, but not less than the fourth. Warp has
+no gap law yet."""
 _LIFTED, _BARRIER = wp.constant(LIFTED), wp.constant(BARRIER)
-_DEEP, _STEEP, _SHORE = wp.constant(DEEP), wp.constant(STEEP), wp.constant(SHORE)
+_DEEP, _BEHIND = wp.constant(3e-3), wp.constant(5e-3)
+_STEEP, _SHORE = wp.constant(STEEP), wp.constant(SHORE)
 
 
 @wp.struct
@@ -84,6 +88,7 @@ class Response:
     terminals: wp.int32
     floor: wp.float32
     cover: wp.float32
+    extent: wp.float32  # shortest side of the domain
     blend0: wp.float32
     blend1: wp.float32
     box0: wp.vec3
@@ -166,7 +171,7 @@ def _need(
     high = green.room1 - p
     room = wp.min(wp.min(wp.min(low[0], low[1]), low[2]), wp.min(wp.min(high[0], high[1]), high[2]))
     crossing = smooth(2.0 - 4.0 * wp.abs(room) / (size + 1e-9))
-    crossing = crossing * smooth((size - _LONG0) / (_LONG1 - _LONG0))
+    crossing = crossing * smooth((size / green.extent - _LONG0) / (_LONG1 - _LONG0))
     crossing = crossing * shapes.extent[node] / shapes.extent[first]
     return size / (wp.max(away, _HALF * size) + _NEAREST) + _CROSSING * crossing
 
@@ -197,7 +202,7 @@ def choose(
     cut.moved[b, v] = moved
     scale = places.scale[e, b]
     away = _off(wp.transform_get_translation(at), green.room0, green.room1)
-    if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u] + _SHORE:
+    if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u] + _SHORE * green.extent:
         return
     first = shapes.first[u]
     cut.node[o, v] = first
@@ -336,7 +341,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
         for d in range(2):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
             depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
-        deep = depth - _DEEP
+        deep = (depth - _DEEP) / _BEHIND
         gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
         for q in range(4):
             before = points[q]
@@ -347,7 +352,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
     cut.lifted[i, v] = lifted
     cut.extent[i, v] = size
     cut.soft[i, v] = scale * shapes.soft[k]
-    cut.beyond[i, v] = smooth(wp.max(off, deep) / _SHORE)
+    cut.beyond[i, v] = smooth(wp.max(off / (_SHORE * green.extent), deep))
     away = wp.length(_off(0.5 * (points[0] + points[3]), green.box0, green.box1))
     cut.near[i, v] = smooth((green.blend1 - away) / (green.blend1 - green.blend0))
 

@@ -17,13 +17,15 @@ import math
 import numpy as np
 
 from capsense._jit import compiled, kernel
-from capsense.elements.outline import nearest, reach_down
+from capsense.elements.outline import middle_height, nearest, reach_down
 from capsense.field.green_kernels import lift, smooth
 
 REACH = 5.0, 8.0
 """What is farther than this from a cell, over h0, comes to count for nothing, and does not."""
 LEAST = 0.025
 """Least length of a field line, over h0: bodies do not come nearer than that."""
+_WAYS, _EXACT = 30, 1e-4
+"""Steps down through a body at most, and how exactly its surface is found, over h0."""
 _STEP = 1e-3
 """Step of differences, over h0."""
 
@@ -40,8 +42,61 @@ def near_bodies(bodies, green):
     for b in range(bodies.shape[0]):
         body = bodies[b]
         if body.outline != 0 and body.softness == 0.0:
-            out[b] = body.position[2] - reach_down(body) < gap.top + 2.0 * gap.validity
+            out[b] = middle_height(body) - reach_down(body) < gap.top + 2.0 * gap.validity
     return out
+
+
+@compiled
+def press_out(bodies, near, green):
+    """Move near bodies that overlap the face of the design up until they touch it.
+
+    Physics engines let hard bodies overlap. What lies inside of a body that way is in contact with
+    it. Bodies whose middle is behind the face stay where they are.
+    """
+    gap, point, room = green.gap, np.empty(9), np.empty(140)
+    for b in range(bodies.shape[0]):
+        if not near[b]:
+            continue
+        below = gap.top - (middle_height(bodies[b]) - reach_down(bodies[b]))
+        if below <= 0.0 or middle_height(bodies[b]) < gap.top:
+            continue
+        deepest = 0.0
+        x, y = bodies[b].position[0], bodies[b].position[1]
+        nearest(bodies[b], x, y, gap.top - 1e3 * bodies[b].scale, point, room)
+        if _faces_cell(point, gap):  # the lowest point
+            deepest = gap.top - point[2]
+        for k in range(gap.block_radius.shape[0]):
+            off, _ = nearest(
+                bodies[b], gap.block_center[k, 0], gap.block_center[k, 1], gap.top, point, room
+            )
+            if off > gap.block_radius[k] or gap.terminal[gap.blocks[k]] < 0:
+                continue
+            for c in range(gap.blocks[k], gap.blocks[k + 1]):
+                depth = 0.0
+                for _ in range(_WAYS):  # down to where the surface is
+                    off, _ = nearest(
+                        bodies[b], float(gap.points[c, 0]), float(gap.points[c, 1]),
+                        gap.top - depth, point, room,
+                    )  # fmt: skip
+                    if off >= -_EXACT * gap.validity:
+                        break
+                    depth -= off
+                deepest = max(deepest, depth)
+        bodies[b].position[2] += min(deepest, below)
+
+
+@kernel
+def _faces_cell(point, gap):
+    """Whether a point is above a cell of a terminal."""
+    for k in range(gap.block_radius.shape[0]):
+        x, y = gap.block_center[k, 0] - point[0], gap.block_center[k, 1] - point[1]
+        if gap.terminal[gap.blocks[k]] < 0 or x * x + y * y > (2.0 * gap.block_radius[k]) ** 2:
+            continue
+        for c in range(gap.blocks[k], gap.blocks[k + 1]):
+            x, y = float(gap.points[c, 0]) - point[0], float(gap.points[c, 1]) - point[1]
+            if x * x + y * y < gap.areas[c]:
+                return True
+    return False
 
 
 @compiled

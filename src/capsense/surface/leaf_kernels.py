@@ -81,7 +81,7 @@ def placed(bodies, cut, green):
 def _fill_leaves(bodies, cut, green, leaves, room):
     """The same; ``room`` is room to work in: two matrices and a vector of three."""
     moments, turn, middle = room
-    space = Space(green.box, green.room, green.cover, green.gap.validity)
+    space = Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
     for j in range(cut.leaves.shape[0]):
         a, corners, points = cut.leaves[j], leaves.true[j], leaves.points[j]
         body, k = bodies[cut.body[a]], cut.node[a]

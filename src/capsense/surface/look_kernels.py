@@ -25,11 +25,12 @@ _LINEAR = 0.45, 0.58
 those larger than the second do not; in between they come to do."""
 _COARSE = 31
 """So many clusters, the coarsest of a body, are looked into wherever they are."""
-LONG = 0.03, 0.06
-"""Clusters that cross a wall come to be looked into where they are longer than this [m]."""
-_SCREENED, _TOUCHING = 2.0 * math.pi, 0.8e-3
+LONG = 0.06, 0.12
+"""Clusters that cross a wall come to be looked into where they are longer than this, over the
+domain's shortest side."""
+_SCREENED = 2.0 * math.pi
 """A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
-of size l has, 1 - exp(-2π d / l) of their energy; the second counts as the other leg of d [m]."""
+of size l has, 1 - exp(-2π d / l) of their energy."""
 _FREED = 20.0
 """Exponent from which on that is not looked at: it is 2e-9."""
 _BEHIND = 4e-3
@@ -106,7 +107,7 @@ def place(body, space, k, points, found):
         Square of its distance from the design [m²]; how high above its box it is [m]; how far it is
         from the next wall, negative beyond it, and how far it is beyond all of them [m].
     """
-    center, square, out, room = doubles(body.center), 0.0, 0.0, 1.0
+    center, square, out, room = doubles(body.center), 0.0, 0.0, math.inf
     for i in range(3):
         x = body.position[i]
         for q in range(3):
@@ -134,7 +135,7 @@ def stiffness(cover, size, square, height):
     """
     if cover > 1.0:  # the box of such designs is no surface
         return 1.0
-    far = _SCREENED * math.sqrt(square + _TOUCHING * _TOUCHING)
+    far = _SCREENED * math.sqrt(square)
     if far >= _FREED * size:
         return 1.0
     return 1.0 - smooth(1.0 + height / _BEHIND) * math.exp(-far / size)
@@ -174,7 +175,7 @@ def _look_into(body, green, coarser, looks, start, wanted):
         The row behind the last one that was filled, and how many points there are.
     """
     kids, extent, (points, rows, inner) = integers(body.kids), doubles(body.extent), wanted
-    space = Space(green.box, green.room, green.cover, green.gap.validity)
+    space = Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
     looks.node[start], looks.told[start] = 0, 1.0
     row, stop, found = start - 1, start + 1, np.int64(0)
     while row + 1 < stop:
@@ -183,11 +184,11 @@ def _look_into(body, green, coarser, looks, start, wanted):
         size, (square, height, room, out) = (
             body.scale * extent[k], place(body, space, k, points, found),
         )  # fmt: skip
-        share = 1.0 - smooth(out / SHORE) if out > 0.0 else 1.0
+        share = 1.0 - smooth(out / (SHORE * space.extent)) if out > 0.0 else 1.0
         looks.crossing[row] = looks.linear[row] = 0.0
-        if size > max(LONG[0], 2.0 * abs(room)):
-            looks.crossing[row] = smooth(2.0 - 4.0 * abs(room) / (size + 1e-9)) * smooth(
-                (size - LONG[0]) / (LONG[1] - LONG[0])
+        if size > max(LONG[0] * space.extent, 2.0 * abs(room)):
+            looks.crossing[row] = smooth(2.0 - 4.0 * abs(room) / size) * smooth(
+                (size / space.extent - LONG[0]) / (LONG[1] - LONG[0])
             )
         if k >= _COARSE:
             part = size / (coarser * math.sqrt(square + 1e-12))

@@ -287,7 +287,7 @@ def _score_nodes(body, green, nodes, looks, last, weight):
     """
     kids, many = integers(body.kids), 2 * nodes.shape[0]
     points, rows, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
-    space = Space(green.box, green.room, green.cover, green.gap.validity)
+    space = Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
     for j in range(many):
         k, rows[j] = nodes[j // 2], last + j
         if j % 2 == 0:
@@ -296,7 +296,7 @@ def _score_nodes(body, green, nodes, looks, last, weight):
         square, height, _, out = place(body, space, looks.node[rows[j]], points, j)
         size = body.scale * doubles(body.extent)[looks.node[rows[j]]]
         looks.stiff[rows[j]] = stiffness(green.cover, size, square, height)
-        inner[j] = 1.0 - smooth(out / SHORE)
+        inner[j] = 1.0 - smooth(out / (SHORE * space.extent))
     far_potentials(points, rows, inner, green, looks.means)
     for k in nodes:
         looks.score[k] = _share(looks, k) * _own_score(body, looks, k, weight)

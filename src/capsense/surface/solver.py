@@ -123,7 +123,7 @@ class SurfaceSolver:
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
         """Middle and diagonal of the domain [m], as :func:`windowed` takes them."""
-        self._sight = self.green.room + SHORE * np.array([[-1.0], [1.0]])
+        self._sight = self.green.room + SHORE * self.green.extent * np.array([[-1.0], [1.0]])
         """Corners of the box beyond which no charge is [m], shape (2, 3)."""
         self._last: tuple[View, Solution] | None = None
         self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
@@ -204,7 +204,12 @@ class SurfaceSolver:
         return [out[k] for k in range(len(scenes))]
 
     def _meets_electrodes(self, view: View) -> bool:
-        """Whether an electrode lies inside a body, or touches a conductor."""
+        """Whether an electrode lies inside a body, or touches a conductor.
+
+        Covered electrodes are not touched: what overlaps their cover is pressed onto it.
+        """
+        if len(self.green.gap.areas) and self.green.cover > 0.0:
+            return False
         near = set(overlapping(view.packed.bounds, *self._sheets.bounds).tolist())
         return bool(near) and any(
             self._sheets.meet(view.scene[k], bool(view.matter.conducting[place]))

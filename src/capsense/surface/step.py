@@ -15,7 +15,7 @@ from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
-from capsense.surface.gap_kernels import local_change, near_bodies
+from capsense.surface.gap_kernels import local_change, near_bodies, press_out
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.network_kernels import (
     as_nodes,
@@ -133,6 +133,7 @@ def solve(
     :func:`prepared`.
     """
     near = near_bodies(bodies, green)
+    press_out(bodies, near, green)
     m, nodes, node, capacitance = as_nodes(bodies, near, green)
     cut, leaves, functions, system = prepared(bodies, green, threshold, width)
     if nodes > 0:
