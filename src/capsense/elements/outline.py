@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capsense._jit import kernel
 from capsense._simd import doubles
-from capsense.scene.geometry_kernels import nearest_on_triangle
 from capsense.scene.mesh_shape import TriangleShape
 from capsense.scene.shapes import Shape, ShapeKind
 
@@ -57,8 +55,14 @@ def reach_down(body):
     if kind == BOX:
         return body.scale * (a * x + b * y + c * z)
     corners = doubles(body.boxes)
-    return 0.5 * body.scale * (
-        x * (corners[3] - corners[0]) + y * (corners[4] - corners[1]) + z * (corners[5] - corners[2])
+    return (
+        0.5
+        * body.scale
+        * (
+            x * (corners[3] - corners[0])
+            + y * (corners[4] - corners[1])
+            + z * (corners[5] - corners[2])
+        )
     )
 
 
@@ -97,7 +101,7 @@ def nearest(body, x, y, z, out, room):
     kind, a, b, c = body.outline, body.sizes[0], body.sizes[1], body.sizes[2]
     faces = 1
     ux = uy = uz = vx = vy = vz = 0.0  # normals of the faces in the body's own frame
-    if kind == SPHERE or kind == CAPSULE:
+    if kind in (SPHERE, CAPSULE):
         along = min(max(pz, -b), b) if kind == CAPSULE else 0.0
         off = math.sqrt(px * px + py * py + (pz - along) ** 2)
         distance, ratio = off - a, a / max(off, 1e-12)
@@ -158,7 +162,7 @@ def nearest(body, x, y, z, out, room):
         distance = _on_mesh(body, px, py, pz, out, room)
         qx, qy, qz = out[0], out[1], out[2]
         faces = int(out[3])
-    if kind != BOX and kind != CYLINDER and faces == 1:
+    if kind not in (BOX, CYLINDER) and faces == 1:
         size = math.copysign(max(abs(distance), 1e-12), distance)
         ux, uy, uz = (px - qx) / size, (py - qy) / size, (pz - qz) / size
     if faces > 2:
@@ -193,6 +197,48 @@ def _ellipsoid(x, y, z, a, b, c):
 
 
 @kernel
+def _nearest_on_triangle(t, o, x, y, z):
+    """Nearest point on the triangle whose corners begin at place ``o`` of an array.
+
+    After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5.
+
+    Returns:
+        The squared distance, the point, and whether it lies within the triangle's edges.
+    """
+    ax, ay, az = t[o], t[o + 1], t[o + 2]
+    ux, uy, uz = t[o + 3] - ax, t[o + 4] - ay, t[o + 5] - az
+    vx, vy, vz = t[o + 6] - ax, t[o + 7] - ay, t[o + 8] - az
+    px, py, pz = x - ax, y - ay, z - az
+    d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
+    uu, uv, vv = (
+        ux * ux + uy * uy + uz * uz,
+        ux * vx + uy * vy + uz * vz,
+        vx * vx + vy * vy + vz * vz,
+    )
+    d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
+    s, w, inner = 0.0, 0.0, False
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    if d1 <= 0.0 and d2 <= 0.0:
+        pass
+    elif d3 >= 0.0 and d4 <= d3:
+        s = 1.0
+    elif d6 >= 0.0 and d5 <= d6:
+        w = 1.0
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        s = d1 / max(d1 - d3, 1e-300)
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / max(d2 - d6, 1e-300)
+    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / max((d4 - d3) + (d5 - d6), 1e-300)
+        s = 1.0 - w
+    else:
+        whole = va + vb + vc
+        s, w, inner = vb / whole, vc / whole, True
+    qx, qy, qz = ax + s * ux + w * vx, ay + s * uy + w * vy, az + s * uz + w * vz
+    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz, inner
+
+
+@kernel
 def _on_mesh(body, x, y, z, out, room):
     """Nearest point on the triangles of a mesh, in its own frame, filled in ``out``.
 
@@ -213,7 +259,7 @@ def _on_mesh(body, x, y, z, out, room):
             first = (q * count) >> (body.levels - 1)
             last = ((q + 1) * count) >> (body.levels - 1)
             for m in range(first, last):
-                found = nearest_on_triangle(triangles, 9 * m, x, y, z)
+                found = _nearest_on_triangle(triangles, 9 * m, x, y, z)
                 if found[0] < best:
                     best, out[0], out[1], out[2], inner = found
                     out[3] = 1.0 if inner else 0.0

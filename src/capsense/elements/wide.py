@@ -124,9 +124,7 @@ def _mean_thickness(mesh: TriMesh) -> float:
     return 2.0 * abs(enclosed_volume(mesh.vertices, mesh.faces)) / area
 
 
-def wide_pieces(
-    shape: Shape, conducting: bool, largest: float, finest: float | None = None
-) -> int:
+def wide_pieces(shape: Shape, conducting: bool, largest: float, finest: float | None = None) -> int:
     """About how many pieces a shape is cut into; 0 where it is neither wide nor a foil.
 
     Nor are dielectrics that are very thin for their size, or open.

@@ -283,12 +283,12 @@ def system_block(
 ) -> Array:  # fmt: skip
     """Return the block of :func:`system_matrix` with rows and columns from … to …."""
     out = np.empty((rows[1] - rows[0], columns[1] - columns[0]))
-    return filled(_fill_system, out, rows[0], columns[0], kind, contrast, floor, panels)
+    return filled(_fill_system, out, (rows[0], columns[0]), kind, contrast, floor, panels)
 
 
 @compiled
-def _fill_system(start, stop, row, column, kind, contrast, floor, p, out):
-    grad = np.empty(3)
+def _fill_system(start, stop, origin, kind, contrast, floor, p, out):
+    (row, column), grad = origin, np.empty(3)
     for i in range(row + start, row + stop):
         line = out[i - row]
         for j in range(column, column + out.shape[1]):

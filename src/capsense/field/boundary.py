@@ -254,7 +254,7 @@ class BoundarySolution:
         return 4 * math.pi * EPS0 * scipy.linalg.lu_solve(self._lu, rhs)
 
     def solve(self, sides: Array) -> Array:
-        """Charge densities over 4π eps0 of right-hand sides, rows as the matrix has them, (n, k)."""
+        """Charge densities over 4π eps0 of right-hand sides in the order of the panels, (n, k)."""
         return scipy.linalg.lu_solve(self._lu, sides)
 
     def _source_terms(self, sources: Array) -> Array:

@@ -110,7 +110,8 @@ def from_arrays(arrays: Mapping[str, Any]) -> GapTable | None:
 def is_flat(design: Design) -> bool:
     """Whether all sheets of a design are flat and level."""
     return all(
-        np.ptp(body.surface.bounds[:, 2]) <= _FLAT * np.ptp(body.surface.bounds[:, :2], axis=0).max()
+        np.ptp(body.surface.bounds[:, 2])
+        <= _FLAT * np.ptp(body.surface.bounds[:, :2], axis=0).max()
         for body in design.sheets
     )
 
@@ -132,7 +133,9 @@ def plane_panels(solution: BoundarySolution, reach: float) -> Panels:
     corners = np.array([e.surface.bounds for e in design.electrodes])
     low, high = corners[:, 0].min(axis=0) - reach, corners[:, 1].max(axis=0) + reach
     low = np.maximum(low, design.domain.lower + 1e-3 * (design.domain.upper - design.domain.lower))
-    high = np.minimum(high, design.domain.upper - 1e-3 * (design.domain.upper - design.domain.lower))
+    high = np.minimum(
+        high, design.domain.upper - 1e-3 * (design.domain.upper - design.domain.lower)
+    )
     whole = rest = box(low[0], low[1], high[0], high[1])
     flat = Facet(whole, np.zeros(3), np.eye(3))
     sheets = sorted(solution.model.sheets, key=lambda sheet: -sheet[0][0].origin[2])
@@ -153,7 +156,15 @@ def plane_panels(solution: BoundarySolution, reach: float) -> Panels:
             continue
         add(rest.intersection(outline), grading)
         rest = rest.difference(outline)
-    add(rest, replace(grading, edge=_OFF * grading.edge, smallest=_OFF * grading.smallest, largest=_OFF * grading.largest))
+    add(
+        rest,
+        replace(
+            grading,
+            edge=_OFF * grading.edge,
+            smallest=_OFF * grading.smallest,
+            largest=_OFF * grading.largest,
+        ),
+    )
     return concatenate(parts)
 
 
@@ -221,14 +232,15 @@ class PlaneResponse:
         out = 0.5 * (model.eps_front + model.eps_back)[:, None] * total
         if len(self._rows):
             jump = (model.eps_front - model.eps_back)[self._rows, None]
-            gradient = self._gradient @ total + kernels.normal_gradient_block(
-                self._rows, model.floor, both, n
-            ) @ on_plane
+            gradient = (
+                self._gradient @ total
+                + kernels.normal_gradient_block(self._rows, model.floor, both, n) @ on_plane
+            )
             out[self._rows] -= jump * gradient / (4 * math.pi)
         return out
 
     def _images(self, plane: Panels) -> Array:
-        """Mean potential on the plane of its charges' images in the floor, sign left out, (m, m)."""
+        """Mean potential on the plane of its charges' images in the floor, without sign, (m, m)."""
         floor, m = self.solution.model.floor, plane.size
         turn = np.array([1.0, 1.0, -1.0])
         shift = np.array([0.0, 0.0, 2 * floor])
@@ -259,7 +271,11 @@ def build_gap_table(
     """
     model = solution.model
     validity = _VALIDITY * unit
-    plane, top, heights = plane_panels(solution, _MARGIN * unit), top_of(solution), unit * _HEIGHTS
+    plane, top, heights = (
+        plane_panels(solution, _MARGIN * unit),
+        top_of(solution),
+        np.asarray(unit * _HEIGHTS, float),
+    )
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
     response = PlaneResponse(solution, plane)
     for k, height in enumerate(heights):
@@ -288,7 +304,7 @@ def _cells_of(
     density = gather @ np.ascontiguousarray(changes.transpose(1, 0, 2)).reshape(len(areas), -1)
     density = density.reshape(len(total), k, columns) / EPS0
     terminal = owner[first]
-    chosen = _columns_of(density, terminal, total, model.n_terminals)
+    chosen = _columns_of(density, np.asarray(terminal), np.asarray(total, float), model.n_terminals)
     take = np.concatenate([chosen, np.full((len(chosen), 1), columns - 1)], axis=1)[terminal]
     kept = np.take_along_axis(density, np.maximum(take, 0)[:, None], axis=2)
     kept = np.where(take[:, None] >= 0, kept, 0.0)

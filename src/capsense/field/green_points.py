@@ -26,6 +26,7 @@ _OPEN = 0.3
 _PER_WIDTH = 0.5
 """Largest spacing of near point charges, over the width of the narrowest electrode."""
 _SPACING = 2.4e-3
+"""Smallest distance of neighbouring point charges, near representation [m]."""
 _RIM = 0.45
 """Behind free rims, which bodies can pass, the openness is larger."""
 
@@ -74,6 +75,17 @@ class GreenSettings:
     """Squared singular values below this share of the largest count for little."""
 
 
+def narrowest_width(design: Design) -> float:
+    """Width of the narrowest electrode [m]: twice its area over the length of its rims.
+
+    Infinite where no electrode has a rim.
+    """
+    rims = [e.surface for e in design.electrodes if len(e.surface.rims)]
+    lengths = [float(np.linalg.norm(np.diff(s.rims, axis=1), axis=2).sum()) for s in rims]
+    widths = [2 * s.area / length for s, length in zip(rims, lengths, strict=True)]
+    return min(widths, default=math.inf)
+
+
 class Surroundings:
     """Points all over the surfaces that bodies see, and from which side."""
 
@@ -99,14 +111,8 @@ class Surroundings:
         self.areas = panels.weights[inner][used]
         on = (model.owner >= 0) & (model.owner < len(design.electrodes))
         electrodes = np.repeat(on[inner], used.sum(axis=1))
-        self.narrowest = min(
-            (
-                2 * e.surface.area / float(np.linalg.norm(np.diff(e.surface.rims, axis=1), axis=2).sum())
-                for e in design.electrodes if len(e.surface.rims)
-            ),
-            default=math.inf,
-        )  # fmt: skip
-        """Width of the narrowest electrode [m]: twice its area over the length of its rims."""
+        self.narrowest = narrowest_width(design)
+        """Width of the narrowest electrode [m]."""
         self.widest = float(np.sqrt(panels.areas[on].max()))
         """Width of the widest panel of an electrode [m]."""
         self.tree = cKDTree(self.points)

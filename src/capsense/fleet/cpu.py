@@ -265,7 +265,13 @@ class CpuCore:
         records, place = np.empty(table.places, BODY), np.empty(table.places, np.int64)
         for e, s in np.argwhere(found.lossy).tolist():
             count = _seen(
-                bodies, where, e, s, (solver.green.room, SHORE * solver.green.extent), records, place
+                bodies,
+                where,
+                e,
+                s,
+                (solver.green.room, SHORE * solver.green.extent),
+                records,
+                place,
             )
             at = place[:count]
             soft, lone = bodies.softness[e, at], records["neutral"][:count] != 0

@@ -115,44 +115,6 @@ def triangle_distance2(tri: Array, x: float, y: float, z: float) -> float:
     )
 
 
-@kernel
-def nearest_on_triangle(t, o, x, y, z):
-    """Nearest point on the triangle whose corners begin at place ``o`` of an array.
-
-    After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5.
-
-    Returns:
-        The squared distance, the point, and whether it lies within the triangle's edges.
-    """
-    ax, ay, az = t[o], t[o + 1], t[o + 2]
-    ux, uy, uz = t[o + 3] - ax, t[o + 4] - ay, t[o + 5] - az
-    vx, vy, vz = t[o + 6] - ax, t[o + 7] - ay, t[o + 8] - az
-    px, py, pz = x - ax, y - ay, z - az
-    d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
-    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
-    d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
-    s, w, inner = 0.0, 0.0, False
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    if d1 <= 0.0 and d2 <= 0.0:
-        pass
-    elif d3 >= 0.0 and d4 <= d3:
-        s = 1.0
-    elif d6 >= 0.0 and d5 <= d6:
-        w = 1.0
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        s = d1 / max(d1 - d3, 1e-300)
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / max(d2 - d6, 1e-300)
-    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        w = (d4 - d3) / max((d4 - d3) + (d5 - d6), 1e-300)
-        s = 1.0 - w
-    else:
-        whole = va + vb + vc
-        s, w, inner = vb / whole, vc / whole, True
-    qx, qy, qz = ax + s * ux + w * vx, ay + s * uy + w * vy, az + s * uz + w * vz
-    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz, inner
-
-
 @compiled
 def signed_distances(boxes: Boxes, points: Array, out: Array) -> None:
     """Distances [m] to a closed surface, negative inside, at points of shape (n, 3)."""

@@ -302,9 +302,7 @@ def local_slope(bodies, near, node, green, size, weights, out):
                     value = 0.0
                     for k in range(size):
                         for m in range(size):
-                            value += (
-                                weights[k, i] * (both[0, k, m] - both[1, k, m]) * weights[m, j]
-                            )
+                            value += weights[k, i] * (both[0, k, m] - both[1, k, m]) * weights[m, j]
                     out[b, i, j, r] += value / (2.0 * delta)
 
 

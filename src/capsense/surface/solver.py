@@ -22,6 +22,7 @@ from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import SHORE, pack_green
+from capsense.field.green_points import narrowest_width
 from capsense.scene import Scene, TriMesh
 from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
@@ -73,16 +74,6 @@ _RESOLVED, _SMOOTH = 0.6, 1.2
 shorter than the second, over the validity distance: bodies come no nearer."""
 
 
-def electrode_width(design: Design, least: float = _NARROW) -> float:
-    """Width of the narrowest electrode [m]: twice its area over the length of its rims."""
-    widths = [
-        2 * surface.area / float(np.linalg.norm(np.diff(surface.rims, axis=1), axis=2).sum())
-        for surface in (e.surface for e in design.electrodes)
-        if len(surface.rims)
-    ]
-    return max(min(widths, default=math.inf), least)
-
-
 @cache
 def _keep_memory() -> None:
     """Let the memory that a step frees stay with the process for the next step.
@@ -129,12 +120,12 @@ class SurfaceSolver:
         self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
-        coarsest = self.preset.coarsest
-        self._largest = coarsest and self.preset.panels * (coarsest * electrode_width(design)) ** 2
+        coarsest, width = self.preset.coarsest, narrowest_width(design)
+        self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2
         """Bodies of so much surface or more [m²] get panels of a few millimetres; None for none."""
         finest = self.preset.finest
         if finest is not None:
-            finest = min(finest, _RESOLVED * electrode_width(design, 0.0))
+            finest = min(finest, _RESOLVED * width)
             finest = max(finest, _SMOOTH * self.green.gap.validity)
         self._finest = finest
         """Panels of other bodies have parts where they are longer than this [m]; None for none."""
