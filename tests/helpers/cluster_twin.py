@@ -138,6 +138,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
             delta[:m, :m], left[:m, :m], coarse[:m], charge,
             leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
             step.estimate(delta, left, coarse[:m], shift, green.electrodes),
+            np.zeros(len(bodies), np.bool_), np.full(len(bodies), -1), np.zeros((m, m)),
         )  # fmt: skip
 
     with (

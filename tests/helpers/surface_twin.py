@@ -310,7 +310,8 @@ def reduced(
 
 COARSE, LINEAR, DECAY, LEAST = 31, (0.45, 0.58), 0.35, 3e-3
 CROSSED, LARGE, SEEN = 0.3, (0.08, 0.12), 0.1
-LONG, SHORE, TOUCHING, BEHIND = (0.03, 0.06), 5e-3, 8e-4, 4e-3
+LONG, SHORE, BEHIND = (0.03, 0.06), 5e-3, 4e-3
+"""The first two in a domain of 0.5 m."""
 CLOSE, GROWTH, USUAL = (8e-3, 12e-3), 0.2, 0.015
 
 
@@ -457,7 +458,7 @@ def _means(
         crossing *= _smooth((size - LONG[0]) / (LONG[1] - LONG[0]))
         even = (linear_from[1] - size / green.distance(point[None])[0]) / np.diff(linear_from)[0]
         even = 1 - within * (1 - _smooth(even))
-        off = math.hypot(green.distance(point[None])[0], TOUCHING)
+        off = green.distance(point[None])[0]
         front = _smooth(1 + (point[2] - green.box[1, 2]) / BEHIND)
         stiff = 1 - front * math.exp(-2 * math.pi * off / size)
         looks[k] = Look(even * (1 - crossing) if k >= COARSE else 0.0, crossing, stiff, size)

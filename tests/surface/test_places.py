@@ -13,9 +13,10 @@ from surface_scenes import Placed, green_of, pack, shape_of
 import capsense as cs
 from capsense.field.green import LEVELS
 from capsense.field.green_kernels import (
+    Green,
+    Space,
     beyond,
     distances,
-    least_gap,
     level_share,
     lift,
     pack_green,
@@ -26,6 +27,13 @@ from capsense.surface.look_kernels import place
 from capsense.surface.pair_kernels import bound_images, leaf_pairs, mean_inverse
 
 Array = np.ndarray
+
+
+def space_of(green: Green) -> Space:
+    """What places of single points need."""
+    return Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
+
+
 BOX = np.array([[-0.05, -0.04, -0.001], [0.05, 0.04, 0.0]])
 
 
@@ -120,29 +128,27 @@ def test_points_within_come_out_at_the_nearest_face() -> None:
     np.testing.assert_allclose(lifted(np.array(within), 3e-4), wanted, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("extent", "cover", "gap"),
-    [(1e-3, 0.0, 1.5e-4), (0.01, 0.0, 1e-4 / 0.18), (0.1, 0.0, 7e-4), (0.1, 3e-4, 4e-4),
-     (0.1, 3e-3, 2e-5)],
-)  # fmt: skip
-def test_gap_grows_with_the_square_of_the_extent(extent: float, cover: float, gap: float) -> None:
-    """Analytic: within bounds, less by what covers the electrodes."""
-    assert least_gap(extent, cover) == pytest.approx(gap)
+H0 = 1.3e-3
+"""A validity distance [m]."""
+
+
+def with_validity(green: Green) -> Green:
+    return green._replace(gap=green.gap._replace(validity=H0))
 
 
 @pytest.mark.parametrize(
     ("center", "expected"),
     [((0.0, 0.0, 0.1), 0.0), ((0.235, 0.0, 0.1), 0.0), ((0.2375, 0.0, 0.1), 0.5),
      ((0.0, -0.24, 0.1), 1.0), ((0.0, 0.0, 0.48), 1.0), ((0.2, 0.0, -0.01), 0.0),
-     ((0.2, 0.0, -0.0125), 0.5), ((0.0, 0.0, -0.002), 0.0), ((0.0, 0.0, -0.0055), 0.5),
+     ((0.2, 0.0, -0.0125), 0.5), ((0.0, 0.0, -2.2 * H0), 0.0), ((0.0, 0.0, -4.2 * H0), 0.5),
      ((0.0, 0.0, -0.009), 1.0), ((0.2, 0.0, -0.009), 0.0)],
 )  # fmt: skip
 def test_beyond_the_walls_and_behind_the_sensor(center: tuple, expected: float) -> None:
-    """Analytic: a smoothstep over 5 mm, from 15 mm before walls and from 3 mm behind the face."""
-    green = green_of()
+    """Analytic: smoothsteps over 5 mm, from 15 mm before walls, and from 2.3 to 6.1 h0 behind."""
+    green = with_validity(green_of())
     np.testing.assert_allclose(green.room, [[-0.235, -0.235, -0.01], [0.235, 0.235, 0.475]])
     assert green.cover == 0.0
-    assert beyond(around(np.array(center)), green) == pytest.approx(expected, abs=1e-9)
+    assert beyond(around(np.array(center)), space_of(green)) == pytest.approx(expected, abs=1e-9)
 
 
 def around(center: Array) -> Array:
@@ -153,11 +159,11 @@ def around(center: Array) -> Array:
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("side", [0, 1])
 def test_behind_the_face_near_a_side(axis: int, side: int) -> None:
-    """Analytic: half as far as it counts, where the side is a quarter of 5.5 mm away."""
-    green = green_of()
+    """Analytic: half as far as it counts, where the side is a quarter of 4.2 h0 away."""
+    green = with_validity(green_of())
     center = np.array([0.0, 0.0, float(green.box[1, 2]) - 0.008])
-    center[axis] = green.box[side, axis] + (0.0055 / 4) * (1 - 2 * side)
-    assert beyond(around(center), green) == pytest.approx(0.5, abs=1e-9)
+    center[axis] = green.box[side, axis] + (4.2 * H0 / 4) * (1 - 2 * side)
+    assert beyond(around(center), space_of(green)) == pytest.approx(0.5, abs=1e-9)
 
 
 def test_distance_of_clusters_from_the_design() -> None:
@@ -174,7 +180,7 @@ def test_curved_designs_lift_nothing() -> None:
     bodies = pack(Placed(cs.Sphere(0.03), (0.0, 0.0, 0.0299)))
     leaves = placed(bodies, chosen(bodies, green, 0.015, 2.5), green)
     np.testing.assert_array_equal(leaves.points, leaves.true)
-    assert beyond(np.array([(0.0, 0.0, -0.009)] * 4), green) == 0.0
+    assert beyond(np.array([(0.0, 0.0, -0.009)] * 4), space_of(green)) == 0.0
 
 
 @pytest.mark.parametrize("cover", [0.0, 3e-4, np.inf])
@@ -185,12 +191,12 @@ def test_clusters_are_looked_at_where_they_are_lifted_to(cover: float) -> None:
     bodies = pack(Placed(shape, (0.0, 0.0, top + 0.0081), (0.0, math.pi / 2, 0.0)))
     tree, raised, point = shape_of(shape).tree, 0, np.zeros((1, 3), np.float32)
     for k in range(bodies[0]["stored"]):
-        square, _, _, _ = place(bodies[0], green, k, point, 0)
+        square, _, _, _ = place(bodies[0], space_of(green), k, point, 0)
         wanted = bodies["rotation"][0] @ tree.center[k] + bodies["position"][0]
-        d, m = wanted[2] - top, least_gap(tree.extent[k], cover)
-        assert square == pytest.approx(d * d, rel=1e-4)
+        d, m = wanted[2] - top, green.gap.validity
         if d < 2 * m and cover < 1.0:
             wanted[2], raised = top + m + d * d / (4 * m), raised + 1
+        assert square == pytest.approx((wanted[2] - top) ** 2, rel=1e-4)
         np.testing.assert_allclose(point[0], wanted, rtol=0, atol=1e-8)
     assert (raised > 0) == (cover < 1.0)
 

@@ -38,6 +38,9 @@ from capsense.surface.solve_kernels import (
     reduced,
 )
 
+LAW = 0.02
+"""Estimated relative error of what the gap law adds: about the median over ``near_map.py``."""
+
 
 class Solution(NamedTuple):
     """What a scene does to a design; 4π eps0 = 1."""
@@ -47,7 +50,8 @@ class Solution(NamedTuple):
     left: NDArray[Any]
     """The part of it that functions outside the system stand for [m], shape (m, m)."""
     coarse: NDArray[Any]
-    """Estimate of what panels are too coarse for, of its diagonal [m], shape (m,)."""
+    """Estimate of what panels are too coarse for, and of the gap law's error, of its diagonal [m],
+    shape (m,)."""
     charge: NDArray[Any]
     """Charge on each leaf for each terminal at 1 V [m], shape (l, m)."""
     points: NDArray[Any]
@@ -142,10 +146,15 @@ def solve(
     charge = leaf_charges(cut, functions, x, leaves.points.shape[0])
     weights = np.zeros((m, m))
     if near.any():
-        local_change(bodies, near, node, green, delta)
+        local, none = np.zeros(delta.shape), np.zeros(0)
+        local_change(bodies, near, node, green, local)
+        delta += local
         weights = potentials_of(delta, m, nodes, capacitance)
-        delta, left = congruent(weights, delta, capacitance), congruent(weights, left, np.zeros(0))
+        delta, left = congruent(weights, delta, capacitance), congruent(weights, left, none)
         charge, coarse = mixed(charge, weights, green.lead), coarse_of(coarse, weights)
+        local = congruent(weights, local, none)
+        for i in range(m):
+            coarse[i] += LAW * abs(local[i, i])
     error = estimate(delta, left, coarse[:m], shift, green.electrodes)
     return Solution(
         delta[:m, :m], left[:m, :m], coarse[:m], charge,
