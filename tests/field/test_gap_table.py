@@ -18,6 +18,7 @@ from capsense.field.gap_table import (
     PlaneResponse,
     build_gap_table,
     from_arrays,
+    has_even_face,
     is_flat,
     plane_panels,
     to_arrays,
@@ -146,3 +147,10 @@ def test_which_designs_are_flat():
     tilted = PAD.replace("center = [0.006, 0.0]", "center = [0.006, 0.0]\ntilt = [0.0, 5.0, 0.0]")
     assert not is_flat(_design(tilted))
     assert math.isfinite(_table().validity)
+
+
+def test_which_faces_are_even():
+    assert has_even_face(_design(PAD))
+    assert has_even_face(_design(PAD + COVER))
+    half = COVER.replace("size = [0.03, 0.02]", "size = [0.012, 0.02]\ncenter = [0.006, 0.0]")
+    assert not has_even_face(_design(PAD + half))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
-from capsense.field.gap_table import build_gap_table, is_flat
+from capsense.field.gap_table import build_gap_table, has_even_face
 from capsense.field.green import GreenFunction, build_green
 
 Array = NDArray[np.float64]
@@ -113,7 +113,7 @@ def build_background(
     if not (np.isfinite(densities).all() and np.isfinite(capacitance).all()):
         raise FieldError(f"the background field of design {design.name!r} is not finite")
     green = build_green(solution, densities, begin)
-    if is_flat(design):
+    if has_even_face(design):
         green = replace(green, gap=build_gap_table(solution, densities, green.clearance, begin))
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)

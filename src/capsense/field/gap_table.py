@@ -30,7 +30,7 @@ from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
 from capsense.field.bem_kernels import Panels
 from capsense.field.boundary import INTERFACE, BoundaryModel, BoundarySolution
-from capsense.field.panels import Grading, concatenate, cut_facet, make_panels
+from capsense.field.panels import PLANE_TOL, Grading, concatenate, cut_facet, make_panels
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -116,9 +116,28 @@ def is_flat(design: Design) -> bool:
     )
 
 
-def top_of(solution: BoundarySolution) -> float:
+def has_even_face(design: Design) -> bool:
+    """Whether a flat design ends at one height over all of its electrodes: bare, or under a layer.
+
+    Bodies can dip into recesses of others, such as below the top of a bezel.
+    """
+    if not is_flat(design):
+        return False
+    top = top_of(design)
+    covers = [la for la in design.layers if not la.facets and abs(la.upper[2] - top) < PLANE_TOL]
+    return all(
+        abs(e.surface.bounds[1, 2] - top) < PLANE_TOL
+        or any(
+            (e.surface.bounds[0, :2] > la.lower[:2] - PLANE_TOL).all()
+            and (e.surface.bounds[1, :2] < la.upper[:2] + PLANE_TOL).all()
+            for la in covers
+        )
+        for e in design.electrodes
+    )
+
+
+def top_of(design: Design) -> float:
     """Height of the face of a flat design [m]: its highest sheet or layer."""
-    design = solution.design
     heights = [float(body.surface.bounds[1, 2]) for body in design.sheets]
     return max([*heights, *(float(layer.upper[2]) for layer in design.layers)])
 
@@ -273,7 +292,7 @@ def build_gap_table(
     validity = _VALIDITY * unit
     plane, top, heights = (
         plane_panels(solution, _MARGIN * unit),
-        top_of(solution),
+        top_of(solution.design),
         np.asarray(unit * _HEIGHTS, float),
     )
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))

@@ -89,12 +89,16 @@ class Gap(NamedTuple):
 
 
 def pack_gap(table: GapTable | None, clearance: float) -> Gap:
-    """Lay a table out for the kernels."""
+    """Lay a table out for the kernels.
+
+    Without one, bodies are kept off a flat design by half the distance ``clearance`` [m] down to
+    which its Green's function was fitted.
+    """
     if table is None:
         none = np.zeros(0)
         few = np.zeros((0, 2), np.float32)
         return Gap(
-            clearance, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
+            0.5 * clearance, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
             np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros(0, np.float32),
             np.zeros((0, 0), np.int64), np.zeros((0, 2, 1), np.float32), np.zeros(1, np.int64),
             np.zeros((0, 2)), none,

@@ -18,9 +18,8 @@ from capsense.errors import SolveError
 from capsense.field.background import Terminals
 from capsense.field.green_kernels import SHORE, Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading
-from capsense.surface.gradient_kernels import jacobian
 from capsense.surface.solver import SurfaceSolver
-from capsense.surface.step import solve, solve_lossy
+from capsense.surface.step import slopes_of, solve, solve_lossy
 
 Array = NDArray[np.float64]
 
@@ -89,7 +88,7 @@ def _step_rows(
                 _matrix(poses.sensors[e, s], turn)
                 for c in range(count):  # bodies turn about their own origins
                     _position(poses, e, place[c], s, turn, room[c])
-                slope = jacobian(out, room[:count], green)
+                slope = slopes_of(out, room[:count], green, sensor.threshold, sensor.width)
                 for c in range(count):
                     found.slope[e, s, place[c]] = slope[c]
 

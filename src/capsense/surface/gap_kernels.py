@@ -17,6 +17,7 @@ import math
 import numpy as np
 
 from capsense._jit import compiled, kernel
+from capsense._simd import doubles
 from capsense.elements.outline import middle_height, nearest, reach_down
 from capsense.field.green_kernels import lift, smooth
 
@@ -26,8 +27,6 @@ LEAST = 0.025
 """Least length of a field line, over h0: bodies do not come nearer than that."""
 _WAYS, _EXACT = 30, 1e-4
 """Steps down through a body at most, and how exactly its surface is found, over h0."""
-_STEP = 1e-3
-"""Step of differences, over h0."""
 
 
 @compiled
@@ -257,70 +256,28 @@ def _arc(distance, across, up):
     return distance * (angle / math.sin(angle) if angle > 1e-4 else 1.0)
 
 
-@compiled
-def local_slope(bodies, near, node, green, size, weights, out):
-    """Add how the local change, reduced by weights, changes with the poses of near bodies.
+@kernel
+def extent_of_body(body):
+    """Extent of a body's charge [m]."""
+    return body.scale * doubles(body.extent)[0]
 
-    By central differences, of the table's own precision.
 
-    Args:
-        bodies, near, node, green: As :func:`local_change` takes them.
-        size: Rows of its matrix, t.
-        weights: Potentials of all rows for each of m terminals at 1 V, shape (t, m).
-        out: Added to, shape (b, m, m, 6).
+@kernel
+def move(out, body, way, change):
+    """Place a record as a body that is moved along x, y or z [m], or turned about one of them.
+
+    ``way`` is 0 to 2 for the one, 3 to 5 for the other [rad].
     """
-    step = _STEP * green.gap.validity
-    lone = np.zeros(bodies.shape[0], np.bool_)
-    for b in range(bodies.shape[0]):
-        lone[b] = near[b]
-    both = np.empty((2, size, size))
-    for b in range(bodies.shape[0]):
-        if not near[b]:
-            continue
-        arm = max(1e-9, _radius(bodies[b]))
-        place, turn = np.empty(3), np.empty((3, 3))
-        for i in range(3):
-            place[i] = bodies[b].position[i]
-            for j in range(3):
-                turn[i, j] = bodies[b].rotation[i, j]
-        for r in range(6):
-            delta = step if r < 3 else step / arm
-            for side in range(2):
-                change = delta * (1.0 - 2.0 * side)
-                if r < 3:
-                    bodies[b].position[r] = place[r] + change
-                else:
-                    _turn(bodies[b].rotation, turn, r - 3, change)
-                both[side, :, :] = 0.0
-                local_change(bodies, lone, node, green, both[side])
-                for i in range(3):
-                    bodies[b].position[i] = place[i]
-                    for j in range(3):
-                        bodies[b].rotation[i, j] = turn[i, j]
-            for i in range(weights.shape[1]):
-                for j in range(weights.shape[1]):
-                    value = 0.0
-                    for k in range(size):
-                        for m in range(size):
-                            value += weights[k, i] * (both[0, k, m] - both[1, k, m]) * weights[m, j]
-                    out[b, i, j, r] += value / (2.0 * delta)
-
-
-@kernel
-def _radius(body):
-    """About the radius of a body [m]."""
-    if body.sizes[0] == 0.0:
-        return 10.0 * body.scale * 1e-2
-    a, b, c = body.sizes[0], body.sizes[1], body.sizes[2]
-    return body.scale * math.sqrt(a * a + b * b + c * c)
-
-
-@kernel
-def _turn(out, turn, axis, angle):
-    """Turn a rotation matrix about an axis of the sensor frame by an angle [rad]."""
-    c, s = math.cos(angle), math.sin(angle)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
+    c, s = math.cos(change), math.sin(change)
+    i, j, axis = (way + 1) % 3, (way + 2) % 3, way % 3
     for k in range(3):
-        out[i, k] = c * turn[i, k] - s * turn[j, k]
-        out[j, k] = s * turn[i, k] + c * turn[j, k]
-        out[axis, k] = turn[axis, k]
+        out.position[k] = body.position[k]
+        for q in range(3):
+            out.rotation[k, q] = body.rotation[k, q]
+    if way < 3:
+        out.position[way] += change
+        return
+    for k in range(3):
+        out.rotation[i, k] = c * body.rotation[i, k] - s * body.rotation[j, k]
+        out.rotation[j, k] = s * body.rotation[i, k] + c * body.rotation[j, k]
+        out.rotation[axis, k] = body.rotation[axis, k]

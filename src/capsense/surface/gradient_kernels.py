@@ -21,7 +21,6 @@ from capsense._dense import multiply, multiply_simd
 from capsense._jit import compiled, kernel
 from capsense.elements.mean_kernels import cluster_moments
 from capsense.field.green_kernels import distances, level_share
-from capsense.surface.gap_kernels import local_slope
 from capsense.surface.leaf_kernels import (
     near_pairs,
     pair_line,
@@ -67,9 +66,6 @@ def jacobian(solution, bodies, green):
                 f[3] -= y * f[2] - z * f[1]
                 f[4] -= z * f[0] - x * f[2]
                 f[5] -= x * f[1] - y * f[0]
-    if solution.near.any():
-        size = solution.weights.shape[0]
-        local_slope(bodies, solution.near, solution.node, green, size, solution.weights, out)
     return out
 
 

@@ -28,7 +28,14 @@ from capsense.scene.contact import Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.packing import Laid, PackedBodies, View, laid_out, same
-from capsense.surface.step import Solution, potential_change, solve, solve_each, solve_lossy
+from capsense.surface.step import (
+    Solution,
+    potential_change,
+    slopes_of,
+    solve,
+    solve_each,
+    solve_lossy,
+)
 
 Array = NDArray[np.float64]
 
@@ -286,9 +293,10 @@ class SurfaceSolver:
                 "a Jacobian is asked for with bodies of lossy matter, which have none yet; give "
                 "them a conductor's or a lossless material"
             )
-        from capsense.surface.gradient_kernels import jacobian
-
-        slope = UNIT * jacobian(solution, bodies.records, self.green)
+        preset = self.preset
+        slope = UNIT * slopes_of(
+            solution, bodies.records, self.green, preset.threshold, preset.width
+        )
         slope[..., 3:] += np.cross(bodies.offsets[:, None, None], slope[..., :3])
         np.add.at(out, bodies.chosen, slope)
         return out

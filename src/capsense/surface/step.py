@@ -15,7 +15,14 @@ from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
-from capsense.surface.gap_kernels import local_change, near_bodies, press_out
+from capsense.surface.gap_kernels import (
+    extent_of_body,
+    local_change,
+    move,
+    near_bodies,
+    press_out,
+)
+from capsense.surface.gradient_kernels import jacobian
 from capsense.surface.leaf_kernels import Leaves, leaf_rows, placed
 from capsense.surface.network_kernels import (
     as_nodes,
@@ -38,6 +45,8 @@ from capsense.surface.solve_kernels import (
     reduced,
 )
 
+DIFFERENCE = 3e-3
+"""Step of central differences, over the validity distance."""
 LAW = 0.02
 """Estimated relative error of what the gap law adds: about the median over ``near_map.py``."""
 
@@ -137,7 +146,9 @@ def solve(
     :func:`prepared`.
     """
     near = near_bodies(bodies, green)
-    press_out(bodies, near, green)
+    if near.any():
+        bodies = bodies.copy()  # what follows changes them
+        press_out(bodies, near, green)
     m, nodes, node, capacitance = as_nodes(bodies, near, green)
     cut, leaves, functions, system = prepared(bodies, green, threshold, width)
     if nodes > 0:
@@ -161,6 +172,37 @@ def solve(
         leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift, error,
         near, node, weights,
     )  # fmt: skip
+
+
+@compiled
+def slopes_of(
+    solution: Solution, bodies: NDArray[np.void], green: Green, threshold: float, width: float
+) -> NDArray[Any]:
+    """How the Maxwell matrix changes with the pose of each body, as ``gradient_kernels.jacobian``.
+
+    Bodies near the design are lifted, and pressed out of it. What that changes is not in the
+    adjoint, so that their slopes are central differences of the step itself, 12 more of it.
+    """
+    out, m = jacobian(solution, bodies, green), green.terminals
+    if not solution.near.any():
+        return out
+    moved = bodies.copy()
+    for b in range(bodies.shape[0]):
+        if not solution.near[b]:
+            continue
+        step = DIFFERENCE * green.gap.validity
+        arm = max(extent_of_body(bodies[b]), green.gap.validity)
+        for r in range(6):
+            delta = step if r < 3 else step / arm
+            move(moved[b], bodies[b], r, delta)
+            after = solve(moved, green, threshold, width, False).delta
+            move(moved[b], bodies[b], r, -delta)
+            before = solve(moved, green, threshold, width, False).delta
+            for i in range(m):
+                for j in range(m):
+                    out[b, i, j, r] = (after[i, j] - before[i, j]) / (2.0 * delta)
+        move(moved[b], bodies[b], 0, 0.0)
+    return out
 
 
 @compiled
