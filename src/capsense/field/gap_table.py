@@ -195,16 +195,6 @@ def moved(panels: Panels, height: float) -> Panels:
     )
 
 
-def _runs(wanted: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Where runs of true values begin and end."""
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
-
-
-_NO_FLOOR = 1e6
-"""Depth of a floor whose images count for nothing, over the width of the plane."""
-
-
 class PlaneResponse:
     """The boundary elements of a design with a plane in front of it.
 
@@ -215,12 +205,6 @@ class PlaneResponse:
 
     def __init__(self, solution: BoundarySolution, plane: Panels) -> None:
         self.solution, self.plane, model = solution, plane, solution.model
-        below = -_NO_FLOOR * float(np.ptp(plane.centers[:, :2], axis=0).max())
-        none = np.zeros(2 * plane.size)
-        self._own = kernels.system_block(
-            none.astype(np.int64), none, below, plane, (0, plane.size), (0, plane.size)
-        )
-        """Mean potential on the plane of its own charges without anything else, (m, m)."""
         jump = model.eps_front - model.eps_back
         self._rows = np.flatnonzero((model.owner != INTERFACE) & (np.abs(jump) > 1e-12))
         """Panels of sheets between two media."""
@@ -240,13 +224,11 @@ class PlaneResponse:
         kind = np.concatenate([solution.kind, np.zeros(m, np.int64)])
         contrast = np.concatenate([solution.contrast, np.zeros(m)])
         blocks = partial(kernels.system_block, kind, contrast, model.floor, both)
-        onto = blocks((n, n + m), (0, n))  # potentials on the plane of the design's charges
-        back = np.ascontiguousarray((onto * plane.areas[:, None]).T) / model.panels.areas[:, None]
-        for first, last in _runs(solution.kind > 0):  # fluxes are not mutual, as potentials are
-            back[first:last] = blocks((first, last), (n, n + m))
-        answer = solution.solve(back)
+        # All blocks by the same quadrature: near contact their errors cancel, panel by panel.
+        onto, own = blocks((n, n + m), (0, n)), blocks((n, n + m), (n, n + m))
+        answer = solution.solve(blocks((0, n), (n, n + m)))
         sides = np.concatenate([-onto @ densities, np.full((m, 1), UNIT)], axis=1)
-        on_plane = np.linalg.solve(self._own - self._images(plane) - onto @ answer, sides)
+        on_plane = np.linalg.solve(own - onto @ answer, sides)
         total = -answer @ on_plane
         out = 0.5 * (model.eps_front + model.eps_back)[:, None] * total
         if len(self._rows):
@@ -257,21 +239,6 @@ class PlaneResponse:
             )
             out[self._rows] -= jump * gradient / (4 * math.pi)
         return out
-
-    def _images(self, plane: Panels) -> Array:
-        """Mean potential on the plane of its charges' images in the floor, without sign, (m, m)."""
-        floor, m = self.solution.model.floor, plane.size
-        turn = np.array([1.0, 1.0, -1.0])
-        shift = np.array([0.0, 0.0, 2 * floor])
-        mirrored = plane._replace(
-            edges=plane.edges * turn + shift, centers=plane.centers * turn + shift,
-            quad=plane.quad * turn + shift,
-        )  # fmt: skip
-        none = np.zeros(2 * m)
-        below = floor - _NO_FLOOR * float(np.ptp(plane.centers[:, :2], axis=0).max())
-        return kernels.system_block(
-            none.astype(np.int64), none, below, concatenate([plane, mirrored]), (0, m), (m, 2 * m)
-        )
 
 
 def build_gap_table(

@@ -28,19 +28,21 @@ class Sheets:
 
     Args:
         sheets: Triangles of each electrode [m], shapes (t, 3, 3).
+        touch: What is nearer to an electrode than this [m] touches it.
     """
 
-    def __init__(self, sheets: Sequence[Array]) -> None:
+    def __init__(self, sheets: Sequence[Array], touch: float = TOUCH) -> None:
+        self._touch = touch
         few = np.concatenate([points_on(corners, _FEW) for corners in sheets])
         self._few = np.unique(few, axis=0)
         self._many = np.concatenate([points_on(corners) for corners in sheets])
         apart = np.linalg.norm(self._many[:, None] - self._few, axis=2)
         self._nearest = apart.argmin(axis=1)
-        self._reach = apart.min(axis=1) + TOUCH
+        self._reach = apart.min(axis=1) + touch
         self._middle = self._few.mean(axis=0, keepdims=True)
         arms = np.concatenate([self._few, self._many]) - self._middle
-        self._radius = float(np.linalg.norm(arms, axis=1).max()) + TOUCH
-        self.bounds = np.array([self._few.min(axis=0) - TOUCH, self._few.max(axis=0) + TOUCH])
+        self._radius = float(np.linalg.norm(arms, axis=1).max()) + touch
+        self.bounds = np.array([self._few.min(axis=0) - touch, self._few.max(axis=0) + touch])
         """Corners of a box around all of them [m], shape (2, 3)."""
 
     def meet(self, body: Body, conducting: bool) -> bool:
@@ -56,15 +58,15 @@ class Sheets:
         close = off[self._nearest] <= self._reach  # others are no nearer than the few around them
         if close.any():
             off = np.concatenate([off, distances(body, self._many[close], each=False)])
-        return met(off, conducting)
+        return met(off, conducting, self._touch)
 
 
-def met(off: Array, conducting: bool) -> bool:
+def met(off: Array, conducting: bool, touch: float = TOUCH) -> bool:
     """Whether points at such distances from a body [m] mean that it holds an electrode.
 
-    One lies inside it, or touches it where it conducts.
+    One lies inside it, or is nearer to it than ``touch`` [m] where it conducts.
     """
-    return bool(off.min() < -TOUCH or (conducting and np.abs(off).min() < TOUCH))
+    return bool(off.min() < -touch or (conducting and np.abs(off).min() < touch))
 
 
 def distances(body: Body, points: Array, *, each: bool = True) -> Array:

@@ -24,9 +24,10 @@ from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import SHORE, pack_green
 from capsense.field.green_points import narrowest_width
 from capsense.scene import Scene, TriMesh
-from capsense.scene.contact import Sheets
+from capsense.scene.contact import TOUCH, Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.shapes import Shape, ShapeKind
+from capsense.surface.gap_kernels import LEAST
 from capsense.surface.packing import Laid, PackedBodies, View, laid_out, same
 from capsense.surface.step import (
     Solution,
@@ -126,7 +127,9 @@ class SurfaceSolver:
         self._last: tuple[View, Solution] | None = None
         self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
-        self._sheets = Sheets([e.surface.triangles for e in design.electrodes])
+        gap = self.green.gap
+        touch = LEAST * gap.validity if len(gap.areas) else TOUCH
+        self._sheets = Sheets([e.surface.triangles for e in design.electrodes], touch)
         coarsest, width = self.preset.coarsest, narrowest_width(design)
         self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2
         """Bodies of so much surface or more [m²] get panels of a few millimetres; None for none."""
