@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
-from capsense.field.gap_table import build_gap_table, has_even_face
+from capsense.field.gap_table import gap_table_of, has_even_face
 from capsense.field.green import GreenFunction, build_green
 
 Array = NDArray[np.float64]
@@ -114,7 +114,8 @@ def build_background(
         raise FieldError(f"the background field of design {design.name!r} is not finite")
     green = build_green(solution, densities, begin)
     if has_even_face(design):
-        green = replace(green, gap=build_gap_table(solution, densities, green.clearance, begin))
+        table = gap_table_of(solution, settings.panel_scale, green.clearance, begin)
+        green = replace(green, gap=table)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)
 

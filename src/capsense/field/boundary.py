@@ -46,7 +46,7 @@ _FEW, _MANY = 3_000, 9_000
 """Designs of fewer panels are cut finer, those of more coarser: a build takes no hours."""
 _FINEST, _COARSEST = 0.5, 8.0
 """The finest, and where the search begins, as multiples of the default sizes."""
-_POWER = 1.7
+POWER = 1.7
 """The number of panels goes with their size to minus this power, about."""
 
 
@@ -129,12 +129,12 @@ def _fitted(design: Design) -> float:
     Sizes are halved from the coarsest on, so that no cut has many more panels than are allowed.
     """
     scale, count = _COARSEST, _cut(design, _COARSEST).panels.size
-    while scale > 1.0 and count * 2**_POWER < 1.5 * _MANY:
+    while scale > 1.0 and count * 2**POWER < 1.5 * _MANY:
         scale /= 2
         count = _cut(design, scale).panels.size
     if scale > 1.0 or count > _MANY:
-        return scale * (count / _MANY) ** (1 / _POWER)
-    return float(np.clip((count / _FEW) ** (1 / _POWER), _FINEST, 1.0))
+        return scale * (count / _MANY) ** (1 / POWER)
+    return float(np.clip((count / _FEW) ** (1 / POWER), _FINEST, 1.0))
 
 
 def _cut(design: Design, scale: float) -> BoundaryModel:

@@ -29,7 +29,13 @@ from capsense.design.geometry import Facet
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
 from capsense.field.bem_kernels import Panels
-from capsense.field.boundary import INTERFACE, BoundaryModel, BoundarySolution
+from capsense.field.boundary import (
+    INTERFACE,
+    POWER,
+    Accuracy,
+    BoundaryModel,
+    BoundarySolution,
+)
 from capsense.field.panels import PLANE_TOL, Grading, concatenate, cut_facet, make_panels
 
 Array = NDArray[np.float64]
@@ -40,6 +46,8 @@ _HEIGHTS = 0.03 * 2.1 ** np.arange(7)
 """Distances of the plane, over the clearance of the Green's function."""
 _OFF = 3.0
 """Panels of the plane beside the sheets, over the size of those above them."""
+_MOST = 3500
+"""About the most boundary elements that a table is made from."""
 _VALIDITY = 1.0
 """The validity distance, over the clearance of the Green's function."""
 _FLAT = 3e-3
@@ -239,6 +247,30 @@ class PlaneResponse:
             )
             out[self._rows] -= jump * gradient / (4 * math.pi)
         return out
+
+
+def gap_table_of(
+    solution: BoundarySolution,
+    panel_scale: float,
+    unit: float,
+    progress: Callable[[str], None] = lambda _: None,
+) -> GapTable:
+    """The table of a design, from coarser boundary elements where it has many.
+
+    They make no difference: what a plane changes is found on the same panels with and without it.
+
+    Args:
+        solution: The factorised boundary elements of the design.
+        panel_scale: Size of their panels, as :class:`~capsense.field.boundary.Accuracy` has it.
+        unit: Smallest distance that its Green's function was fitted at [m].
+        progress: Called with what is being done.
+    """
+    count = solution.model.panels.size
+    if count > _MOST:
+        scale = max(panel_scale, 1.0) * (count / _MOST) ** (1 / POWER)
+        solution = BoundarySolution(solution.design, Accuracy(scale))
+    densities = solution.densities(np.eye(solution.model.n_terminals))
+    return build_gap_table(solution, densities, unit, progress)
 
 
 def build_gap_table(
