@@ -85,11 +85,20 @@ def _step_rows(
                 for j in range(m):
                     found.delta[e, s, i, j] = out.delta[i, j] if out.shift >= 0.0 else np.nan
             if slopes and out.shift >= 0.0:
+                slope = slopes_of(out, room[:count], green, sensor.threshold, sensor.width)
                 _matrix(poses.sensors[e, s], turn)
                 for c in range(count):  # bodies turn about their own origins
+                    x, y, z = room[c].position[0], room[c].position[1], room[c].position[2]
                     _position(poses, e, place[c], s, turn, room[c])
-                slope = slopes_of(out, room[:count], green, sensor.threshold, sensor.width)
-                for c in range(count):
+                    x -= room[c].position[0]
+                    y -= room[c].position[1]
+                    z -= room[c].position[2]
+                    for i in range(m):
+                        for j in range(m):
+                            f = slope[c, i, j]
+                            f[3] += y * f[2] - z * f[1]
+                            f[4] += z * f[0] - x * f[2]
+                            f[5] += x * f[1] - y * f[0]
                     found.slope[e, s, place[c]] = slope[c]
 
 
