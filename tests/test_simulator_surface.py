@@ -221,8 +221,8 @@ def test_contact_is_finite_and_monotone(simulators, design, name):
     change = np.diff(np.log(read), axis=0)
     assert change[gaps[1:] > 0.0].min() > -1e-4
     assert change.min() > {"bar": -0.03, "box": -0.015}.get(name, -3e-3)
-    assert change.max() < 0.1
-    assert read[-1].max() < 55e-12
+    assert change.max() < 0.5  # near contact readings go with 1 / distance
+    assert read[-1].max() < 300e-12
 
 
 def test_deep_in_the_sensor_a_reading_says_that_it_is_rough(sim):

@@ -37,7 +37,7 @@ def test_a_field_is_that_of_its_boundary_elements() -> None:
     assert parts[0] == 0.0
     assert told[-1] == ("done", 1.0)
     assert set(background._STAGES) < set(stages)
-    assert len(set(parts)) == len(set(background._STAGES)) + 2
+    assert len(set(parts)) >= len(set(background._STAGES.values())) + 2
 
 
 def test_settings_count_and_have_defaults(monkeypatch: pytest.MonkeyPatch) -> None:

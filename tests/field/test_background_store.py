@@ -33,7 +33,7 @@ def test_a_field_comes_back_to_the_last_bit(built: BackgroundField, tmp_path: Pa
     assert digest(back) == digest(built)
     assert (back.terminals, back.n_panels) == (built.terminals, built.n_panels)
     for name, array in arrays(back).items():
-        assert array.flags.c_contiguous, name
+        assert array.flags.c_contiguous or name.endswith("gap_change"), name
     assert os.listdir(tmp_path) == ["a.npz"]
 
 

@@ -114,7 +114,7 @@ def test_disc_in_a_large_box(box):
     ids=["pair with a ground strip", "grid"],
 )  # fmt: skip
 def test_pads_on_a_board(centers, side, strip, board, wanted):
-    """Against panels of 0.35 and 0.5 times the size, by ``benchmarks/designer_cases.py``: 0.9 %.
+    """Against panels of 0.35 and 0.5 times the size, by ``benchmarks/designer_cases.py``: 1.1 %.
 
     The finer ones are not yet converged: that of the pair would end some 0.2 % higher.
 
@@ -136,7 +136,7 @@ def test_pads_on_a_board(centers, side, strip, board, wanted):
         ]
     found = capacitance(parse_design(data)) / (1e-3 * PICO)
     for at, value in wanted.items():
-        assert found[at] == pytest.approx(value, rel=0.01)
+        assert found[at] == pytest.approx(value, rel=0.012)
 
 
 def test_large_array_is_cut_to_what_fits():
@@ -146,9 +146,9 @@ def test_large_array_is_cut_to_what_fits():
     assert 6_000 < build_model(pads).panels.size < 10_000
 
 
-@pytest.mark.parametrize(("size", "along"), [(0.3, 8), (1.0, 12)])
+@pytest.mark.parametrize(("size", "along"), [(0.3, 12), (1.0, 12)])
 def test_walls_are_cut_evenly_whatever_is_inside(size, along):
-    """Analytic: squares of about 40 mm, or 80 mm in a box of 1 m, on the five faces of the box."""
+    """Analytic: squares of a twelfth of the five faces of the box."""
     design = patches(rectangle((size / 2 - 0.05, 0), (0.03, 0.03)), size=size, backplane=size / 2)
     model = build_model(design, Accuracy(fitted=False))
     walls = model.panels.areas[model.owner == boundary.GROUND]

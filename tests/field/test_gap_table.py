@@ -90,7 +90,7 @@ def test_near_contact_it_is_a_plate_capacitor():
     table = _table()
     plate = EPS0 * 1e-4 / table.heights[0]
     assert _entry(table, 0, 0, 0) == pytest.approx(plate, rel=0.01)
-    assert _entry(table, 0, -1, 0) == pytest.approx(-plate, rel=0.02)
+    assert _entry(table, 0, -1, 0) == pytest.approx(-plate, rel=0.03)
 
 
 def test_a_cover_is_in_series():

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.field.green_kernels import Green
+from capsense.field.green_kernels import Green, pack_gap
 from capsense.surface import step
 from capsense.surface.choose_kernels import Cut, Functions, functions_of
 from capsense.surface.leaf_kernels import leaf_rows, placed
@@ -152,13 +152,15 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 def twin_of(fleet: cs.Fleet) -> cs.Simulator:
     """A simulator with the shapes of a fleet; use it within :func:`same_functions`.
 
-    Fleets on Warp do without the middle one of the Green's function's representations.
+    Fleets on Warp do without the middle one of the Green's function's representations, and without
+    the table of the gap law.
     """
     simulator = cs.Simulator(fleet.design)
     simulator._solver = copy(fleet._solver)
     green = simulator._solver.green
     (near, _, far), (_, start) = green.levels, green.blends
     simulator._solver.green = green._replace(
-        levels=(near, far, far), blends=np.array([start, start + 1.0])
-    )
+        levels=(near, far, far), blends=np.array([start, start + 1.0]),
+        gap=pack_gap(None, 2.0 * green.gap.validity),
+    )  # fmt: skip
     return simulator

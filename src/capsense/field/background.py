@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -80,9 +81,9 @@ class BackgroundField:
 
 _STAGES = {
     "boundary elements: factorising": 0.2,
-    "response to charges: where": 0.3,
-    "response to charges: boundary elements": 0.4,
-    "response to charges: fit": 0.9,
+    "response to charges: where": 0.2,
+    "response to charges: boundary elements": 0.3,
+    "response to charges: fit": 0.5,
 }
 """Share of a build's time that is over when a stage begins; 0 for the others."""
 
@@ -103,7 +104,11 @@ def build_background(
     tell = (lambda stage, fraction: None) if progress is None else progress
 
     def begin(stage: str) -> None:
-        tell(stage, _STAGES.get(stage, 0.0))
+        plane = re.fullmatch(r"response to a plane: (\d+) of (\d+)", stage)
+        if plane:
+            tell(stage, 0.6 + 0.4 * (int(plane[1]) - 1) / int(plane[2]))
+        else:
+            tell(stage, _STAGES.get(stage, 0.0))
 
     names = tuple(terminals(design))
     solution = BoundarySolution(design, Accuracy(settings.panel_scale), begin)

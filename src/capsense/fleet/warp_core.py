@@ -288,7 +288,7 @@ def _response(solver: SurfaceSolver, device: Any) -> Any:
     out.columns = wp.array(columns, dtype=warp_cut.many, device=device)
     out.far, out.passes = count, width // warp_cut.WIDTH
     out.lead, out.terminals, out.middle = green.lead, green.terminals, wp.vec3(*solver.middle)
-    out.extent = green.extent
+    out.extent, out.validity = green.extent, green.gap.validity
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blends[-1].tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (

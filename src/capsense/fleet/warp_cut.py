@@ -33,10 +33,6 @@ _NEAREST = wp.constant(1e-3)
 _HALF = wp.constant(0.5)
 _CROSSING = wp.constant(2.0)
 _LONG0, _LONG1 = (wp.constant(x) for x in LONG)
-_GAP0, _GAP1, _GAP2, _GAP3 = (wp.constant(x) for x in (1.5e-4, 7e-4, 0.18, 2e-5))
-"""Least gap to a flat design [m]: the square of a cluster's extent over the third, at least the
-first, at most the second; less by the thickness of a cover, but not less than the fourth. Warp has
-no gap law yet."""
 _LIFTED, _BARRIER = wp.constant(LIFTED), wp.constant(BARRIER)
 _DEEP, _BEHIND = wp.constant(3e-3), wp.constant(5e-3)
 _STEEP, _SHORE = wp.constant(STEEP), wp.constant(SHORE)
@@ -89,6 +85,7 @@ class Response:
     floor: wp.float32
     cover: wp.float32
     extent: wp.float32  # shortest side of the domain
+    validity: wp.float32  # distance from which the Green's function is valid
     blend0: wp.float32
     blend1: wp.float32
     box0: wp.vec3
@@ -342,7 +339,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
             depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
         deep = (depth - _DEEP) / _BEHIND
-        gap = wp.max(_GAP3, wp.min(_GAP1, wp.max(_GAP0, size * size / _GAP2)) - green.cover)
+        gap = green.validity  # Warp has no gap law yet: what the lift takes away is not added
         for q in range(4):
             before = points[q]
             points[q] = _lift(before, gap, green)

@@ -33,7 +33,7 @@ _WAYS, _EXACT = 30, 1e-4
 def near_bodies(bodies, green):
     """Conductors with an outline within twice h0 of a flat design, (b,).
 
-    Not those of dielectrics, nor bodies far to the side.
+    Not dielectrics, nor bodies that are mostly behind the face, or reach far behind it.
     """
     out, gap = np.zeros(bodies.shape[0], np.bool_), green.gap
     if gap.areas.shape[0] == 0:
@@ -41,7 +41,9 @@ def near_bodies(bodies, green):
     for b in range(bodies.shape[0]):
         body = bodies[b]
         if body.outline != 0 and body.softness == 0.0:
-            out[b] = middle_height(body) - reach_down(body) < gap.top + 2.0 * gap.validity
+            middle = middle_height(body) - gap.top
+            lowest = (middle - reach_down(body)) / gap.validity
+            out[b] = middle >= 0.0 and -REACH[1] < lowest < 2.0
     return out
 
 

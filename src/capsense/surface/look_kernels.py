@@ -31,6 +31,8 @@ domain's shortest side."""
 _SCREENED = 2.0 * math.pi
 """A grounded plane at a distance d leaves charges of wavelength 2 l, as the function of a cluster
 of size l has, 1 - exp(-2π d / l) of their energy."""
+_LEAST_LEFT = 1e-3
+"""Least part of its energy that a cluster counts as left with."""
 _FREED = 20.0
 """Exponent from which on that is not looked at: it is 2e-9."""
 _BEHIND = 4e-3
@@ -138,7 +140,7 @@ def stiffness(cover, size, square, height):
     far = _SCREENED * math.sqrt(square)
     if far >= _FREED * size:
         return 1.0
-    return 1.0 - smooth(1.0 + height / _BEHIND) * math.exp(-far / size)
+    return max(1.0 - smooth(1.0 + height / _BEHIND) * math.exp(-far / size), _LEAST_LEFT)
 
 
 @compiled
