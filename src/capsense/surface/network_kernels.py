@@ -73,7 +73,7 @@ def potentials_of(matrix, terminals, nodes, capacitance):
             side[a, i] = -matrix[terminals + a, i]
     for k in range(nodes):  # few and definite: elimination without pivots
         for a in range(k + 1, nodes):
-            share = own[a, k] / own[k, k]
+            share = own[a, k] / own[k, k] if own[k, k] > 0.0 else 0.0
             for b in range(k, nodes):
                 own[a, b] -= share * own[k, b]
             for i in range(terminals):
@@ -83,7 +83,8 @@ def potentials_of(matrix, terminals, nodes, capacitance):
             value = side[k, i]
             for b in range(k + 1, nodes):
                 value -= own[k, b] * out[terminals + b, i]
-            out[terminals + k, i] = value / own[k, k]
+            # nothing of a node may be within reach
+            out[terminals + k, i] = value / own[k, k] if own[k, k] > 0.0 else 0.0
     return out
 
 
