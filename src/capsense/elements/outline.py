@@ -16,8 +16,6 @@ from capsense.scene.shapes import Shape, ShapeKind
 
 BOX, SPHERE, CAPSULE, CYLINDER, ELLIPSOID, MESH = (1 + int(kind) for kind in ShapeKind if kind < 6)
 """Codes of ``BODY["outline"]``; 0 where a body has none."""
-_DEPTH = 64
-"""Levels of a tree of boxes, at most; its size grows by two with each."""
 _STEPS = 30
 """Newton steps towards the nearest point of an ellipsoid, at most."""
 

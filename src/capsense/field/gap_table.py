@@ -2,12 +2,9 @@
 
 A compact Green's function does not resolve distances smaller than the spacing of its charges. The
 boundary elements of the design do. A grounded plane is put in front of them, at some distances z,
-by a Schur complement of their factorised system. From its charges follow
-
-* the validity distance h0: the least z from which the energies of a small and of a large grounded
-  plate by the Green's function are those by the boundary elements;
-* T_ij(p, z): what the plane changes in the charge density on terminal i at its point p, with
-  terminal j, or the plane itself, at 1 V.
+by a Schur complement of their factorised system. From its charges follows T_ij(p, z): what the
+plane changes in the charge density on terminal i at its point p, with terminal j, or the plane
+itself, at 1 V. The validity distance h0 is not measured: it is the smallest distance of the fit.
 """
 
 from __future__ import annotations
@@ -58,8 +55,6 @@ _DEEP = 3.0
 """Longest series distance, over the largest height."""
 _MARGIN = 8.0
 """How far the plane reaches beyond the terminals, over the clearance."""
-_VALID = 0.01
-"""Relative error of the energy of a plate up to which the Green's function is valid."""
 _CELL = 0.6
 """Size of the cells of the table, over the validity distance."""
 _CELLS = 16_000
@@ -257,7 +252,7 @@ def gap_table_of(
 ) -> GapTable:
     """The table of a design, from coarser boundary elements where it has many.
 
-    They make no difference: what a plane changes is found on the same panels with and without it.
+    What a plane changes is found on the same panels with and without it.
 
     Args:
         solution: The factorised boundary elements of the design.

@@ -48,7 +48,7 @@ from capsense.surface.solve_kernels import (
 DIFFERENCE = 3e-3
 """Step of central differences, over the validity distance."""
 LAW = 0.02
-"""Estimated relative error of what the gap law adds: about the median over ``near_map.py``."""
+"""Assumed relative error of what the gap law adds; not fitted to measured errors."""
 
 
 class Solution(NamedTuple):
