@@ -554,7 +554,7 @@ def of_skin(matrix: np.ndarray) -> list[float]:
         ("learning", False, 0.12),
         ("standard", False, 0.04),
         ("standard", True, 0.08),
-        ("fine", False, 0.01),
+        ("fine", False, 0.015),
         ("fine", True, 0.02),
     ],
 )
