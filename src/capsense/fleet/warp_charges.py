@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.fleet.warp_cut import SOURCES, Places, Response, Shapes, WarpCut, many
+from capsense.fleet.warp_cut import SOURCES, Places, Response, Shapes, WarpCut, idle, many
 from capsense.fleet.warp_pairs import (
     COLUMNS,
     Leaf,
@@ -35,7 +35,7 @@ from capsense.fleet.warp_pairs import (
     seen,
     some,
 )  # fmt: skip
-from capsense.fleet.warp_solve import Circuit, Left, own, times
+from capsense.fleet.warp_solve import Left, own, times
 from capsense.surface.pair_kernels import BARRIER
 from capsense.surface.solve_kernels import COARSE, GAIN
 
@@ -52,6 +52,8 @@ def coarse(
 ):  # fmt: skip
     """What panels are too coarse for [m], see ``solve_kernels.COARSE``, (t, v)."""
     t, v = wp.tid()
+    if t >= cut.columns[v]:
+        return
     total = float(0.0)
     for f in range(matrix.shape[0]):
         if cut.number[f, v] >= 0 and cut.ends[f, v] > 0.0:
@@ -77,7 +79,7 @@ def modes(
     """Sums of ψ over all charges, (modes, 2 lead, v); ``added`` to what there is."""
     k, chunk, v = wp.tid()
     first = _COLUMNS * chunk
-    if lead + k >= cut.width[v] or (first >= lead and cut.lossy[v] == 0):
+    if lead + k >= cut.width[v] or idle(cut, lead, first, v):
         return
     total = some()
     if added != 0:
@@ -101,7 +103,7 @@ def strengths(
     lead = green.lead
     width = cut.width[v]
     near = _SOURCES * batch >= green.far
-    if (near and width < green.columns.shape[0]) or (c >= lead and cut.lossy[v] == 0):
+    if (near and width < green.columns.shape[0]) or idle(cut, lead, c, v):
         return
     total = many()
     if c < lead:
@@ -119,7 +121,7 @@ def to_clusters(
 ):  # fmt: skip
     """Charges of clusters from those of functions; these become those of the shapes' functions."""
     c, v = wp.tid()
-    if c >= lead and cut.lossy[v] == 0:
+    if idle(cut, lead, c, v):
         return
     for step in range(cut.leader.shape[0]):
         b = cut.leader.shape[0] - 1 - step
@@ -198,7 +200,7 @@ def residuals(shapes: Shapes, places: Places, green: Response, cut: WarpCut, lef
     k = cut.node[i, v]
     first = _COLUMNS * chunk
     imaginary = first >= green.lead
-    if imaginary and cut.lossy[v] == 0:
+    if idle(cut, green.lead, first, v):
         return
     b = i // cut.clusters
     e = v // places.hidden.shape[0]
@@ -338,44 +340,3 @@ def add(values: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32))
     out[i, c, v] = out[i, c, v] + values[i, c, v]
 
 
-@wp.kernel
-def follow(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d), out: wp.array3d(dtype=wp.float32)):
-    """Potential of each terminal while an electrode is at 1 V, (t, n, v); floating ones follow.
-
-    ``whole`` is as ``eliminate`` leaves it: row p of a floating conductor holds its coupling with
-    those before it, these still in the network.
-    """
-    j, v = wp.tid()
-    for a in range(whole.shape[0]):
-        volts = float(0.0)
-        if a == j:
-            volts = 1.0
-        if a >= circuit.driven:
-            charge = wp.float32(0.0)
-            for c in range(a):
-                charge += wp.float32(whole[a, c, v][0] / whole[a, a, v][0]) * out[c, j, v]
-            volts = -charge
-        out[a, j, v] = volts
-
-
-@wp.kernel
-def slopes(
-    circuit: Circuit, cut: WarpCut, turn: wp.array3d(dtype=wp.float32),
-    charge: wp.array3d(dtype=wp.float32), pull: wp.array3d(dtype=wp.spatial_vector),
-    out: wp.array4d(dtype=wp.spatial_vector),
-):  # fmt: skip
-    """Derivative of the matrices by the pose of each body [F/m], [F/rad], (v, b, n, n)."""
-    b, i, v = wp.tid()
-    for j in range(circuit.electrodes):
-        total = wp.spatial_vector()
-        for k in range(turn.shape[0]):
-            for c in range(turn.shape[0]):
-                share = turn[k, i, v] * turn[c, j, v]
-                if share != 0.0:
-                    for f in range(cut.node.shape[0]):
-                        if body_of(cut, f) == b and cut.node[f, v] >= 0:
-                            one = charge[f, k, v] * pull[f, c, v]
-                            total += share * (one + charge[f, c, v] * pull[f, k, v])
-        force = wp.spatial_top(total)
-        torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
-        out[v, b, i, j] = circuit.unit * wp.spatial_vector(force, torque)

@@ -14,15 +14,20 @@ from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
 from capsense.fleet import warp_charges as charges
-from capsense.fleet import warp_cut
+from capsense.fleet import warp_cut, warp_gap, warp_near
+from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
 from capsense.fleet.bodies import Bodies, on_device
 from capsense.fleet.warp_chips import WarpChips
+from capsense.fleet.warp_outline import pack_outlines
 from capsense.readout import Readout
 from capsense.surface.solver import SurfaceSolver
 
 Array = NDArray[np.float64]
+
+_NODES = 8
+"""At most so many conductors near a design that are not at ground are nodes in each view."""
 
 
 class WarpCore:
@@ -45,32 +50,43 @@ class WarpCore:
         self.shapes: Any = None
         self._before: list[Any] = []
         self._captured = False
-        self.green, self.circuit = _response(solver, device), _circuit(terminals, device)
-        self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         environments, places, sensors = counts
+        table = solver.green.gap
+        slots = min(places, _NODES) if len(table.areas) else 0
+        self.green, self.circuit = _response(solver, slots, device), _circuit(terminals, device)
+        self.circuit.omega = 2 * np.pi * solver.excitation_frequency
+        self.gap = warp_near.pack_gap(table, self.green.terminals, slots, device)
+        self.outlines: Any = None
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
         passes, t, lead = self.green.table.shape[1], self.green.terminals, self.green.lead
+        size, chunks = t + slots, len(self.gap.owner)
         width, room, struct = passes * warp_cut.WIDTH, self.room, self._struct
         self.cut = struct(warp_cut.WarpCut, {
             "split number score part mix weight ends out": (n, views),
             "node lifted extent soft beyond near points unlifted": (3 * n, views),
-            "pose moved leader tie": (places, views),
-            "lossy width walled": (views,),
+            "pose moved leader tie slot": (places, views),
+            "lossy width walled columns": (views,),
         })  # fmt: skip
         self.cut.clusters = clusters
         self.left = struct(solution.Left, {
             "charge on residual": (n, 2 * lead, views),
             "sums": (width - lead, 2 * lead, views),
             "strength": (len(self.green.sources), 2 * lead, views),
-            "energy": (n, views), "doubt": (t, views), "dropped": (views,),
+            "energy": (n, views), "doubt": (size, views), "dropped": (views,),
+            "below local": (size, size, views), "volts": (slots, t, views),
+        })  # fmt: skip
+        self.near = struct(warp_near.Near, {
+            "count": (views,), "body below foot": (places, views), "depth": (chunks, places, views),
+            "capacitance": (slots, views),
+            "part": (chunks, table.columns.shape[1] + slots, views),
         })  # fmt: skip
         self.places = struct(warp_cut.Places, {
             "choice neutral softness tie scale slack": (environments, places),
             "hidden": (sensors, places), "group": (places,),
         })  # fmt: skip
         self.rows, self.matrix = room(n, width, views), room(n, n, views)
-        self.loss, self.quadrature = room(n, views), room(n, t, views)
-        self.whole = room(t, t, views, dtype=wp.vec2d)
+        self.loss, self.quadrature = room(n, views), room(n, size, views)
+        self.whole = room(size, size, views, dtype=wp.vec2d)
         self.capacitance, self.delta, self.conductance = (
             room(environments, sensors, m, m) for _ in range(3)
         )
@@ -102,13 +118,14 @@ class WarpCore:
         if len(bodies.shapes) != self._taken:
             if self._captured:
                 self._captured = False
-                before = self.shapes, self.places.choice, self.circuit.rest, self.circuit.empty
+                before = self.shapes, self.outlines, self.places.choice, self.circuit.rest, self.circuit.empty
                 self._before.append(before)
-                self.places.choice = wp.clone(before[1])
-                self.circuit.rest, self.circuit.empty = map(wp.clone, before[2:])
-                for matrix in before[2:]:
+                self.places.choice = wp.clone(before[2])
+                self.circuit.rest, self.circuit.empty = map(wp.clone, before[3:])
+                for matrix in before[3:]:
                     matrix.fill_(np.nan)
             self.shapes, self._taken = _shapes(shapes, bodies, self._array), len(bodies.shapes)
+            self.outlines = pack_outlines(shapes, self._array)
         for name in ("choice", "neutral", "hidden", "group"):
             getattr(self.places, name).assign(getattr(bodies, name).astype(np.int32))
         for name in ("scale", "slack"):
@@ -134,13 +151,14 @@ class WarpCore:
         bodies = as_transforms(bodies, self.poses)
         sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
         n, views = self.cut.number.shape
-        t = self.green.terminals
+        size = self.whole.shape[0]
         green, cut, circuit = self.green, self.cut, self.circuit
         at = (self.shapes, self.places)
         rows, matrix, whole = self.rows, self.matrix, self.whole
-        width = rows.shape[1]
-        self.launch(warp_cut.choose, (self.counts[1], views), *at, green, bodies, sensors, cut)
-        self.launch(warp_cut.connect, views, self.places, cut)
+        width, stood = rows.shape[1], (self.counts[1], views)
+        self.launch(warp_cut.stand, stood, *at, green, bodies, sensors, cut)
+        self._look_near()
+        self.launch(warp_cut.choose, stood, *at, green, cut)
         self.launch(warp_cut.place, (3 * n, views), *at, green, cut)
         self.launch(warp_cut.weigh, views, *at, green, cut)
         self.launch(pairs.rows, (n, width // warp_cut.WIDTH, views), green, cut, rows)
@@ -157,19 +175,33 @@ class WarpCore:
         rest, loss, quadrature = self.left, self.loss, self.quadrature
         self.launch(solution.factorise, views, cut, matrix, rest.dropped)
         self.launch(solution.factorise_lossy, views, cut, matrix, loss, rest.dropped)
-        self.launch(solution.forward, (t, views), cut, matrix, loss, rows, quadrature)
+        self.launch(solution.forward, (size, views), cut, matrix, loss, rows, quadrature)
         self._look_below()
-        self.launch(solution.change, (t, t, views), circuit, cut, rows, quadrature, rest, whole)
-        self.launch(solution.eliminate, views, circuit, whole)
+        near = self.gap, self.near
+        dim = size, size, views
+        self.launch(network.change, dim, *near, cut, rows, quadrature, rest, whole)
+        self.launch(network.eliminate, views, circuit, *near, cut, rest, whole)
         self.launch(
-            solution.report, (circuit.electrodes, views), circuit, whole,
+            network.report, (circuit.electrodes, views), circuit, whole,
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
         )  # fmt: skip
+
+    def _look_near(self) -> None:
+        """What is near the design, and what the gap law adds for it."""
+        near = self.shapes, self.outlines, self.places, self.gap
+        (chunks, _, views), launch = self.near.depth.shape, self.launch
+        launch(warp_near.connect, views, *near, self.cut, self.near)
+        if self.gap.there:
+            launch(warp_near.press, (views, chunks), *near, self.cut, self.near)
+            launch(warp_near.press_out, views, self.gap, self.cut, self.near)
+            launch(
+                warp_gap.local_change, (views, chunks), *near, self.green, self.cut, self.near
+            )  # fmt: skip
 
     def _look_below(self) -> None:
         """Charges, and the potentials that they leave in functions that are not solved for."""
         cut, green, rest, rows = self.cut, self.green, self.left, self.rows
-        (n, columns, views), lead, t = rest.charge.shape, green.lead, green.terminals
+        (n, columns, views), lead, t = rest.charge.shape, green.lead, self.whole.shape[0]
         launch, matrix, loss = self.launch, self.matrix, self.loss
         parts, batches = columns // pairs.COLUMNS, green.columns.shape[1]
         solved = matrix, loss, rows, self.quadrature
@@ -188,7 +220,7 @@ class WarpCore:
         environments, places, sensors = self.counts
         n, views = self.cut.number.shape
         circuit, green, cut, rest = self.circuit, self.green, self.cut, self.left
-        m, t, lead, room = circuit.electrodes, green.terminals, green.lead, self.room
+        m, t, lead, room = circuit.electrodes, self.whole.shape[0], green.lead, self.room
         sources, modes = len(green.sources), rest.sums.shape[0]
         if self._slopes is None:
             self._slopes = [
@@ -215,8 +247,8 @@ class WarpCore:
         size = green.columns.shape[1], lead, views
         launch(charges.strengths, size, green, cut, sums, strength)
         launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, pull)
-        launch(charges.follow, (m, views), circuit, self.whole, turn)
-        launch(charges.slopes, (places, m, views), circuit, cut, turn, charge, pull, out)
+        launch(network.follow, (m, views), circuit, cut, self.whole, turn)
+        launch(network.slopes, (places, m, views), circuit, cut, turn, charge, pull, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
@@ -274,20 +306,22 @@ def as_transforms(poses: Any, room: Any) -> Any:
     return out
 
 
-def _response(solver: SurfaceSolver, device: Any) -> Any:
+def _response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     out, green = warp_cut.Response(), solver.green
+    lead = pairs.COLUMNS * -(-(green.terminals + slots) // pairs.COLUMNS)
     near, _, far = green.levels  # the middle level is not used here
     sources = np.concatenate([far.sources.T, near.sources.T]).astype(np.float32)
-    (count, width), size = far.table.shape, warp_cut.SOURCES
-    table = np.zeros((size * -(-len(sources) // size), near.table.shape[1]), np.float32)
-    table[:count, :width], table[count : len(sources)] = far.table, near.table
+    tables = [_widened(level.table, green.lead, lead) for level in (far, near)]
+    (count, width), size = tables[0].shape, warp_cut.SOURCES
+    table = np.zeros((size * -(-len(sources) // size), tables[1].shape[1]), np.float32)
+    table[:count, :width], table[count : len(sources)] = tables
     columns = np.ascontiguousarray(table.T).reshape(len(table.T), -1, size)
     parts = table[: len(sources)].reshape(len(sources), -1, warp_cut.WIDTH)
     out.sources = wp.array(sources, dtype=wp.vec3, device=device)
     out.table = wp.array(parts, dtype=warp_cut.row, device=device)
     out.columns = wp.array(columns, dtype=warp_cut.many, device=device)
     out.far, out.passes = count, width // warp_cut.WIDTH
-    out.lead, out.terminals, out.middle = green.lead, green.terminals, wp.vec3(*solver.middle)
+    out.lead, out.terminals, out.middle = lead, green.terminals, wp.vec3(*solver.middle)
     out.extent, out.validity = green.extent, green.gap.validity
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blends[-1].tolist()
@@ -297,8 +331,17 @@ def _response(solver: SurfaceSolver, device: Any) -> Any:
     return out
 
 
+def _widened(table: NDArray[Any], before: int, lead: int) -> NDArray[Any]:
+    """A table of φ⁰ and ψ with room for more of the first, columns of zeros."""
+    used = before + np.flatnonzero(table[:, before:].any(axis=0)).max(initial=-1) + 1
+    width = warp_cut.WIDTH * -(-(lead + used - before) // warp_cut.WIDTH)
+    out = np.zeros((len(table), width), np.float32)
+    out[:, :before], out[:, lead : lead + used - before] = table[:, :before], table[:, before:used]
+    return out
+
+
 def _circuit(terminals: Terminals, device: Any) -> Any:
-    out = solution.Circuit()
+    out = network.Circuit()
     out.electrodes, out.driven, out.unit = terminals.electrodes, terminals.driven, UNIT
     for name in ("rest", "empty"):
         setattr(out, name, wp.array(getattr(terminals, name), dtype=wp.float64, device=device))

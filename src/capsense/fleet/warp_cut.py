@@ -124,6 +124,8 @@ class WarpCut:
     near: wp.array2d(dtype=wp.float32)  # share of the near sources, (l, v)
     leader: wp.array2d(dtype=wp.int32)  # first of the places that a place is joined with, (b, v)
     tie: wp.array2d(dtype=wp.vec2)  # energy of the net charge of the leader and all others, (b, v)
+    slot: wp.array2d(dtype=wp.int32)  # number of the node that a body is part of, else -1, (b, v)
+    columns: wp.array(dtype=wp.int32)  # terminals and nodes, (v,)
     lossy: wp.array(dtype=wp.int32)  # whether a view has matter with losses, (v,)
     width: wp.array(dtype=wp.int32)  # columns of φ⁰ and ψ that are not zero, (v,)
 
@@ -173,24 +175,34 @@ def _need(
     return size / (wp.max(away, _HALF * size) + _NEAREST) + _CROSSING * crossing
 
 
+@wp.func
+def idle(cut: WarpCut, lead: int, first: int, v: int):
+    """Whether no column from this one on means something in a view."""
+    imaginary = first >= lead
+    at = wp.where(imaginary, first - lead, first)
+    return at >= cut.columns[v] or (imaginary and cut.lossy[v] == 0)
+
+
 @wp.kernel
-def choose(
+def stand(
     shapes: Shapes, places: Places, green: Response, bodies: wp.array2d(dtype=wp.transform),
     sensors: wp.array2d(dtype=wp.transform), cut: WarpCut,
 ):  # fmt: skip
-    """Cut every body that a sensor sees into clusters."""
+    """Where bodies stand in the sensors' frames, and which of them a sensor sees."""
     b, v = wp.tid()
     e = v // sensors.shape[1]
     s = v % sensors.shape[1]
     u = places.choice[e, b]
     o = b * cut.clusters
-    for j in range(cut.clusters):
-        cut.node[o + j, v] = -1
-        cut.number[o + j, v] = -1
-    cut.ends[o, v] = 0.0
+    cut.node[o, v] = -1
+    cut.number[o, v] = -1
     if u < 0 or places.hidden[s, b] != 0:
         return
-    at = wp.transform_multiply(wp.transform_inverse(_unit(sensors[e, s])), _unit(bodies[e, b]))
+    frame = _unit(sensors[e, s])
+    body = _unit(bodies[e, b])
+    turn = wp.quat_inverse(wp.transform_get_rotation(frame))
+    off = wp.transform_get_translation(body) - wp.transform_get_translation(frame)
+    at = wp.transform(wp.quat_rotate(turn, off), turn * wp.transform_get_rotation(body))
     slack = places.slack[e, b]
     off = wp.transform_point(wp.transform_inverse(at), green.middle)
     moved = wp.transform_vector(at, wp.min(wp.max(off, -slack), slack))
@@ -201,8 +213,24 @@ def choose(
     away = _off(wp.transform_get_translation(at), green.room0, green.room1)
     if wp.max(away[0], wp.max(away[1], away[2])) > scale * shapes.radius[u] + _SHORE * green.extent:
         return
-    first = shapes.first[u]
-    cut.node[o, v] = first
+    cut.node[o, v] = shapes.first[u]
+
+
+@wp.kernel
+def choose(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
+    """Cut every body that a sensor sees into clusters."""
+    b, v = wp.tid()
+    e = v // places.hidden.shape[0]
+    o = b * cut.clusters
+    for j in range(1, cut.clusters):
+        cut.node[o + j, v] = -1
+        cut.number[o + j, v] = -1
+    cut.ends[o, v] = 0.0
+    first = cut.node[o, v]
+    if first < 0:
+        return
+    at = cut.pose[b, v]
+    scale = places.scale[e, b]
     cut.score[o, v] = _need(shapes, green, at, scale, first, first)
     for j in range(1, cut.clusters):
         best = int(0)
@@ -229,50 +257,8 @@ def choose(
             cut.score[o + j, v] = 0.0
 
 
-@wp.kernel
-def connect(places: Places, cut: WarpCut):
-    """What ties the bodies of a view to ground; places that are joined are one conductor.
-
-    Those that are out of sight count for the tie. The leader of those in sight has the function of
-    the net charge. That of each other member is its own equilibrium charge less the leader's,
-    which is neutral.
-    """
-    v = wp.tid()
-    e = v // places.hidden.shape[0]
-    lossy = int(0)
-    for b in range(places.group.shape[0]):
-        o = b * cut.clusters
-        leader = int(b)
-        tie = places.tie[e, b]
-        neutral = places.neutral[e, b]
-        if cut.node[o, v] >= 0:
-            others = int(0)
-            grounded = int(0)
-            ground = float(0.0)
-            for c in range(places.group.shape[0]):
-                if places.group[c] == places.group[b] and places.choice[e, c] >= 0:
-                    if cut.node[c * cut.clusters, v] >= 0:
-                        leader = wp.min(leader, c)
-                        others = wp.where(c == b, others, 1)
-                    if places.neutral[e, c] == 0:  # those out of sight count too
-                        others = wp.where(c == b, others, 1)
-                        if places.tie[e, c][0] == 0.0:
-                            grounded = 1
-                        else:
-                            ground += 1.0 / places.tie[e, c][0]
-            if others == 1:
-                neutral = wp.where(grounded == 0 and ground == 0.0, 1, 0)
-                tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
-            cut.number[o, v] = wp.where(leader == b and neutral != 0, -1, 0)
-            if tie[1] != 0.0 or places.softness[e, b][1] != 0.0:
-                lossy = 1
-        cut.leader[b, v] = leader
-        cut.tie[b, v] = tie
-    cut.lossy[v] = lossy
-
-
 @wp.func
-def _lift(p: wp.vec3, gap: float, green: Response):
+def lift(p: wp.vec3, gap: float, green: Response):
     """Keep a point off a flat design, as ``green_kernels.lift``."""
     away = _off(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
     way = wp.length(away)
@@ -339,10 +325,9 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
             depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
         deep = (depth - _DEEP) / _BEHIND
-        gap = green.validity  # Warp has no gap law yet: what the lift takes away is not added
         for q in range(4):
             before = points[q]
-            points[q] = _lift(before, gap, green)
+            points[q] = lift(before, green.validity, green)
             if wp.length(points[q] - before) > _LIFTED:
                 lifted = 1
     cut.points[i, v] = points

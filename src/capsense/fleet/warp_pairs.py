@@ -122,6 +122,9 @@ def rows(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
             total += seen(green, leaf, s) * green.table[s, part]
     for c in range(_WIDTH):
         out[i, part * _WIDTH + c, v] = total[c]
+    slot = cut.slot[i // cut.clusters, v]
+    if part == 0 and slot >= 0:  # of a node at 1 V, the bodies' own potential less 1 V
+        out[i, green.terminals + slot, v] = wp.where(cut.node[i, v] >= 0, -1.0, 0.0)
 
 
 @wp.func

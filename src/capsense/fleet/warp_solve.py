@@ -12,11 +12,9 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.fleet.warp_cut import Places, Shapes, WarpCut
-from capsense.surface.solve_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-_GAIN = wp.constant(GAIN)
 _DROPPED = wp.constant(1e-5)
 """Functions whose pivot is so small against their own energy are left out."""
 
@@ -143,19 +141,6 @@ def assemble(
         matrix[g, f, v] = value[1]
 
 
-@wp.struct
-class Circuit:
-    """The t terminals of a design, of which k are driven, n of these electrodes."""
-
-    electrodes: wp.int32
-    driven: wp.int32
-    unit: wp.float32  # 4π eps0 [F/m]
-    omega: wp.float32  # angular frequency [rad/s]
-    rest: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
-    empty: wp.array2d(dtype=wp.float64)  # that of the driven ones, the others eliminated, (k, k)
-    screened: wp.array2d(dtype=wp.float32)  # bound of what an entry changes by [F], (t, t)
-
-
 @wp.func
 def times(x: wp.vec2, y: wp.vec2):
     """Product of complex numbers."""
@@ -246,6 +231,8 @@ def forward(
 ):  # fmt: skip
     """Replace φ⁰ of the functions by L⁻¹ φ⁰, whose imaginary part is in ``quadrature``."""
     t, v = wp.tid()
+    if t >= cut.columns[v]:
+        return
     lossy = cut.lossy[v] != 0
     for i in range(matrix.shape[0]):
         right = wp.vec2()
@@ -281,6 +268,8 @@ def charges(
 ):  # fmt: skip
     """Charges L⁻ᵀ L⁻¹ φ⁰ of the functions from L⁻¹ φ⁰, (n, 2 lead, v)."""
     t, v = wp.tid()
+    if t >= cut.columns[v]:
+        return
     n = matrix.shape[0]
     lossy = cut.lossy[v] != 0
     for step in range(n):
@@ -315,87 +304,6 @@ class Left:
     energy: wp.array2d(dtype=wp.vec2)  # of that function, (n, v)
     dropped: wp.array(dtype=wp.int32)  # functions solved for that were left out, (v,)
     doubt: wp.array2d(dtype=wp.float32)  # estimated error of each diagonal [m], (t, v)
-
-
-@wp.kernel
-def change(
-    circuit: Circuit, cut: WarpCut, potentials: wp.array3d(dtype=wp.float32),
-    quadrature: wp.array3d(dtype=wp.float32), left: Left, whole: wp.array3d(dtype=wp.vec2d),
-):  # fmt: skip
-    """Complex Maxwell matrices of all terminals [F], (t, t, v), and what is in doubt."""
-    i, j, v = wp.tid()
-    total = wp.vec2()
-    more = wp.vec2()
-    lead = left.residual.shape[1] // 2
-    for f in range(potentials.shape[0]):
-        total += times(
-            wp.vec2(potentials[f, i, v], quadrature[f, i, v]),
-            wp.vec2(potentials[f, j, v], quadrature[f, j, v]),
-        )
-        own = left.energy[f, v]
-        if own[0] > 0.0:
-            x = wp.vec2(left.residual[f, i, v], 0.0)
-            y = wp.vec2(left.residual[f, j, v], 0.0)
-            if cut.lossy[v] != 0:
-                x[1] = left.residual[f, lead + i, v]
-                y[1] = left.residual[f, lead + j, v]
-            more += _GAIN * over(times(x, y), own)
-    total += more
-    real = circuit.unit * total[0]
-    if real > circuit.screened[i, j]:  # the lesser of NaN and a number would be the number
-        real = circuit.screened[i, j]
-    whole[i, j, v] = wp.vec2d(
-        circuit.rest[i, j] + wp.float64(real), wp.float64(circuit.unit * total[1])
-    )
-    if i == j:
-        left.doubt[i, v] = left.doubt[i, v] + wp.abs(more[0])
-        if left.dropped[v] > 0:
-            left.doubt[i, v] = wp.abs(total[0])
-
-
-@wp.func
-def _times(x: wp.vec2d, y: wp.vec2d):
-    return wp.vec2d(x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0])
-
-
-@wp.kernel
-def eliminate(circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d)):
-    """Take floating conductors of the design out of the matrices, the last one first."""
-    v = wp.tid()
-    terminals = whole.shape[0]
-    for step in range(terminals - circuit.driven):
-        p = terminals - 1 - step
-        pivot = whole[p, p, v]
-        inverse = wp.vec2d(pivot[0], -pivot[1]) / wp.dot(pivot, pivot)
-        for i in range(p):
-            share = _times(whole[i, p, v], inverse)
-            for j in range(p):
-                whole[i, j, v] -= _times(share, whole[p, j, v])
-
-
-@wp.kernel
-def report(
-    circuit: Circuit, whole: wp.array3d(dtype=wp.vec2d),
-    capacitance: wp.array4d(dtype=wp.float32), delta: wp.array4d(dtype=wp.float32),
-    conductance: wp.array4d(dtype=wp.float32), shields: wp.array3d(dtype=wp.float64),
-    doubt: wp.array2d(dtype=wp.float32), error: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
-    """Matrices of the electrodes [F], [S], what shields couple to them [F], and errors [F]."""
-    i, v = wp.tid()
-    e = v // delta.shape[1]
-    s = v % delta.shape[1]
-    for j in range(circuit.electrodes):
-        value = whole[i, j, v]
-        capacitance[e, s, i, j] = wp.float32(value[0])
-        delta[e, s, i, j] = wp.float32(value[0] - circuit.empty[i, j])
-        conductance[e, s, i, j] = -circuit.omega * wp.float32(value[1])
-    total = wp.float64(0.0)
-    for j in range(circuit.electrodes, circuit.driven):
-        total += whole[i, j, v][0]
-    shields[e, s, i] = total
-    if i == 0:
-        largest = float(0.0)
-        for t in range(circuit.electrodes):
-            if largest == largest and not (doubt[t, v] <= largest):  # NaN is the largest
-                largest = doubt[t, v]
-        error[e, s] = circuit.unit * largest
+    below: wp.array3d(dtype=wp.float32)  # of the matrix, by functions not solved for [m], (t, t, v)
+    local: wp.array3d(dtype=wp.float32)  # of the matrix, by the gap law [m], (t, t, v)
+    volts: wp.array3d(dtype=wp.float32)  # of nodes, with a terminal at 1 V, (slots, t, v)

@@ -1,0 +1,193 @@
+"""The gap law of many environments as Warp kernels: what bodies near a flat design add.
+
+The twin of these kernels is :mod:`capsense.surface.gap_kernels`; see :mod:`capsense.fleet.warp_near`
+for what they work with. Lengths in metres, 4π eps0 = 1.
+"""
+
+from __future__ import annotations
+
+import math
+
+import warp as wp
+
+from capsense.fleet.warp_cut import Places, Response, Shapes, WarpCut, lift, smooth
+from capsense.fleet.warp_mesh import Hit, Outlines
+from capsense.fleet.warp_near import GapLaw, Near, may_meet, nearest_of
+from capsense.surface.gap_kernels import LEAST, REACH
+
+wp.set_module_options({"enable_backward": False})
+
+_REACH0, _REACH1, _LEAST = wp.constant(REACH[0]), wp.constant(REACH[1]), wp.constant(LEAST)
+_PI = wp.constant(math.pi)
+
+
+@wp.func
+def _arc(distance: float, across: float, up: float):
+    """Length of an arc that leaves the face at a right angle, over a distance."""
+    angle = wp.min(wp.atan2(across, up), 2.5)
+    return distance * wp.where(angle > 1.0e-3, angle / wp.sin(wp.max(angle, 1.0e-3)), 1.0)
+
+
+@wp.func
+def _flatter(normal: wp.vec3, ratio: float):
+    """Normal of a lifted face; of length 0 where there is none."""
+    out = wp.vec3(ratio * normal[0], ratio * normal[1], wp.min(normal[2], 0.0))
+    size = wp.length(out)
+    return wp.where(size < 1.0e-9, 0.0, 1.0) * out / wp.max(size, 1.0e-9)
+
+
+@wp.func
+def _support(hit: Hit, ratio: float, back: wp.vec3, far: float):
+    """Distance from a place to lifted faces, and how far its way points down, see the twin."""
+    one = _flatter(hit.first, ratio)
+    two = _flatter(hit.second, ratio)
+    along = far
+    up = float(1.0)
+    if wp.length(one) > 0.0:
+        first = wp.dot(one, back)
+        second = wp.dot(two, back)
+        both = wp.dot(one, two)
+        if hit.faces == 1:
+            along = wp.max(first, 0.0)
+            up = -one[2]
+        elif wp.length(two) > 0.0:
+            if first < second * both:
+                along = wp.max(second, 0.0)
+                up = -two[2]
+            elif second < first * both:
+                along = wp.max(first, 0.0)
+                up = -one[2]
+    return along, up
+
+
+@wp.func
+def lengths(gap: GapLaw, green: Response, hit: Hit, x: wp.vec3):
+    """Lengths of the field lines from a place on the face to a body, and to the lifted body [m]."""
+    h0 = gap.validity
+    least = _LEAST * h0
+    if hit.off <= 0.0:
+        return least, h0
+    across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])
+    true = _arc(wp.length(hit.way), across, hit.way[2])
+    p = x + hit.way
+    dx = wp.max(wp.max(green.box0[0] - p[0], p[0] - green.box1[0]), 0.0)
+    dy = wp.max(wp.max(green.box0[1] - p[1], p[1] - green.box1[1]), 0.0)
+    beside = dx * dx + dy * dy
+    height = wp.max(hit.way[2], 0.0)
+    if beside + height * height >= 4.0 * h0 * h0:
+        return true, true
+    p[2] = gap.top + height
+    moved = lift(p, h0, green) - x
+    wide = wp.sqrt(moved[0] * moved[0] + moved[1] * moved[1])
+    far = wp.length(moved)
+    lifted = _arc(far, wide, moved[2])
+    if hit.faces > 0:  # another point of the lifted surface, which is flatter, may be nearer
+        along, up = _support(hit, height / (2.0 * h0), -moved, far)
+        if along < far:
+            lower = _arc(along, along * wp.sqrt(wp.max(0.0, 1.0 - up * up)), along * up)
+            share = smooth(1.0 - wp.sqrt(beside) / h0)
+            lifted += share * (wp.min(lower, lifted) - lifted)
+    if true < 2.0 * least:
+        true = least + true * true / (4.0 * least)
+    return true, wp.max(lifted, true)
+
+
+@wp.func
+def place_of(gap: GapLaw, length: float):
+    """Place of a length among the heights of the table, and the share of the next one."""
+    x = wp.log(length / gap.lowest) / gap.log_ratio
+    k = wp.clamp(wp.int32(wp.floor(x)), 0, gap.change.shape[1] - 2)
+    return k, wp.clamp(x - float(k), 0.0, 1.0)
+
+
+@wp.func
+def _add_cell(
+    outlines: Outlines, places: Places, gap: GapLaw, green: Response, cut: WarpCut, near: Near,
+    met: wp.int64, c: int, p: int, v: int,
+):  # fmt: skip
+    """Add what one cell changes; ``met`` has a bit for every near body that may count."""
+    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
+    best = float(1.0e30)
+    high = float(1.0e30)
+    body = int(-1)
+    for k in range(near.count[v]):
+        if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
+            b = near.body[k, v]
+            true, lifted = lengths(gap, green, nearest_of(outlines, places, cut, b, v, x), x)
+            if true < best:
+                best = true
+                high = lifted
+                body = b
+    weight = 1.0 - smooth((best / gap.validity - _REACH0) / (_REACH1 - _REACH0))
+    if body < 0 or high <= best or weight <= 0.0:
+        return
+    weight *= gap.areas[c] / (4.0 * _PI)
+    k, s = place_of(gap, best)
+    m, w = place_of(gap, high)
+    one = weight / (best + gap.series[c])
+    two = weight / (high + gap.series[c])
+    columns = gap.columns.shape[1]
+    for col in range(columns + 1):
+        value = one * ((1.0 - s) * gap.change[c, k, col] + s * gap.change[c, k + 1, col])
+        value -= two * ((1.0 - w) * gap.change[c, m, col] + w * gap.change[c, m + 1, col])
+        to = col
+        if col == columns:
+            to = wp.where(cut.slot[body, v] < 0, -1, columns + cut.slot[body, v])
+        if to >= 0:
+            near.part[p, to, v] = near.part[p, to, v] + value
+
+
+@wp.kernel
+def local_change(
+    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, green: Response,
+    cut: WarpCut, near: Near,
+):  # fmt: skip
+    """Local change by near bodies of a chunk's cells [m], as ``gap_kernels.local_change``."""
+    v, p = wp.tid()
+    count = near.count[v]
+    if count == 0:
+        return
+    for k in range(near.part.shape[1]):
+        near.part[p, k, v] = 0.0
+    grounded = gap.owner[p] < 0
+    if grounded and cut.columns[v] == gap.terminals:
+        return
+    for q in range(gap.chunks[p], gap.chunks[p + 1]):
+        x = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
+        reach = _REACH1 * gap.validity + gap.radius[q]
+        met = wp.int64(0)
+        for k in range(count):
+            b = near.body[k, v]
+            if cut.slot[b, v] >= 0 or not grounded:
+                if may_meet(shapes, places, cut, b, v, x, reach):
+                    hit = nearest_of(outlines, places, cut, b, v, x)
+                    if hit.off < reach:
+                        met = met | (wp.int64(1) << wp.int64(wp.min(k, 63)))
+        if met != wp.int64(0):
+            for c in range(gap.blocks[q], gap.blocks[q + 1]):
+                _add_cell(outlines, places, gap, green, cut, near, met, c, p, v)
+
+
+@wp.func
+def local_of(gap: GapLaw, near: Near, i: int, j: int, v: int):
+    """The local change of an entry of the matrix of terminals and nodes [m]."""
+    total = float(0.0)
+    t = gap.terminals
+    columns = gap.columns.shape[1]
+    a = wp.min(i, j)
+    k = wp.max(i, j)
+    if k < t:
+        for side in range(2):
+            row = wp.where(side == 0, i, j)
+            other = wp.where(side == 0, j, i)
+            for col in range(columns):
+                if gap.columns[row, col] == other:
+                    for p in range(gap.span[row + 1], gap.span[row + 2]):
+                        total += 0.5 * near.part[p, col, v]
+    elif a < t:
+        for p in range(gap.span[a + 1], gap.span[a + 2]):
+            total += near.part[p, columns + k - t, v]
+    elif a == k:
+        for p in range(gap.owner.shape[0]):
+            total -= near.part[p, columns + k - t, v]
+    return total

@@ -1,0 +1,282 @@
+"""What is near a flat design in many environments, as Warp kernels; 4π eps0 = 1.
+
+The twins of these kernels are ``near_bodies`` and ``press_out`` of
+:mod:`capsense.surface.gap_kernels`, and ``network_kernels.as_nodes``. A design's cells stand in
+blocks, and a few blocks of one terminal are a *chunk*, which a thread works out for one view. Sums
+of chunks are added in a fixed order. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from capsense.elements.matter import SHUT
+from capsense.field.green_kernels import Gap as HostGap
+from capsense.fleet.warp_cut import Places, Shapes, WarpCut
+from capsense.fleet.warp_mesh import Outlines
+from capsense.fleet.warp_outline import lowest_point, middle_height, nearest, reach_down
+from capsense.surface.gap_kernels import _EXACT as EXACT
+from capsense.surface.gap_kernels import _WAYS as WAYS
+from capsense.surface.gap_kernels import REACH
+
+wp.set_module_options({"enable_backward": False})
+
+_REACH = wp.constant(REACH[1])
+_WAYS, _EXACT, _SHUT = wp.constant(WAYS), wp.constant(EXACT), wp.constant(SHUT)
+_BLOCKS = 3
+"""About so many blocks are a chunk."""
+
+
+@wp.struct
+class GapLaw:
+    """The table of a design, see ``gap_table.GapTable``: c cells in q blocks in p chunks."""
+
+    validity: wp.float32
+    top: wp.float32
+    lowest: wp.float32  # the first of the heights of the table [m]
+    log_ratio: wp.float32
+    terminals: wp.int32
+    slots: wp.int32  # conductors near the design that can be nodes
+    there: wp.int32  # 0 where the design has no table
+    points: wp.array(dtype=wp.vec2)
+    areas: wp.array(dtype=wp.float32)
+    series: wp.array(dtype=wp.float32)
+    columns: wp.array2d(dtype=wp.int32)
+    change: wp.array3d(dtype=wp.float32)
+    blocks: wp.array(dtype=wp.int32)  # first cell of each, and their number, (q + 1,)
+    center: wp.array(dtype=wp.vec2)
+    radius: wp.array(dtype=wp.float32)
+    chunks: wp.array(dtype=wp.int32)  # first block of each, and their number, (p + 1,)
+    owner: wp.array(dtype=wp.int32)  # terminal of a chunk, -1 for grounded sheets, (p,)
+    span: wp.array(dtype=wp.int32)  # first chunk of grounded sheets and each terminal, (t + 2,)
+
+
+@wp.struct
+class Near:
+    """What is near the design in every view."""
+
+    count: wp.array(dtype=wp.int32)  # bodies that are near, (v,)
+    body: wp.array2d(dtype=wp.int32)  # these, in its first rows, (b, v)
+    below: wp.array2d(dtype=wp.float32)  # how far a near body reaches below the face [m], (b, v)
+    foot: wp.array2d(dtype=wp.vec3)  # its lowest point [m], (b, v)
+    depth: wp.array3d(dtype=wp.float32)  # how far it overlaps cells of a chunk [m], (p, b, v)
+    capacitance: wp.array2d(dtype=wp.float32)  # of nodes to ground [m], (slots, v)
+    part: wp.array3d(dtype=wp.float32)  # local change by columns, then by nodes, (p, n + slots, v)
+
+
+def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
+    """Lay a table out for the kernels."""
+    out, cells = GapLaw(), len(gap.areas)
+    out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
+    out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
+    out.there = int(cells > 0)
+    owners = gap.terminal[gap.blocks[:-1]] if cells else np.zeros(0, np.int64)
+    first: list[int] = []
+    for t in range(-1, terminals):
+        of = np.flatnonzero(owners == t)
+        first.extend(of[::_BLOCKS].tolist())
+    owner = owners[first]
+    span = np.searchsorted(owner, np.arange(-1, terminals + 1))
+    for name, values, kind in (
+        ("points", gap.points, wp.vec2), ("areas", gap.areas, wp.float32),
+        ("series", gap.series, wp.float32), ("columns", gap.columns, wp.int32),
+        ("change", gap.change, wp.float32), ("blocks", gap.blocks, wp.int32),
+        ("center", gap.block_center, wp.vec2), ("radius", gap.block_radius, wp.float32),
+        ("chunks", [*first, len(owners)], wp.int32), ("owner", owner, wp.int32),
+        ("span", span, wp.int32),
+    ):  # fmt: skip
+        setattr(out, name, wp.array(np.ascontiguousarray(values), dtype=kind, device=device))
+    return out
+
+
+@wp.kernel
+def connect(
+    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near
+):
+    """What ties the bodies of a view to ground, which of them are near, and which are nodes.
+
+    Places that are joined are one conductor; those that are out of sight count for the tie. The
+    leader of those in sight has the function of the net charge. That of each other member is its
+    own equilibrium charge less the leader's, which is neutral. Those that are nodes are their own
+    leaders, at ground or at 1 V.
+    """
+    v = wp.tid()
+    e = v // places.hidden.shape[0]
+    lossy = int(0)
+    for b in range(places.group.shape[0]):
+        o = b * cut.clusters
+        leader = int(b)
+        tie = places.tie[e, b]
+        neutral = places.neutral[e, b]
+        if cut.node[o, v] >= 0:
+            others = int(0)
+            grounded = int(0)
+            ground = float(0.0)
+            for c in range(places.group.shape[0]):
+                if places.group[c] == places.group[b] and places.choice[e, c] >= 0:
+                    if cut.node[c * cut.clusters, v] >= 0:
+                        leader = wp.min(leader, c)
+                        others = wp.where(c == b, others, 1)
+                    if places.neutral[e, c] == 0:  # those out of sight count too
+                        others = wp.where(c == b, others, 1)
+                        if places.tie[e, c][0] == 0.0:
+                            grounded = 1
+                        else:
+                            ground += 1.0 / places.tie[e, c][0]
+            if others == 1:
+                neutral = wp.where(grounded == 0 and ground == 0.0, 1, 0)
+                tie = wp.vec2(wp.where(grounded == 1 or neutral == 1, 0.0, 1.0 / ground), 0.0)
+            cut.number[o, v] = wp.where(leader == b and neutral != 0, -1, 0)
+            if tie[1] != 0.0 or places.softness[e, b][1] != 0.0:
+                lossy = 1
+        cut.leader[b, v] = leader
+        cut.tie[b, v] = tie
+        cut.slot[b, v] = -1
+    cut.lossy[v] = lossy
+    near.count[v] = 0
+    cut.columns[v] = gap.terminals
+    if gap.there != 0 and lossy == 0:
+        _find_near(shapes, outlines, places, gap, cut, near, v)
+
+
+@wp.func
+def _find_near(
+    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near,
+    v: int,
+):  # fmt: skip
+    """Enter the bodies that are near, and make nodes of those that are not at ground.
+
+    Where there are more of these than slots, the rest is lifted and nothing is added.
+    """
+    e = v // places.hidden.shape[0]
+    nodes = int(0)
+    count = int(0)
+    for b in range(places.group.shape[0]):
+        there = int(0)
+        if cut.node[b * cut.clusters, v] >= 0 and places.softness[e, b][0] == 0.0:
+            there = _is_near(outlines, places, gap, cut, near, b, v)
+        if there != 0 and cut.slot[b, v] < 0:
+            tie = cut.tie[b, v][0]
+            neutral = cut.number[cut.leader[b, v] * cut.clusters, v] < 0
+            if neutral or tie > 0.0:
+                there = 0
+                if nodes < gap.slots:
+                    there = 1
+                    own = float(0.0)
+                    if not neutral and tie < 0.5 * _SHUT:
+                        own = 1.0 / tie
+                    near.capacitance[nodes, v] = own
+                    for c in range(places.group.shape[0]):
+                        if places.group[c] == places.group[b] and cut.node[c * cut.clusters, v] >= 0:
+                            cut.slot[c, v] = nodes
+                            cut.leader[c, v] = c
+                            cut.number[c * cut.clusters, v] = 0
+                            cut.tie[c, v] = wp.vec2()
+                    nodes += 1
+        if there != 0:
+            near.body[count, v] = b
+            count += 1
+    near.count[v] = count
+    cut.columns[v] = gap.terminals + nodes
+
+
+@wp.func
+def _is_near(
+    outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near, b: int, v: int
+):
+    """Whether a conductor is within twice h0 of the face, as ``gap_kernels.near_bodies``."""
+    e = v // places.hidden.shape[0]
+    u = places.choice[e, b]
+    out = int(0)
+    if outlines.kind[u] != 0:
+        at = cut.pose[b, v]
+        scale = places.scale[e, b]
+        middle = middle_height(outlines, u, at, scale) - gap.top
+        lowest = middle - reach_down(outlines, u, wp.transform_get_rotation(at), scale)
+        near.below[b, v] = -lowest
+        if lowest < 0.0:
+            near.foot[b, v] = lowest_point(outlines, u, at, scale)
+        if middle >= 0.0 and lowest > -_REACH * gap.validity and lowest < 2.0 * gap.validity:
+            out = 1
+    return out
+
+
+@wp.func
+def may_meet(shapes: Shapes, places: Places, cut: WarpCut, b: int, v: int, x: wp.vec3, off: float):
+    """Whether a body may be within a distance of a point, by the ball that holds it."""
+    e = v // places.hidden.shape[0]
+    reach = places.scale[e, b] * shapes.radius[places.choice[e, b]] + off
+    return wp.length(x - wp.transform_get_translation(cut.pose[b, v])) < reach
+
+
+@wp.func
+def nearest_of(
+    outlines: Outlines, places: Places, cut: WarpCut, b: int, v: int, x: wp.vec3
+):  # fmt: skip
+    """Nearest point of the body in a place."""
+    e = v // places.hidden.shape[0]
+    return nearest(outlines, places.choice[e, b], cut.pose[b, v], places.scale[e, b], x)
+
+
+@wp.kernel
+def press(
+    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near
+):
+    """How far bodies overlap the cells of a chunk, as ``gap_kernels.press_out``, (p, b, v)."""
+    v, p = wp.tid()
+    for k in range(near.count[v]):
+        b = near.body[k, v]
+        deepest = float(0.0)
+        if near.below[b, v] > 0.0 and gap.owner[p] >= 0:
+            foot = near.foot[b, v]
+            for q in range(gap.chunks[p], gap.chunks[p + 1]):
+                middle = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
+                if may_meet(shapes, places, cut, b, v, middle, gap.radius[q]):
+                    hit = nearest_of(outlines, places, cut, b, v, middle)
+                    if hit.off <= gap.radius[q]:
+                        for c in range(gap.blocks[q], gap.blocks[q + 1]):
+                            x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
+                            deepest = wp.max(
+                                deepest, _overlap(outlines, places, gap, cut, b, v, x)
+                            )
+                            beside = wp.vec2(foot[0] - x[0], foot[1] - x[1])
+                            if wp.dot(beside, beside) < gap.areas[c]:
+                                deepest = wp.max(deepest, gap.top - foot[2])
+        near.depth[p, b, v] = deepest
+
+
+@wp.func
+def _overlap(
+    outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, b: int, v: int, x: wp.vec3
+):  # fmt: skip
+    """How far down the surface of a body is below a place of the face [m]."""
+    at = x
+    going = int(1)
+    for _ in range(_WAYS):
+        if going == 1:
+            hit = nearest_of(outlines, places, cut, b, v, at)
+            if hit.off >= -_EXACT * gap.validity:
+                going = 0
+            else:
+                at[2] = at[2] + hit.off
+    return x[2] - at[2]
+
+
+@wp.kernel
+def press_out(gap: GapLaw, cut: WarpCut, near: Near):
+    """Move near bodies that overlap the face up until they touch it."""
+    v = wp.tid()
+    for k in range(near.count[v]):
+        b = near.body[k, v]
+        if near.below[b, v] > 0.0:
+            deepest = float(0.0)
+            for p in range(gap.owner.shape[0]):
+                deepest = wp.max(deepest, near.depth[p, b, v])
+            at = cut.pose[b, v]
+            up = wp.vec3(0.0, 0.0, wp.min(deepest, near.below[b, v]))
+            cut.pose[b, v] = wp.transform(
+                wp.transform_get_translation(at) + up, wp.transform_get_rotation(at)
+            )
