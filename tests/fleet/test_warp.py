@@ -270,6 +270,7 @@ def test_functions_that_add_nothing_are_left_out(lossy):
     cut = WarpCut()
     cut.number = wp.zeros((3, 1), dtype=wp.int32, device="cpu")
     cut.lossy = wp.array([int(lossy)], dtype=wp.int32, device="cpu")
+    cut.columns = wp.ones(1, dtype=wp.int32, device="cpu")
     matrix, loss, rows, quadrature = (
         wp.array(x, dtype=wp.float32, device="cpu")
         for x in (
@@ -292,7 +293,7 @@ def test_functions_that_add_nothing_are_left_out(lossy):
 
 
 MODULES = [
-    "warp_cut", "warp_solve", "warp_chip_kernels",
+    "warp_cut", "warp_near", "warp_gap", "warp_network", "warp_solve", "warp_chip_kernels",
     *(pytest.param(m, marks=pytest.mark.e2e) for m in ("warp_pairs", "warp_charges")),
 ]  # fmt: skip
 

@@ -12,10 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import capsense as cs
-from capsense.field.green_kernels import Green, pack_gap
+from capsense.field.green_kernels import Green
 from capsense.surface import step
 from capsense.surface.choose_kernels import Cut, Functions, functions_of
+from capsense.surface.gap_kernels import local_change, near_bodies, press_out
 from capsense.surface.leaf_kernels import leaf_rows, placed
+from capsense.surface.network_kernels import (
+    as_nodes,
+    coarse_of,
+    congruent,
+    mixed,
+    potentials_of,
+    with_nodes,
+)
 from capsense.surface.packing import PackedBodies, View
 from capsense.surface.pair_kernels import BARRIER, bound_images, leaf_pairs
 from capsense.surface.solve_kernels import System, assembled, leaf_charges, reduced
@@ -130,15 +139,29 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
+        near = near_bodies(bodies, green)
+        if near.any():
+            bodies = bodies.copy()
+            press_out(bodies, near, green)
+        m, nodes, node, capacitance = as_nodes(bodies, near, green)
         cut, leaves, functions, system = prepared(bodies, green)
+        if nodes > 0:
+            system = with_nodes(system, functions, node, m, nodes)
         delta, left, coarse, x, shift = reduced(functions, system, True)
         charge = leaf_charges(cut, functions, x, len(leaves.points))
-        m = green.terminals
+        weights = np.zeros((m, m))
+        if near.any():
+            local, none = np.zeros(delta.shape), np.zeros(0)
+            local_change(bodies, near, node, green, local)
+            weights = potentials_of(delta + local, m, nodes, capacitance)
+            delta = congruent(weights, delta + local, capacitance)
+            left = congruent(weights, left, none)
+            charge, coarse = mixed(charge, weights, green.lead), coarse_of(coarse, weights)
+            coarse += step.LAW * np.abs(np.diag(congruent(weights, local, none)))
         return step.Solution(
             delta[:m, :m], left[:m, :m], coarse[:m], charge,
             leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
-            step.estimate(delta, left, coarse[:m], shift, green.electrodes),
-            np.zeros(len(bodies), np.bool_), np.full(len(bodies), -1), np.zeros((m, m)),
+            step.estimate(delta, left, coarse[:m], shift, green.electrodes), near, node, weights,
         )  # fmt: skip
 
     with (
@@ -152,15 +175,13 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 def twin_of(fleet: cs.Fleet) -> cs.Simulator:
     """A simulator with the shapes of a fleet; use it within :func:`same_functions`.
 
-    Fleets on Warp do without the middle one of the Green's function's representations, and without
-    the table of the gap law.
+    Fleets on Warp do without the middle one of the Green's function's representations.
     """
     simulator = cs.Simulator(fleet.design)
     simulator._solver = copy(fleet._solver)
     green = simulator._solver.green
     (near, _, far), (_, start) = green.levels, green.blends
     simulator._solver.green = green._replace(
-        levels=(near, far, far), blends=np.array([start, start + 1.0]),
-        gap=pack_gap(None, 2.0 * green.gap.validity),
-    )  # fmt: skip
+        levels=(near, far, far), blends=np.array([start, start + 1.0])
+    )
     return simulator
