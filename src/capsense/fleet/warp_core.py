@@ -14,7 +14,7 @@ from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
 from capsense.fleet import warp_charges as charges
-from capsense.fleet import warp_cut, warp_gap, warp_near
+from capsense.fleet import warp_cut, warp_gap, warp_near, warp_slope
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
@@ -226,9 +226,9 @@ class WarpCore:
             self._slopes = [
                 *(room(rows, lead, views) for rows in (3 * n, n, sources, modes)),
                 room(t, m, views), room(3 * n, lead, views, dtype=wp.spatial_vector),
-                room(views, places, m, m, dtype=wp.spatial_vector),
+                room(views, places, m, m, dtype=wp.spatial_vector), self._room_of_slopes(),
             ]  # fmt: skip
-        charge, back, strength, sums, turn, pull, out = self._slopes
+        charge, back, strength, sums, turn, pull, out, local = self._slopes
         launch, parts, at = self.launch, lead // pairs.COLUMNS, (self.shapes, self.places)
         launch(charges.estimated, (n, lead, views), cut, rest, charge)
         launch(charges.felt, (sources, parts, views), green, cut, charge, strength)
@@ -248,11 +248,25 @@ class WarpCore:
         launch(charges.strengths, size, green, cut, sums, strength)
         launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, pull)
         launch(network.follow, (m, views), circuit, cut, self.whole, turn)
-        launch(network.slopes, (places, m, views), circuit, cut, turn, charge, pull, out)
+        near = self.gap, self.near
+        if self.gap.there:
+            all_of = self.shapes, self.outlines, self.places
+            size = views, len(self.gap.owner)
+            launch(warp_slope.local_slopes, size, *all_of, self.gap, green, cut, self.near, local)
+            launch(warp_slope.press_slopes, views, *all_of[1:], *near[:1], cut, near[1], local)
+        dim = places, m, views
+        launch(network.slopes, dim, circuit, *near, cut, turn, charge, pull, local, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
         )  # fmt: skip
+
+    def _room_of_slopes(self) -> Any:
+        chunks, places, views = self.near.depth.shape
+        columns = self.gap.columns.shape[1]
+        return self._struct(warp_slope.NearSlopes, {
+            "part": (chunks, columns + 1, places, views), "lift": (places, views),
+        })  # fmt: skip
 
     def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
         """Chips for all sensors, see :class:`WarpChips`."""

@@ -289,6 +289,27 @@ def lift(p: wp.vec3, gap: float, green: Response):
     return q
 
 
+@wp.func
+def lift_back(force: wp.vec3, p: wp.vec3, gap: float, green: Response):
+    """Force on a point before it is lifted by :func:`lift`, from that on the lifted point."""
+    low = wp.vec3(green.box0[0], green.box0[1], p[2])
+    away = _off(p, low, green.box1)
+    way = wp.length(away)
+    if way >= 2.0 * gap:
+        return force
+    if way == 0.0:
+        held = wp.normalize(lift(p, gap, green) - p)
+        return force - wp.dot(force, held) * held
+    out = force
+    u = wp.vec3()
+    for i in range(3):
+        if away[i] > 0.0:
+            u[i] = wp.where(p[i] < low[i], -away[i], away[i]) / way
+            out[i] = force[i] * (gap + way * way / (4.0 * gap)) / way
+    along = wp.dot(force, u)
+    return out + (way / (2.0 * gap) - (gap + way * way / (4.0 * gap)) / way) * along * u
+
+
 @wp.kernel
 def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
     """Place all leaves in the sensor frame, and find where they stand to design and walls."""

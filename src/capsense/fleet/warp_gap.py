@@ -101,23 +101,55 @@ def place_of(gap: GapLaw, length: float):
 
 
 @wp.func
-def _add_cell(
-    outlines: Outlines, places: Places, gap: GapLaw, green: Response, cut: WarpCut, near: Near,
-    met: wp.int64, c: int, p: int, v: int,
+def met_by(
+    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near,
+    q: int, owner: int, v: int,
 ):  # fmt: skip
-    """Add what one cell changes; ``met`` has a bit for every near body that may count."""
-    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
+    """A bit for every near body that may count in a block of cells."""
+    x = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
+    reach = _REACH1 * gap.validity + gap.radius[q]
+    met = wp.int64(0)
+    for k in range(near.count[v]):
+        b = near.body[k, v]
+        if cut.slot[b, v] >= 0 or owner >= 0:
+            if may_meet(shapes, places, cut, b, v, x, reach):
+                hit = nearest_of(outlines, places, cut, b, v, x)
+                if hit.off < reach:
+                    met = met | (wp.int64(1) << wp.int64(wp.min(k, 63)))
+    return met
+
+
+@wp.func
+def nearest_cell(
+    outlines: Outlines, places: Places, gap: GapLaw, green: Response, cut: WarpCut, near: Near,
+    met: wp.int64, x: wp.vec3, v: int,
+):  # fmt: skip
+    """The shortest field line from a place, that to the lifted body, and whose these are.
+
+    The last is a place in ``near.body``, -1 for none; ``met`` is as of :func:`met_by`.
+    """
     best = float(1.0e30)
     high = float(1.0e30)
     body = int(-1)
     for k in range(near.count[v]):
         if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
-            b = near.body[k, v]
-            true, lifted = lengths(gap, green, nearest_of(outlines, places, cut, b, v, x), x)
+            hit = nearest_of(outlines, places, cut, near.body[k, v], v, x)
+            true, lifted = lengths(gap, green, hit, x)
             if true < best:
                 best = true
                 high = lifted
-                body = b
+                body = k
+    return best, high, body
+
+
+@wp.func
+def _add_cell(
+    outlines: Outlines, places: Places, gap: GapLaw, green: Response, cut: WarpCut, near: Near,
+    met: wp.int64, c: int, p: int, v: int,
+):  # fmt: skip
+    """Add what one cell changes."""
+    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
+    best, high, body = nearest_cell(outlines, places, gap, green, cut, near, met, x, v)
     weight = 1.0 - smooth((best / gap.validity - _REACH0) / (_REACH1 - _REACH0))
     if body < 0 or high <= best or weight <= 0.0:
         return
@@ -127,12 +159,13 @@ def _add_cell(
     one = weight / (best + gap.series[c])
     two = weight / (high + gap.series[c])
     columns = gap.columns.shape[1]
+    slot = cut.slot[near.body[body, v], v]
     for col in range(columns + 1):
         value = one * ((1.0 - s) * gap.change[c, k, col] + s * gap.change[c, k + 1, col])
         value -= two * ((1.0 - w) * gap.change[c, m, col] + w * gap.change[c, m + 1, col])
         to = col
         if col == columns:
-            to = wp.where(cut.slot[body, v] < 0, -1, columns + cut.slot[body, v])
+            to = wp.where(slot < 0, -1, columns + slot)
         if to >= 0:
             near.part[p, to, v] = near.part[p, to, v] + value
 
@@ -144,25 +177,14 @@ def local_change(
 ):  # fmt: skip
     """Local change by near bodies of a chunk's cells [m], as ``gap_kernels.local_change``."""
     v, p = wp.tid()
-    count = near.count[v]
-    if count == 0:
+    if near.count[v] == 0:
         return
     for k in range(near.part.shape[1]):
         near.part[p, k, v] = 0.0
-    grounded = gap.owner[p] < 0
-    if grounded and cut.columns[v] == gap.terminals:
+    if gap.owner[p] < 0 and cut.columns[v] == gap.terminals:
         return
     for q in range(gap.chunks[p], gap.chunks[p + 1]):
-        x = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
-        reach = _REACH1 * gap.validity + gap.radius[q]
-        met = wp.int64(0)
-        for k in range(count):
-            b = near.body[k, v]
-            if cut.slot[b, v] >= 0 or not grounded:
-                if may_meet(shapes, places, cut, b, v, x, reach):
-                    hit = nearest_of(outlines, places, cut, b, v, x)
-                    if hit.off < reach:
-                        met = met | (wp.int64(1) << wp.int64(wp.min(k, 63)))
+        met = met_by(shapes, outlines, places, gap, cut, near, q, gap.owner[p], v)
         if met != wp.int64(0):
             for c in range(gap.blocks[q], gap.blocks[q + 1]):
                 _add_cell(outlines, places, gap, green, cut, near, met, c, p, v)

@@ -240,7 +240,7 @@ def press(
                         for c in range(gap.blocks[q], gap.blocks[q + 1]):
                             x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
                             deepest = wp.max(
-                                deepest, _overlap(outlines, places, gap, cut, b, v, x)
+                                deepest, overlap(outlines, places, gap, cut, b, v, x)
                             )
                             beside = wp.vec2(foot[0] - x[0], foot[1] - x[1])
                             if wp.dot(beside, beside) < gap.areas[c]:
@@ -249,7 +249,7 @@ def press(
 
 
 @wp.func
-def _overlap(
+def overlap(
     outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, b: int, v: int, x: wp.vec3
 ):  # fmt: skip
     """How far down the surface of a body is below a place of the face [m]."""

@@ -13,6 +13,7 @@ from capsense.fleet.warp_cut import WarpCut
 from capsense.fleet.warp_gap import local_of
 from capsense.fleet.warp_near import GapLaw, Near
 from capsense.fleet.warp_pairs import body_of
+from capsense.fleet.warp_slope import NearSlopes
 from capsense.fleet.warp_solve import Left, over, times
 from capsense.surface.solve_kernels import GAIN
 from capsense.surface.step import LAW
@@ -213,11 +214,37 @@ def follow(
         out[a, j, v] = volts
 
 
+@wp.func
+def _local_slope(
+    gap: GapLaw, near: Near, cut: WarpCut, slopes: NearSlopes, turn: wp.array3d(dtype=wp.float32),
+    k: int, i: int, j: int, v: int,
+):  # fmt: skip
+    """Derivative of the local change of an entry by a near body's pose."""
+    total = wp.spatial_vector()
+    columns = gap.columns.shape[1]
+    slot = cut.slot[near.body[k, v], v]
+    for p in range(gap.owner.shape[0]):
+        a = gap.owner[p]
+        if a >= 0:
+            for col in range(columns):
+                c = gap.columns[a, col]
+                if c >= 0:
+                    share = turn[a, i, v] * turn[c, j, v] + turn[c, i, v] * turn[a, j, v]
+                    total += 0.5 * share * slopes.part[p, col, k, v]
+        if slot >= 0:
+            c = gap.terminals + slot
+            share = -turn[c, i, v] * turn[c, j, v]
+            if a >= 0:
+                share += turn[a, i, v] * turn[c, j, v] + turn[c, i, v] * turn[a, j, v]
+            total += share * slopes.part[p, columns, k, v]
+    return total
+
+
 @wp.kernel
 def slopes(
-    circuit: Circuit, cut: WarpCut, turn: wp.array3d(dtype=wp.float32),
+    circuit: Circuit, gap: GapLaw, near: Near, cut: WarpCut, turn: wp.array3d(dtype=wp.float32),
     charge: wp.array3d(dtype=wp.float32), pull: wp.array3d(dtype=wp.spatial_vector),
-    out: wp.array4d(dtype=wp.spatial_vector),
+    local: NearSlopes, out: wp.array4d(dtype=wp.spatial_vector),
 ):  # fmt: skip
     """Derivative of the matrices by the pose of each body [F/m], [F/rad], (v, b, n, n)."""
     b, i, v = wp.tid()
@@ -231,6 +258,10 @@ def slopes(
                         if body_of(cut, f) == b and cut.node[f, v] >= 0:
                             one = charge[f, k, v] * pull[f, c, v]
                             total += share * (one + charge[f, c, v] * pull[f, k, v])
+        for k in range(near.count[v]):
+            if near.body[k, v] == b:
+                total += _local_slope(gap, near, cut, local, turn, k, i, j, v)
+                total += total[2] * local.lift[b, v]
         force = wp.spatial_top(total)
         torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
         out[v, b, i, j] = circuit.unit * wp.spatial_vector(force, torque)

@@ -11,7 +11,7 @@ import warp as wp
 
 from capsense.elements.mean_kernels import FAR
 from capsense.field.green_kernels import LEAST
-from capsense.fleet.warp_cut import WIDTH, Response, WarpCut, four, row, smooth
+from capsense.fleet.warp_cut import WIDTH, Response, WarpCut, four, idle, lift_back, row, smooth
 from capsense.surface.pair_kernels import _WIDE as WIDE
 from capsense.surface.pair_kernels import BARRIER
 
@@ -289,6 +289,9 @@ def source_forces(
         for q in range(4):
             p = leaf.points[q]
             pull = _source(p, green.sources[s], green.floor, least_of(green, s))
+            if leaf.lifted != 0:
+                p = leaf.unlifted[q]
+                pull = lift_back(pull, p, green.validity, green)
             force += pull
             torque += wp.cross(p - origin, pull)
         both = share_of(green, leaf, s) * wp.spatial_vector(force, torque)
@@ -306,16 +309,16 @@ def _near(d: wp.vec3, fourth: float):
 
 @wp.func
 def pair_force(
-    a: Leaf, cut: WarpCut, j: int, v: int, mirrored: float, floor: float, origin: wp.vec3
+    green: Response, a: Leaf, cut: WarpCut, j: int, v: int, mirrored: float, origin: wp.vec3
 ):  # fmt: skip
     """Force on a cluster, and torque about an origin, of the mean of 1/r to another."""
-    b = _facing(cut.points[j, v], mirrored, floor)
+    b = _facing(cut.points[j, v], mirrored, green.floor)
     d = 0.5 * (a.points[0] + a.points[3] - b[0] - b[3])
     square = wp.dot(d, d)
     size = a.extent + cut.extent[j, v]
     force = wp.vec3()
     torque = wp.vec3()
-    if square > _FAR * _FAR * size * size:
+    if square > _FAR * _FAR * size * size and a.lifted == 0:
         x = 0.5 * (a.points[0] - a.points[1])
         y = 0.5 * (a.points[0] - a.points[2])
         z = 0.5 * (b[0] - b[1])
@@ -339,8 +342,12 @@ def pair_force(
             pull = wp.vec3()
             for q in range(4):
                 pull += _near(a.points[p] - b[q], fourth)
+            at = a.points[p]
+            if a.lifted != 0:
+                at = a.unlifted[p]
+                pull = lift_back(pull, at, green.validity, green)
             force += pull / 16.0
-            torque += wp.cross(a.points[p] - origin, pull) / 16.0
+            torque += wp.cross(at - origin, pull) / 16.0
     return wp.spatial_vector(force, torque)
 
 
@@ -355,6 +362,8 @@ def forces(
     """
     i, chunk, v = wp.tid()
     first = _COLUMNS * chunk
+    if idle(cut, green.lead, first, v):
+        return
     total = pulls()
     if cut.node[i, v] >= 0:
         leaf = leaf_of(cut, i, v)
@@ -363,9 +372,9 @@ def forces(
         total = source_forces(green, leaf, strength, origin, first, v)
         for j in range(cut.node.shape[0]):
             if cut.node[j, v] >= 0:
-                pull = pair_force(leaf, cut, j, v, 1.0, green.floor, origin)
-                if body_of(cut, j) != body:
-                    pull -= pair_force(leaf, cut, j, v, 0.0, green.floor, origin)
+                pull = pair_force(green, leaf, cut, j, v, 1.0, origin)
+                if body_of(cut, j) != body or (i != j and leaf.lifted + cut.lifted[j, v] > 0):
+                    pull -= pair_force(green, leaf, cut, j, v, 0.0, origin)
                 total += wp.outer(columns_of(charge, j, first, v), pull)
     for c in range(_COLUMNS):
         out[i, first + c, v] = wp.spatial_vector(
