@@ -108,6 +108,7 @@ def _add_slopes(
     at = cut.pose[b, v]
     step = _STEP * gap.validity
     arm = wp.max(places.scale[e, b] * shapes.extent[shapes.first[u]], gap.validity)
+    here = nearest_of(outlines, places, cut, b, v, x)
     way = wp.spatial_vector()
     up = wp.spatial_vector()
     six = int(6)  # not unrolled
@@ -117,8 +118,16 @@ def _add_slopes(
         two = nearest(outlines, u, _moved(at, r, -change), places.scale[e, b], x)
         a, d = lengths(gap, green, one, x)
         f, g = lengths(gap, green, two, x)
-        way[r] = (a - f) / (2.0 * change)
-        up[r] = (d - g) / (2.0 * change)
+        if one.faces == here.faces and two.faces == here.faces:
+            change = 2.0 * change
+        elif one.faces == here.faces:
+            f = best
+            g = high
+        elif two.faces == here.faces:
+            a = best
+            d = high
+        way[r] = (a - f) / change
+        up[r] = (d - g) / change
     area = gap.areas[c] / (4.0 * _PI)
     inner = wp.clamp(place, 0.0, 1.0)
     fade = -6.0 * inner * (1.0 - inner) / ((_REACH1 - _REACH0) * gap.validity)
