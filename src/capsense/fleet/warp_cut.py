@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from capsense.field.green_kernels import SHORE, STEEP
+from capsense.field.green_kernels import DEEP, SHORE, STEEP
 from capsense.surface.look_kernels import LONG
 from capsense.surface.pair_kernels import BARRIER, LIFTED
 
@@ -34,7 +34,7 @@ _HALF = wp.constant(0.5)
 _CROSSING = wp.constant(2.0)
 _LONG0, _LONG1 = (wp.constant(x) for x in LONG)
 _LIFTED, _BARRIER = wp.constant(LIFTED), wp.constant(BARRIER)
-_DEEP, _BEHIND = wp.constant(3e-3), wp.constant(5e-3)
+_DEEP, _BEHIND = wp.constant(DEEP[0]), wp.constant(DEEP[1])
 _STEEP, _SHORE = wp.constant(STEEP), wp.constant(SHORE)
 
 
@@ -345,7 +345,7 @@ def place(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
         for d in range(2):
             depth = wp.min(depth, _STEEP * (c[d] - green.box0[d]))
             depth = wp.min(depth, _STEEP * (green.box1[d] - c[d]))
-        deep = (depth - _DEEP) / _BEHIND
+        deep = (depth / green.validity - _DEEP) / _BEHIND
         for q in range(4):
             before = points[q]
             points[q] = lift(before, green.validity, green)
