@@ -204,10 +204,10 @@ def local_of(gap: GapLaw, near: Near, i: int, j: int, v: int):
             other = wp.where(side == 0, j, i)
             for col in range(columns):
                 if gap.columns[row, col] == other:
-                    for p in range(gap.span[row + 1], gap.span[row + 2]):
+                    for p in range(gap.span[row], gap.span[row + 1]):
                         total += 0.5 * near.part[p, col, v]
     elif a < t:
-        for p in range(gap.span[a + 1], gap.span[a + 2]):
+        for p in range(gap.span[a], gap.span[a + 1]):
             total += near.part[p, columns + k - t, v]
     elif a == k:
         for p in range(gap.owner.shape[0]):

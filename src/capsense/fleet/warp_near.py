@@ -51,7 +51,7 @@ class GapLaw:
     radius: wp.array(dtype=wp.float32)
     chunks: wp.array(dtype=wp.int32)  # first block of each, and their number, (p + 1,)
     owner: wp.array(dtype=wp.int32)  # terminal of a chunk, -1 for grounded sheets, (p,)
-    span: wp.array(dtype=wp.int32)  # first chunk of grounded sheets and each terminal, (t + 2,)
+    span: wp.array(dtype=wp.int32)  # first chunk of each terminal and grounded sheets, (t + 2,)
 
 
 @wp.struct
@@ -74,12 +74,10 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
     out.there = int(cells > 0)
     owners = gap.terminal[gap.blocks[:-1]] if cells else np.zeros(0, np.int64)
-    first: list[int] = []
-    for t in range(-1, terminals):
-        of = np.flatnonzero(owners == t)
-        first.extend(of[::_BLOCKS].tolist())
+    each = [np.flatnonzero(owners == t)[::_BLOCKS] for t in (*range(terminals), -1)]  # as they lie
+    first = np.concatenate(each)
     owner = owners[first]
-    span = np.searchsorted(owner, np.arange(-1, terminals + 1))
+    span = np.cumsum([0, *map(len, each)])
     for name, values, kind in (
         ("points", gap.points, wp.vec2), ("areas", gap.areas, wp.float32),
         ("series", gap.series, wp.float32), ("columns", gap.columns, wp.int32),
