@@ -360,3 +360,16 @@ class Fleet:
             SolveError: As by :meth:`step`.
         """
         return compare(self, poses, sensors, samples, seed)
+
+    def lifted(self, poses: Array, sensors: Array, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which sensors of some environments lack the first millimetres, see :class:`FleetCheck`.
+
+        Args:
+            poses, sensors: As :meth:`step` takes them, on the host.
+            rows: Numbers of the environments, shape (k,).
+
+        Returns:
+            Shape (k, s).
+        """
+        nodes = self.places if self._warp is None else self._warp.gap.slots
+        return self._cpu.lifted(poses, sensors, rows, nodes)

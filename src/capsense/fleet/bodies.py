@@ -74,6 +74,10 @@ class FleetCheck:
     contact: tuple[tuple[int, int], ...] = ()
     """Environments and sensors whose readings mean nothing: an electrode lies inside a body, or
     within 0.2 mm of a conductor."""
+    lifted: tuple[tuple[int, int], ...] = ()
+    """Environments and sensors whose readings lack the first millimetres, as those that they are
+    compared with do: dielectrics near a flat design, and all that is near where matter has losses.
+    On Warp also where more than 8 conductors that are not at ground are near."""
 
 
 def on_device(values: Any) -> bool:
@@ -293,7 +297,10 @@ def compare(
     return FleetCheck(
         tuple(rows.tolist()), float(np.sqrt((errors**2).mean())), float(errors.max()),
         (int(rows[row]), int(sensor)),
-        tuple((int(rows[k]), int(j)) for k, j in np.argwhere(contact)),
+        *(
+            tuple((int(rows[k]), int(j)) for k, j in np.argwhere(some))
+            for some in (contact, fleet.lifted(where, at, rows))
+        ),
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from capsense.errors import SolveError
 from capsense.field.background import Terminals
 from capsense.field.green_kernels import SHORE, Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading
+from capsense.surface.gap_kernels import near_bodies
 from capsense.surface.solver import SurfaceSolver
 from capsense.surface.step import slopes_of, solve, solve_lossy
 
@@ -262,6 +263,37 @@ class CpuCore:
             terminals.empty[:n, :n] + change.real, change.real, UNIT * found.error, shields,
             conductance=None if loss is None else -omega * change.imag, jacobian=slopes,
         )  # fmt: skip
+
+    def lifted(
+        self, bodies: Array, sensors: Array, rows: NDArray[np.int64], nodes: int
+    ) -> NDArray[np.bool_]:
+        """Where bodies near the design are lifted and nothing is added for it, shape (k, s).
+
+        These are dielectrics, all near bodies where some matter has losses, and conductors that are
+        not at ground beyond the number of ``nodes``; see ``surface.gap_kernels``.
+
+        Args:
+            bodies, sensors: Poses, shapes (e, b, 7) and (e, s, 7).
+            rows: Which environments are looked at, shape (k,).
+            nodes: How many such conductors can be nodes.
+        """
+        solver, table = self._solver, self._table.bodies
+        where, green = Poses(bodies, sensors, solver.middle), solver.green
+        sight = green.room, SHORE * green.extent
+        records = np.empty(table.choice.shape[1], BODY)
+        place = np.empty(len(records), np.int64)
+        out = np.zeros((len(rows), sensors.shape[1]), np.bool_)
+        for k, s in np.ndindex(out.shape):
+            e = int(rows[k])
+            some = records[: _seen(table, where, e, s, sight, records, place)].copy()
+            at = place[: len(some)]
+            soft, ties = table.softness[e, at], table.tie[e, at]
+            some["softness"] = 0.0
+            near = near_bodies(some, green)
+            loose = near & (soft == 0.0) & ((some["neutral"] != 0) | (some["tie"] > 0.0))
+            out[k, s] = (near & (soft != 0.0)).any() or len(set(some["group"][loose])) > nodes
+            out[k, s] |= near.any() and ((soft.imag != 0.0).any() or (ties.imag != 0.0).any())
+        return out
 
     def _lossy(self, where: Poses, found: Found) -> NDArray[Any] | None:
         """Solve what has losses; the part in quadrature (e, s, m, m), None where nothing has."""

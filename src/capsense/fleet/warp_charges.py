@@ -338,5 +338,3 @@ def add(values: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32))
     """Add values to others."""
     i, c, v = wp.tid()
     out[i, c, v] = out[i, c, v] + values[i, c, v]
-
-

@@ -118,7 +118,13 @@ class WarpCore:
         if len(bodies.shapes) != self._taken:
             if self._captured:
                 self._captured = False
-                before = self.shapes, self.outlines, self.places.choice, self.circuit.rest, self.circuit.empty
+                before = (
+                    self.shapes,
+                    self.outlines,
+                    self.places.choice,
+                    self.circuit.rest,
+                    self.circuit.empty,
+                )
                 self._before.append(before)
                 self.places.choice = wp.clone(before[2])
                 self.circuit.rest, self.circuit.empty = map(wp.clone, before[3:])

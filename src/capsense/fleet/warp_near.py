@@ -168,7 +168,10 @@ def _find_near(
                         own = 1.0 / tie
                     near.capacitance[nodes, v] = own
                     for c in range(places.group.shape[0]):
-                        if places.group[c] == places.group[b] and cut.node[c * cut.clusters, v] >= 0:
+                        if (
+                            places.group[c] == places.group[b]
+                            and cut.node[c * cut.clusters, v] >= 0
+                        ):
                             cut.slot[c, v] = nodes
                             cut.leader[c, v] = c
                             cut.number[c * cut.clusters, v] = 0
@@ -237,9 +240,7 @@ def press(
                     if hit.off <= gap.radius[q]:
                         for c in range(gap.blocks[q], gap.blocks[q + 1]):
                             x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
-                            deepest = wp.max(
-                                deepest, overlap(outlines, places, gap, cut, b, v, x)
-                            )
+                            deepest = wp.max(deepest, overlap(outlines, places, gap, cut, b, v, x))
                             beside = wp.vec2(foot[0] - x[0], foot[1] - x[1])
                             if wp.dot(beside, beside) < gap.areas[c]:
                                 deepest = wp.max(deepest, gap.top - foot[2])
