@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from capsense.elements.matter import UNIT
 from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
@@ -21,6 +20,7 @@ from capsense.fleet import warp_solve as solution
 from capsense.fleet.bodies import Bodies, on_device
 from capsense.fleet.warp_chips import WarpChips
 from capsense.fleet.warp_outline import pack_outlines
+from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
 from capsense.readout import Readout
 from capsense.surface.solver import SurfaceSolver
 
@@ -53,7 +53,8 @@ class WarpCore:
         environments, places, sensors = counts
         table = solver.green.gap
         slots = min(places, _NODES) if len(table.areas) else 0
-        self.green, self.circuit = _response(solver, slots, device), _circuit(terminals, device)
+        self.green = pack_response(solver, slots, device)
+        self.circuit = pack_circuit(terminals, device)
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         self.gap = warp_near.pack_gap(table, self.green.terminals, slots, device)
         self.outlines: Any = None
@@ -84,6 +85,11 @@ class WarpCore:
             "choice neutral softness tie scale slack": (environments, places),
             "hidden": (sensors, places), "group": (places,),
         })  # fmt: skip
+        for name in ("scale", "softness", "group"):
+            setattr(self.near, name, getattr(self.places, name))
+        for name in ("pose", "slot", "columns", "lossy"):
+            setattr(self.near, name, getattr(self.cut, name))
+        self.near.sensors = sensors
         self.rows, self.matrix = room(n, width, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, size, views)
         self.whole = room(size, size, views, dtype=wp.vec2d)
@@ -118,20 +124,15 @@ class WarpCore:
         if len(bodies.shapes) != self._taken:
             if self._captured:
                 self._captured = False
-                before = (
-                    self.shapes,
-                    self.outlines,
-                    self.places.choice,
-                    self.circuit.rest,
-                    self.circuit.empty,
-                )
-                self._before.append(before)
-                self.places.choice = wp.clone(before[2])
-                self.circuit.rest, self.circuit.empty = map(wp.clone, before[3:])
-                for matrix in before[3:]:
+                before = self.places.choice, self.circuit.rest, self.circuit.empty
+                self._before.append((self.shapes, self.outlines, *before))
+                self.places.choice = wp.clone(before[0])
+                self.circuit.rest, self.circuit.empty = map(wp.clone, before[1:])
+                for matrix in before[1:]:
                     matrix.fill_(np.nan)
-            self.shapes, self._taken = _shapes(shapes, bodies, self._array), len(bodies.shapes)
+            self.shapes, self._taken = pack_shapes(shapes, bodies, self._array), len(bodies.shapes)
             self.outlines = pack_outlines(shapes, self._array)
+            self.near.choice, self.near.radius = self.places.choice, self.shapes.radius
         for name in ("choice", "neutral", "hidden", "group"):
             getattr(self.places, name).assign(getattr(bodies, name).astype(np.int32))
         for name in ("scale", "slack"):
@@ -183,10 +184,9 @@ class WarpCore:
         self.launch(solution.factorise_lossy, views, cut, matrix, loss, rest.dropped)
         self.launch(solution.forward, (size, views), cut, matrix, loss, rows, quadrature)
         self._look_below()
-        near = self.gap, self.near
         dim = size, size, views
-        self.launch(network.change, dim, *near, cut, rows, quadrature, rest, whole)
-        self.launch(network.eliminate, views, circuit, *near, cut, rest, whole)
+        self.launch(network.change, dim, self.gap, self.near, rows, quadrature, rest, whole)
+        self.launch(network.eliminate, views, circuit, self.near, rest, whole)
         self.launch(
             network.report, (circuit.electrodes, views), circuit, whole,
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
@@ -194,15 +194,14 @@ class WarpCore:
 
     def _look_near(self) -> None:
         """What is near the design, and what the gap law adds for it."""
-        near = self.shapes, self.outlines, self.places, self.gap
+        near = self.outlines, self.gap
         (chunks, _, views), launch = self.near.depth.shape, self.launch
-        launch(warp_near.connect, views, *near, self.cut, self.near)
-        if self.gap.there:
-            launch(warp_near.press, (views, chunks), *near, self.cut, self.near)
-            launch(warp_near.press_out, views, self.gap, self.cut, self.near)
-            launch(
-                warp_gap.local_change, (views, chunks), *near, self.green, self.cut, self.near
-            )  # fmt: skip
+        launch(warp_near.connect, views, self.places, self.cut, self.green.terminals)
+        if chunks:
+            launch(warp_near.find_near, views, *near, self.cut, self.near)
+            launch(warp_near.press, (views, chunks), *near, self.near)
+            launch(warp_near.press_out, views, self.gap, self.near)
+            launch(warp_gap.local_change, (views, chunks), *near, self.green, self.near)
 
     def _look_below(self) -> None:
         """Charges, and the potentials that they leave in functions that are not solved for."""
@@ -231,10 +230,15 @@ class WarpCore:
         if self._slopes is None:
             self._slopes = [
                 *(room(rows, lead, views) for rows in (3 * n, n, sources, modes)),
-                room(t, m, views), room(3 * n, lead, views, dtype=wp.spatial_vector),
-                room(views, places, m, m, dtype=wp.spatial_vector), self._room_of_slopes(),
+                room(views, places, m, m, dtype=wp.spatial_vector),
+                self._struct(warp_slope.Slopes, {
+                    "volts": (t, m, views), "charge pull": (3 * n, lead, views),
+                    "lift": (places, views),
+                    "part": (len(self.gap.owner), self.gap.columns.shape[1] + 1, places, views),
+                }),
             ]  # fmt: skip
-        charge, back, strength, sums, turn, pull, out, local = self._slopes
+            self._slopes[-1].charge = self._slopes[0]
+        charge, back, strength, sums, out, slopes = self._slopes
         launch, parts, at = self.launch, lead // pairs.COLUMNS, (self.shapes, self.places)
         launch(charges.estimated, (n, lead, views), cut, rest, charge)
         launch(charges.felt, (sources, parts, views), green, cut, charge, strength)
@@ -252,27 +256,18 @@ class WarpCore:
         launch(charges.to_clusters, (lead, views), cut, lead, rest.charge, charge)
         size = green.columns.shape[1], lead, views
         launch(charges.strengths, size, green, cut, sums, strength)
-        launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, pull)
-        launch(network.follow, (m, views), circuit, cut, self.whole, turn)
-        near = self.gap, self.near
-        if self.gap.there:
-            all_of = self.shapes, self.outlines, self.places
-            size = views, len(self.gap.owner)
-            launch(warp_slope.local_slopes, size, *all_of, self.gap, green, cut, self.near, local)
-            launch(warp_slope.press_slopes, views, *all_of[1:], *near[:1], cut, near[1], local)
-        dim = places, m, views
-        launch(network.slopes, dim, circuit, *near, cut, turn, charge, pull, local, out)
+        launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, slopes.pull)
+        launch(network.follow, (m, views), circuit, cut, self.whole, slopes.volts)
+        gap, near, chunks = self.gap, self.near, len(self.gap.owner)
+        if chunks:
+            both = self.outlines, gap
+            launch(warp_slope.local_slopes, (views, chunks), *both, green, near, slopes)
+            launch(warp_slope.press_slopes, views, *both, near, slopes)
+        launch(network.slopes, (places, m, views), circuit, gap, near, cut, slopes, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
         )  # fmt: skip
-
-    def _room_of_slopes(self) -> Any:
-        chunks, places, views = self.near.depth.shape
-        columns = self.gap.columns.shape[1]
-        return self._struct(warp_slope.NearSlopes, {
-            "part": (chunks, columns + 1, places, views), "lift": (places, views),
-        })  # fmt: skip
 
     def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
         """Chips for all sensors, see :class:`WarpChips`."""
@@ -323,77 +318,4 @@ def as_transforms(poses: Any, room: Any) -> Any:
         )
     out = wp.array(ptr=poses.ptr, dtype=wp.transform, shape=room.shape, device=room.device)
     out.owner = poses  # whose memory it is
-    return out
-
-
-def _response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
-    out, green = warp_cut.Response(), solver.green
-    lead = pairs.COLUMNS * -(-(green.terminals + slots) // pairs.COLUMNS)
-    near, _, far = green.levels  # the middle level is not used here
-    sources = np.concatenate([far.sources.T, near.sources.T]).astype(np.float32)
-    tables = [_widened(level.table, green.lead, lead) for level in (far, near)]
-    (count, width), size = tables[0].shape, warp_cut.SOURCES
-    table = np.zeros((size * -(-len(sources) // size), tables[1].shape[1]), np.float32)
-    table[:count, :width], table[count : len(sources)] = tables
-    columns = np.ascontiguousarray(table.T).reshape(len(table.T), -1, size)
-    parts = table[: len(sources)].reshape(len(sources), -1, warp_cut.WIDTH)
-    out.sources = wp.array(sources, dtype=wp.vec3, device=device)
-    out.table = wp.array(parts, dtype=warp_cut.row, device=device)
-    out.columns = wp.array(columns, dtype=warp_cut.many, device=device)
-    out.far, out.passes = count, width // warp_cut.WIDTH
-    out.lead, out.terminals, out.middle = lead, green.terminals, wp.vec3(*solver.middle)
-    out.extent, out.validity = green.extent, green.gap.validity
-    out.floor, out.cover = green.floor, min(green.cover, 1e3)
-    out.blend0, out.blend1 = green.blends[-1].tolist()
-    (out.box0, out.box1), (out.room0, out.room1) = (
-        (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.room)
-    )
-    return out
-
-
-def _widened(table: NDArray[Any], before: int, lead: int) -> NDArray[Any]:
-    """A table of φ⁰ and ψ with room for more of the first, columns of zeros."""
-    used = before + np.flatnonzero(table[:, before:].any(axis=0)).max(initial=-1) + 1
-    width = warp_cut.WIDTH * -(-(lead + used - before) // warp_cut.WIDTH)
-    out = np.zeros((len(table), width), np.float32)
-    out[:, :before], out[:, lead : lead + used - before] = table[:, :before], table[:, before:used]
-    return out
-
-
-def _circuit(terminals: Terminals, device: Any) -> Any:
-    out = network.Circuit()
-    out.electrodes, out.driven, out.unit = terminals.electrodes, terminals.driven, UNIT
-    for name in ("rest", "empty"):
-        setattr(out, name, wp.array(getattr(terminals, name), dtype=wp.float64, device=device))
-    bound = np.minimum(terminals.bound, np.finfo(np.float32).max).astype(np.float32)
-    out.screened = wp.array(bound, dtype=wp.float32, device=device)
-    return out
-
-
-def _shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any:
-    """Lay shapes out one behind the other."""
-    trees = [shape.tree for shape in shapes]
-    sizes = np.array([len(shape.panels) for shape in shapes])
-    blocks = [shape.energy.ravel() for shape in shapes]
-    soft = bodies.shapes["impedance"] != 0
-    inside = [
-        (shape.impedance if s else np.zeros_like(shape.energy)).ravel()
-        for shape, s in zip(shapes, soft, strict=True)
-    ]
-
-    def joined(name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(tree, name) for tree in trees])
-
-    out = warp_cut.Shapes()
-    out.first = array(np.concatenate([[0], np.cumsum(2 * sizes - 1)[:-1]]), wp.int32)
-    out.functions = array(sizes, wp.int32)
-    out.block = array(np.concatenate([[0], np.cumsum(sizes**2)[:-1]]), wp.int64)
-    out.radius = array(bodies.radius, wp.float32)
-    for name, kind in (
-        ("kids", wp.int32), ("function", wp.int32), ("charge", wp.float32), ("center", wp.vec3),
-        ("points", wp.vec3), ("extent", wp.float32), ("soft", wp.float32),
-    ):  # fmt: skip
-        setattr(out, name, array(joined(name), kind))
-    out.energy = array(np.concatenate(blocks), wp.float32)
-    out.impedance = array(np.concatenate(inside), wp.float32)
     return out

@@ -1,7 +1,7 @@
 """The gap law of many environments as Warp kernels: what bodies near a flat design add.
 
-The twin of these kernels is :mod:`capsense.surface.gap_kernels`; see :mod:`capsense.fleet.warp_near`
-for what they work with. Lengths in metres, 4π eps0 = 1.
+The twin of these kernels is :mod:`capsense.surface.gap_kernels`; what they work with is told in
+:mod:`capsense.fleet.warp_near`. Lengths in metres, 4π eps0 = 1.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 
 import warp as wp
 
-from capsense.fleet.warp_cut import Places, Response, Shapes, WarpCut, lift, smooth
+from capsense.fleet.warp_cut import Response, lift, smooth
 from capsense.fleet.warp_mesh import Hit, Outlines
 from capsense.fleet.warp_near import GapLaw, Near, may_meet, nearest_of
 from capsense.surface.gap_kernels import LEAST, REACH
@@ -101,28 +101,23 @@ def place_of(gap: GapLaw, length: float):
 
 
 @wp.func
-def met_by(
-    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near,
-    q: int, owner: int, v: int,
-):  # fmt: skip
-    """A bit for every near body that may count in a block of cells."""
+def met_by(outlines: Outlines, gap: GapLaw, near: Near, q: int, grounded: bool, v: int):
+    """A bit for every near body that may count in a block of cells; nodes alone on pours."""
     x = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
     reach = _REACH1 * gap.validity + gap.radius[q]
     met = wp.int64(0)
     for k in range(near.count[v]):
         b = near.body[k, v]
-        if cut.slot[b, v] >= 0 or owner >= 0:
-            if may_meet(shapes, places, cut, b, v, x, reach):
-                hit = nearest_of(outlines, places, cut, b, v, x)
-                if hit.off < reach:
-                    met = met | (wp.int64(1) << wp.int64(wp.min(k, 63)))
+        if (near.slot[b, v] >= 0 or not grounded) and may_meet(near, b, v, x, reach):
+            hit = nearest_of(outlines, near, b, v, x)
+            if hit.off < reach:
+                met = met | (wp.int64(1) << wp.int64(wp.min(k, 63)))
     return met
 
 
 @wp.func
 def nearest_cell(
-    outlines: Outlines, places: Places, gap: GapLaw, green: Response, cut: WarpCut, near: Near,
-    met: wp.int64, x: wp.vec3, v: int,
+    outlines: Outlines, gap: GapLaw, green: Response, near: Near, met: wp.int64, x: wp.vec3, v: int
 ):  # fmt: skip
     """The shortest field line from a place, that to the lifted body, and whose these are.
 
@@ -133,7 +128,7 @@ def nearest_cell(
     body = int(-1)
     for k in range(near.count[v]):
         if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
-            hit = nearest_of(outlines, places, cut, near.body[k, v], v, x)
+            hit = nearest_of(outlines, near, near.body[k, v], v, x)
             true, lifted = lengths(gap, green, hit, x)
             if true < best:
                 best = true
@@ -143,13 +138,8 @@ def nearest_cell(
 
 
 @wp.func
-def _add_cell(
-    outlines: Outlines, places: Places, gap: GapLaw, green: Response, cut: WarpCut, near: Near,
-    met: wp.int64, c: int, p: int, v: int,
-):  # fmt: skip
-    """Add what one cell changes."""
-    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
-    best, high, body = nearest_cell(outlines, places, gap, green, cut, near, met, x, v)
+def _add_cell(gap: GapLaw, near: Near, c: int, p: int, best: float, high: float, body: int, v: int):
+    """Add what one cell changes, of lengths as of :func:`nearest_cell`."""
     weight = 1.0 - smooth((best / gap.validity - _REACH0) / (_REACH1 - _REACH0))
     if body < 0 or high <= best or weight <= 0.0:
         return
@@ -159,7 +149,7 @@ def _add_cell(
     one = weight / (best + gap.series[c])
     two = weight / (high + gap.series[c])
     columns = gap.columns.shape[1]
-    slot = cut.slot[near.body[body, v], v]
+    slot = near.slot[near.body[body, v], v]
     for col in range(columns + 1):
         value = one * ((1.0 - s) * gap.change[c, k, col] + s * gap.change[c, k + 1, col])
         value -= two * ((1.0 - w) * gap.change[c, m, col] + w * gap.change[c, m + 1, col])
@@ -171,23 +161,23 @@ def _add_cell(
 
 
 @wp.kernel
-def local_change(
-    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, green: Response,
-    cut: WarpCut, near: Near,
-):  # fmt: skip
+def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: Near):
     """Local change by near bodies of a chunk's cells [m], as ``gap_kernels.local_change``."""
     v, p = wp.tid()
     if near.count[v] == 0:
         return
     for k in range(near.part.shape[1]):
         near.part[p, k, v] = 0.0
-    if gap.owner[p] < 0 and cut.columns[v] == gap.terminals:
+    grounded = gap.owner[p] < 0
+    if grounded and near.columns[v] == gap.terminals:
         return
     for q in range(gap.chunks[p], gap.chunks[p + 1]):
-        met = met_by(shapes, outlines, places, gap, cut, near, q, gap.owner[p], v)
+        met = met_by(outlines, gap, near, q, grounded, v)
         if met != wp.int64(0):
             for c in range(gap.blocks[q], gap.blocks[q + 1]):
-                _add_cell(outlines, places, gap, green, cut, near, met, c, p, v)
+                x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
+                best, high, body = nearest_cell(outlines, gap, green, near, met, x, v)
+                _add_cell(gap, near, c, p, best, high, body, v)
 
 
 @wp.func

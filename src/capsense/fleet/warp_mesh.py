@@ -184,18 +184,18 @@ def _inside(outlines: Outlines, u: int, p: wp.vec3):
         k = room[top]
         low = outlines.low[root + k]
         high = outlines.high[root + k]
-        if p[2] <= high[2] and p[0] >= low[0] and p[0] <= high[0]:
-            if p[1] >= low[1] and p[1] <= high[1]:
-                if k < leaves - 1:
-                    room[top] = 2 * k + 1
-                    room[top + 1] = 2 * k + 2
-                    top += 2
-                else:
-                    q = wp.int64(k - leaves + 1)
-                    start = wp.int32((q * count) >> wp.int64(levels - 1))
-                    stop = wp.int32(((q + wp.int64(1)) * count) >> wp.int64(levels - 1))
-                    for m in range(start, stop):
-                        total += _crossing(outlines, outlines.first[u] + m, p)
+        inside = p[0] >= low[0] and p[0] <= high[0] and p[1] >= low[1] and p[1] <= high[1]
+        if p[2] <= high[2] and inside:
+            if k < leaves - 1:
+                room[top] = 2 * k + 1
+                room[top + 1] = 2 * k + 2
+                top += 2
+            else:
+                q = wp.int64(k - leaves + 1)
+                start = wp.int32((q * count) >> wp.int64(levels - 1))
+                stop = wp.int32(((q + wp.int64(1)) * count) >> wp.int64(levels - 1))
+                for m in range(start, stop):
+                    total += _crossing(outlines, outlines.first[u] + m, p)
     return total
 
 

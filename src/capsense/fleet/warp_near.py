@@ -15,7 +15,7 @@ import warp as wp
 
 from capsense.elements.matter import SHUT
 from capsense.field.green_kernels import Gap as HostGap
-from capsense.fleet.warp_cut import Places, Shapes, WarpCut
+from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import lowest_point, middle_height, nearest, reach_down
 from capsense.surface.gap_kernels import _EXACT as EXACT
@@ -40,7 +40,6 @@ class GapLaw:
     log_ratio: wp.float32
     terminals: wp.int32
     slots: wp.int32  # conductors near the design that can be nodes
-    there: wp.int32  # 0 where the design has no table
     points: wp.array(dtype=wp.vec2)
     areas: wp.array(dtype=wp.float32)
     series: wp.array(dtype=wp.float32)
@@ -56,8 +55,22 @@ class GapLaw:
 
 @wp.struct
 class Near:
-    """What is near the design in every view."""
+    """What is near the design in every view; b places for bodies.
 
+    The first ones are arrays of ``Places``, ``Shapes`` and ``WarpCut``: kernels that took all of
+    these would have more arguments than a GPU takes.
+    """
+
+    sensors: wp.int32  # in each environment
+    choice: wp.array2d(dtype=wp.int32)
+    scale: wp.array2d(dtype=wp.float32)
+    softness: wp.array2d(dtype=wp.vec2)
+    group: wp.array(dtype=wp.int32)
+    radius: wp.array(dtype=wp.float32)
+    pose: wp.array2d(dtype=wp.transform)
+    slot: wp.array2d(dtype=wp.int32)
+    columns: wp.array(dtype=wp.int32)
+    lossy: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)  # bodies that are near, (v,)
     body: wp.array2d(dtype=wp.int32)  # these, in its first rows, (b, v)
     below: wp.array2d(dtype=wp.float32)  # how far a near body reaches below the face [m], (b, v)
@@ -72,7 +85,6 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
     out, cells = GapLaw(), len(gap.areas)
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
-    out.there = int(cells > 0)
     owners = gap.terminal[gap.blocks[:-1]] if cells else np.zeros(0, np.int64)
     each = [np.flatnonzero(owners == t)[::_BLOCKS] for t in (*range(terminals), -1)]  # as they lie
     first = np.concatenate(each)
@@ -91,15 +103,12 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
 
 
 @wp.kernel
-def connect(
-    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near
-):
-    """What ties the bodies of a view to ground, which of them are near, and which are nodes.
+def connect(places: Places, cut: WarpCut, terminals: int):
+    """What ties the bodies of a view to ground; places that are joined are one conductor.
 
-    Places that are joined are one conductor; those that are out of sight count for the tie. The
-    leader of those in sight has the function of the net charge. That of each other member is its
-    own equilibrium charge less the leader's, which is neutral. Those that are nodes are their own
-    leaders, at ground or at 1 V.
+    Those that are out of sight count for the tie. The leader of those in sight has the function of
+    the net charge. That of each other member is its own equilibrium charge less the leader's,
+    which is neutral.
     """
     v = wp.tid()
     e = v // places.hidden.shape[0]
@@ -134,129 +143,124 @@ def connect(
         cut.tie[b, v] = tie
         cut.slot[b, v] = -1
     cut.lossy[v] = lossy
-    near.count[v] = 0
-    cut.columns[v] = gap.terminals
-    if gap.there != 0 and lossy == 0:
-        _find_near(shapes, outlines, places, gap, cut, near, v)
+    cut.columns[v] = terminals
 
 
-@wp.func
-def _find_near(
-    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near,
-    v: int,
-):  # fmt: skip
+@wp.kernel
+def find_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: Near):
     """Enter the bodies that are near, and make nodes of those that are not at ground.
 
-    Where there are more of these than slots, the rest is lifted and nothing is added.
+    Of places that are joined, all become one node, and are their own leaders, at ground or at 1 V.
+    Where there are more nodes than slots, the rest is lifted and nothing is added.
     """
-    e = v // places.hidden.shape[0]
+    v = wp.tid()
     nodes = int(0)
     count = int(0)
-    for b in range(places.group.shape[0]):
-        there = int(0)
-        if cut.node[b * cut.clusters, v] >= 0 and places.softness[e, b][0] == 0.0:
-            there = _is_near(outlines, places, gap, cut, near, b, v)
-        if there != 0 and cut.slot[b, v] < 0:
-            tie = cut.tie[b, v][0]
+    if cut.lossy[v] == 0:
+        for b in range(near.group.shape[0]):
+            there = _is_near(outlines, gap, cut, near, b, v)
             neutral = cut.number[cut.leader[b, v] * cut.clusters, v] < 0
-            if neutral or tie > 0.0:
-                there = 0
-                if nodes < gap.slots:
-                    there = 1
-                    own = float(0.0)
-                    if not neutral and tie < 0.5 * _SHUT:
-                        own = 1.0 / tie
-                    near.capacitance[nodes, v] = own
-                    for c in range(places.group.shape[0]):
-                        if (
-                            places.group[c] == places.group[b]
-                            and cut.node[c * cut.clusters, v] >= 0
-                        ):
-                            cut.slot[c, v] = nodes
-                            cut.leader[c, v] = c
-                            cut.number[c * cut.clusters, v] = 0
-                            cut.tie[c, v] = wp.vec2()
+            if there and cut.slot[b, v] < 0 and (neutral or cut.tie[b, v][0] > 0.0):
+                there = nodes < gap.slots
+                if there:
+                    _make_node(cut, near, b, neutral, nodes, v)
                     nodes += 1
-        if there != 0:
-            near.body[count, v] = b
-            count += 1
+            if there:
+                near.body[count, v] = b
+                count += 1
     near.count[v] = count
     cut.columns[v] = gap.terminals + nodes
 
 
 @wp.func
-def _is_near(
-    outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near, b: int, v: int
-):
+def _make_node(cut: WarpCut, near: Near, b: int, neutral: bool, slot: int, v: int):
+    """Make a node of a place and of those that it is joined with."""
+    tie = cut.tie[b, v][0]
+    own = float(0.0)
+    if not neutral and tie < 0.5 * _SHUT:
+        own = 1.0 / tie
+    near.capacitance[slot, v] = own
+    for c in range(near.group.shape[0]):
+        if near.group[c] == near.group[b] and cut.node[c * cut.clusters, v] >= 0:
+            cut.slot[c, v] = slot
+            cut.leader[c, v] = c
+            cut.number[c * cut.clusters, v] = 0
+            cut.tie[c, v] = wp.vec2()
+
+
+@wp.func
+def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: Near, b: int, v: int):
     """Whether a conductor is within twice h0 of the face, as ``gap_kernels.near_bodies``."""
-    e = v // places.hidden.shape[0]
-    u = places.choice[e, b]
-    out = int(0)
-    if outlines.kind[u] != 0:
-        at = cut.pose[b, v]
-        scale = places.scale[e, b]
-        middle = middle_height(outlines, u, at, scale) - gap.top
-        lowest = middle - reach_down(outlines, u, wp.transform_get_rotation(at), scale)
-        near.below[b, v] = -lowest
-        if lowest < 0.0:
-            near.foot[b, v] = lowest_point(outlines, u, at, scale)
-        if middle >= 0.0 and lowest > -_REACH * gap.validity and lowest < 2.0 * gap.validity:
-            out = 1
+    e = v // near.sensors
+    out = bool(False)
+    if cut.node[b * cut.clusters, v] >= 0 and near.softness[e, b][0] == 0.0:
+        u = near.choice[e, b]
+        at = near.pose[b, v]
+        scale = near.scale[e, b]
+        if outlines.kind[u] != 0:
+            middle = middle_height(outlines, u, at, scale) - gap.top
+            lowest = middle - reach_down(outlines, u, wp.transform_get_rotation(at), scale)
+            near.below[b, v] = -lowest
+            out = middle >= 0.0 and lowest > -_REACH * gap.validity and lowest < 2.0 * gap.validity
+            if lowest < 0.0:
+                near.foot[b, v] = lowest_point(outlines, u, at, scale)
     return out
 
 
 @wp.func
-def may_meet(shapes: Shapes, places: Places, cut: WarpCut, b: int, v: int, x: wp.vec3, off: float):
+def may_meet(near: Near, b: int, v: int, x: wp.vec3, off: float):
     """Whether a body may be within a distance of a point, by the ball that holds it."""
-    e = v // places.hidden.shape[0]
-    reach = places.scale[e, b] * shapes.radius[places.choice[e, b]] + off
-    return wp.length(x - wp.transform_get_translation(cut.pose[b, v])) < reach
+    e = v // near.sensors
+    reach = near.scale[e, b] * near.radius[near.choice[e, b]] + off
+    return wp.length(x - wp.transform_get_translation(near.pose[b, v])) < reach
 
 
 @wp.func
-def nearest_of(
-    outlines: Outlines, places: Places, cut: WarpCut, b: int, v: int, x: wp.vec3
-):  # fmt: skip
+def nearest_of(outlines: Outlines, near: Near, b: int, v: int, x: wp.vec3):
     """Nearest point of the body in a place."""
-    e = v // places.hidden.shape[0]
-    return nearest(outlines, places.choice[e, b], cut.pose[b, v], places.scale[e, b], x)
+    e = v // near.sensors
+    return nearest(outlines, near.choice[e, b], near.pose[b, v], near.scale[e, b], x)
 
 
 @wp.kernel
-def press(
-    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near
-):
+def press(outlines: Outlines, gap: GapLaw, near: Near):
     """How far bodies overlap the cells of a chunk, as ``gap_kernels.press_out``, (p, b, v)."""
     v, p = wp.tid()
     for k in range(near.count[v]):
         b = near.body[k, v]
         deepest = float(0.0)
         if near.below[b, v] > 0.0 and gap.owner[p] >= 0:
-            foot = near.foot[b, v]
             for q in range(gap.chunks[p], gap.chunks[p + 1]):
-                middle = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
-                if may_meet(shapes, places, cut, b, v, middle, gap.radius[q]):
-                    hit = nearest_of(outlines, places, cut, b, v, middle)
-                    if hit.off <= gap.radius[q]:
-                        for c in range(gap.blocks[q], gap.blocks[q + 1]):
-                            x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
-                            deepest = wp.max(deepest, overlap(outlines, places, gap, cut, b, v, x))
-                            beside = wp.vec2(foot[0] - x[0], foot[1] - x[1])
-                            if wp.dot(beside, beside) < gap.areas[c]:
-                                deepest = wp.max(deepest, gap.top - foot[2])
+                deepest = wp.max(deepest, _overlap_of_block(outlines, gap, near, b, q, v))
         near.depth[p, b, v] = deepest
 
 
 @wp.func
-def overlap(
-    outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, b: int, v: int, x: wp.vec3
-):  # fmt: skip
+def _overlap_of_block(outlines: Outlines, gap: GapLaw, near: Near, b: int, q: int, v: int):
+    """How far a body overlaps the cells of a block [m]."""
+    middle = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
+    foot = near.foot[b, v]
+    deepest = float(0.0)
+    if may_meet(near, b, v, middle, gap.radius[q]):
+        hit = nearest_of(outlines, near, b, v, middle)
+        if hit.off <= gap.radius[q]:
+            for c in range(gap.blocks[q], gap.blocks[q + 1]):
+                x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
+                deepest = wp.max(deepest, _overlap(outlines, gap, near, b, v, x))
+                beside = wp.vec2(foot[0] - x[0], foot[1] - x[1])
+                if wp.dot(beside, beside) < gap.areas[c]:
+                    deepest = wp.max(deepest, gap.top - foot[2])
+    return deepest
+
+
+@wp.func
+def _overlap(outlines: Outlines, gap: GapLaw, near: Near, b: int, v: int, x: wp.vec3):
     """How far down the surface of a body is below a place of the face [m]."""
     at = x
     going = int(1)
     for _ in range(_WAYS):
         if going == 1:
-            hit = nearest_of(outlines, places, cut, b, v, at)
+            hit = nearest_of(outlines, near, b, v, at)
             if hit.off >= -_EXACT * gap.validity:
                 going = 0
             else:
@@ -265,7 +269,7 @@ def overlap(
 
 
 @wp.kernel
-def press_out(gap: GapLaw, cut: WarpCut, near: Near):
+def press_out(gap: GapLaw, near: Near):
     """Move near bodies that overlap the face up until they touch it."""
     v = wp.tid()
     for k in range(near.count[v]):
@@ -274,8 +278,8 @@ def press_out(gap: GapLaw, cut: WarpCut, near: Near):
             deepest = float(0.0)
             for p in range(gap.owner.shape[0]):
                 deepest = wp.max(deepest, near.depth[p, b, v])
-            at = cut.pose[b, v]
+            at = near.pose[b, v]
             up = wp.vec3(0.0, 0.0, wp.min(deepest, near.below[b, v]))
-            cut.pose[b, v] = wp.transform(
+            near.pose[b, v] = wp.transform(
                 wp.transform_get_translation(at) + up, wp.transform_get_rotation(at)
             )

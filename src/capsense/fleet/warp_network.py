@@ -13,7 +13,7 @@ from capsense.fleet.warp_cut import WarpCut
 from capsense.fleet.warp_gap import local_of
 from capsense.fleet.warp_near import GapLaw, Near
 from capsense.fleet.warp_pairs import body_of
-from capsense.fleet.warp_slope import NearSlopes
+from capsense.fleet.warp_slope import Slopes
 from capsense.fleet.warp_solve import Left, over, times
 from capsense.surface.solve_kernels import GAIN
 from capsense.surface.step import LAW
@@ -38,12 +38,12 @@ class Circuit:
 
 @wp.kernel
 def change(
-    gap: GapLaw, near: Near, cut: WarpCut, potentials: wp.array3d(dtype=wp.float32),
+    gap: GapLaw, near: Near, potentials: wp.array3d(dtype=wp.float32),
     quadrature: wp.array3d(dtype=wp.float32), left: Left, whole: wp.array3d(dtype=wp.vec2d),
 ):  # fmt: skip
     """Complex change of the matrices of terminals and nodes [m], (t, t, v), and parts of it."""
     i, j, v = wp.tid()
-    if wp.max(i, j) >= cut.columns[v]:
+    if wp.max(i, j) >= near.columns[v]:
         return
     total = wp.vec2()
     more = wp.vec2()
@@ -57,7 +57,7 @@ def change(
         if own[0] > 0.0:
             x = wp.vec2(left.residual[f, i, v], 0.0)
             y = wp.vec2(left.residual[f, j, v], 0.0)
-            if cut.lossy[v] != 0:
+            if near.lossy[v] != 0:
                 x[1] = left.residual[f, lead + i, v]
                 y[1] = left.residual[f, lead + j, v]
             more += _GAIN * over(times(x, y), own)
@@ -89,10 +89,7 @@ def _eliminate(whole: wp.array3d(dtype=wp.vec2d), p: int, v: int):
 
 
 @wp.kernel
-def eliminate(
-    circuit: Circuit, gap: GapLaw, near: Near, cut: WarpCut, left: Left,
-    whole: wp.array3d(dtype=wp.vec2d),
-):  # fmt: skip
+def eliminate(circuit: Circuit, near: Near, left: Left, whole: wp.array3d(dtype=wp.vec2d)):
     """Take nodes, then floating conductors of the design out of the matrices, the last one first.
 
     What is left is in farads, the empty domain's matrix added. What is in doubt of each terminal's
@@ -100,7 +97,7 @@ def eliminate(
     """
     v = wp.tid()
     t = circuit.rest.shape[0]
-    nodes = cut.columns[v] - t
+    nodes = near.columns[v] - t
     for step in range(nodes):
         p = t + nodes - 1 - step
         if whole[p, p, v][0] > wp.float64(0.0):  # else nothing of a node may be within reach
@@ -198,8 +195,8 @@ def follow(
 ):  # fmt: skip
     """Potential of each terminal and node while an electrode is at 1 V, (t, n, v).
 
-    ``whole`` is as ``eliminate`` leaves it: row p of a floating conductor or node holds its coupling
-    with those before it, these still in the network.
+    ``whole`` is as ``eliminate`` leaves it: row p of a floating conductor or node holds its
+    coupling with those before it, these still in the network.
     """
     j, v = wp.tid()
     for a in range(cut.columns[v]):
@@ -216,43 +213,45 @@ def follow(
 
 @wp.func
 def _local_slope(
-    gap: GapLaw, near: Near, cut: WarpCut, slopes: NearSlopes, turn: wp.array3d(dtype=wp.float32),
-    k: int, i: int, j: int, v: int,
+    gap: GapLaw, near: Near, slopes: Slopes, k: int, i: int, j: int, v: int
 ):  # fmt: skip
     """Derivative of the local change of an entry by a near body's pose."""
     total = wp.spatial_vector()
     columns = gap.columns.shape[1]
-    slot = cut.slot[near.body[k, v], v]
+    volts = slopes.volts
+    slot = near.slot[near.body[k, v], v]
     for p in range(gap.owner.shape[0]):
         a = gap.owner[p]
         if a >= 0:
             for col in range(columns):
                 c = gap.columns[a, col]
                 if c >= 0:
-                    share = turn[a, i, v] * turn[c, j, v] + turn[c, i, v] * turn[a, j, v]
+                    share = volts[a, i, v] * volts[c, j, v] + volts[c, i, v] * volts[a, j, v]
                     total += 0.5 * share * slopes.part[p, col, k, v]
         if slot >= 0:
             c = gap.terminals + slot
-            share = -turn[c, i, v] * turn[c, j, v]
+            share = -volts[c, i, v] * volts[c, j, v]
             if a >= 0:
-                share += turn[a, i, v] * turn[c, j, v] + turn[c, i, v] * turn[a, j, v]
+                share += volts[a, i, v] * volts[c, j, v] + volts[c, i, v] * volts[a, j, v]
             total += share * slopes.part[p, columns, k, v]
     return total
 
 
 @wp.kernel
 def slopes(
-    circuit: Circuit, gap: GapLaw, near: Near, cut: WarpCut, turn: wp.array3d(dtype=wp.float32),
-    charge: wp.array3d(dtype=wp.float32), pull: wp.array3d(dtype=wp.spatial_vector),
-    local: NearSlopes, out: wp.array4d(dtype=wp.spatial_vector),
+    circuit: Circuit, gap: GapLaw, near: Near, cut: WarpCut, slopes: Slopes,
+    out: wp.array4d(dtype=wp.spatial_vector),
 ):  # fmt: skip
     """Derivative of the matrices by the pose of each body [F/m], [F/rad], (v, b, n, n)."""
     b, i, v = wp.tid()
+    volts = slopes.volts
+    charge = slopes.charge
+    pull = slopes.pull
     for j in range(circuit.electrodes):
         total = wp.spatial_vector()
         for k in range(cut.columns[v]):
             for c in range(cut.columns[v]):
-                share = turn[k, i, v] * turn[c, j, v]
+                share = volts[k, i, v] * volts[c, j, v]
                 if share != 0.0:
                     for f in range(cut.node.shape[0]):
                         if body_of(cut, f) == b and cut.node[f, v] >= 0:
@@ -260,8 +259,8 @@ def slopes(
                             total += share * (one + charge[f, c, v] * pull[f, k, v])
         for k in range(near.count[v]):
             if near.body[k, v] == b:
-                total += _local_slope(gap, near, cut, local, turn, k, i, j, v)
-                total += total[2] * local.lift[b, v]
+                total += _local_slope(gap, near, slopes, k, i, j, v)
+                total += total[2] * slopes.lift[b, v]
         force = wp.spatial_top(total)
         torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
         out[v, b, i, j] = circuit.unit * wp.spatial_vector(force, torque)

@@ -1,7 +1,7 @@
 """Outlines of bodies as the Warp kernels take them: nearest points of primitives and meshes.
 
-The twin of these functions is :mod:`capsense.elements.outline`. Ways to the nearest point are worked
-out, not the point itself: near contact a way is short, and single precision has all of its digits.
+The twin of these functions is :mod:`capsense.elements.outline`. Ways to the nearest point are
+worked out, not the point itself: near contact a way is short, and has all digits of its precision.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def nearest(outlines: Outlines, u: int, at: wp.transform, scale: float, x: wp.ve
         hit = _to_cylinder(p, s)
     else:
         hit.faces = 1
-        if kind == _SPHERE or kind == _CAPSULE:  # noqa: PLR1714 - Warp knows no membership
+        if kind == _SPHERE or kind == _CAPSULE:  # noqa: SIM109 - Warp knows no membership
             axis = p
             if kind == _CAPSULE:
                 axis[2] = p[2] - wp.clamp(p[2], -s[1], s[1])

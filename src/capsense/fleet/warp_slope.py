@@ -1,8 +1,8 @@
 """The gap law of many environments as Warp kernels: how it changes as near bodies move.
 
-The lengths of field lines are differenced as a body moves, which are nearly linear in its pose; what
-the table has of them, and the share of a cell, are differentiated. For bodies that are pressed out
-of the face, what they are moved by is differentiated at the point that touches.
+The lengths of field lines are differenced as a body moves, as they are nearly linear in its pose;
+what the table has of them, and the share of a cell, are differentiated. For bodies that are pressed
+out of the face, what they are moved by is differentiated at the point that touches.
 Lengths in metres, 4π eps0 = 1.
 """
 
@@ -12,10 +12,10 @@ import math
 
 import warp as wp
 
-from capsense.fleet.warp_cut import Places, Response, Shapes, WarpCut, smooth
+from capsense.fleet.warp_cut import Response, smooth
 from capsense.fleet.warp_gap import lengths, met_by, nearest_cell, place_of
 from capsense.fleet.warp_mesh import Outlines
-from capsense.fleet.warp_near import GapLaw, Near, nearest_of, overlap
+from capsense.fleet.warp_near import GapLaw, Near, nearest_of
 from capsense.fleet.warp_outline import nearest
 from capsense.surface.gap_kernels import REACH
 
@@ -32,11 +32,16 @@ _STEEP = wp.constant(0.2)
 
 
 @wp.struct
-class NearSlopes:
-    """How what is near changes with the poses of near bodies, about what they stand at."""
+class Slopes:
+    """What derivatives are made of; t terminals and nodes, n electrodes, l leaves.
 
-    part: wp.array4d(dtype=wp.spatial_vector)  # of ``Near.part``, the last one its node's,
-    # by the place in ``Near.body``, (p, n + 1, b, v)
+    What is near is differentiated about where bodies stand, by the places in ``Near.body``.
+    """
+
+    volts: wp.array3d(dtype=wp.float32)  # with an electrode at 1 V, (t, n, v)
+    charge: wp.array3d(dtype=wp.float32)  # on leaves [m], (l, lead, v)
+    pull: wp.array3d(dtype=wp.spatial_vector)  # forces on leaves, (l, lead, v)
+    part: wp.array4d(dtype=wp.spatial_vector)  # of ``Near.part``, the node's last, (p, n + 1, b, v)
     lift: wp.array2d(dtype=wp.spatial_vector)  # of what presses a body out, (b, v)
 
 
@@ -71,77 +76,87 @@ def _slope_of(gap: GapLaw, c: int, col: int, length: float):
 
 
 @wp.kernel
-def local_slopes(
-    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, green: Response,
-    cut: WarpCut, near: Near, out: NearSlopes,
-):  # fmt: skip
+def local_slopes(outlines: Outlines, gap: GapLaw, green: Response, near: Near, out: Slopes):
     """Derivatives of the local change of a chunk's cells by the poses of near bodies."""
     v, p = wp.tid()
     columns = gap.columns.shape[1]
     for k in range(near.count[v]):
         for col in range(columns + 1):
             out.part[p, col, k, v] = wp.spatial_vector()
-    if near.count[v] == 0 or (gap.owner[p] < 0 and cut.columns[v] == gap.terminals):
+    grounded = gap.owner[p] < 0
+    if near.count[v] == 0 or (grounded and near.columns[v] == gap.terminals):
         return
     for q in range(gap.chunks[p], gap.chunks[p + 1]):
-        met = met_by(shapes, outlines, places, gap, cut, near, q, gap.owner[p], v)
+        met = met_by(outlines, gap, near, q, grounded, v)
         if met != wp.int64(0):
             for c in range(gap.blocks[q], gap.blocks[q + 1]):
-                _add_slopes(shapes, outlines, places, gap, green, cut, near, met, c, p, v, out)
+                x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
+                best, high, k = nearest_cell(outlines, gap, green, near, met, x, v)
+                if k >= 0 and high > best and best < _REACH1 * gap.validity:
+                    b = near.body[k, v]
+                    way, up = _turns(outlines, gap, green, near, x, b, v)
+                    for col in range(columns + 1):
+                        slope = _cell_slope(gap, c, col, best, high, way, up)
+                        out.part[p, col, k, v] = out.part[p, col, k, v] + slope
 
 
 @wp.func
-def _add_slopes(
-    shapes: Shapes, outlines: Outlines, places: Places, gap: GapLaw, green: Response,
-    cut: WarpCut, near: Near, met: wp.int64, c: int, p: int, v: int, out: NearSlopes,
+def _turns(
+    outlines: Outlines, gap: GapLaw, green: Response, near: Near, x: wp.vec3, b: int, v: int
 ):  # fmt: skip
-    """Add the derivatives of what one cell changes."""
-    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
-    best, high, k = nearest_cell(outlines, places, gap, green, cut, near, met, x, v)
-    place = (best / gap.validity - _REACH0) / (_REACH1 - _REACH0)
-    weight = 1.0 - smooth(place)
-    if k < 0 or high <= best or weight <= 0.0:
-        return
-    e = v // places.hidden.shape[0]
-    b = near.body[k, v]
-    u = places.choice[e, b]
-    at = cut.pose[b, v]
+    """Differences of the lengths of two field lines over those of a body's pose.
+
+    They step where the nearest point comes to another face or edge, so that they are taken on the
+    side where it does not.
+    """
+    e = v // near.sensors
+    u = near.choice[e, b]
+    scale = near.scale[e, b]
+    at = near.pose[b, v]
+    here = nearest(outlines, u, at, scale, x)
+    best, high = lengths(gap, green, here, x)
     step = _STEP * gap.validity
-    arm = wp.max(places.scale[e, b] * shapes.extent[shapes.first[u]], gap.validity)
-    here = nearest_of(outlines, places, cut, b, v, x)
+    arm = wp.max(scale * near.radius[u], gap.validity)
     way = wp.spatial_vector()
     up = wp.spatial_vector()
     six = int(6)  # not unrolled
     for r in range(six):
         change = wp.where(r < 3, step, step / arm)
-        one = nearest(outlines, u, _moved(at, r, change), places.scale[e, b], x)
-        two = nearest(outlines, u, _moved(at, r, -change), places.scale[e, b], x)
+        one = nearest(outlines, u, _moved(at, r, change), scale, x)
+        two = nearest(outlines, u, _moved(at, r, -change), scale, x)
         a, d = lengths(gap, green, one, x)
         f, g = lengths(gap, green, two, x)
-        if one.faces == here.faces and two.faces == here.faces:
+        if (one.faces == here.faces) == (two.faces == here.faces):
             change = 2.0 * change
         elif one.faces == here.faces:
             f = best
             g = high
-        elif two.faces == here.faces:
+        else:
             a = best
             d = high
         way[r] = (a - f) / change
         up[r] = (d - g) / change
-    area = gap.areas[c] / (4.0 * _PI)
+    return way, up
+
+
+@wp.func
+def _cell_slope(
+    gap: GapLaw, c: int, col: int, best: float, high: float, way: wp.spatial_vector,
+    up: wp.spatial_vector,
+):  # fmt: skip
+    """Derivative of what a cell changes in a column, from those of the two lengths."""
+    place = (best / gap.validity - _REACH0) / (_REACH1 - _REACH0)
     inner = wp.clamp(place, 0.0, 1.0)
+    weight = 1.0 - smooth(place)
     fade = -6.0 * inner * (1.0 - inner) / ((_REACH1 - _REACH0) * gap.validity)
-    for col in range(gap.columns.shape[1] + 1):
-        true, by_true = _slope_of(gap, c, col, best)
-        lifted, by_lifted = _slope_of(gap, c, col, high)
-        slope = (fade * (true - lifted) + weight * by_true) * way - weight * by_lifted * up
-        out.part[p, col, k, v] = out.part[p, col, k, v] + area * slope
+    true, by_true = _slope_of(gap, c, col, best)
+    lifted, by_lifted = _slope_of(gap, c, col, high)
+    slope = (fade * (true - lifted) + weight * by_true) * way - weight * by_lifted * up
+    return gap.areas[c] / (4.0 * _PI) * slope
 
 
 @wp.kernel
-def press_slopes(
-    outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near, out: NearSlopes
-):
+def press_slopes(outlines: Outlines, gap: GapLaw, near: Near, out: Slopes):
     """Derivative of what presses a body out of the face by its pose."""
     v = wp.tid()
     for k in range(near.count[v]):
@@ -158,18 +173,15 @@ def press_slopes(
             point = near.foot[b, v]
             normal = wp.vec3(0.0, 0.0, -1.0)
             if gap.top - point[2] > deepest + _FLAT * gap.validity:  # it is beside all cells
-                point, normal = _touching(outlines, places, gap, cut, near, b, most, up, v)
+                point, normal = _touching(outlines, gap, near, b, most, v)
                 point[2] = point[2] - up
-            origin = wp.transform_get_translation(cut.pose[b, v]) - wp.vec3(0.0, 0.0, up)
+            origin = wp.transform_get_translation(near.pose[b, v]) - wp.vec3(0.0, 0.0, up)
             slope = normal / wp.max(-normal[2], _STEEP)
             out.lift[b, v] = wp.spatial_vector(slope, wp.cross(point - origin, slope))
 
 
 @wp.func
-def _touching(
-    outlines: Outlines, places: Places, gap: GapLaw, cut: WarpCut, near: Near, b: int, p: int,
-    up: float, v: int,
-):  # fmt: skip
+def _touching(outlines: Outlines, gap: GapLaw, near: Near, b: int, p: int, v: int):
     """The point of a body, pressed out, that touches a cell of a chunk, and its normal."""
     least = float(1.0e30)
     point = wp.vec3()
@@ -177,7 +189,7 @@ def _touching(
     for q in range(gap.chunks[p], gap.chunks[p + 1]):
         for c in range(gap.blocks[q], gap.blocks[q + 1]):
             x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
-            hit = nearest_of(outlines, places, cut, b, v, x)
+            hit = nearest_of(outlines, near, b, v, x)
             if hit.off < least:
                 least = hit.off
                 point = x

@@ -1,0 +1,94 @@
+"""The design of a fleet on Warp, its circuit, and shapes of bodies, laid out for the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from capsense.elements.matter import UNIT
+from capsense.elements.rigid import RigidShape
+from capsense.field.background import Terminals
+from capsense.fleet import warp_cut
+from capsense.fleet import warp_network as network
+from capsense.fleet import warp_pairs as pairs
+from capsense.fleet.bodies import Bodies
+from capsense.surface.solver import SurfaceSolver
+
+
+def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
+    """The Green's function of a design, with columns for nodes behind those of its terminals."""
+    out, green = warp_cut.Response(), solver.green
+    lead = pairs.COLUMNS * -(-(green.terminals + slots) // pairs.COLUMNS)
+    near, _, far = green.levels  # the middle level is not used here
+    sources = np.concatenate([far.sources.T, near.sources.T]).astype(np.float32)
+    tables = [_widened(level.table, green.lead, lead) for level in (far, near)]
+    (count, width), size = tables[0].shape, warp_cut.SOURCES
+    table = np.zeros((size * -(-len(sources) // size), tables[1].shape[1]), np.float32)
+    table[:count, :width], table[count : len(sources)] = tables
+    columns = np.ascontiguousarray(table.T).reshape(len(table.T), -1, size)
+    parts = table[: len(sources)].reshape(len(sources), -1, warp_cut.WIDTH)
+    out.sources = wp.array(sources, dtype=wp.vec3, device=device)
+    out.table = wp.array(parts, dtype=warp_cut.row, device=device)
+    out.columns = wp.array(columns, dtype=warp_cut.many, device=device)
+    out.far, out.passes = count, width // warp_cut.WIDTH
+    out.lead, out.terminals, out.middle = lead, green.terminals, wp.vec3(*solver.middle)
+    out.extent, out.validity = green.extent, green.gap.validity
+    out.floor, out.cover = green.floor, min(green.cover, 1e3)
+    out.blend0, out.blend1 = green.blends[-1].tolist()
+    (out.box0, out.box1), (out.room0, out.room1) = (
+        (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.room)
+    )
+    return out
+
+
+def _widened(table: NDArray[Any], before: int, lead: int) -> NDArray[Any]:
+    """A table of φ⁰ and ψ with room for more of the first, columns of zeros."""
+    used = before + np.flatnonzero(table[:, before:].any(axis=0)).max(initial=-1) + 1
+    width = warp_cut.WIDTH * -(-(lead + used - before) // warp_cut.WIDTH)
+    out = np.zeros((len(table), width), np.float32)
+    out[:, :before], out[:, lead : lead + used - before] = table[:, :before], table[:, before:used]
+    return out
+
+
+def pack_circuit(terminals: Terminals, device: Any) -> Any:
+    """The terminals of a design."""
+    out = network.Circuit()
+    out.electrodes, out.driven, out.unit = terminals.electrodes, terminals.driven, UNIT
+    for name in ("rest", "empty"):
+        setattr(out, name, wp.array(getattr(terminals, name), dtype=wp.float64, device=device))
+    bound = np.minimum(terminals.bound, np.finfo(np.float32).max).astype(np.float32)
+    out.screened = wp.array(bound, dtype=wp.float32, device=device)
+    return out
+
+
+def pack_shapes(shapes: Sequence[RigidShape], bodies: Bodies, array: Any) -> Any:
+    """Lay shapes out one behind the other."""
+    trees = [shape.tree for shape in shapes]
+    sizes = np.array([len(shape.panels) for shape in shapes])
+    blocks = [shape.energy.ravel() for shape in shapes]
+    soft = bodies.shapes["impedance"] != 0
+    inside = [
+        (shape.impedance if s else np.zeros_like(shape.energy)).ravel()
+        for shape, s in zip(shapes, soft, strict=True)
+    ]
+
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(tree, name) for tree in trees])
+
+    out = warp_cut.Shapes()
+    out.first = array(np.concatenate([[0], np.cumsum(2 * sizes - 1)[:-1]]), wp.int32)
+    out.functions = array(sizes, wp.int32)
+    out.block = array(np.concatenate([[0], np.cumsum(sizes**2)[:-1]]), wp.int64)
+    out.radius = array(bodies.radius, wp.float32)
+    for name, kind in (
+        ("kids", wp.int32), ("function", wp.int32), ("charge", wp.float32), ("center", wp.vec3),
+        ("points", wp.vec3), ("extent", wp.float32), ("soft", wp.float32),
+    ):  # fmt: skip
+        setattr(out, name, array(joined(name), kind))
+    out.energy = array(np.concatenate(blocks), wp.float32)
+    out.impedance = array(np.concatenate(inside), wp.float32)
+    return out
