@@ -15,7 +15,14 @@ import capsense as cs
 from capsense.field.green_kernels import Green
 from capsense.surface import step
 from capsense.surface.choose_kernels import Cut, Functions, functions_of
-from capsense.surface.gap_kernels import local_change, near_bodies, press_out
+from capsense.surface.gap_kernels import (
+    extent_of_body,
+    local_change,
+    move,
+    near_bodies,
+    press_out,
+)
+from capsense.surface.gradient_kernels import jacobian
 from capsense.surface.leaf_kernels import leaf_rows, placed
 from capsense.surface.network_kernels import (
     as_nodes,
@@ -26,7 +33,7 @@ from capsense.surface.network_kernels import (
     with_nodes,
 )
 from capsense.surface.packing import PackedBodies, View
-from capsense.surface.pair_kernels import BARRIER, bound_images, leaf_pairs
+from capsense.surface.pair_kernels import BARRIER, LIFTED, bound_images, leaf_pairs
 from capsense.surface.solve_kernels import System, assembled, leaf_charges, reduced
 from capsense.surface.solver import SurfaceSolver
 
@@ -164,8 +171,28 @@ def same_functions(count: int) -> Iterator[list[Array]]:
             step.estimate(delta, left, coarse[:m], shift, green.electrodes), near, node, weights,
         )  # fmt: skip
 
+    def slopes(
+        solution: step.Solution, bodies: NDArray[np.void], green: Green, *others: float
+    ) -> NDArray[np.float64]:
+        out, moved = jacobian(solution, bodies, green), bodies.copy()
+        leaves = prepared(bodies, green)[1]
+        moves = np.abs(leaves.points - leaves.true).max(axis=(1, 2)) > LIFTED
+        lifted = solution.near | (np.bincount(leaves.owner, moves, len(bodies)) > 0)
+        for b, r in np.ndindex(len(bodies), 6):
+            if lifted[b]:
+                length = step.DIFFERENCE * green.gap.validity
+                length /= 1.0 if r < 3 else max(extent_of_body(bodies[b]), green.gap.validity)
+                ends = []
+                for sign in (1, -1):
+                    move(moved[b], bodies[b], r, sign * length)
+                    ends.append(solve(moved, green).delta)
+                move(moved[b], bodies[b], 0, 0.0)
+                out[b, ..., r] = (ends[0] - ends[1]) / (2.0 * length)
+        return out
+
     with (
         patch.object(SurfaceSolver, "pack", packed),
+        patch("capsense.surface.solver.slopes_of", slopes),
         patch("capsense.surface.solver.solve", solve),
         patch.object(step, "prepared", prepared),
     ):
