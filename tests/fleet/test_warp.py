@@ -287,7 +287,7 @@ def test_functions_that_add_nothing_are_left_out(lossy):
     for kernel, dim, inputs in (
         (warp_solve.factorise, 1, [cut, matrix, dropped]),
         (warp_solve.factorise_lossy, 1, [cut, matrix, loss, dropped]),
-        (warp_solve.forward, (1, 1), [cut, matrix, loss, rows, quadrature]),
+        (warp_solve.forward, (1, 1), [cut, 1, rows, matrix, loss, rows, quadrature]),
     ):
         wp.launch(kernel, dim=dim, inputs=inputs, device="cpu")
     assert dropped.numpy()[0] == 1

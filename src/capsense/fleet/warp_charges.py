@@ -79,13 +79,14 @@ def modes(
     """Sums of ψ over all charges, (modes, 2 lead, v); ``added`` to what there is."""
     k, chunk, v = wp.tid()
     first = _COLUMNS * chunk
-    if lead + k >= cut.width[v] or idle(cut, lead, first, v):
+    start = rows.shape[1] - out.shape[0]
+    if start + k >= cut.width[v] or idle(cut, lead, first, v):
         return
     total = some()
     if added != 0:
         total = columns_of(out, k, first, v)
     for f in range(rows.shape[0]):
-        total += rows[f, lead + k, v] * columns_of(charge, f, first, v)
+        total += rows[f, start + k, v] * columns_of(charge, f, first, v)
     for c in range(_COLUMNS):
         out[k, first + c, v] = total[c]
 
@@ -100,16 +101,15 @@ def strengths(
     Those of near sources are not worked out where a view needs none.
     """
     batch, c, v = wp.tid()
-    lead = green.lead
     width = cut.width[v]
     near = _SOURCES * batch >= green.far
-    if (near and width < green.columns.shape[0]) or idle(cut, lead, c, v):
+    if (near and width < green.columns.shape[0]) or idle(cut, green.lead, c, v):
         return
     total = many()
-    if c < lead:
+    if c < green.first:
         total = green.columns[c, batch]
-    for k in range(lead, width):
-        total += sums[k - lead, c, v] * green.columns[k, batch]
+    for k in range(green.first, width):
+        total += sums[k - green.first, c, v] * green.columns[k, batch]
     for s in range(wp.min(_SOURCES, out.shape[0] - _SOURCES * batch)):
         out[_SOURCES * batch + s, c, v] = total[s]
 
@@ -272,9 +272,9 @@ def answered(
     k, chunk, v = wp.tid()
     first = _COLUMNS * chunk
     total = some()
-    if green.lead + k < cut.width[v]:
+    if green.first + k < cut.width[v]:
         for batch in range(green.columns.shape[1]):
-            few = green.columns[green.lead + k, batch]
+            few = green.columns[green.first + k, batch]
             for s in range(wp.min(_SOURCES, potential.shape[0] - _SOURCES * batch)):
                 total += few[s] * columns_of(potential, _SOURCES * batch + s, first, v)
     for c in range(_COLUMNS):
@@ -320,15 +320,16 @@ def pairs_below(
 
 @wp.kernel
 def modes_below(
-    cut: WarpCut, lead: int, rows: wp.array3d(dtype=wp.float32), sums: wp.array3d(dtype=wp.float32),
+    cut: WarpCut, rows: wp.array3d(dtype=wp.float32), sums: wp.array3d(dtype=wp.float32),
     out: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Add the potentials in functions by the design, from sums of ψ over charges, (n, lead, v)."""
     f, chunk, v = wp.tid()
     first = _COLUMNS * chunk
     total = columns_of(out, f, first, v)
-    for k in range(lead, cut.width[v]):
-        total += rows[f, k, v] * columns_of(sums, k - lead, first, v)
+    start = rows.shape[1] - sums.shape[0]
+    for k in range(start, cut.width[v]):
+        total += rows[f, k, v] * columns_of(sums, k - start, first, v)
     for c in range(_COLUMNS):
         out[f, first + c, v] = total[c]
 

@@ -71,7 +71,7 @@ class WarpCore:
         self.cut.clusters = clusters
         self.left = struct(solution.Left, {
             "charge on residual": (n, 2 * lead, views),
-            "sums": (width - lead, 2 * lead, views),
+            "sums": (width - self.green.first, 2 * lead, views),
             "strength": (len(self.green.sources), 2 * lead, views),
             "energy": (n, views), "doubt": (size, views), "dropped": (views,),
             "below local": (size, size, views), "volts": (slots, t, views),
@@ -90,6 +90,7 @@ class WarpCore:
         for name in ("pose", "slot", "columns", "lossy"):
             setattr(self.near, name, getattr(self.cut, name))
         self.near.sensors = sensors
+        self.solved = room(n, size, views)
         self.rows, self.matrix = room(n, width, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, size, views)
         self.whole = room(size, size, views, dtype=wp.vec2d)
@@ -178,14 +179,17 @@ class WarpCore:
         self.launch(solution.to_functions, (width, views), cut, 1, rows)
         for values in (matrix, turned):
             self.launch(solution.to_functions, (n, views), cut, 0, values)
-        self.launch(solution.assemble, (n, n, views), *at, cut, green.lead, rows, matrix, self.loss)
+        self.launch(
+            solution.assemble, (n, n, views), *at, cut, green.first, rows, matrix, self.loss
+        )
         rest, loss, quadrature = self.left, self.loss, self.quadrature
         self.launch(solution.factorise, views, cut, matrix, rest.dropped)
         self.launch(solution.factorise_lossy, views, cut, matrix, loss, rest.dropped)
-        self.launch(solution.forward, (size, views), cut, matrix, loss, rows, quadrature)
+        solved = matrix, loss, self.solved, quadrature
+        self.launch(solution.forward, (size, views), cut, green.terminals, rows, *solved)
         self._look_below()
         dim = size, size, views
-        self.launch(network.change, dim, self.gap, self.near, rows, quadrature, rest, whole)
+        self.launch(network.change, dim, self.gap, self.near, *solved[2:], rest, whole)
         self.launch(network.eliminate, views, circuit, self.near, rest, whole)
         self.launch(
             network.report, (circuit.electrodes, views), circuit, whole,
@@ -209,7 +213,7 @@ class WarpCore:
         (n, columns, views), lead, t = rest.charge.shape, green.lead, self.whole.shape[0]
         launch, matrix, loss = self.launch, self.matrix, self.loss
         parts, batches = columns // pairs.COLUMNS, green.columns.shape[1]
-        solved = matrix, loss, rows, self.quadrature
+        solved = matrix, loss, self.solved, self.quadrature
         launch(solution.charges, (t, views), cut, lead, *solved, rest.charge)
         launch(charges.coarse, (t, views), cut, matrix, loss, rest.charge, rest.doubt)
         size = rest.sums.shape[0], parts, views
@@ -247,10 +251,10 @@ class WarpCore:
         launch(solution.from_functions, (lead, views), cut, 0, back)
         launch(charges.pairs_below, (n, parts, views), green, cut, charge, back)
         launch(solution.to_functions, (lead, views), cut, 0, back)
-        launch(charges.modes_below, (n, parts, views), cut, lead, self.rows, sums, back)
+        launch(charges.modes_below, (n, parts, views), cut, self.rows, sums, back)
         solved = self.matrix, self.loss, back, self.quadrature
-        launch(solution.forward, (t, views), cut, *solved)
-        launch(charges.add, (n, t, views), self.rows, back)
+        launch(solution.forward, (t, views), cut, t, back, *solved)
+        launch(charges.add, (n, t, views), self.solved, back)
         launch(solution.charges, (t, views), cut, lead, *solved, rest.charge)
         launch(charges.modes, (modes, parts, views), cut, lead, self.rows, rest.charge, 1, sums)
         launch(charges.to_clusters, (lead, views), cut, lead, rest.charge, charge)

@@ -80,7 +80,8 @@ class Response:
     columns: wp.array2d(dtype=many)  # the same table, (columns, batches of sources)
     far: wp.int32  # how many are far ones
     passes: wp.int32  # that these have
-    lead: wp.int32
+    first: wp.int32  # column of the first ψ in these
+    lead: wp.int32  # columns of charges: of terminals, then of nodes
     terminals: wp.int32
     floor: wp.float32
     cover: wp.float32

@@ -20,37 +20,32 @@ from capsense.surface.solver import SurfaceSolver
 
 
 def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
-    """The Green's function of a design, with columns for nodes behind those of its terminals."""
+    """The Green's function of a design, and how many columns terminals and nodes have."""
     out, green = warp_cut.Response(), solver.green
     lead = pairs.COLUMNS * -(-(green.terminals + slots) // pairs.COLUMNS)
     near, _, far = green.levels  # the middle level is not used here
     sources = np.concatenate([far.sources.T, near.sources.T]).astype(np.float32)
-    tables = [_widened(level.table, green.lead, lead) for level in (far, near)]
-    (count, width), size = tables[0].shape, warp_cut.SOURCES
-    table = np.zeros((size * -(-len(sources) // size), tables[1].shape[1]), np.float32)
-    table[:count, :width], table[count : len(sources)] = tables
+    (count, few), size = far.table.shape, warp_cut.SOURCES
+    width, whole = (
+        warp_cut.WIDTH * -(-columns // warp_cut.WIDTH) for columns in (few, near.table.shape[1])
+    )
+    table = np.zeros((size * -(-len(sources) // size), whole), np.float32)
+    table[:count, :few] = far.table
+    table[count : len(sources), : near.table.shape[1]] = near.table
     columns = np.ascontiguousarray(table.T).reshape(len(table.T), -1, size)
     parts = table[: len(sources)].reshape(len(sources), -1, warp_cut.WIDTH)
     out.sources = wp.array(sources, dtype=wp.vec3, device=device)
     out.table = wp.array(parts, dtype=warp_cut.row, device=device)
     out.columns = wp.array(columns, dtype=warp_cut.many, device=device)
     out.far, out.passes = count, width // warp_cut.WIDTH
-    out.lead, out.terminals, out.middle = lead, green.terminals, wp.vec3(*solver.middle)
+    out.first, out.lead = green.lead, lead
+    out.terminals, out.middle = green.terminals, wp.vec3(*solver.middle)
     out.extent, out.validity = green.extent, green.gap.validity
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blends[-1].tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (
         (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.room)
     )
-    return out
-
-
-def _widened(table: NDArray[Any], before: int, lead: int) -> NDArray[Any]:
-    """A table of φ⁰ and ψ with room for more of the first, columns of zeros."""
-    used = before + np.flatnonzero(table[:, before:].any(axis=0)).max(initial=-1) + 1
-    width = warp_cut.WIDTH * -(-(lead + used - before) // warp_cut.WIDTH)
-    out = np.zeros((len(table), width), np.float32)
-    out[:, :before], out[:, lead : lead + used - before] = table[:, :before], table[:, before:used]
     return out
 
 

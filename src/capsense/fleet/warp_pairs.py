@@ -122,9 +122,6 @@ def rows(green: Response, cut: WarpCut, out: wp.array3d(dtype=wp.float32)):
             total += seen(green, leaf, s) * green.table[s, part]
     for c in range(_WIDTH):
         out[i, part * _WIDTH + c, v] = total[c]
-    slot = cut.slot[i // cut.clusters, v]
-    if part == 0 and slot >= 0:  # of a node at 1 V, the bodies' own potential less 1 V
-        out[i, green.terminals + slot, v] = wp.where(cut.node[i, v] >= 0, -1.0, 0.0)
 
 
 @wp.func
@@ -237,7 +234,7 @@ def bound_images(
     if inverse * side < _WIDE or least < 0.0:
         return
     met = _between(leaf.points, _facing(leaf.points, 1.0, green.floor), _fourth(0.0))
-    for k in range(green.lead, cut.width[v]):
+    for k in range(green.first, cut.width[v]):
         met += rows[i, k, v] * rows[i, k, v]
     extra = met - _mirror(2.0 / (inverse * side)) / side
     pairs[i, i, v] = pairs[i, i, v] + wp.max(extra, 0.0) * smooth(10.0 * extra / met)

@@ -97,7 +97,7 @@ def from_functions(
 
 @wp.kernel
 def assemble(
-    shapes: Shapes, places: Places, cut: WarpCut, lead: int,
+    shapes: Shapes, places: Places, cut: WarpCut, start: int,
     potentials: wp.array3d(dtype=wp.float32), matrix: wp.array3d(dtype=wp.float32),
     loss: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
@@ -114,7 +114,7 @@ def assemble(
     value = wp.vec2(wp.where(f == g, 1.0, 0.0), 0.0)
     if x >= 0 and y >= 0:
         value = wp.vec2(matrix[f, g, v], 0.0)
-        for k in range(lead, cut.width[v]):
+        for k in range(start, cut.width[v]):
             value[0] -= potentials[f, k, v] * potentials[g, k, v]
         b = f // cut.clusters
         c = g // cut.clusters
@@ -226,10 +226,14 @@ def factorise_lossy(
 
 @wp.kernel
 def forward(
-    cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
+    cut: WarpCut, terminals: int, given: wp.array3d(dtype=wp.float32),
+    matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
     potentials: wp.array3d(dtype=wp.float32), quadrature: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Replace φ⁰ of the functions by L⁻¹ φ⁰, whose imaginary part is in ``quadrature``."""
+    """L⁻¹ φ⁰ of the functions, whose imaginary part is in ``quadrature``, from ``given`` φ⁰.
+
+    Columns behind so many ``terminals`` are of nodes at 1 V, where net charges have -1 V.
+    """
     t, v = wp.tid()
     if t >= cut.columns[v]:
         return
@@ -237,7 +241,10 @@ def forward(
     for i in range(matrix.shape[0]):
         right = wp.vec2()
         if cut.number[i, v] >= 0:
-            right[0] = potentials[i, t, v]
+            if t < terminals:
+                right[0] = given[i, t, v]
+            elif i % cut.clusters == 0 and cut.slot[i // cut.clusters, v] == t - terminals:
+                right[0] = -1.0
             if lossy:
                 for k in range(i):
                     right -= times(
