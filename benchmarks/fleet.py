@@ -115,9 +115,22 @@ def rate(options: dict[str, Any], count: int, crowd: bool) -> tuple[float, float
     return 1.0 / float(clock), float(busy)
 
 
+SHARED = {
+    "choice", "scale", "softness", "group", "radius", "pose", "slot", "columns", "lossy", "charge"
+}  # fmt: skip
+"""Arrays of structures of Warp that are another's."""
+
+
+def arrays_of(struct: Any, kind: Any, shared: set[str] | None = None) -> list[Any]:
+    """The arrays of a structure of Warp but for those that it shares."""
+    return [getattr(struct, name) for name in kind.vars if name not in (shared or set())]
+
+
 def memory(options: dict[str, Any], crowd: bool) -> tuple[int, int]:
     """Bytes that a sensor takes on Warp, without gradients and with them."""
     from capsense.fleet.warp_cut import WarpCut
+    from capsense.fleet.warp_near import Near
+    from capsense.fleet.warp_slope import Slopes
     from capsense.fleet.warp_solve import Left
 
     sizes = []
@@ -128,9 +141,11 @@ def memory(options: dict[str, Any], crowd: bool) -> tuple[int, int]:
         core = fleet._warp
         parts = [
             list(vars(core).values()),
-            [getattr(core.cut, name) for name in WarpCut.vars]
-            + [getattr(core.left, name) for name in Left.vars],
-            core._slopes,
+            [
+                *arrays_of(core.cut, WarpCut), *arrays_of(core.left, Left),
+                *arrays_of(core.near, Near, SHARED),
+            ],
+            [*core._slopes[:-1], *arrays_of(core._slopes[-1], Slopes, SHARED)],
         ]  # fmt: skip
         sizes.append([sum(getattr(x, "capacity", 0) or 0 for x in part) for part in parts])
     core_size, cut, slopes = ((b - a) // 8 for a, b in zip(*sizes, strict=True))
