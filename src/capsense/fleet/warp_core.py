@@ -76,7 +76,7 @@ class WarpCore:
             "energy": (n, views), "doubt": (size, views), "dropped": (views,),
             "below local": (size, size, views), "volts": (slots, t, views),
         })  # fmt: skip
-        self.near = struct(warp_near.Near, {
+        self.near = struct(warp_near.NearBodies, {
             "count": (views,), "body below foot": (places, views), "depth": (chunks, places, views),
             "capacitance": (slots, views),
             "part": (chunks, table.columns.shape[1] + slots, views),

@@ -12,7 +12,7 @@ import warp as wp
 
 from capsense.fleet.warp_cut import Response, lift, smooth
 from capsense.fleet.warp_mesh import Hit, Outlines
-from capsense.fleet.warp_near import GapLaw, Near, may_meet, nearest_of
+from capsense.fleet.warp_near import GapLaw, NearBodies, may_meet, nearest_of
 from capsense.surface.gap_kernels import LEAST, REACH
 
 wp.set_module_options({"enable_backward": False})
@@ -101,7 +101,7 @@ def place_of(gap: GapLaw, length: float):
 
 
 @wp.func
-def met_by(outlines: Outlines, gap: GapLaw, near: Near, q: int, grounded: bool, v: int):
+def met_by(outlines: Outlines, gap: GapLaw, near: NearBodies, q: int, grounded: bool, v: int):
     """A bit for every near body that may count in a block of cells; nodes alone on pours."""
     x = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
     reach = _REACH1 * gap.validity + gap.radius[q]
@@ -117,7 +117,8 @@ def met_by(outlines: Outlines, gap: GapLaw, near: Near, q: int, grounded: bool, 
 
 @wp.func
 def nearest_cell(
-    outlines: Outlines, gap: GapLaw, green: Response, near: Near, met: wp.int64, x: wp.vec3, v: int
+    outlines: Outlines, gap: GapLaw, green: Response, near: NearBodies, met: wp.int64, x: wp.vec3,
+    v: int,
 ):  # fmt: skip
     """The shortest field line from a place, that to the lifted body, and whose these are.
 
@@ -138,7 +139,9 @@ def nearest_cell(
 
 
 @wp.func
-def _add_cell(gap: GapLaw, near: Near, c: int, p: int, best: float, high: float, body: int, v: int):
+def _add_cell(
+    gap: GapLaw, near: NearBodies, c: int, p: int, best: float, high: float, body: int, v: int
+):  # fmt: skip
     """Add what one cell changes, of lengths as of :func:`nearest_cell`."""
     weight = 1.0 - smooth((best / gap.validity - _REACH0) / (_REACH1 - _REACH0))
     if body < 0 or high <= best or weight <= 0.0:
@@ -161,7 +164,7 @@ def _add_cell(gap: GapLaw, near: Near, c: int, p: int, best: float, high: float,
 
 
 @wp.kernel
-def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: Near):
+def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: NearBodies):
     """Local change by near bodies of a chunk's cells [m], as ``gap_kernels.local_change``."""
     v, p = wp.tid()
     if near.count[v] == 0:
@@ -181,7 +184,7 @@ def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: Near):
 
 
 @wp.func
-def local_of(gap: GapLaw, near: Near, i: int, j: int, v: int):
+def local_of(gap: GapLaw, near: NearBodies, i: int, j: int, v: int):
     """The local change of an entry of the matrix of terminals and nodes [m]."""
     total = float(0.0)
     t = gap.terminals

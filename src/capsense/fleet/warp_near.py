@@ -54,7 +54,7 @@ class GapLaw:
 
 
 @wp.struct
-class Near:
+class NearBodies:
     """What is near the design in every view; b places for bodies.
 
     The first ones are arrays of ``Places``, ``Shapes`` and ``WarpCut``: kernels that took all of
@@ -147,7 +147,7 @@ def connect(places: Places, cut: WarpCut, terminals: int):
 
 
 @wp.kernel
-def find_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: Near):
+def find_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies):
     """Enter the bodies that are near, and make nodes of those that are not at ground.
 
     Of places that are joined, all become one node, and are their own leaders, at ground or at 1 V.
@@ -173,7 +173,7 @@ def find_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: Near):
 
 
 @wp.func
-def _make_node(cut: WarpCut, near: Near, b: int, neutral: bool, slot: int, v: int):
+def _make_node(cut: WarpCut, near: NearBodies, b: int, neutral: bool, slot: int, v: int):
     """Make a node of a place and of those that it is joined with."""
     tie = cut.tie[b, v][0]
     own = float(0.0)
@@ -189,7 +189,7 @@ def _make_node(cut: WarpCut, near: Near, b: int, neutral: bool, slot: int, v: in
 
 
 @wp.func
-def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: Near, b: int, v: int):
+def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b: int, v: int):
     """Whether a conductor is within twice h0 of the face, as ``gap_kernels.near_bodies``."""
     e = v // near.sensors
     out = bool(False)
@@ -208,7 +208,7 @@ def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: Near, b: int, 
 
 
 @wp.func
-def may_meet(near: Near, b: int, v: int, x: wp.vec3, off: float):
+def may_meet(near: NearBodies, b: int, v: int, x: wp.vec3, off: float):
     """Whether a body may be within a distance of a point, by the ball that holds it."""
     e = v // near.sensors
     reach = near.scale[e, b] * near.radius[near.choice[e, b]] + off
@@ -216,14 +216,14 @@ def may_meet(near: Near, b: int, v: int, x: wp.vec3, off: float):
 
 
 @wp.func
-def nearest_of(outlines: Outlines, near: Near, b: int, v: int, x: wp.vec3):
+def nearest_of(outlines: Outlines, near: NearBodies, b: int, v: int, x: wp.vec3):
     """Nearest point of the body in a place."""
     e = v // near.sensors
     return nearest(outlines, near.choice[e, b], near.pose[b, v], near.scale[e, b], x)
 
 
 @wp.kernel
-def press(outlines: Outlines, gap: GapLaw, near: Near):
+def press(outlines: Outlines, gap: GapLaw, near: NearBodies):
     """How far bodies overlap the cells of a chunk, as ``gap_kernels.press_out``, (p, b, v)."""
     v, p = wp.tid()
     for k in range(near.count[v]):
@@ -236,7 +236,7 @@ def press(outlines: Outlines, gap: GapLaw, near: Near):
 
 
 @wp.func
-def _overlap_of_block(outlines: Outlines, gap: GapLaw, near: Near, b: int, q: int, v: int):
+def _overlap_of_block(outlines: Outlines, gap: GapLaw, near: NearBodies, b: int, q: int, v: int):
     """How far a body overlaps the cells of a block [m]."""
     middle = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
     foot = near.foot[b, v]
@@ -254,7 +254,7 @@ def _overlap_of_block(outlines: Outlines, gap: GapLaw, near: Near, b: int, q: in
 
 
 @wp.func
-def _overlap(outlines: Outlines, gap: GapLaw, near: Near, b: int, v: int, x: wp.vec3):
+def _overlap(outlines: Outlines, gap: GapLaw, near: NearBodies, b: int, v: int, x: wp.vec3):
     """How far down the surface of a body is below a place of the face [m]."""
     at = x
     going = int(1)
@@ -269,7 +269,7 @@ def _overlap(outlines: Outlines, gap: GapLaw, near: Near, b: int, v: int, x: wp.
 
 
 @wp.kernel
-def press_out(gap: GapLaw, near: Near):
+def press_out(gap: GapLaw, near: NearBodies):
     """Move near bodies that overlap the face up until they touch it."""
     v = wp.tid()
     for k in range(near.count[v]):

@@ -11,7 +11,7 @@ import warp as wp
 
 from capsense.fleet.warp_cut import WarpCut
 from capsense.fleet.warp_gap import local_of
-from capsense.fleet.warp_near import GapLaw, Near
+from capsense.fleet.warp_near import GapLaw, NearBodies
 from capsense.fleet.warp_pairs import body_of
 from capsense.fleet.warp_slope import Slopes
 from capsense.fleet.warp_solve import Left, over, times
@@ -38,7 +38,7 @@ class Circuit:
 
 @wp.kernel
 def change(
-    gap: GapLaw, near: Near, potentials: wp.array3d(dtype=wp.float32),
+    gap: GapLaw, near: NearBodies, potentials: wp.array3d(dtype=wp.float32),
     quadrature: wp.array3d(dtype=wp.float32), left: Left, whole: wp.array3d(dtype=wp.vec2d),
 ):  # fmt: skip
     """Complex change of the matrices of terminals and nodes [m], (t, t, v), and parts of it."""
@@ -89,7 +89,7 @@ def _eliminate(whole: wp.array3d(dtype=wp.vec2d), p: int, v: int):
 
 
 @wp.kernel
-def eliminate(circuit: Circuit, near: Near, left: Left, whole: wp.array3d(dtype=wp.vec2d)):
+def eliminate(circuit: Circuit, near: NearBodies, left: Left, whole: wp.array3d(dtype=wp.vec2d)):
     """Take nodes, then floating conductors of the design out of the matrices, the last one first.
 
     What is left is in farads, the empty domain's matrix added. What is in doubt of each terminal's
@@ -213,7 +213,7 @@ def follow(
 
 @wp.func
 def _local_slope(
-    gap: GapLaw, near: Near, slopes: Slopes, k: int, i: int, j: int, v: int
+    gap: GapLaw, near: NearBodies, slopes: Slopes, k: int, i: int, j: int, v: int
 ):  # fmt: skip
     """Derivative of the local change of an entry by a near body's pose."""
     total = wp.spatial_vector()
@@ -239,7 +239,7 @@ def _local_slope(
 
 @wp.kernel
 def slopes(
-    circuit: Circuit, gap: GapLaw, near: Near, cut: WarpCut, slopes: Slopes,
+    circuit: Circuit, gap: GapLaw, near: NearBodies, cut: WarpCut, slopes: Slopes,
     out: wp.array4d(dtype=wp.spatial_vector),
 ):  # fmt: skip
     """Derivative of the matrices by the pose of each body [F/m], [F/rad], (v, b, n, n)."""

@@ -15,7 +15,7 @@ import warp as wp
 from capsense.fleet.warp_cut import Response, smooth
 from capsense.fleet.warp_gap import lengths, met_by, nearest_cell, place_of
 from capsense.fleet.warp_mesh import Outlines
-from capsense.fleet.warp_near import GapLaw, Near, nearest_of
+from capsense.fleet.warp_near import GapLaw, NearBodies, nearest_of
 from capsense.fleet.warp_outline import nearest
 from capsense.surface.gap_kernels import REACH
 
@@ -35,13 +35,13 @@ _STEEP = wp.constant(0.2)
 class Slopes:
     """What derivatives are made of; t terminals and nodes, n electrodes, l leaves.
 
-    What is near is differentiated about where bodies stand, by the places in ``Near.body``.
+    What is near is differentiated about where bodies stand, by the places in ``NearBodies.body``.
     """
 
     volts: wp.array3d(dtype=wp.float32)  # with an electrode at 1 V, (t, n, v)
     charge: wp.array3d(dtype=wp.float32)  # on leaves [m], (l, lead, v)
     pull: wp.array3d(dtype=wp.spatial_vector)  # forces on leaves, (l, lead, v)
-    part: wp.array4d(dtype=wp.spatial_vector)  # of ``Near.part``, the node's last, (p, n + 1, b, v)
+    part: wp.array4d(dtype=wp.spatial_vector)  # of their part, the node's last, (p, n + 1, b, v)
     lift: wp.array2d(dtype=wp.spatial_vector)  # of what presses a body out, (b, v)
 
 
@@ -76,7 +76,7 @@ def _slope_of(gap: GapLaw, c: int, col: int, length: float):
 
 
 @wp.kernel
-def local_slopes(outlines: Outlines, gap: GapLaw, green: Response, near: Near, out: Slopes):
+def local_slopes(outlines: Outlines, gap: GapLaw, green: Response, near: NearBodies, out: Slopes):
     """Derivatives of the local change of a chunk's cells by the poses of near bodies."""
     v, p = wp.tid()
     columns = gap.columns.shape[1]
@@ -102,7 +102,7 @@ def local_slopes(outlines: Outlines, gap: GapLaw, green: Response, near: Near, o
 
 @wp.func
 def _turns(
-    outlines: Outlines, gap: GapLaw, green: Response, near: Near, x: wp.vec3, b: int, v: int
+    outlines: Outlines, gap: GapLaw, green: Response, near: NearBodies, x: wp.vec3, b: int, v: int
 ):  # fmt: skip
     """Differences of the lengths of two field lines over those of a body's pose.
 
@@ -156,7 +156,7 @@ def _cell_slope(
 
 
 @wp.kernel
-def press_slopes(outlines: Outlines, gap: GapLaw, near: Near, out: Slopes):
+def press_slopes(outlines: Outlines, gap: GapLaw, near: NearBodies, out: Slopes):
     """Derivative of what presses a body out of the face by its pose."""
     v = wp.tid()
     for k in range(near.count[v]):
@@ -181,7 +181,7 @@ def press_slopes(outlines: Outlines, gap: GapLaw, near: Near, out: Slopes):
 
 
 @wp.func
-def _touching(outlines: Outlines, gap: GapLaw, near: Near, b: int, p: int, v: int):
+def _touching(outlines: Outlines, gap: GapLaw, near: NearBodies, b: int, p: int, v: int):
     """The point of a body, pressed out, that touches a cell of a chunk, and its normal."""
     least = float(1.0e30)
     point = wp.vec3()
