@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_whole, shorten
 from capsense.elements.matter import matter_of
+from capsense.elements.outline import write_outline
 from capsense.elements.panels import windowed
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import BODY, RigidShape
@@ -138,10 +139,16 @@ class BodyTable:
         """Without what is good in one process only: numbers of objects, and pointers to arrays."""
         soft = [kind[1] for kind in self._kinds]
         bodies = self.bodies._replace(shapes=np.zeros(0, BODY))
-        return {**vars(self), "_kinds": soft, "bodies": bodies}
+        outlines = [getattr(shape, "_outline", None) for shape in self.shapes]
+        return {**vars(self), "_kinds": soft, "bodies": bodies, "outlines": outlines}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        outlines = state.pop("outlines")
         vars(self).update(state)
+        for shape, outline in zip(self.shapes, outlines, strict=True):
+            if outline is not None:  # which shapes do not take along
+                write_outline(shape.record, outline)
+                vars(shape)["_outline"] = outline
         kinds = list(zip(self.shapes, state["_kinds"], strict=True))
         self._kinds = {(id(shape), soft): k for k, (shape, soft) in enumerate(kinds)}
         records = [_record(shape, soft) for shape, soft in kinds]
