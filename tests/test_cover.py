@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from capsense.cover import MAX_STRAIN, StressStrain, compression, contact_force, depth_of_force
+from capsense.cover import (
+    MAX_STRAIN,
+    StressStrain,
+    compression,
+    contact_force,
+    depth_of_force,
+    fabric_change,
+)
 from capsense.errors import DesignError, SceneError
 
 T, E = 2e-3, 60e3
@@ -46,3 +53,9 @@ def test_wrong_forces_are_refused():
         depth_of_force(np.zeros(1), np.ones(1), -1.0, T, law)
     with pytest.raises(SceneError, match="over the cover"):
         depth_of_force(np.full(1, np.inf), np.ones(1), 1.0, T, law)
+
+
+def test_grounded_fabric_pressed_flat_is_a_plate_capacitor():
+    owner, area = np.array([0, 0, 1, -1]), np.array([1e-5, 3e-5, 2e-5, 9e-5])
+    change = fabric_change(np.array([1e-3, 1e-3, 0.0, 1e-3]), area, owner, T, 1.6, 2)
+    np.testing.assert_allclose(change, [8.8541878128e-12 * 1.6 * 4e-5 / T, 0.0], rtol=1e-9)

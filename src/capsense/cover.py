@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.constants import EPS0
 from capsense.errors import DesignError, SceneError
 
 Array = NDArray[np.float64]
@@ -125,3 +126,28 @@ def depth_of_force(
         else:
             high = middle
     return high
+
+
+def fabric_change(
+    pressed: Array,
+    area: Array,
+    owner: NDArray[np.int64],
+    thickness: float,
+    eps_r: float,
+    count: int,
+) -> Array:
+    """Change of self-capacitances below a grounded sheet on top of a cover [F], shape (count,).
+
+    The parallel-plate integral of eps0 eps_r [1 / (t - compression) - 1 / t], without fringes.
+
+    Args:
+        pressed: Compression at each cell [m], below ``thickness``, shape (n,).
+        area: Areas of the cells [m²], shape (n,).
+        owner: Electrode below each cell, -1 beside all of them, shape (n,).
+        thickness: Thickness t of the cover [m].
+        eps_r: Its relative permittivity.
+        count: Number of electrodes.
+    """
+    on = owner >= 0
+    change = EPS0 * eps_r * (1.0 / (thickness - pressed) - 1.0 / thickness) * area
+    return np.bincount(owner[on], change[on], count).astype(np.float64)
