@@ -1,0 +1,153 @@
+"""Mechanics of a cover: a soft layer on electrodes, as an elastic (Winkler) foundation.
+
+Each point of the cover gives way on its own: its pressure depends on its own compression only
+(Johnson, *Contact Mechanics*, section 4.3). Static; without relaxation or hysteresis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense.constants import EPS0
+from capsense.errors import DesignError, SceneError
+
+Array = NDArray[np.float64]
+
+MAX_STRAIN = 0.95
+"""Compression of a cover with a modulus stays below this share of its thickness."""
+_STEPS = 200
+"""Bisections at most; double precision is reached before."""
+
+
+@dataclass(frozen=True, eq=False)
+class StressStrain:
+    """Pressure of a cover against its strain, compression over thickness; piecewise linear."""
+
+    strain: Array
+    """Ascending from 0, below 1, shape (n,), n >= 2."""
+    stress: Array
+    """Pressure at each strain [Pa], strictly ascending from 0, shape (n,)."""
+
+    def __post_init__(self) -> None:
+        """Check the table.
+
+        Raises:
+            DesignError: If it is not a strictly ascending table from (0, 0) with strains below 1.
+        """
+        strain, stress = (np.array(a, dtype=float) for a in (self.strain, self.stress))
+        good = strain.ndim == 1 and strain.shape == stress.shape and len(strain) >= 2
+        good = good and bool(np.isfinite(strain).all() and np.isfinite(stress).all())
+        good = good and strain[0] == 0.0 and stress[0] == 0.0 and strain[-1] < 1.0
+        if not (good and (np.diff(strain) > 0.0).all() and (np.diff(stress) > 0.0).all()):
+            raise DesignError(
+                f"cover: stress_strain has strains {strain.tolist()} and pressures "
+                f"{stress.tolist()}; give pairs [strain, pressure in Pa] that ascend strictly from "
+                "[0, 0], strains below 1"
+            )
+        object.__setattr__(self, "strain", strain)
+        object.__setattr__(self, "stress", stress)
+
+    @classmethod
+    def linear(cls, modulus: float) -> StressStrain:
+        """Pressure ``modulus * strain``; ``modulus`` in Pa.
+
+        Raises:
+            DesignError: If the modulus is not a positive number.
+        """
+        if not (np.isfinite(modulus) and modulus > 0.0):
+            raise DesignError(f"cover: modulus is {modulus} Pa; give a positive number")
+        return cls(np.array([0.0, MAX_STRAIN]), np.array([0.0, MAX_STRAIN * modulus]))
+
+    def pressure(self, strain: Array) -> Array:
+        """Pressure at strains [Pa], any shape; past the table its last slope continues."""
+        slope = (self.stress[-1] - self.stress[-2]) / (self.strain[-1] - self.strain[-2])
+        beyond = np.maximum(np.asarray(strain) - self.strain[-1], 0.0)
+        return np.asarray(np.interp(strain, self.strain, self.stress) + slope * beyond)
+
+
+def compression(height: Array, depth: float, thickness: float, law: StressStrain) -> Array:
+    """Compression of the cover below a body that is pressed in [m], of the shape of ``height``.
+
+    Args:
+        height: Height of the body's underside over its lowest point at each cell [m]; infinite
+            beside the body.
+        depth: How far its lowest point is below the undeformed outer face [m].
+        thickness: Thickness of the cover [m].
+        law: Stress-strain law; compression stops at the end of its table.
+    """
+    return np.clip(depth - height, 0.0, law.strain[-1] * thickness)
+
+
+def contact_force(
+    height: Array, area: Array, depth: float, thickness: float, law: StressStrain
+) -> float:
+    """Force that holds a body at a depth [N]; arguments as :func:`depth_of_force`."""
+    return float(area @ law.pressure(np.maximum(depth - height, 0.0) / thickness))
+
+
+def depth_of_force(
+    height: Array, area: Array, force: float, thickness: float, law: StressStrain
+) -> float:
+    """Find the depth whose pressure integrates to a normal force [m].
+
+    Args:
+        height: As in :func:`compression`, of cells that tile the whole covered face, (n,).
+        area: Their areas [m²], shape (n,).
+        force: Normal force that presses the body in [N].
+        thickness: Thickness of the cover [m].
+        law: Stress-strain law.
+
+    Raises:
+        SceneError: If the force is negative or not finite, or no cell lies below the body.
+    """
+    if not (np.isfinite(force) and force >= 0.0):
+        raise SceneError(f"contact force is {force} N; give a finite force >= 0")
+    below = np.isfinite(height)
+    if not below.any():
+        raise SceneError(
+            f"a force of {force} N presses a body that is not over the cover; move it over it"
+        )
+    height, area = height[below], area[below]
+    low = float(height.min())
+    if force == 0.0:
+        return low
+    high = low + thickness
+    while contact_force(height, area, high, thickness, law) < force:
+        high = low + 2.0 * (high - low)
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        if contact_force(height, area, middle, thickness, law) < force:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def fabric_change(
+    pressed: Array,
+    area: Array,
+    owner: NDArray[np.int64],
+    thickness: float,
+    eps_r: float,
+    count: int,
+) -> Array:
+    """Change of self-capacitances below a grounded sheet on top of a cover [F], shape (count,).
+
+    The parallel-plate integral of eps0 eps_r [1 / (t - compression) - 1 / t], without fringes.
+
+    Args:
+        pressed: Compression at each cell [m], below ``thickness``, shape (n,).
+        area: Areas of the cells [m²], shape (n,).
+        owner: Electrode below each cell, -1 beside all of them, shape (n,).
+        thickness: Thickness t of the cover [m].
+        eps_r: Its relative permittivity.
+        count: Number of electrodes.
+    """
+    on = owner >= 0
+    change = EPS0 * eps_r * (1.0 / (thickness - pressed) - 1.0 / thickness) * area
+    return np.bincount(owner[on], change[on], count).astype(np.float64)
