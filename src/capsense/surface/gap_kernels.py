@@ -65,7 +65,7 @@ def press_out(bodies, near, green):
         x, y = bodies[b].position[0], bodies[b].position[1]
         nearest(bodies[b], x, y, gap.top - 1e3 * bodies[b].scale, point, room)
         if _faces_cell(point, gap):  # the lowest point
-            deepest = gap.top - point[2]
+            deepest = max(0.0, gap.top - point[2])
         for k in range(gap.block_radius.shape[0]):
             off, _ = nearest(
                 bodies[b], gap.block_center[k, 0], gap.block_center[k, 1], gap.top, point, room
