@@ -132,7 +132,7 @@ def _open_shell() -> cs.TriMesh:
     ("shape", "height", "of_steel", "of_wood"),
     [
         (cs.Box((0.15, 0.15, 0.02)), 0.009, True, True),
-        (cs.Box((0.15, 0.15, 0.02)), 0.0101, True, False),
+        (cs.Box((0.15, 0.15, 0.02)), 0.01002, True, False),
         (cs.Box((0.15, 0.15, 0.02)), 0.0106, False, False),
         (cs.Box((3.0, 3.0, 3.0)), 0.0, True, True),
         (cs.Sphere(0.03), 0.027, True, True),

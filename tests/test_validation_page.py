@@ -81,7 +81,7 @@ def test_references(validation: ModuleType) -> None:
     errors = {tuple(cells(x)[:2]): numbers(cells(x)[2])[0] for x in lines[2:]}
     near = {case for case in errors if case[1] in ("bar 1", "bar 2")}
     assert len(near) == 2
-    assert max(errors[case] for case in near) < 17
+    assert max(errors[case] for case in near) < 2
     assert max(error for case, error in errors.items() if case not in near) < 3
     by_case = {tuple(cells(x)[:2]): x for x in PAGE.splitlines() if x.startswith("|")}
     for line in lines[2:]:
@@ -94,7 +94,7 @@ def test_maps(validation: ModuleType) -> None:
     text = validation.presets(["standard"])
     found = [cells(line) for line in text.splitlines()[2:]]
     assert [int(row[2]) for row in found] == [89, 96, 24]
-    for row, (rms, worst) in zip(found, ((0.55, 2.5), (1.0, 5.5), (3.2, 14.0)), strict=True):
+    for row, (rms, worst) in zip(found, ((0.55, 2.5), (1.0, 5.5), (1.3, 7.0)), strict=True):
         assert float(row[3]) < rms
         assert float(row[5]) < worst
     assert_on_page(text, 0.05)
@@ -109,7 +109,7 @@ def test_designs(validation: ModuleType, only: str, count: int) -> None:
     found = rows(text)
     assert len(found) == count
     for name, (_, _, own, error) in found.items():
-        assert abs(numbers(own)[1]) < 3.0, name
+        assert abs(numbers(own)[1]) < 4.0, name
         assert numbers(error)[0] < 0.5, name
     assert_on_page(text, 0.05)
 
