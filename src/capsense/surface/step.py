@@ -35,6 +35,7 @@ from capsense.surface.network_kernels import (
 from capsense.surface.pair_kernels import bound_images, leaf_pairs
 from capsense.surface.part_kernels import add_parts
 from capsense.surface.reach_kernels import reached
+from capsense.surface.series_kernels import in_series, in_series_lossy
 from capsense.surface.solve_kernels import (
     COARSE,
     GAIN,
@@ -47,6 +48,10 @@ from capsense.surface.solve_kernels import (
 
 DIFFERENCE = 3e-3
 """Step of central differences, over the validity distance."""
+NOTHING = 1e9
+"""Softness 1 / (eps - 1) of what is as good as not there."""
+SERIES = 0.1
+"""Assumed relative error of what near dielectrics add."""
 LAW = 0.02
 """Assumed relative error of what the gap law adds; not fitted to measured errors."""
 
@@ -145,6 +150,44 @@ def solve(
     ``adjoint`` asks for charges that the derivatives of the result follow from; else as
     :func:`prepared`.
     """
+    soft = near_bodies(bodies, green, True)
+    if not soft.any():
+        return solve_lifted(bodies, green, threshold, width, adjoint)
+    bodies = bodies.copy()
+    press_out(bodies, soft, green)
+    found = solve_lifted(bodies, green, threshold, width, adjoint)
+    rest = np.zeros(found.delta.shape)
+    stiff = bodies.copy()
+    if not soft.all():
+        for b in range(bodies.shape[0]):
+            if soft[b]:
+                stiff[b].softness = NOTHING
+        rest = solve_lifted(stiff, green, threshold, width, False).delta
+    for b in range(bodies.shape[0]):
+        if soft[b]:
+            stiff[b].softness = 0.0
+    high = solve_lifted(stiff, green, threshold, width, False).delta
+    for b in range(bodies.shape[0]):
+        if soft[b]:
+            stiff[b].outline = 0  # lifted, and nothing is added
+    low = solve_lifted(stiff, green, threshold, width, False).delta
+    delta = rest + in_series(found.delta - rest, low - rest, high - rest)
+    doubt = 0.0
+    for i in range(green.electrodes):
+        doubt = max(doubt, SERIES * abs(delta[i, i] - found.delta[i, i]))
+    found.delta[:] = delta
+    return Solution(
+        found.delta, found.left, found.coarse, found.charge, found.points, found.extent, found.soft,
+        found.owner, found.size, found.shift, found.error + doubt, found.near | soft, found.node,
+        found.weights,
+    )  # fmt: skip
+
+
+@compiled
+def solve_lifted(
+    bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
+) -> Solution:
+    """As :func:`solve`; of near dielectrics, nothing of what the lift removes is added."""
     near = near_bodies(bodies, green)
     if near.any():
         bodies = bodies.copy()  # what follows changes them
@@ -280,6 +323,39 @@ def solve_lossy(
         softness: 1 / (eps - 1), shape (n,).
         green, threshold, width: As in :func:`prepared`.
     """
+    records = records.copy()
+    records["softness"] = np.abs(softness)
+    near = near_bodies(records, green, True)
+    press_out(records, near, green)
+    found = _lossy_lifted(records, ties, softness, green, threshold, width)
+    if not near.any():
+        return found
+
+    def real(value: float, outline: bool = True) -> NDArray[Any]:
+        some = records.copy()
+        some["softness"][near] = value
+        some["outline"][near] *= outline
+        return np.asarray(solve_lifted(some, green, threshold, width, False).delta)
+
+    rest, off = 0.0, np.zeros_like(found.delta.real)
+    if not near.all():
+        gone = np.where(near, NOTHING, softness)
+        rest = _lossy_lifted(records, ties, gone, green, threshold, width).delta
+        off = real(NOTHING)
+    delta = rest + in_series_lossy(found.delta - rest, real(0.0, False) - off, real(0.0) - off)
+    doubt = SERIES * np.abs(np.diag(delta - found.delta))[: green.electrodes].max(initial=0.0)
+    return found._replace(delta=delta, error=found.error + float(doubt), near=near)
+
+
+def _lossy_lifted(
+    records: NDArray[np.void],
+    ties: NDArray[np.complex128],
+    softness: NDArray[np.complex128],
+    green: Green,
+    threshold: float,
+    width: float,
+) -> Solution:
+    """As :func:`solve_lossy`, of bodies that are lifted near the design."""
     plain = records.copy()
     plain["tie"], plain["softness"] = 0.0, 0.0
     cut, leaves, functions, system = prepared(plain, green, threshold, width)

@@ -1,0 +1,151 @@
+"""The step, compiled: dielectrics in the first millimetres in front of a flat design.
+
+A dielectric is a conductor that floats, with the impedance of its inside in series. The lift that
+keeps bodies off the design changes the gap and not the inside. With D the change of the Maxwell
+matrix by the lifted dielectric, F' that by the same body as a floating conductor, lifted, and F
+that by the conductor where it is, by the gap law, the dielectric where it is changes
+
+  (F⁻¹ + R)⁻¹,   R = D⁻¹ − F'⁻¹ ≥ 0.
+
+It is never more than F, becomes F as the permittivity grows, and D where nothing is lifted.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capsense._jit import compiled
+
+_SWEEPS = 30
+"""Sweeps of Jacobi's method at most."""
+_SMALL = 1e-6
+"""Eigenvalues below this share of the largest count as so much."""
+
+
+@compiled
+def in_series(dielectric, lifted, conductor):
+    """Change of the Maxwell matrix by a dielectric near a design, from three others; see above.
+
+    Args:
+        dielectric: D [m], symmetric, shape (m, m).
+        lifted: F' [m], positive semidefinite, shape (m, m).
+        conductor: F [m], shape (m, m).
+
+    Returns:
+        Its change [m], shape (m, m).
+    """
+    m = dielectric.shape[0]
+    value, vector = eigen(lifted)
+    largest = max(value.max(), 0.0)
+    if largest == 0.0:
+        return dielectric.copy()
+    root = np.sqrt(np.maximum(value, _SMALL * largest))
+    base = vector / root  # lifted becomes 1
+    share, turn = eigen(_product(_product(base.T.copy(), dielectric), base))
+    share = np.minimum(np.maximum(share, _SMALL), 1.0)
+    base = _product(base, turn)
+    back = _product(turn.T.copy(), (vector * root).T.copy())
+    inside = np.sqrt(1.0 / share - 1.0)
+    after = _product(_product(base.T.copy(), conductor), base)
+    added = _behind(after, inside)
+    same = _behind(np.eye(m), inside)  # D, but for what was bounded
+    out = _product(_product(back.T.copy(), added - same), back)
+    return dielectric + 0.5 * (out + out.T)
+
+
+@compiled
+def _behind(front, inside):
+    """(front⁻¹ + diag(inside²))⁻¹ without an inverse of ``front``, which may be singular."""
+    m = front.shape[0]
+    half = front * inside  # by columns
+    matrix = np.eye(m)
+    for i in range(m):
+        for j in range(m):
+            matrix[i, j] += inside[i] * half[i, j]
+    side = half.T.copy()
+    for k in range(m):  # definite: elimination without pivots
+        for i in range(k + 1, m):
+            part = matrix[i, k] / matrix[k, k]
+            for j in range(k, m):
+                matrix[i, j] -= part * matrix[k, j]
+            for c in range(m):
+                side[i, c] -= part * side[k, c]
+    for k in range(m - 1, -1, -1):
+        for c in range(m):
+            total = side[k, c]
+            for j in range(k + 1, m):
+                total -= matrix[k, j] * side[j, c]
+            side[k, c] = total / matrix[k, k]
+    return front - _product(half, side)
+
+
+@compiled
+def eigen(matrix):
+    """Eigenvalues (m,) and eigenvectors (m, m), in columns, of a symmetric matrix, by Jacobi.
+
+    Golub and Van Loan, *Matrix Computations*, section 8.5.
+    """
+    a, m = 0.5 * (matrix + matrix.T), matrix.shape[0]
+    vector = np.eye(m)
+    scale = 0.0
+    for i in range(m):
+        for j in range(m):
+            scale = max(scale, abs(a[i, j]))
+    for _ in range(_SWEEPS):
+        most = 0.0
+        for p in range(m):
+            for q in range(p + 1, m):
+                most = max(most, abs(a[p, q]))
+                if abs(a[p, q]) <= 1e-15 * scale:
+                    continue
+                ratio = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
+                tangent = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(1.0 + ratio * ratio))
+                c = 1.0 / math.sqrt(1.0 + tangent * tangent)
+                s = tangent * c
+                for k in range(m):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
+                for k in range(m):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
+                for k in range(m):
+                    x, y = vector[k, p], vector[k, q]
+                    vector[k, p], vector[k, q] = c * x - s * y, s * x + c * y
+        if most <= 1e-14 * scale:
+            break
+    return np.diag(a).copy(), vector
+
+
+@compiled
+def _product(left, right):
+    """``left @ right``, with the same bits however many threads a BLAS has."""
+    out = np.zeros((left.shape[0], right.shape[1]))
+    for i in range(left.shape[0]):
+        for k in range(left.shape[1]):
+            for j in range(right.shape[1]):
+                out[i, j] += left[i, k] * right[k, j]
+    return out
+
+
+def in_series_lossy(
+    dielectric: NDArray[np.complex128], lifted: NDArray[np.float64], conductor: NDArray[np.float64]
+) -> NDArray[np.complex128]:
+    """As :func:`in_series`, of a body with losses, whose D is complex."""
+    value, vector = np.linalg.eigh(0.5 * (lifted + lifted.T))
+    if value[-1] <= 0.0:
+        return dielectric
+    root = np.sqrt(np.maximum(value, _SMALL * value[-1]))
+    base, back, one = vector / root, (vector * root).T, np.eye(len(root))
+    own = base.T @ dielectric @ base + _SMALL * one
+    inside = np.linalg.inv(own) - one
+    share, turn = np.linalg.eigh(0.5 * (inside.real + inside.real.T))
+    inside = (turn * np.maximum(share, 0.0)) @ turn.T + 0.5j * (inside.imag + inside.imag.T)
+
+    def behind(front: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return np.linalg.solve(one + front @ inside, front.astype(complex))
+
+    out = back.T @ (behind(base.T @ conductor @ base) - behind(one)) @ back
+    return np.asarray(dielectric + 0.5 * (out + out.T))
