@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -67,7 +69,7 @@ def test_permittivities_near_the_design(read, gap):
     """Limits and bounds: rises with the permittivity, up to the floating conductor."""
     readings = [read(gap, of(eps)) for eps in (2.0, 4.0, 20.0, 80.0, 500.0, 1e7)]
     steel = read(gap, "steel")
-    for less, more in zip(readings, readings[1:], strict=False):
+    for less, more in pairwise(readings):
         assert np.linalg.eigvalsh(more - less).min() > -1e-3 * np.abs(more).max()
         assert (np.diag(more) >= np.diag(less)).all()
     assert (np.diag(readings[-2]) < np.diag(steel) + 1e-3 * steel.max()).all()
