@@ -13,6 +13,7 @@ It is never more than F, becomes F as the permittivity grows, and D where nothin
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,9 @@ _SMALL = 1e-6
 
 
 @compiled
-def in_series(dielectric, lifted, conductor):
+def in_series(
+    dielectric: NDArray[Any], lifted: NDArray[Any], conductor: NDArray[Any]
+) -> NDArray[Any]:
     """Change of the Maxwell matrix by a dielectric near a design, from three others; see above.
 
     Args:
@@ -57,7 +60,7 @@ def in_series(dielectric, lifted, conductor):
 
 
 @compiled
-def _behind(front, inside):
+def _behind(front: NDArray[Any], inside: NDArray[Any]) -> NDArray[Any]:
     """(front⁻¹ + diag(inside²))⁻¹ without an inverse of ``front``, which may be singular."""
     m = front.shape[0]
     half = front * inside  # by columns
@@ -83,7 +86,7 @@ def _behind(front, inside):
 
 
 @compiled
-def eigen(matrix):
+def eigen(matrix: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Eigenvalues (m,) and eigenvectors (m, m), in columns, of a symmetric matrix, by Jacobi.
 
     Golub and Van Loan, *Matrix Computations*, section 8.5.
@@ -120,7 +123,7 @@ def eigen(matrix):
 
 
 @compiled
-def _product(left, right):
+def _product(left: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
     """``left @ right``, with the same bits however many threads a BLAS has."""
     out = np.zeros((left.shape[0], right.shape[1]))
     for i in range(left.shape[0]):
@@ -131,7 +134,7 @@ def _product(left, right):
 
 
 def in_series_lossy(
-    dielectric: NDArray[np.complex128], lifted: NDArray[np.float64], conductor: NDArray[np.float64]
+    dielectric: NDArray[Any], lifted: NDArray[np.float64], conductor: NDArray[np.float64]
 ) -> NDArray[np.complex128]:
     """As :func:`in_series`, of a body with losses, whose D is complex."""
     value, vector = np.linalg.eigh(0.5 * (lifted + lifted.T))

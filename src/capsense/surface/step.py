@@ -337,7 +337,7 @@ def solve_lossy(
         some["outline"][near] *= outline
         return np.asarray(solve_lifted(some, green, threshold, width, False).delta)
 
-    rest, off = 0.0, np.zeros_like(found.delta.real)
+    rest, off = np.zeros_like(found.delta), np.zeros_like(found.delta.real)
     if not near.all():
         gone = np.where(near, NOTHING, softness)
         rest = _lossy_lifted(records, ties, gone, green, threshold, width).delta
