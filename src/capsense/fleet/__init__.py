@@ -371,5 +371,5 @@ class Fleet:
         Returns:
             Shape (k, s).
         """
-        nodes = self.places if self._warp is None else self._warp.gap.slots
+        nodes = None if self._warp is None else self._warp.gap.slots
         return self._cpu.lifted(poses, sensors, rows, nodes)

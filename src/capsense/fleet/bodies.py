@@ -76,9 +76,10 @@ class FleetCheck:
     """Environments and sensors whose readings mean nothing: an electrode lies inside a body, or
     within 0.2 mm of a conductor."""
     lifted: tuple[tuple[int, int], ...] = ()
-    """Environments and sensors whose readings lack the first millimetres, as those that they are
-    compared with do: dielectrics near a flat design, and all that is near where matter has losses.
-    On Warp also where more than 8 conductors that are not at ground are near."""
+    """Environments and sensors whose readings lack the first millimetres in front of a flat design:
+    of conductors where matter has losses, which the readings that they are compared with lack, too.
+    On Warp also of dielectrics, and where more than 8 conductors that are not at ground are near.
+    """
 
 
 def on_device(values: Any) -> bool:

@@ -265,17 +265,18 @@ class CpuCore:
         )  # fmt: skip
 
     def lifted(
-        self, bodies: Array, sensors: Array, rows: NDArray[np.int64], nodes: int
+        self, bodies: Array, sensors: Array, rows: NDArray[np.int64], nodes: int | None
     ) -> NDArray[np.bool_]:
         """Where bodies near the design are lifted and nothing is added for it, shape (k, s).
 
-        These are dielectrics, all near bodies where some matter has losses, and conductors that are
-        not at ground beyond the number of ``nodes``; see ``surface.gap_kernels``.
+        These are conductors where some matter has losses. On Warp they are dielectrics, too, and
+        conductors that are not at ground beyond the number of ``nodes``; see
+        ``surface.gap_kernels``.
 
         Args:
             bodies, sensors: Poses, shapes (e, b, 7) and (e, s, 7).
             rows: Which environments are looked at, shape (k,).
-            nodes: How many such conductors can be nodes.
+            nodes: How many such conductors can be nodes; None for a fleet on the CPU.
         """
         solver, table = self._solver, self._table.bodies
         where, green = Poses(bodies, sensors, solver.middle), solver.green
@@ -290,9 +291,12 @@ class CpuCore:
             soft, ties = table.softness[e, at], table.tie[e, at]
             some["softness"] = 0.0
             near = near_bodies(some, green)
-            loose = near & (soft == 0.0) & ((some["neutral"] != 0) | (some["tie"] > 0.0))
-            out[k, s] = (near & (soft != 0.0)).any() or len(set(some["group"][loose])) > nodes
-            out[k, s] |= near.any() and ((soft.imag != 0.0).any() or (ties.imag != 0.0).any())
+            metal = near & (soft == 0.0)
+            lossy = (soft.imag != 0.0).any() or (ties.imag != 0.0).any()
+            out[k, s] = metal.any() and lossy
+            if nodes is not None:
+                loose = metal & ((some["neutral"] != 0) | (some["tie"] > 0.0))
+                out[k, s] |= (near & ~metal).any() or len(set(some["group"][loose])) > nodes
         return out
 
     def _lossy(self, where: Poses, found: Found) -> NDArray[Any] | None:
