@@ -266,3 +266,28 @@ def substitute(factor, sides):
             if (n - i) % 2 == 0:
                 total = madd(-at(factor, line + n - 1), span(sides, (n - 1) * m + c), total)
             put_span(sides, o, madd(1.0 / at(factor, line + i), vadd(total, other), splat(0.0)))
+
+
+@kernel
+def eliminate(matrix, sides):
+    """Replace right-hand sides (n, m) by the solution for a symmetric matrix (n, n), lost.
+
+    Real or complex. Without pivots, which it needs none of where its real part is positive
+    definite, as energies are, and losses have one sign (Higham, *Accuracy and Stability of
+    Numerical Algorithms*, section 10.4).
+    Compiled, as the bits of a BLAS depend on how many threads it has.
+    """
+    n, m = sides.shape
+    for k in range(n):
+        for i in range(k + 1, n):
+            share = matrix[i, k] / matrix[k, k]
+            for j in range(k + 1, n):
+                matrix[i, j] -= share * matrix[k, j]
+            for c in range(m):
+                sides[i, c] -= share * sides[k, c]
+    for k in range(n - 1, -1, -1):
+        for c in range(m):
+            sides[k, c] /= matrix[k, k]
+        for i in range(k):
+            for c in range(m):
+                sides[i, c] -= matrix[i, k] * sides[k, c]

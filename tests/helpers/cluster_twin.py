@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import capsense as cs
 from capsense.field.green_kernels import Green
-from capsense.surface import step
+from capsense.surface import lossy, step
 from capsense.surface.choose_kernels import Cut, Functions, functions_of
 from capsense.surface.gap_kernels import (
     extent_of_body,
@@ -194,7 +194,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         patch.object(SurfaceSolver, "pack", packed),
         patch("capsense.surface.solver.slopes_of", slopes),
         patch("capsense.surface.solver.solve", solve),
-        patch.object(step, "prepared", prepared),
+        patch.object(lossy, "prepared", prepared),
     ):
         yield favoured
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capsense.surface.step import eliminate
+from capsense._dense import eliminate
 
 
 def test_elimination_without_pivots():

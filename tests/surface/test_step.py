@@ -41,6 +41,7 @@ from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
 from capsense.surface.choose_kernels import Cut, choose
 from capsense.surface.look_kernels import Looks
+from capsense.surface.lossy import solve_lossy
 from capsense.surface.pair_kernels import _mirror_mean, leaf_pairs, mean_inverse
 from capsense.surface.score_kernels import score
 from capsense.surface.solve_kernels import Reduced, _products, factorise, reduced
@@ -52,7 +53,6 @@ from capsense.surface.step import (
     prepared,
     solve,
     solve_each,
-    solve_lossy,
 )
 
 Array = np.ndarray

@@ -150,7 +150,7 @@ class Matter:
         return _repeated(self, tuple(places))
 
     def write(self, records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> None:
-        """Enter what the kernels need to know; losses are left to ``step.solve_lossy``."""
+        """Enter what the kernels need to know; losses are left to ``lossy.solve_lossy``."""
         ties, softness = self.ties(sizes_of(records, shapes)), self.softness
         members = np.bincount(self.group, minlength=len(records))[self.group]
         none = np.isinf(ties.real)

@@ -19,8 +19,9 @@ from capsense.field.background import Terminals
 from capsense.field.green_kernels import SHORE, Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading
 from capsense.surface.gap_kernels import near_bodies
+from capsense.surface.lossy import solve_lossy
 from capsense.surface.solver import SurfaceSolver
-from capsense.surface.step import slopes_of, solve, solve_lossy
+from capsense.surface.step import slopes_of, solve
 
 Array = NDArray[np.float64]
 

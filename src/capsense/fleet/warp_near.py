@@ -18,9 +18,7 @@ from capsense.field.green_kernels import Gap as HostGap
 from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import lowest_point, middle_height, nearest, reach_down
-from capsense.surface.gap_kernels import _EXACT as EXACT
-from capsense.surface.gap_kernels import _WAYS as WAYS
-from capsense.surface.gap_kernels import REACH
+from capsense.surface.gap_kernels import EXACT, REACH, WAYS
 
 wp.set_module_options({"enable_backward": False})
 

@@ -190,7 +190,7 @@ def factorise_lossy(
     cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
     dropped: wp.array(dtype=wp.int32),
 ):  # fmt: skip
-    """Factor L of every complex symmetric matrix L Lᵀ, without pivots: see ``step.eliminate``."""
+    """Factor L of every complex symmetric matrix L Lᵀ, without pivots: see ``_dense.eliminate``."""
     v = wp.tid()
     if cut.lossy[v] == 0:
         return

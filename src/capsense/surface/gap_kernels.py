@@ -25,7 +25,7 @@ REACH = 5.0, 8.0
 """What is farther than this from a cell, over h0, comes to count for nothing, and does not."""
 LEAST = 0.025
 """Least length of a field line, over h0: bodies do not come nearer than that."""
-_WAYS, _EXACT = 30, 1e-4
+WAYS, EXACT = 30, 1e-4
 """Steps down through a body at most, and how exactly its surface is found, over h0."""
 
 
@@ -74,12 +74,12 @@ def press_out(bodies, near, green):
                 continue
             for c in range(gap.blocks[k], gap.blocks[k + 1]):
                 depth = 0.0
-                for _ in range(_WAYS):  # down to where the surface is
+                for _ in range(WAYS):  # down to where the surface is
                     off, _ = nearest(
                         bodies[b], float(gap.points[c, 0]), float(gap.points[c, 1]),
                         gap.top - depth, point, room,
                     )  # fmt: skip
-                    if off >= -_EXACT * gap.validity:
+                    if off >= -EXACT * gap.validity:
                         break
                     depth -= off
                 deepest = max(deepest, depth)

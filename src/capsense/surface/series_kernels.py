@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense._dense import eliminate
 from capsense._jit import compiled
 
 _SWEEPS = 30
@@ -69,19 +70,7 @@ def _behind(front: NDArray[Any], inside: NDArray[Any]) -> NDArray[Any]:
         for j in range(m):
             matrix[i, j] += inside[i] * half[i, j]
     side = half.T.copy()
-    for k in range(m):  # definite: elimination without pivots
-        for i in range(k + 1, m):
-            part = matrix[i, k] / matrix[k, k]
-            for j in range(k, m):
-                matrix[i, j] -= part * matrix[k, j]
-            for c in range(m):
-                side[i, c] -= part * side[k, c]
-    for k in range(m - 1, -1, -1):
-        for c in range(m):
-            total = side[k, c]
-            for j in range(k + 1, m):
-                total -= matrix[k, j] * side[j, c]
-            side[k, c] = total / matrix[k, k]
+    eliminate(matrix, side)
     return front - _product(half, side)
 
 

@@ -28,6 +28,7 @@ from capsense.scene.contact import TOUCH, Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.shapes import Shape, ShapeKind
 from capsense.surface.gap_kernels import LEAST
+from capsense.surface.lossy import solve_lossy
 from capsense.surface.packing import Laid, PackedBodies, View, laid_out, same
 from capsense.surface.step import (
     Solution,
@@ -35,7 +36,6 @@ from capsense.surface.step import (
     slopes_of,
     solve,
     solve_each,
-    solve_lossy,
 )
 
 Array = NDArray[np.float64]
