@@ -21,8 +21,8 @@ class StepStats:
     solver_error: float
     """Estimated error of a capacitance that more unknowns or iterations would remove [F].
 
-    As large as the largest capacitance where the reading means nothing: an electrode lies inside a
-    body, or within 0.2 mm of a conductor.
+    As large as the largest capacitance where the reading means nothing: a bare electrode lies
+    inside a body, or touches a conductor.
     """
     wall_time: float
     """Time the step took [s]."""

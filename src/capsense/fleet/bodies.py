@@ -73,8 +73,8 @@ class FleetCheck:
     where: tuple[int, int]
     """Environment and sensor that have it."""
     contact: tuple[tuple[int, int], ...] = ()
-    """Environments and sensors whose readings mean nothing: an electrode lies inside a body, or
-    within 0.2 mm of a conductor."""
+    """Environments and sensors whose readings mean nothing: a bare electrode lies inside a body,
+    or touches a conductor."""
     lifted: tuple[tuple[int, int], ...] = ()
     """Environments and sensors whose readings lack the first millimetres in front of a flat design:
     of conductors where matter has losses, which the readings that they are compared with lack, too.
