@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.cover import Touch
+
 if TYPE_CHECKING:
     from capsense.readout.conversions import Counts
 
@@ -54,6 +56,9 @@ class Reading:
     """Conductance matrix G of the electrodes [S], shields at ground, shape (M, M), where matter
     has losses: their admittance is ``G + 1j * 2π f * capacitance`` at the simulator's frequency
     f."""
+    touch: Touch | None = None
+    """Force [N] and compression [m] of the cover above each electrode, if the design has a
+    ``[[cover]]``."""
 
     @property
     def self_capacitance(self) -> Array:

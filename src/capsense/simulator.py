@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from capsense._frozen import read_only
 from capsense._thread_pool import OneAtATime, ThreadPool, some_failed
 from capsense._validate import checked_frequency, shorten
+from capsense.cover import Touch
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.errors import BatchError, CapSenseError, FieldError, ReadoutError, SceneError
@@ -48,7 +49,9 @@ class _Solver(Protocol):
     together: int
     """How many scenes of a batch a thread takes at a time, at most."""
 
-    def solve(self, scene: Scene, *, jacobian: bool = False) -> Change: ...
+    def solve(
+        self, scene: Scene, *, jacobian: bool = False, time: float | None = None
+    ) -> Change: ...
 
     def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]: ...
 
@@ -232,7 +235,8 @@ class Simulator:
 
         Args:
             scene: What stands around the sensor.
-            time: Time of the scene [s], not before that of the last step; a readout needs it.
+            time: Time of the scene [s], not before that of the last step; a readout needs it, and
+                the relaxation and hysteresis of a cover follow it: without it there are none.
             jacobian: Whether to work out ``reading.jacobian`` as well, for half a step's time.
 
         Raises:
@@ -251,7 +255,7 @@ class Simulator:
             scene = scene.scene()
         with self._one:
             self.steps += 1
-            found = self._solver.solve(scene, jacobian=jacobian)
+            found = self._solver.solve(scene, jacobian=jacobian, time=time)
             reading = self._of(found, scene, perf_counter() - start)
             if self.readout is None or time is None:
                 return reading
@@ -275,7 +279,7 @@ class Simulator:
         total = terminals.empty + change
         error = min(error, float(np.abs(total).max()))
         stats = StepStats(error, seconds, found.unknowns, found.iterations)
-        reading = self._reading(change.real, total.real, stats, slope)
+        reading = self._reading(change.real, total.real, stats, slope, found.touch)
         if not reading.delta.any():
             scene.warn_of_units(max(self.design.domain.size))
         if found.loss is None:
@@ -286,7 +290,12 @@ class Simulator:
         )
 
     def _reading(
-        self, change: Array, total: Array, stats: StepStats, slope: Array | None = None
+        self,
+        change: Array,
+        total: Array,
+        stats: StepStats,
+        slope: Array | None = None,
+        touch: Touch | None = None,
     ) -> Reading:
         """A reading by the matrix of electrodes and shields and its change [F]."""
         n = self._terminals.electrodes
@@ -298,6 +307,7 @@ class Simulator:
             self._names,
             total[:n, n:].sum(axis=1),
             jacobian=slope,
+            touch=touch,
         )
 
     def step_batch(
@@ -398,7 +408,8 @@ class Simulator:
         )  # fmt: skip
 
     def reset(self, *, seed: int | None = None, start: float = 0.0) -> None:
-        """Forget the step before, from which ``"fem_masked"`` starts; restart the chip.
+        """Forget the step before, from which ``"fem_masked"`` starts, and what the cover remembers
+        of its contacts; restart the chip.
 
         Args:
             seed: Of the readout's noise from now on; by default its random numbers repeat.

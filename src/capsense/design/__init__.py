@@ -18,6 +18,7 @@ from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
 from capsense._validate import nearest, read_toml, suggest
+from capsense.design.cover import read_cover
 from capsense.design.geometry import (
     PLACEMENT_KEYS,
     TOUCH,
@@ -60,6 +61,7 @@ TOP_KEYS = (
     "electrode",
     "electrodes_from_stl",
     "layer",
+    "cover",
     "conductor",
     "bend",
     "build",
@@ -157,6 +159,17 @@ def parse_design(
     electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack)) for e in electrodes]
     conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
     conductors = [Conductor(c.name, c.role, snap_to_layers(c.surface, stack)) for c in conductors]
+    cover = None
+    covers = items("cover")
+    for table in covers:
+        if len(covers) > 1 or "bend" in data:
+            fix = "describe those below it as [[layer]]" if len(covers) > 1 else "remove [bend]"
+            raise table.error(f"a flat design can have one cover; {fix}")
+        cover, layer, fabric = read_cover(
+            table, _read_material(table), domain, [*electrodes, *conductors], layers
+        )
+        layers.append(layer)
+        conductors += [fabric] if fabric is not None else []
     if "bend" in data:
         radius = read_bend(DesignTable(data["bend"], source, "bend", limit))
         if slabs := [layer.name for layer in layers if not layer.facets]:
@@ -171,10 +184,11 @@ def parse_design(
         name=name,
         domain=domain,
         electrodes=tuple(electrodes),
-        layers=stack,
+        layers=tuple(layers),
         conductors=tuple(conductors),
         description=description,
         build=build,
+        cover=cover,
     )
     check_design(design, source=source)
     return design

@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.cover import Cover
 from capsense.design.geometry import (
     TOUCH,
     Facet,
@@ -129,12 +130,16 @@ class Design:
     description: str = ""
     build: Mapping[str, float] = field(default_factory=dict)
     """Numerical settings of the ``[build]`` table; ``resolution`` is the only one."""
+    cover: Cover | None = None
+    """How the outermost layer gives way, if it does; the layer itself, and the fabric on it if
+    any, are among ``layers`` and ``conductors``."""
 
     def content_hash(self) -> str:
         """SHA-256 (hex) over the geometry, materials and domain.
 
-        Names, description, file formatting and ``build`` do not enter; the order of electrodes
-        does, since it is the order of matrix rows. Coordinates count to a nanometre.
+        Names, description, file formatting, ``build`` and the mechanics of a cover do not enter:
+        the field in the empty domain does not depend on them. The order of electrodes does, since it is
+        the order of matrix rows. Coordinates count to a nanometre.
         """
         lines = ["capsense design 1"]
         lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.cover import Touch
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
@@ -143,6 +144,8 @@ class Change:
     jacobian: Array | None = None
     """How the matrix changes with the poses of the scene's bodies, where it was asked for, shape
     (bodies, terminals, terminals, 6)."""
+    touch: Touch | None = None
+    """What its bodies press onto the cover, if the design has one."""
 
 
 @dataclass(frozen=True, eq=False)

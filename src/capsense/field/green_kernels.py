@@ -32,6 +32,7 @@ from capsense.design.model import Design
 from capsense.field.gap_table import GapTable, is_flat
 from capsense.field.green import LEVELS, GreenFunction
 from capsense.field.grid_kernels import Grid, grid_over
+from capsense.field.soft import Soft, no_soft, pack_soft
 
 LEAST = 1e-3, 2e-3, 3e-3
 """Distances from near, middle and far sources [m] below which their potential grows no more. They
@@ -86,9 +87,18 @@ class Gap(NamedTuple):
     """Middle of each block [m], shape (q, 2)."""
     block_radius: NDArray[Any]
     """Radius of a circle about it that holds its cells [m], shape (q,)."""
+    least: float
+    """Least length of a field line [m]: bodies do not come nearer than that."""
+    soft: Soft
+    """The cover, if it gives way."""
 
 
-def pack_gap(table: GapTable | None, clearance: float) -> Gap:
+LEAST_LENGTH = 0.025
+"""Least length of a field line, over the validity distance h0, or over thickness by permittivity of
+what covers the electrodes, where that is less."""
+
+
+def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     """Lay a table out for the kernels.
 
     Without one, bodies are kept off a flat design by half the distance ``clearance`` [m] down to
@@ -101,7 +111,7 @@ def pack_gap(table: GapTable | None, clearance: float) -> Gap:
             0.5 * clearance, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
             np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros(0, np.float32),
             np.zeros((0, 0), np.int64), np.zeros((0, 2, 1), np.float32), np.zeros(1, np.int64),
-            np.zeros((0, 2)), none,
+            np.zeros((0, 2)), none, LEAST_LENGTH * clearance, no_soft(0),
         )  # fmt: skip
     count = len(table.areas)
     blocks = np.append(table.blocks, count)
@@ -111,6 +121,10 @@ def pack_gap(table: GapTable | None, clearance: float) -> Gap:
     center = np.stack([np.bincount(number, x) / size for x in points.T], axis=1)
     radius = np.zeros(len(size))
     np.maximum.at(radius, number, np.linalg.norm(points - center[number], axis=1))
+    least = table.validity
+    if cover_of(design) > 0.0:
+        most = max([1.0, *(layer.eps_r for layer in design.layers)])
+        least = min(least, cover_of(design) / most)
     return Gap(
         table.validity, table.top, table.heights, math.log(table.heights[1] / table.heights[0]),
         np.ascontiguousarray(points, np.float32), np.ascontiguousarray(table.areas, np.float32),
@@ -118,6 +132,7 @@ def pack_gap(table: GapTable | None, clearance: float) -> Gap:
         np.ascontiguousarray(table.series, np.float32),
         np.ascontiguousarray(table.columns, np.int64),
         np.ascontiguousarray(table.change, np.float32), blocks.astype(np.int64), center, radius,
+        LEAST_LENGTH * least, pack_soft(table, design),
     )  # fmt: skip
 
 
@@ -219,7 +234,7 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         (near, middle, far), score_table, grid_over(np.asarray(green.box, float), walls, phi),
         lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
         np.asarray(green.blends, float), room, extent, cover_of(design),
-        pack_gap(green.gap, green.clearance),
+        pack_gap(green.gap, green.clearance, design),
     )  # fmt: skip
 
 

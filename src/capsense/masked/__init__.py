@@ -366,7 +366,7 @@ class MaskedScenes:
                 out.append(error)
         return out
 
-    def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
+    def solve(self, scene: Scene, *, jacobian: bool = False, time: float | None = None) -> Change:
         """Return what a scene changes, from the last one's potentials; there is no Jacobian."""
         assert not jacobian
         inside = np.full(self._mesh.n_tets, -1, dtype=np.int64)

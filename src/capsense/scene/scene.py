@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense._validate import as_number, shorten
 from capsense.errors import SceneError
 from capsense.scene.materials import Grounding, Material, checked_grounding
 from capsense.scene.materials import material as find_material
@@ -30,6 +32,9 @@ class Body:
         grounding: ``"grounded"``, ``"floating"``, or the capacitance [F] that ties the body to
             ground. It matters for conductors only.
         name: Optional; unique within a scene.
+        force: Normal force that presses it onto the cover of a design [N], such as the contact
+            force of a simulator; it then decides how deep the body lies in the cover, whatever the
+            height of its pose. By default the overlap with the cover does.
 
     Raises:
         SceneError: An argument is of the wrong kind or out of range.
@@ -40,6 +45,7 @@ class Body:
     material: Material
     grounding: Grounding
     name: str | None
+    force: float | None
 
     def __init__(
         self,
@@ -48,6 +54,7 @@ class Body:
         material: Material | str = "steel",
         grounding: Grounding = "grounded",
         name: str | None = None,
+        force: float | None = None,
     ) -> None:
         if not isinstance(shape, Shape):
             mesh = hasattr(shape, "vertices") and hasattr(shape, "faces")
@@ -65,6 +72,18 @@ class Body:
         fields["material"] = material if isinstance(material, Material) else find_material(material)
         fields["grounding"] = checked_grounding(grounding)
         fields["name"] = name
+        fields["force"] = checked_force(force)
+
+    def pressed(self, force: float | None) -> Body:
+        """Return the same body under a normal force [N]; the rest is shared.
+
+        Raises:
+            SceneError: The force is no finite number from 0 on.
+        """
+        body = object.__new__(Body)
+        body.__dict__.update(self.__dict__)
+        body.__dict__["force"] = checked_force(force)
+        return body
 
     def moved(self, pose: Pose) -> Body:
         """Return the same body at another pose; shape and material are shared.
@@ -76,6 +95,22 @@ class Body:
         body.__dict__.update(self.__dict__)
         body.__dict__["pose"] = checked_pose(pose)
         return body
+
+
+def checked_force(force: float | None) -> float | None:
+    """A contact force [N], or None.
+
+    Raises:
+        SceneError: It is no finite number from 0 on.
+    """
+    if force is None:
+        return None
+    value = as_number(force)
+    if not 0.0 <= value < math.inf:
+        raise SceneError(
+            f"force is {shorten(force)}; give a finite number in N, from 0 on, or None"
+        )
+    return value
 
 
 class DeformableSurface:

@@ -20,11 +20,10 @@ from capsense._jit import compiled, kernel
 from capsense._simd import doubles
 from capsense.elements.outline import middle_height, nearest, reach_down
 from capsense.field.green_kernels import lift, smooth
+from capsense.field.soft import BODY
 
 REACH = 5.0, 8.0
 """What is farther than this from a cell, over h0, comes to count for nothing, and does not."""
-LEAST = 0.025
-"""Least length of a field line, over h0: bodies do not come nearer than that."""
 WAYS, EXACT = 30, 1e-4
 """Steps down through a body at most, and how exactly its surface is found, over h0."""
 
@@ -52,7 +51,8 @@ def press_out(bodies, near, green):
     """Move near bodies that overlap the face of the design up until they touch it.
 
     Physics engines let hard bodies overlap. What lies inside of a body that way is in contact with
-    it. Bodies whose middle is behind the face stay where they are.
+    it. A cover that gives way is compressed as far as it can be. Bodies whose middle is behind the
+    face stay where they are.
     """
     gap, point, room = green.gap, np.empty(9), np.empty(140)
     for b in range(bodies.shape[0]):
@@ -83,7 +83,7 @@ def press_out(bodies, near, green):
                         break
                     depth -= off
                 deepest = max(deepest, depth)
-        bodies[b].position[2] += min(deepest, below)
+        bodies[b].position[2] += max(0.0, min(deepest, below) - gap.soft.limit)
 
 
 @kernel
@@ -128,6 +128,51 @@ def local_change(bodies, near, node, green, matrix):
             continue
         for c in range(gap.blocks[k], gap.blocks[k + 1]):
             _add_cell(bodies, chosen, count, node, green, c, (point, room, moved), matrix)
+            if gap.soft.target == BODY and gap.soft.below[c] >= 0.0:
+                _add_compressed(bodies, chosen, count, node, gap, c, (point, room), matrix)
+
+
+@kernel
+def _add_compressed(bodies, chosen, count, node, gap, c, work, matrix):
+    """Add what one cell changes as a body is pressed into the cover above it.
+
+    The parallel-plate law eps0 [1/l - 1/l_0] per area, l the length of the field line through the
+    cover over its permittivity, and what lies below it; l_0 that to its undeformed face.
+    """
+    length, at = compressed_length(bodies, chosen, count, gap, c, work)
+    if at < 0:
+        return
+    soft, i, j = gap.soft, gap.terminal[c], node[chosen[at]]
+    value = float(gap.areas[c]) / (4.0 * math.pi)
+    rest = float(soft.below[c])
+    value *= 1.0 / (rest + length / soft.eps) - 1.0 / (rest + soft.thickness / soft.eps)
+    if i >= 0:
+        matrix[i, i] += value
+    if j >= 0:
+        matrix[j, j] += value
+        if i >= 0:
+            matrix[i, j] -= value
+            matrix[j, i] -= value
+
+
+@kernel
+def compressed_length(bodies, chosen, count, gap, c, work):
+    """Length of the field line through the cover at a cell [m], and the place of its body.
+
+    The place is -1 where no body is pressed into the cover there.
+    """
+    soft, (point, room) = gap.soft, work
+    x, y, z = float(gap.points[c, 0]), float(gap.points[c, 1]), gap.top - soft.thickness
+    length, at = soft.thickness, -1
+    for k in range(count):
+        off, _ = nearest(bodies[chosen[k]], x, y, z, point, room)
+        if off < length:
+            if off > 0.0:
+                dx, dy = point[0] - x, point[1] - y
+                off = _arc(off, math.sqrt(dx * dx + dy * dy), point[2] - z)
+            if off < length:
+                length, at = max(off, soft.thickness - soft.limit), k
+    return length, at
 
 
 @kernel
@@ -167,6 +212,82 @@ def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
             matrix[j, j] -= value
 
 
+@compiled
+def fabric_change(bodies, green, matrix):
+    """Add what compression below a conducting fabric on the cover changes [m], 4π eps0 = 1.
+
+    The fabric follows the bodies that are pressed into it, of whatever matter. Where it has a
+    bending length, compression falls off beside them over that.
+
+    Args:
+        bodies: Records of :data:`~capsense.elements.rigid.BODY`, shape (b,).
+        green: Green's function of the design.
+        matrix: Added to, shape (t, t).
+    """
+    gap, soft = green.gap, green.gap.soft
+    if soft.target == BODY:
+        return
+    chosen, count = np.empty(bodies.shape[0], np.int64), 0
+    for b in range(bodies.shape[0]):
+        if bodies[b].outline != 0:
+            middle = middle_height(bodies[b])
+            if middle >= gap.top and middle - reach_down(bodies[b]) < gap.top:
+                chosen[count] = b
+                count += 1
+    if count == 0:
+        return
+    depth = np.zeros(gap.areas.shape[0])
+    point, room = np.empty(9), np.empty(140)
+    for k in range(gap.block_radius.shape[0]):
+        x, y, reach = gap.block_center[k, 0], gap.block_center[k, 1], gap.block_radius[k]
+        for q in range(count):
+            off, _ = nearest(bodies[chosen[q]], x, y, gap.top, point, room)
+            if off < reach:
+                for c in range(gap.blocks[k], gap.blocks[k + 1]):
+                    if soft.below[c] >= 0.0:
+                        length, at = compressed_length(bodies, chosen, count, gap, c, (point, room))
+                        if at >= 0:
+                            depth[c] = soft.thickness - length
+                break
+    if soft.spread > 0.0:
+        pressed = depth.copy()
+        _spread(pressed, gap, depth)
+    for c in range(depth.shape[0]):
+        i, j = gap.terminal[c], soft.target
+        if i < 0 or i == j or depth[c] <= 0.0:
+            continue
+        rest, length = float(soft.below[c]), soft.thickness - depth[c]
+        value = float(gap.areas[c]) / (4.0 * math.pi)
+        value *= 1.0 / (rest + length / soft.eps) - 1.0 / (rest + soft.thickness / soft.eps)
+        matrix[i, i] += value
+        if j >= 0:
+            matrix[j, j] += value
+            matrix[i, j] -= value
+            matrix[j, i] -= value
+
+
+@kernel
+def _spread(depth, gap, out):
+    """Compression of the cells as a fabric carries it on: the largest of exp(-r / l) times each."""
+    soft = gap.soft
+    for c in range(depth.shape[0]):
+        if depth[c] <= 0.0:
+            continue
+        for k in range(gap.block_radius.shape[0]):
+            x = gap.block_center[k, 0] - gap.points[c, 0]
+            y = gap.block_center[k, 1] - gap.points[c, 1]
+            far = math.sqrt(x * x + y * y) - gap.block_radius[k]
+            if far > 8.0 * soft.spread:
+                continue
+            for q in range(gap.blocks[k], gap.blocks[k + 1]):
+                if soft.below[q] >= 0.0:
+                    x = float(gap.points[q, 0] - gap.points[c, 0])
+                    y = float(gap.points[q, 1] - gap.points[c, 1])
+                    fall = math.exp(-math.sqrt(x * x + y * y) / soft.spread)
+                    out[q] = max(out[q], depth[c] * fall)
+    return out
+
+
 @kernel
 def _place(length, gap):
     """Place of a length among the heights of the table, and the share of the next one."""
@@ -188,7 +309,7 @@ def lengths(off, faces, point, x, y, green, moved):
         moved: Room to work in, shape (1, 3).
     """
     gap = green.gap
-    h0, least = gap.validity, LEAST * gap.validity
+    h0, least = gap.validity, gap.least
     if off <= 0.0:
         return least, h0
     dx, dy, dz = point[0] - x, point[1] - y, point[2] - gap.top

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from capsense._dense import eliminate, whole_lines
 from capsense.field.green_kernels import Green
-from capsense.surface.gap_kernels import near_bodies, press_out
+from capsense.surface.gap_kernels import fabric_change, near_bodies, press_out
 from capsense.surface.series_kernels import in_series_lossy
 from capsense.surface.solve_kernels import COARSE, GAIN, factorise, leaf_charges
 from capsense.surface.step import NOTHING, SERIES, Solution, estimate, prepared, solve_lifted
@@ -37,6 +37,21 @@ def solve_lossy(
         softness: 1 / (eps - 1), shape (n,).
         green, threshold, width: As in :func:`prepared`.
     """
+    found = _solve_lossy(records, ties, softness, green, threshold, width)
+    fabric = np.zeros(found.delta.shape)
+    fabric_change(records, green, fabric)
+    return found._replace(delta=found.delta + fabric)
+
+
+def _solve_lossy(
+    records: NDArray[np.void],
+    ties: NDArray[np.complex128],
+    softness: NDArray[np.complex128],
+    green: Green,
+    threshold: float,
+    width: float,
+) -> Solution:
+    """As :func:`solve_lossy`, but for a fabric on the cover."""
     records = records.copy()
     records["softness"] = np.abs(softness)
     near = near_bodies(records, green, True)

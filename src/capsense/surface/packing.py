@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import is_
@@ -9,12 +10,14 @@ from operator import is_
 import numpy as np
 from numpy.typing import NDArray
 
+from capsense.cover import Touch
 from capsense.elements.matter import Matter
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import BODY, RigidShape
 from capsense.scene import Scene
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape
+from capsense.surface.touch import Pressed
 
 Array = NDArray[np.float64]
 
@@ -45,6 +48,10 @@ class PackedBodies:
     """What the records point to."""
     offsets: Array
     """From the bodies' origins to those of the parts of them that are solved for [m], (n, 3)."""
+    touch: Touch | None = None
+    """What they press onto the cover, if the design has one."""
+    pressed: Sequence[Pressed] = ()
+    """Those that touch the cover."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,16 +27,18 @@ from capsense.scene import Scene, TriMesh
 from capsense.scene.contact import TOUCH, Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.shapes import Shape, ShapeKind
-from capsense.surface.gap_kernels import LEAST
+from capsense.surface.gap_kernels import extent_of_body
 from capsense.surface.lossy import solve_lossy
 from capsense.surface.packing import Laid, PackedBodies, View, laid_out, same
 from capsense.surface.step import (
+    DIFFERENCE,
     Solution,
     potential_change,
     slopes_of,
     solve,
     solve_each,
 )
+from capsense.surface.touch import CoverContact, Pressed
 
 Array = NDArray[np.float64]
 
@@ -93,6 +95,15 @@ def _keep_memory() -> None:
     np.empty((32 << 20) - 8192, np.uint8)
 
 
+def _turned(axis: int, angle: float) -> Array:
+    """Rotation matrix about one of the axes [rad]."""
+    out, (i, j) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
+    out[i, i] = out[j, j] = math.cos(angle)
+    out[j, i] = math.sin(angle)
+    out[i, j] = -out[j, i]
+    return out
+
+
 class SurfaceSolver:
     """Solves scenes, each by itself.
 
@@ -128,7 +139,12 @@ class SurfaceSolver:
         self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         gap = self.green.gap
-        touch = LEAST * gap.validity if len(gap.areas) else TOUCH
+        touch = gap.least if len(gap.areas) else TOUCH
+        self._contact = (
+            CoverContact(design.cover, gap, self.green.electrodes)
+            if design.cover is not None
+            else None
+        )
         self._sheets = Sheets([e.surface.triangles for e in design.electrodes], touch)
         coarsest, width = self.preset.coarsest, narrowest_width(design)
         self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2
@@ -144,8 +160,8 @@ class SurfaceSolver:
         """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
         return self.__dict__ | {"_laid": {}}
 
-    def solve(self, scene: Scene, *, jacobian: bool = False) -> Change:
-        """Return what a scene changes.
+    def solve(self, scene: Scene, *, jacobian: bool = False, time: float | None = None) -> Change:
+        """Return what a scene changes; ``time`` [s] is what a cover's relaxation follows.
 
         Raises:
             SceneError: A Jacobian is asked for of what has none.
@@ -153,22 +169,24 @@ class SurfaceSolver:
         """
         view = self.look(scene)
         self._last = None
-        bodies, solution = self.solution(view, jacobian=jacobian)
+        bodies, solution = self.solution(view, jacobian=jacobian, time=time)
         slope = self.jacobian(view, bodies, solution) if jacobian else None
         if solution is None:
-            return self._change(view, np.zeros((self.green.terminals,) * 2), 0.0, 0, slope)
-        self._last = view, solution
-        matrix, error = UNIT * solution.delta, UNIT * solution.error
-        return self._change(view, matrix, error, solution.size, slope)
+            change = self._change(view, bodies, np.zeros((self.green.terminals,) * 2), 0.0, 0)
+        else:
+            self._last = view, solution
+            matrix, error = UNIT * solution.delta, UNIT * solution.error
+            change = self._change(view, bodies, matrix, error, solution.size)
+        return replace(change, jacobian=slope)
 
     def _change(
-        self, view: View, matrix: NDArray[Any], error: float, size: int, slope: Array | None
+        self, view: View, bodies: PackedBodies, matrix: NDArray[Any], error: float, size: int
     ) -> Change:
         """What a scene changes, by its matrix [F] and the error of that."""
         if self._meets_electrodes(view):
             error = math.inf
         loss = -matrix.imag if np.iscomplexobj(matrix) else None
-        return Change(matrix.real, error, unknowns=size, loss=loss, jacobian=slope)
+        return Change(matrix.real, error, unknowns=size, loss=loss, touch=bodies.touch)
 
     def solve_each(self, scenes: Sequence[Scene]) -> list[Change | CapSenseError]:
         """Return what each of many scenes changes, or what was wrong with it.
@@ -197,9 +215,9 @@ class SurfaceSolver:
                 )
             delta, doubt = UNIT * delta, UNIT * doubt
             sound = np.isfinite(delta).all(axis=(1, 2))
-            for i, (k, view, _) in enumerate(plain):
+            for i, (k, view, bodies) in enumerate(plain):
                 if sound[i]:
-                    out[k] = self._change(view, delta[i], float(doubt[i]), int(size[i]), None)
+                    out[k] = self._change(view, bodies, delta[i], float(doubt[i]), int(size[i]))
                 else:
                     out[k] = SolveError(_NO_SOLUTION)
         return [out[k] for k in range(len(scenes))]
@@ -244,8 +262,10 @@ class SurfaceSolver:
         return Charges(solution.points.mean(axis=1), density, float(np.median(solution.extent)))
 
     def reset(self) -> None:
-        """Forget the last scene; no reading depends on the one before."""
+        """Forget the last scene, and what covers remember of their contacts."""
         self._last = None
+        if self._contact is not None:
+            self._contact.reset()
 
     def look(self, scene: Scene) -> View:
         """Find the bodies of a scene that reach into the domain."""
@@ -255,7 +275,7 @@ class SurfaceSolver:
         return View(scene, packed, met, matter)
 
     def solution(
-        self, view: View, *, jacobian: bool = False
+        self, view: View, *, jacobian: bool = False, time: float | None = None
     ) -> tuple[PackedBodies, Solution | None]:
         """Return the packed bodies of a scene and their charges; None where none is in the domain.
 
@@ -263,7 +283,7 @@ class SurfaceSolver:
             SolveError: Bodies lie within each other in a way that leaves no solution.
         """
         with first_use():
-            bodies, preset = self.pack(view), self.preset
+            bodies, preset = self.pack(view, time), self.preset
             if not len(bodies.records):
                 return bodies, None
             matter = bodies.matter
@@ -302,10 +322,46 @@ class SurfaceSolver:
         )
         slope[..., 3:] += np.cross(bodies.offsets[:, None, None], slope[..., :3])
         np.add.at(out, bodies.chosen, slope)
+        for pressed in bodies.pressed:
+            if pressed.held:
+                out[bodies.chosen[pressed.rows[0]]] = self._held_slope(bodies, pressed)
         return out
 
-    def pack(self, view: View) -> PackedBodies:
-        """Lay out the bodies that reach into the domain."""
+    def _held_slope(self, bodies: PackedBodies, pressed: Pressed) -> Array:
+        """As :meth:`jacobian`, of one body that a force holds, (terminals, terminals, 6).
+
+        Central differences of the step; the force stays the same, so that z does not count.
+        """
+        assert self._contact is not None
+        out = np.zeros((self.green.terminals, self.green.terminals, 6))
+        rows, preset = pressed.rows, self.preset
+        start = bodies.records[rows].copy()
+        start["position"][:, 2] += pressed.depth
+        origin = start["position"] - bodies.offsets[rows]
+        step = DIFFERENCE * self.green.gap.validity
+        arm = max(step, *(extent_of_body(record) for record in start))
+        for way in (0, 1, 3, 4, 5):
+            change = step if way < 3 else step / arm
+            found = []
+            for sign in (1.0, -1.0):
+                moved = start.copy()
+                if way < 3:
+                    moved["position"][:, way] += sign * change
+                else:
+                    turn = _turned(way - 3, sign * change)
+                    moved["rotation"] = turn @ start["rotation"]
+                    moved["position"] = origin + (start["position"] - origin) @ turn.T
+                self._contact.lower(moved, pressed)
+                records = bodies.records.copy()
+                records[rows] = moved
+                found.append(
+                    solve(records, self.green, preset.threshold, preset.width, False).delta
+                )
+            out[..., way] = UNIT * (found[0] - found[1]) / (2.0 * change)
+        return out
+
+    def pack(self, view: View, time: float | None = None) -> PackedBodies:
+        """Lay out the bodies that reach into the domain, pressed into the cover if there is one."""
         matter, packed = self._joined(view), view.packed
         bodies = [packed.shapes[k] for k in view.met.tolist()]
         offsets: list[tuple[int, Array]] = []
@@ -324,7 +380,11 @@ class SurfaceSolver:
         for i, at in offsets:
             shift[i] = rotation[i] @ at
             records["position"][i] += shift[i]
-        return PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
+        packed_bodies = PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
+        if self._contact is None:
+            return packed_bodies
+        touch, pressed = self._contact.press(records, chosen, view.scene.bodies, time)
+        return replace(packed_bodies, touch=touch, pressed=pressed)
 
     def _lay_out(
         self, view: View, matter: Matter, bodies: list[Shape], laid: Laid | None

@@ -16,6 +16,7 @@ from capsense.field.green_kernels import Green
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
 from capsense.surface.gap_kernels import (
     extent_of_body,
+    fabric_change,
     local_change,
     move,
     near_bodies,
@@ -146,6 +147,16 @@ def solve(
     ``adjoint`` asks for charges that the derivatives of the result follow from; else as
     :func:`prepared`.
     """
+    found = _solve(bodies, green, threshold, width, adjoint)
+    fabric_change(bodies, green, found.delta)
+    return found
+
+
+@compiled
+def _solve(
+    bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
+) -> Solution:
+    """As :func:`solve`, but for a fabric on the cover."""
     soft = near_bodies(bodies, green, True)
     if not soft.any():
         return solve_lifted(bodies, green, threshold, width, adjoint)
