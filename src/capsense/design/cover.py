@@ -68,7 +68,8 @@ def read_cover(
     if "size" in table:
         sx, sy = table.sizes("size", 2, "[x, y] in metres")
         middle = np.array(table.coordinates("center", (2,), (0.0, 0.0)))
-        low, high = middle - [sx / 2, sy / 2], middle + [sx / 2, sy / 2]
+        half = 0.5 * np.array([sx, sy])
+        low, high = middle - half, middle + half
     elif "center" in table:
         raise table.error(
             "center needs size = [x, y] in metres; without both it lies on everything"

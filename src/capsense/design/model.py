@@ -138,8 +138,8 @@ class Design:
         """SHA-256 (hex) over the geometry, materials and domain.
 
         Names, description, file formatting, ``build`` and the mechanics of a cover do not enter:
-        the field in the empty domain does not depend on them. The order of electrodes does, since it is
-        the order of matrix rows. Coordinates count to a nanometre.
+        the field in the empty domain does not depend on them. The order of electrodes does, since
+        it is the order of matrix rows. Coordinates count to a nanometre.
         """
         lines = ["capsense design 1"]
         lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")
