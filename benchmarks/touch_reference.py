@@ -37,8 +37,10 @@ MARKED = 0.1
 """Share of the largest difference above which a triangle is refined."""
 HALVINGS = 12
 """How often lines are halved towards rims and places of contact."""
-LARGEST = 30.0
-"""Largest triangle of the first mesh [mm]."""
+LARGEST = 0.25
+"""Largest triangle of the first mesh, over the radius of the domain."""
+GRADINGS = (0.3, 0.25, 0.35, 0.2, 0.4, 0.15)
+"""Growth of triangles; where the mesher fails in the wedge beside a place of contact, the next."""
 
 
 class Values(NamedTuple):
@@ -194,15 +196,22 @@ class Drawing:
             shape, leftdomain=number[left], rightdomain=number[right], bc=name
         )
 
-    def mesh(self) -> Any:
-        """The first mesh, curved."""
+    def mesh(self, largest: float) -> Any:
+        """The first mesh, curved; of triangles up to a size [m]."""
         import ngsolve as ng
+        from netgen.meshing import NgException
 
         for k, name in enumerate(self.REGIONS):
             self.geometry.SetMaterial(k + 1, name)
-        mesh = ng.Mesh(self.geometry.GenerateMesh(maxh=LARGEST, grading=0.3))
-        mesh.Curve(ORDERS[1])
-        return mesh
+        for grading in GRADINGS:
+            try:
+                mesh = ng.Mesh(self.geometry.GenerateMesh(maxh=1e3 * largest, grading=grading))
+            except NgException:
+                if grading == GRADINGS[-1]:
+                    raise
+                continue
+            mesh.Curve(ORDERS[1])
+            return mesh
 
 
 def draw(s: Section) -> Drawing:
@@ -297,7 +306,7 @@ def converged(s: Section, tolerance: float) -> Iterator[tuple[Array, Array]]:
     """Maxwell matrices [F] of both orders on meshes that become finer, until they agree."""
     import ngsolve as ng
 
-    mesh = draw(s).mesh()
+    mesh = draw(s).mesh(LARGEST * s.domain[0])
     names = ["electrode"] + ["body"] * bool(s.outline and not s.fabric)
     table = {"below": 1.0, "air": 1.0, "cover": s.eps_r, "board": s.board[1] if s.board else 1.0}
     while True:
