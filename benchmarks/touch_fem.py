@@ -133,8 +133,9 @@ def scene(
     layers: list[Row] = []
     t = case.thickness
     if case.guard:
+        inner, outer = case.guard
         conductors.append({"name": "guard", "role": "ground", "shape": "ring",
-                           "inner_radius": case.guard[0], "outer_radius": case.guard[1]})  # fmt: skip
+                           "inner_radius": inner, "outer_radius": outer})  # fmt: skip
     if case.board:
         deep, eps_r = case.board
         conductors.append({"name": "plane", "role": "ground", "shape": "rectangle",
@@ -148,8 +149,9 @@ def scene(
     if hard:
         layers.append({"name": "cover", "eps_r": case.eps_r, "size": [SIDE, SIDE], "z": [0.0, t]})
     else:
+        top = "ground" if case.fabric else "none"
         design["cover"] = [{"name": "cover", "thickness": t, "eps_r": case.eps_r,
-                            "modulus": MODULUS, "top": "ground" if case.fabric else "none"}]  # fmt: skip
+                            "modulus": MODULUS, "top": top}]  # fmt: skip
     design |= {"conductor": conductors} if conductors else {}
     design |= {"layer": layers} if layers else {}
     if depth is None:
@@ -341,9 +343,9 @@ def report(rows: list[Row]) -> None:
     """Print errors, and what became of the targets."""
     for name in dict.fromkeys(r["case"] for r in rows):
         some = [r for r in rows if r["case"] == name]
-        print(f"\n{name}: baseline {some[0]['baseline_error']:+.2f} %\n{'':9s} {'gap/depth, mm':>13s}"
-              f" {'strain':>7s} {'ΔC, fF':>9s} {'CapSense':>9s} {'error, %':>9s} {'estimate, %':>11s}"
-              f" {'reference, %':>12s}")  # fmt: skip
+        print(f"\n{name}: baseline {some[0]['baseline_error']:+.2f} %")
+        print(f"{'':9s} {'gap, mm':>13s} {'strain':>7s} {'ΔC, fF':>9s} {'CapSense':>9s} "
+              f"{'error, %':>9s} {'estimate, %':>11s} {'reference, %':>12s}")  # fmt: skip
         for r in some:
             print(f"{r['grounding']:9s} {-1e3 * r['depth']:13.2f} {max(r['strain'], 0):7.1f} "
                   f"{r['truth_fF']:9.1f} {r['delta_fF']:9.1f} {r['error']:+9.1f} "

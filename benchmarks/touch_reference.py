@@ -7,9 +7,9 @@ in place of the box. The cover's outer face is at height min(t, underside of the
 above it (elastic foundation: it gives way at each point on its own). Below a grounded fabric, what
 lies above the cover's outer face is no part of the domain.
 
-Curved triangles are refined where the fields of orders 3 and 4 differ, for one volt on the electrode
-and on the body in turn, until their energies agree. The value is that of order 4, its stated error
-the difference to order 3. (Recovered fluxes are no measure: they jump at the electrode.)
+Curved triangles are refined where the fields of orders 3 and 4 differ, for one volt on the
+electrode and on the body in turn, until their energies agree. The value is that of order 4, its
+stated error the difference to order 3.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,12 +176,14 @@ class Drawing:
         if a != b:
             self._append(["line", a, b], left, right, name)
 
-    def piece(self, piece: Piece, ends: tuple[float, float], right: str, fine: float | None) -> None:
+    def piece(
+        self, piece: Piece, ends: tuple[float, float], right: str, fine: float | None
+    ) -> None:
         """Part of a body's outline, ``right`` beside it."""
         if ends[1] - ends[0] < 1e-12:
             return
         parts = graded(*ends, fine)
-        for s, e in zip(parts[:-1], parts[1:], strict=True):
+        for s, e in pairwise(parts):
             if not piece.radius:
                 self.line(piece.at(s), piece.at(e), "", right, "body")
                 continue
@@ -192,9 +195,7 @@ class Drawing:
 
     def _append(self, shape: list[Any], left: str, right: str, name: str) -> None:
         number = {"": 0} | {n: k + 1 for k, n in enumerate(self.REGIONS)}
-        self.geometry.Append(
-            shape, leftdomain=number[left], rightdomain=number[right], bc=name
-        )
+        self.geometry.Append(shape, leftdomain=number[left], rightdomain=number[right], bc=name)
 
     def mesh(self, largest: float) -> Any:
         """The first mesh, curved; of triangles up to a size [m]."""
@@ -221,7 +222,7 @@ def draw(s: Section) -> Drawing:
     top = "cover" if t else "air"
     under = "board" if s.board else "below"
     deep = -s.board[0] if s.board else 0.0
-    d.line((0, 0), (0, deep), under, "", "axis") if s.board else None
+    d.line((0, 0), (0, deep), under, "", "axis")
     d.line((0, deep), (0, floor), "below", "", "axis")
     d.line((0, floor), (wall, floor), "below", "", "ground")
     d.line((wall, floor), (wall, 0), "below", "", "ground")
@@ -229,7 +230,7 @@ def draw(s: Section) -> Drawing:
         d.line((0, deep), (ext, deep), "board", "below", "ground")
         d.line((ext, deep), (ext, 0), "board", "below", "inner")
     radii = sorted({0.0, s.radius, *(s.guard or ()), ext, wall})
-    for a, b in zip(radii[:-1], radii[1:], strict=True):
+    for a, b in pairwise(radii):
         middle = (a + b) / 2
         name = "electrode" if middle < s.radius else "inner"
         if s.guard and s.guard[0] < middle < s.guard[1]:
@@ -237,13 +238,13 @@ def draw(s: Section) -> Drawing:
         inside = middle < ext
         above, beneath = (top, under) if inside else ("air", "below")
         cut = graded(a, b, b if name == "electrode" else a)
-        for p, q in zip(cut[:-1], cut[1:], strict=True):
+        for p, q in pairwise(cut):
             d.line((p, 0), (q, 0), above, beneath, name)
     contact = body(d, s, top)
     if t:
         outer = "" if s.fabric else "air"
         cut = graded(contact, ext, contact)
-        for p, q in zip(cut[:-1], cut[1:], strict=True):
+        for p, q in pairwise(cut):
             d.line((p, t), (q, t), outer, "cover", "ground" if s.fabric else "inner")
         d.line((ext, 0), (ext, t), "cover", "air", "inner")
     if s.fabric:
