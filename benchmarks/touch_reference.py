@@ -37,7 +37,11 @@ TRIANGLES = 20_000
 MARKED = 0.1
 """Share of the largest difference above which a triangle is refined."""
 HALVINGS = 12
-"""How often lines are halved towards rims and places of contact."""
+"""How often lines are halved towards rims."""
+WEDGE = 7
+"""How often outlines are halved towards the place of contact."""
+TINY = 1e-12
+"""Lengths and angles below it are 0 [m, rad]."""
 LARGEST = 0.25
 """Largest triangle of the first mesh, over the radius of the domain."""
 GRADINGS = (0.3, 0.25, 0.35, 0.2, 0.4, 0.15)
@@ -85,15 +89,15 @@ class Piece:
         (r, z), (dr, dz) = self.start, self.along
         if self.radius:
             r, z = r + self.radius * math.sin(s), z - self.radius * math.cos(s)
-            return (0.0 if abs(r) < 1e-12 else r), z
+            return (0.0 if abs(r) < TINY else r), z
         return r + s * dr, z + s * dz
 
     def reaches(self, height: float) -> float:
         """Parameter where it rises through a height; its first end where it is all above."""
-        (a, b), tiny = self.ends, 1e-12
-        if self.at(a)[1] >= height - tiny and self.at(b)[1] > height + tiny:
+        a, b = self.ends
+        if self.at(a)[1] >= height - TINY and self.at(b)[1] > height + TINY:
             return a
-        if self.at(b)[1] <= height + tiny:
+        if self.at(b)[1] <= height + TINY:
             return b
         if self.radius:
             return math.acos((self.start[1] - height) / self.radius)
@@ -140,11 +144,9 @@ class Section:
     """Radius, floor and ceiling of the grounded cylinder."""
 
 
-def graded(low: float, high: float, fine_at: float | None) -> list[float]:
-    """Ends of parts of an interval; they halve towards one of its ends, or are equal quarters."""
-    if fine_at is None:
-        return np.linspace(low, high, 5).tolist()
-    steps = [0.0] + [0.5**k for k in range(HALVINGS, -1, -1)]
+def graded(low: float, high: float, fine_at: float, halvings: int = HALVINGS) -> list[float]:
+    """Ends of parts of an interval that halve towards one of its ends."""
+    steps = [0.0] + [0.5**k for k in range(halvings, -1, -1)]
     far = high if fine_at == low else low
     parts = [fine_at + (far - fine_at) * u for u in steps]
     return parts if fine_at == low else parts[::-1]
@@ -177,12 +179,12 @@ class Drawing:
             self._append(["line", a, b], left, right, name)
 
     def piece(
-        self, piece: Piece, ends: tuple[float, float], right: str, fine: float | None
-    ) -> None:
-        """Part of a body's outline, ``right`` beside it."""
-        if ends[1] - ends[0] < 1e-12:
-            return
-        parts = graded(*ends, fine)
+        self, piece: Piece, ends: tuple[float, float], right: str, fine: float
+    ) -> list[float]:
+        """Part of a body's outline, ``right`` beside it; radii of its points."""
+        if ends[1] - ends[0] < TINY:
+            return []
+        parts = graded(*ends, fine, WEDGE)
         for s, e in pairwise(parts):
             if not piece.radius:
                 self.line(piece.at(s), piece.at(e), "", right, "body")
@@ -192,6 +194,7 @@ class Drawing:
             joint = self.geometry.AppendPoint(1e3 * corner[0], 1e3 * corner[1])
             a, b = self.point(*piece.at(s)), self.point(*piece.at(e))
             self._append(["spline3", a, joint, b], "", right, "body")
+        return [piece.at(s)[0] for s in parts]
 
     def _append(self, shape: list[Any], left: str, right: str, name: str) -> None:
         number = {"": 0} | {n: k + 1 for k, n in enumerate(self.REGIONS)}
@@ -240,11 +243,10 @@ def draw(s: Section) -> Drawing:
         cut = graded(a, b, b if name == "electrode" else a)
         for p, q in pairwise(cut):
             d.line((p, 0), (q, 0), above, beneath, name)
-    contact = body(d, s, top)
+    beside = body(d, s, top)
     if t:
         outer = "" if s.fabric else "air"
-        cut = graded(contact, ext, contact)
-        for p, q in pairwise(cut):
+        for p, q in pairwise([*beside, ext]):
             d.line((p, t), (q, t), outer, "cover", "ground" if s.fabric else "inner")
         d.line((ext, 0), (ext, t), "cover", "air", "inner")
     if s.fabric:
@@ -256,19 +258,24 @@ def draw(s: Section) -> Drawing:
     return d
 
 
-def body(d: Drawing, s: Section, top: str) -> float:
-    """Draw the axis above the electrode and the body; radius where cover and body part [m]."""
+def body(d: Drawing, s: Section, top: str) -> list[float]:
+    """Draw the axis above the electrode and the body.
+
+    Returns:
+        Radii [m] of points of the cover's outer face, from where it parts from the body. They are
+        those of the body's own points: the wedge between both is cut into slices.
+    """
     t, ceiling = s.thickness, s.domain[2]
     if not s.outline:
         d.line((0, t), (0, 0), top, "", "axis")
         if not s.fabric:
             d.line((0, ceiling), (0, t), "air", "", "axis")
-        return 0.0
+        return [0.0]
     lowest = s.outline[0].at(s.outline[0].ends[0])[1]
     d.line((0, min(t, lowest)), (0, 0), top, "", "axis")
-    if lowest > t + 1e-12:
+    if lowest > t + TINY:
         d.line((0, lowest), (0, t), "air", "", "axis")
-    contact = 0.0
+    contact, radii = 0.0, []
     for piece in s.outline:
         a, b = piece.ends
         part = piece.reaches(t)
@@ -276,10 +283,11 @@ def body(d: Drawing, s: Section, top: str) -> float:
             contact = piece.at(part)[0]
             d.piece(piece, (a, part), "cover", part)
         if not s.fabric:
-            d.piece(piece, (part, b), "air", part)
+            radii += d.piece(piece, (part, b), "air", part)
     if not s.fabric:
         d.line((0, ceiling), s.outline[-1].at(s.outline[-1].ends[1]), "air", "", "axis")
-    return contact
+    furthest = radii.index(max(radii)) + 1 if radii else 0
+    return [contact, *(r for r in radii[:furthest] if r > contact + TINY)]
 
 
 def solved(mesh: Any, order: int, eps: Any, names: list[str]) -> tuple[Array, list[Any]]:
