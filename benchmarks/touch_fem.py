@@ -339,18 +339,20 @@ def measure(case: Case, preset: str, hard: bool) -> list[Row]:
     return rows
 
 
+def show(rows: list[Row]) -> None:
+    """Print the errors of a case."""
+    print(f"\n{rows[0]['case']}: baseline {rows[0]['baseline_error']:+.2f} %")
+    print(f"{'':9s} {'gap, mm':>13s} {'strain':>7s} {'ΔC, fF':>9s} {'CapSense':>9s} "
+          f"{'error, %':>9s} {'estimate, %':>11s} {'reference, %':>12s}")  # fmt: skip
+    for r in rows:
+        print(f"{r['grounding']:9s} {-1e3 * r['depth']:13.2f} {max(r['strain'], 0):7.1f} "
+              f"{r['truth_fF']:9.1f} {r['delta_fF']:9.1f} {r['error']:+9.1f} "
+              f"{100 * r['solver_error_fF'] / r['truth_fF']:11.1f} "
+              f"{r['reference_error']:12.2f}", flush=True)  # fmt: skip
+
+
 def report(rows: list[Row]) -> None:
-    """Print errors, and what became of the targets."""
-    for name in dict.fromkeys(r["case"] for r in rows):
-        some = [r for r in rows if r["case"] == name]
-        print(f"\n{name}: baseline {some[0]['baseline_error']:+.2f} %")
-        print(f"{'':9s} {'gap, mm':>13s} {'strain':>7s} {'ΔC, fF':>9s} {'CapSense':>9s} "
-              f"{'error, %':>9s} {'estimate, %':>11s} {'reference, %':>12s}")  # fmt: skip
-        for r in some:
-            print(f"{r['grounding']:9s} {-1e3 * r['depth']:13.2f} {max(r['strain'], 0):7.1f} "
-                  f"{r['truth_fF']:9.1f} {r['delta_fF']:9.1f} {r['error']:+9.1f} "
-                  f"{100 * r['solver_error_fF'] / r['truth_fF']:11.1f} "
-                  f"{r['reference_error']:12.2f}")  # fmt: skip
+    """Print what became of the targets."""
     errors = np.array([r["error"] for r in rows])
     print(f"\nall: rms {np.sqrt((errors**2).mean()):.1f}, worst {np.abs(errors).max():.1f} %")
     for strain, target in TARGETS:
@@ -383,7 +385,10 @@ def main() -> None:
     for preset in [] if args.laws else args.presets:
         cases = [c for c in CASES if c.name in args.cases and not (args.hard and c.fabric)]
         print(f"preset {preset!r}")
-        rows = [row for case in cases for row in measure(case, preset, args.hard)]
+        rows = []
+        for case in cases:
+            rows += measure(case, preset, args.hard)
+            show([row for row in rows if row["case"] == case.name])
         out[preset] = rows
         report(rows)
     if args.output:
