@@ -158,7 +158,9 @@ def parse_design(
     unit = length_unit([e.surface.area for e in electrodes]) if electrodes else 1.0
     electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack, unit)) for e in electrodes]
     conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
-    conductors = [Conductor(c.name, c.role, snap_to_layers(c.surface, stack, unit)) for c in conductors]
+    conductors = [
+        Conductor(c.name, c.role, snap_to_layers(c.surface, stack, unit)) for c in conductors
+    ]
     if "bend" in data:
         radius = read_bend(DesignTable(data["bend"], source, "bend", limit))
         if slabs := [layer.name for layer in layers if not layer.facets]:
