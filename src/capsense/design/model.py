@@ -312,13 +312,14 @@ def _apart(one: Layer, other: Layer, unit: float, source: str) -> None:
         point = overlap(one.surface, other.surface)
         if point is not None:
             raise DesignError(
-                f"{source}: {_label(other)}: overlaps {_label(one)} at {_at(unit * point)}; move one of "
-                "them or cut it back in CAD, so that they share no more than flat faces"
+                f"{source}: {_label(other)}: overlaps {_label(one)} at {_at(unit * point)}; move "
+                "one of them or cut it back in CAD, so that they share no more than flat faces"
             )
     else:
         raise DesignError(
             f"{source}: {_label(other)}: overlaps {_label(one)} over {_at(unit * (high - low))} at "
-            f"{_at(unit * (low + high) / 2)}; change z, size or center so that they only share a face"
+            f"{_at(unit * (low + high) / 2)}; change z, size or center so that they only share a "
+            "face"
         )
 
 
@@ -338,16 +339,16 @@ def _no_short(
         area = coplanar_overlap(one.surface, other.surface)
         if area > TOUCH**2:
             raise DesignError(
-                f"{source}: {_label(other)}: lies on {_label(one)} over {unit**2 * area * 1e6:.6g} mm² "
-                f"at {_at(unit * point)}; cut one of them back, they may only share edges"
+                f"{source}: {_label(other)}: lies on {_label(one)} over "
+                f"{unit**2 * area * 1e6:.6g} mm² at {_at(unit * point)}; cut one of them back, they may only share edges"
             )
         return
     fix = "move them apart (center, z) or reduce their size"
     if isinstance(one, Electrode) and isinstance(other, Conductor):
         fix = f"set clearance = 0.0005 on {_label(other)} or move it to another z"
     raise DesignError(
-        f"{source}: {_label(one)}: touches or overlaps {_label(other)} at {_at(unit * point)}, a short "
-        f"circuit; {fix}"
+        f"{source}: {_label(one)}: touches or overlaps {_label(other)} at {_at(unit * point)}, a "
+        f"short circuit; {fix}"
     )
 
 
@@ -359,10 +360,12 @@ def _not_crossing(sheet: Electrode | Conductor, layer: Layer, unit: float, sourc
     within = np.all(low >= layer.lower - TOUCH) and np.all(high <= layer.upper + TOUCH)
     if within or not enters_box(sheet.surface, layer.lower, layer.upper):
         return
+    span, other = (f"{_at(unit * a)} to {_at(unit * b)}" for a, b in (
+        (low, high), (layer.lower, layer.upper),
+    ))  # fmt: skip
     raise DesignError(
-        f"{source}: {_label(sheet)}: crosses the surface of {_label(layer)}: it spans {_at(unit * low)} "
-        f"to {_at(unit * high)}, the layer {_at(unit * layer.lower)} to {_at(unit * layer.upper)}; put it on a face of "
-        f"the layer (such as z = {unit * layer.upper[2]:g}), or wholly inside or outside"
+        f"{source}: {_label(sheet)}: crosses the surface of {_label(layer)}: it spans {span}, the "
+        f"layer {other}; put it on a face of the layer (such as z = {unit * layer.upper[2]:g}), or wholly inside or outside"
     )
 
 
@@ -375,7 +378,7 @@ def _not_through(sheet: Electrode | Conductor, part: Layer, unit: float, source:
     point = crossing(sheet.surface.triangles, part.surface.triangles)
     if point is not None:
         raise DesignError(
-            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at {_at(unit * point)}, and "
-            "partly outside; put it wholly inside or outside, or flat on a flat face; where both "
+            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at {_at(unit * point)}, "
+            "and partly outside; put it wholly inside or outside, or flat on a flat face; where both "
             "are curved leave a gap of 0.2 mm, for they are made of flat pieces"
         )

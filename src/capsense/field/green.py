@@ -54,8 +54,9 @@ _MIDDLE = 0.05
 class GreenFunction:
     """The grounded Green's function of a design and the potentials of its terminals.
 
-    Lengths are in the design's ``unit``, points that functions take in metres. All tables are single precision and contiguous. With b_s(p) = 1/|p − s| − 1/|p − s*|, s* the
-    image of s in the floor, ψ_k(p) = Σ_s b_s(p) modes[s, k] and φ⁰_i(p) = Σ_s b_s(p) phi[s, i].
+    Lengths are in the design's ``unit``, those that functions take and give in metres. All tables
+    are single precision and contiguous. With b_s(p) = 1/|p − s| − 1/|p − s*|, s* the image of s in
+    the floor, ψ_k(p) = Σ_s b_s(p) modes[s, k] and φ⁰_i(p) = Σ_s b_s(p) phi[s, i].
     """
 
     floor: float
@@ -225,7 +226,7 @@ def build_green(
         raise FieldError(f"the Green's function of design {design.name!r} is not finite")
     numbers = {
         "floor": floor, "box": design_box(design), "blends": np.array(settings.blends),
-        "clearance": surface.clearance(settings), "misfit": misfit,
+        "clearance": surface.clearance(settings), "misfit": misfit, "unit": 1.0,
     }  # fmt: skip
     return from_arrays({**dict(zip(TABLES, tables, strict=True)), **numbers})
 
