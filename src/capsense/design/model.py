@@ -340,7 +340,8 @@ def _no_short(
         if area > TOUCH**2:
             raise DesignError(
                 f"{source}: {_label(other)}: lies on {_label(one)} over "
-                f"{unit**2 * area * 1e6:.6g} mm² at {_at(unit * point)}; cut one of them back, they may only share edges"
+                f"{unit**2 * area * 1e6:.6g} mm² at {_at(unit * point)}; "
+                "cut one of them back, they may only share edges"
             )
         return
     fix = "move them apart (center, z) or reduce their size"
@@ -365,7 +366,8 @@ def _not_crossing(sheet: Electrode | Conductor, layer: Layer, unit: float, sourc
     ))  # fmt: skip
     raise DesignError(
         f"{source}: {_label(sheet)}: crosses the surface of {_label(layer)}: it spans {span}, the "
-        f"layer {other}; put it on a face of the layer (such as z = {unit * layer.upper[2]:g}), or wholly inside or outside"
+        f"layer {other}; put it on a face of the layer (such as "
+        f"z = {unit * layer.upper[2]:g}), or wholly inside or outside"
     )
 
 
@@ -378,7 +380,7 @@ def _not_through(sheet: Electrode | Conductor, part: Layer, unit: float, source:
     point = crossing(sheet.surface.triangles, part.surface.triangles)
     if point is not None:
         raise DesignError(
-            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at {_at(unit * point)}, "
-            "and partly outside; put it wholly inside or outside, or flat on a flat face; where both "
-            "are curved leave a gap of 0.2 mm, for they are made of flat pieces"
+            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at "
+            f"{_at(unit * point)}, and partly outside; put it wholly inside or outside, or flat on "
+            "a flat face; where both are curved leave a gap of 0.2 mm: they are made of flat pieces"
         )
