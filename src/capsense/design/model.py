@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 _INFINITY = 1e5
 """How many box sizes below an open domain its ground lies."""
+_SIGHT = 10.0
+"""How many box sizes beyond an open domain bodies still count."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Domain:
     """The grounded box around a sensor, centred in x and y, its floor at z = −backplane.
 
     An open domain has no walls: ground is at infinity, and the box only says where bodies are
-    looked for.
+    mostly. They count far beyond it.
     """
 
     size: tuple[float, float, float] = (0.5, 0.5, 0.5)
@@ -64,6 +66,15 @@ class Domain:
     def upper(self) -> Array:
         """Upper corner of the box [m] in the sensor frame, shape (3,)."""
         return self.lower + np.array(self.size)
+
+    @property
+    def sight(self) -> Array:
+        """Corners of the box beyond which bodies do not count [m], shape (2, 3): the walls.
+
+        Of an open domain it reaches so much farther that what lies beyond it changes nothing.
+        """
+        beyond = _SIGHT * max(self.size) if self.open else 0.0
+        return np.array([self.lower - beyond, self.upper + beyond])
 
     def measured_in(self, unit: float) -> Domain:
         """The same domain with lengths in a unit [m]."""

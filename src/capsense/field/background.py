@@ -120,10 +120,11 @@ def build_background(
     capacitance = 0.5 * unit * (capacitance + capacitance.T)
     if not (np.isfinite(densities).all() and np.isfinite(capacitance).all()):
         raise FieldError(f"the background field of design {name!r} is not finite")
-    green = replace(build_green(solution, densities, begin), unit=unit)
+    green = build_green(solution, densities, begin)
     if has_even_face(design):
-        table = gap_table_of(solution, settings.panel_scale, green.clearance, begin)
+        table = gap_table_of(solution, settings.panel_scale, green, begin)
         green = replace(green, gap=table)
+    green = replace(green, unit=unit)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)
 
