@@ -37,14 +37,15 @@ class Sensor(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Where everything is: position [m] and quaternion (x, y, z, w) in the world's frame."""
+    """Where everything is: position, over the solver's ``length``, and quaternion (x, y, z, w) in
+    the world's frame."""
 
     bodies: NDArray[Any]
     """Shape (e, b, 7)."""
     sensors: NDArray[Any]
     """Shape (e, s, 7)."""
     middle: NDArray[Any]
-    """Middle of the domain in the sensor frame [m], shape (3,)."""
+    """Middle of the domain in the sensor frame, shape (3,)."""
 
 
 class Found(NamedTuple):
@@ -217,6 +218,12 @@ def _placed(
     return True
 
 
+def _in_units(solver: SurfaceSolver, bodies: Array, sensors: Array) -> Poses:
+    """Poses, (e, b, 7) and (e, s, 7), with lengths as the solver's kernels take them."""
+    length = np.array([solver.length] * 3 + [1.0] * 4)
+    return Poses(bodies / length, sensors / length, solver.middle)
+
+
 class CpuCore:
     """Solves all sensors of all environments.
 
@@ -237,7 +244,7 @@ class CpuCore:
         """
         (e, b, _), s = bodies.shape, sensors.shape[1]
         solver, terminals = self._solver, self._terminals
-        where = Poses(bodies, sensors, solver.middle)
+        where = _in_units(solver, bodies, sensors)
         green = solver.green
         m = green.terminals
         slope = np.zeros((e if jacobian else 0, s, b, m, m, 6))
@@ -254,14 +261,17 @@ class CpuCore:
                 f"{len(failed)} of {e} environments have no solution, the first is {failed[0]}: "
                 "look for bodies that coincide"
             )
-        n, change = terminals.electrodes, terminals.screened(UNIT * found.delta)
-        slopes = terminals.slope(change, UNIT * slope) if jacobian else None
-        change = terminals.change(change if loss is None else change - 1j * UNIT * loss)
+        n, unit = terminals.electrodes, solver.unit
+        change = terminals.screened(unit * found.delta)
+        slope[..., :3] *= UNIT
+        slope[..., 3:] *= unit
+        slopes = terminals.slope(change, slope) if jacobian else None
+        change = terminals.change(change if loss is None else change - 1j * unit * loss)
         shields = (terminals.empty + change.real)[..., :n, n:].sum(axis=-1)
         change = change[..., :n, :n]
         omega = 2 * np.pi * solver.excitation_frequency
         return FleetReading(
-            terminals.empty[:n, :n] + change.real, change.real, UNIT * found.error, shields,
+            terminals.empty[:n, :n] + change.real, change.real, unit * found.error, shields,
             conductance=None if loss is None else -omega * change.imag, jacobian=slopes,
         )  # fmt: skip
 
@@ -280,7 +290,7 @@ class CpuCore:
             nodes: How many such conductors can be nodes; None for a fleet on the CPU.
         """
         solver, table = self._solver, self._table.bodies
-        where, green = Poses(bodies, sensors, solver.middle), solver.green
+        where, green = _in_units(solver, bodies, sensors), solver.green
         sight = green.room, SHORE * green.extent
         records = np.empty(table.choice.shape[1], BODY)
         place = np.empty(len(records), np.int64)

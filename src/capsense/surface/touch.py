@@ -39,23 +39,24 @@ class Pressed:
     elastic: float
     """What its force would be without relaxation and hysteresis [N]."""
     depth: float
-    """How much lower it stands than its pose says [m]."""
+    """How much lower it stands than its pose says, in the length unit."""
 
 
 class CoverContact:
     """How bodies are pressed into a cover, step by step.
 
     Args:
-        cover: The cover.
-        gap: Cells of the design's gap table.
+        cover: The cover, in a length unit.
+        gap: Cells of the design's gap table, in the same unit.
         electrodes: How many of its terminals are electrodes, the first ones.
+        unit: The length unit [m].
     """
 
-    def __init__(self, cover: Cover, gap: Gap, electrodes: int) -> None:
-        self.cover, self._electrodes = cover, electrodes
+    def __init__(self, cover: Cover, gap: Gap, electrodes: int, unit: float) -> None:
+        self.cover, self._electrodes, self._unit = cover, electrodes, unit
         some = (gap.terminal >= 0) & (gap.terminal < electrodes) & (gap.soft.below >= 0.0)
         self._points = np.ascontiguousarray(gap.points[some], np.float64)
-        self._areas, self._owner = gap.areas[some].astype(float), gap.terminal[some]
+        self._areas, self._owner = unit**2 * gap.areas[some].astype(float), gap.terminal[some]
         self._states: dict[str | int, Viscosity] = {}
 
     def reset(self) -> None:
@@ -106,7 +107,7 @@ class CoverContact:
             for name, state in self._states.items():
                 if name not in touching:
                     state.force(0.0, time)
-        return Touch(force, deepest, total), found
+        return Touch(force, self._unit * deepest, total), found
 
     def lower(self, records: NDArray[np.void], pressed: Pressed) -> None:
         """Put a body that a force holds to the height at which it is carried.
@@ -136,7 +137,7 @@ class CoverContact:
         return out
 
     def _heights(self, rows: NDArray[np.void], spans: Array, held: bool) -> tuple[Array, Array]:
-        """Heights of a body's underside over the cover's face, and areas of the cells [m, m²].
+        """Heights of a body's underside over the cover's face, and areas of the cells [m²].
 
         Of the cells that it may be pressed into; where a force holds it, of those that are at most
         the cover's thickness higher than the lowest one.
@@ -157,12 +158,12 @@ class CoverContact:
         high = np.minimum(high, fine.max(axis=0) + size)
         points, size = _grid(low, high, _FINE)
         height = undersides(rows, points, highest, exact) - top
-        return height, np.full(len(height), size.prod())
+        return height, np.full(len(height), self._unit**2 * size.prod())
 
     def _depth(
         self, height: Array, area: Array, force: float, state: Viscosity | None, time: float | None
     ) -> float:
-        """How far a body has to be lowered for a force to be carried [m]."""
+        """How far a body has to be lowered for a force to be carried, in the length unit."""
         if state is not None and time is not None:
             force = state.elastic(force, time)
         if force <= 0.0:  # to where it just touches, if it is in the cover
@@ -170,7 +171,7 @@ class CoverContact:
         return depth_of_force(height, area, force, self.cover.thickness, self.cover.law)
 
     def _electrode_forces(self, rows: NDArray[np.void]) -> tuple[Array, Array]:
-        """Elastic forces [N] and largest compressions [m] above the electrodes, (m,) each."""
+        """Elastic forces [N] and largest compressions above the electrodes, (m,) each."""
         cover, top = self.cover, float(self.cover.upper[2])
         height = undersides(rows, self._points, top, _EXACT * cover.thickness) - top
         strain = np.maximum(-height, 0.0) / cover.thickness
