@@ -174,6 +174,7 @@ class Design:
         lines = ["capsense design 1"]
         lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")
         lines += ["open"] * self.domain.open
+        lines += ["its cover gives way"] * (self.cover is not None)
         for electrode in self.electrodes:
             lines += ["electrode", *_surface_lines(electrode.surface)]
         others = [

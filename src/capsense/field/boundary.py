@@ -269,18 +269,23 @@ class BoundarySolution:
             rhs[rows] = self.contrast[rows, None] * flux.T
         return rhs / panels.areas[:, None]
 
-    def terminal_charges(self, densities: Array) -> Array:
-        """Free charge [C] on each terminal, shape (terminals, k)."""
+    def free_densities(self, densities: Array) -> Array:
+        """Free charge density [C/m²] on the panels of conductors, of total densities, (n, k)."""
         model, panels = self.model, self.model.panels
         mean = 0.5 * (model.eps_front + model.eps_back)
         jump = model.eps_front - model.eps_back
         free = mean[:, None] * densities
-        rows = np.flatnonzero((model.owner >= 0) & (np.abs(jump) > 1e-12))
+        rows = np.flatnonzero((model.owner != INTERFACE) & (np.abs(jump) > 1e-12))
         if len(rows):
             grad = kernels.normal_gradient_matrix(rows, model.floor, panels)
             # eps0 E_n = -grad . n sigma / (4 pi)
             free[rows] -= jump[rows, None] * (grad @ densities) / (4 * math.pi)
-        charge = free * panels.areas[:, None]
+        return free
+
+    def terminal_charges(self, densities: Array) -> Array:
+        """Free charge [C] on each terminal, shape (terminals, k)."""
+        model = self.model
+        charge = self.free_densities(densities) * model.panels.areas[:, None]
         out = np.zeros((model.n_terminals, densities.shape[1]))
         driven = model.owner >= 0
         np.add.at(out, model.owner[driven], charge[driven])

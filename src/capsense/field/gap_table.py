@@ -35,6 +35,7 @@ from capsense.field.boundary import (
     BoundarySolution,
 )
 from capsense.field.panels import PLANE_TOL, Grading, concatenate, cut_facet, make_panels
+from capsense.field.pressed_table import PressedTable, pressed_table_of
 
 if TYPE_CHECKING:
     from capsense.field.green import GreenFunction
@@ -96,26 +97,40 @@ class GapTable:
     """(z + series) T_ij / eps0, with the plane at 1 V in the last column, shape (c, k, n + 1)."""
     blocks: NDArray[np.int64]
     """First cell of each block of neighbouring cells of one terminal, ascending, shape (q,)."""
+    pressed: PressedTable | None = None
+    """What compression of the cover changes, if it gives way."""
 
 
-_PREFIX = "gap_"
+_PREFIX, _PRESSED = "gap_", "pressed_"
 
 
 def to_arrays(table: GapTable) -> dict[str, NDArray[Any]]:
-    """All of a table, each name after ``gap_``; changes in half precision."""
-    out = {_PREFIX + name: np.asarray(value) for name, value in vars(table).items()}
+    """All of a table, each name after ``gap_`` or ``pressed_``; changes in half precision."""
+    own = {name: value for name, value in vars(table).items() if name != "pressed"}
+    out = {_PREFIX + name: np.asarray(value) for name, value in own.items()}
     change = np.asarray(table.change).transpose(2, 1, 0)  # packs better
-    return out | {_PREFIX + "change": change.astype(np.float16)}
+    out[_PREFIX + "change"] = change.astype(np.float16)
+    if table.pressed is not None:
+        out |= {_PRESSED + name: np.asarray(value) for name, value in vars(table.pressed).items()}
+        for name in ("change", "sheet_density"):
+            out[_PRESSED + name] = out[_PRESSED + name].astype(np.float16)
+    return out
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> GapTable | None:
     """Undo :func:`to_arrays`; None where there is no table."""
     if _PREFIX + "change" not in arrays:
         return None
-    values = {f.name: np.asarray(arrays[_PREFIX + f.name]) for f in fields(GapTable)}
+    own = [f.name for f in fields(GapTable) if f.name != "pressed"]
+    values: dict[str, Any] = {name: np.asarray(arrays[_PREFIX + name]) for name in own}
     change = np.ascontiguousarray(values["change"].transpose(2, 1, 0), np.float32)
     numbers = {name: float(values[name]) for name in ("validity", "top")}
-    return GapTable(**{**values, **numbers, "change": change})  # type: ignore[arg-type]
+    if _PRESSED + "strains" in arrays:
+        parts = {f.name: np.asarray(arrays[_PRESSED + f.name]) for f in fields(PressedTable)}
+        for name in ("change", "sheet_density"):
+            parts[name] = np.ascontiguousarray(parts[name], np.float32)
+        values["pressed"] = PressedTable(**parts)
+    return GapTable(**{**values, **numbers, "change": change})
 
 
 def is_flat(design: Design) -> bool:
@@ -288,7 +303,10 @@ def gap_table_of(
         scale = max(panel_scale, 1.0) * (count / _MOST) ** (1 / POWER)
         solution = BoundarySolution(solution.design, Accuracy(scale))
     densities = solution.densities(np.eye(solution.model.n_terminals))
-    return build_gap_table(solution, densities, green.clearance, green, progress)
+    table = build_gap_table(solution, densities, green.clearance, green, progress)
+    if solution.design.cover is None:
+        return table
+    return replace(table, pressed=pressed_table_of(solution, panel_scale, table, progress))
 
 
 def build_gap_table(
@@ -387,7 +405,7 @@ def _cells_of(
     """Gather panels in cells of the table; ``changes`` [C/m²] has shape (k, p, t + 1)."""
     areas = model.panels.areas[: model.sheet_panels]
     size = max(_CELL * validity, math.sqrt(areas[model.owner[: len(areas)] >= 0].sum() / _CELLS))
-    panel, points, area = _samples(model.panels, model.sheet_panels, 0.5 * size)
+    panel, points, area = samples(model.panels, model.sheet_panels, 0.5 * size)
     owner = model.owner[panel]
     place = np.floor((points - points.min(axis=0)) / size + 1e-6).astype(np.int64)
     key = np.column_stack([owner % (model.n_terminals + 1), place // _BLOCK, place])
@@ -434,7 +452,7 @@ def _columns_of(density: Array, terminal: Ints, areas: Array, terminals: int) ->
     return np.where(np.take_along_axis(wanted, best, axis=1), best, -1)
 
 
-def _samples(panels: Panels, count: int, size: float) -> tuple[Ints, Array, Array]:
+def samples(panels: Panels, count: int, size: float) -> tuple[Ints, Array, Array]:
     """Points no farther apart than ``size`` [m] all over the first panels, and their areas.
 
     Returns:

@@ -179,6 +179,8 @@ class Space(NamedTuple):
     extent: float
     cover: float
     validity: float
+    limit: float
+    """Largest compression of the cover [m]."""
 
 
 def cover_of(design: Design) -> float:
@@ -338,9 +340,23 @@ def beyond(points, space):
         if i < 2:
             depth = min(depth, STEEP * (c - space.box[0, i]), STEEP * (space.box[1, i] - c))
         else:
-            depth = min(depth, space.box[1, 2] - c)
+            depth = min(depth, space.box[1, 2] - space.limit - c)
     deep = (depth / space.validity - DEEP[0]) / DEEP[1] if space.cover < 1.0 else 0.0
     return smooth(max(math.sqrt(out) / (SHORE * space.extent), deep))
+
+
+@kernel
+def settle(points, space):
+    """Move points (k, 3) in the cover up to its face: what is pressed into it is in contact."""
+    for q in range(points.shape[0]):
+        depth = space.box[1, 2] - points[q, 2]
+        if 0.0 < depth <= space.limit:
+            inside = True
+            for i in range(2):
+                x = points[q, i]
+                inside = inside and space.box[0, i] < x < space.box[1, i]
+            if inside:
+                points[q, 2] = space.box[1, 2]
 
 
 @kernel

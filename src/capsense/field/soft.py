@@ -8,16 +8,15 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from capsense.cover import FLOATING, NONE
+from capsense.cover import NONE
 from capsense.design.model import Design
-from capsense.field.boundary import terminals
 from capsense.field.gap_table import GapTable
 from capsense.field.panels import PLANE_TOL
 
 Array = NDArray[np.float64]
 
-BODY, GROUND = -2, -1
-"""Codes of :attr:`Soft.target`."""
+BODY, FABRIC = 0, 1
+"""Codes of :attr:`Soft.top`."""
 
 
 class Soft(NamedTuple):
@@ -29,24 +28,38 @@ class Soft(NamedTuple):
     """Relative permittivity."""
     limit: float
     """Largest compression [m]."""
-    target: int
-    """What comes nearer as it is compressed: the body, ground, or the terminal of this index."""
+    top: int
+    """What comes nearer as it is compressed: the body, or a fabric."""
     spread: float
     """Bending length of the fabric on it [m]; 0 for none."""
     below: NDArray[Any]
     """Thickness over permittivity of what lies between each cell of the gap table and the cover
     [m]; -1 where the cover is not above it, or a conductor is between them, shape (c,)."""
+    bottom: float
+    """Height of its lower face [m]."""
+    strains: NDArray[Any]
+    change: NDArray[Any]
+    sheet_points: NDArray[Any]
+    sheet_areas: NDArray[Any]
+    sheet_terminals: NDArray[Any]
+    sheet_density: NDArray[Any]
+    """These as in :class:`~capsense.field.pressed_table.PressedTable`."""
 
 
 def no_soft(count: int) -> Soft:
     """For designs without a cover, whose table has a number of cells."""
-    return Soft(0.0, 1.0, 0.0, BODY, 0.0, np.full(count, -1.0, np.float32))
+    none = np.zeros(0, np.float32)
+    return Soft(
+        0.0, 1.0, 0.0, BODY, 0.0, np.full(count, -1.0, np.float32), 0.0, np.zeros(2),
+        np.zeros((0, 2, 1), np.float32), np.zeros((0, 2), np.float32), none,
+        np.zeros((0, 1), np.int64), np.zeros((0, 2, 1), np.float32),
+    )  # fmt: skip
 
 
 def pack_soft(table: GapTable, design: Design) -> Soft:
     """The cover of a design, for the cells of its gap table."""
-    cover = design.cover
-    if cover is None:
+    cover, pressed = design.cover, table.pressed
+    if cover is None or pressed is None:
         return no_soft(len(table.areas))
     points, bottom = np.asarray(table.points, float), float(cover.lower[2])
     over = (points[:, :2] > cover.lower[:2]).all(axis=1) & (points[:, 2] < bottom + PLANE_TOL)
@@ -72,11 +85,12 @@ def pack_soft(table: GapTable, design: Design) -> Soft:
         air = np.where(inside.all(axis=1), np.maximum(thick, 0.0), 0.0)
         below += air * (1.0 / layer.eps_r - 1.0)
     below += np.maximum(bottom - points[:, 2], 0.0)
-    names = terminals(design)
-    target = BODY if cover.top == NONE else GROUND
-    if cover.top == FLOATING:
-        target = names.index(f"{cover.name} top")
     return Soft(
-        cover.thickness, cover.eps_r, cover.limit, target, cover.bending_length,
-        np.where(over, np.maximum(below, 0.0), -1.0).astype(np.float32),
+        cover.thickness, cover.eps_r, cover.limit, BODY if cover.top == NONE else FABRIC,
+        cover.bending_length, np.where(over, np.maximum(below, 0.0), -1.0).astype(np.float32),
+        bottom, pressed.strains, np.ascontiguousarray(pressed.change, np.float32),
+        np.ascontiguousarray(pressed.sheet_points, np.float32),
+        np.ascontiguousarray(pressed.sheet_areas, np.float32),
+        np.ascontiguousarray(pressed.sheet_terminals, np.int64),
+        np.ascontiguousarray(pressed.sheet_density, np.float32),
     )  # fmt: skip

@@ -128,48 +128,75 @@ def local_change(bodies, near, node, green, matrix):
             continue
         for c in range(gap.blocks[k], gap.blocks[k + 1]):
             _add_cell(bodies, chosen, count, node, green, c, (point, room, moved), matrix)
-            if gap.soft.target == BODY and gap.soft.below[c] >= 0.0:
+            if gap.soft.top == BODY and gap.soft.below[c] >= 0.0:
                 _add_compressed(bodies, chosen, count, node, gap, c, (point, room), matrix)
 
 
 @kernel
 def _add_compressed(bodies, chosen, count, node, gap, c, work, matrix):
-    """Add what one cell changes as a body is pressed into the cover above it.
-
-    The parallel-plate law eps0 [1/l - 1/l_0] per area, l the length of the field line through the
-    cover over its permittivity, and what lies below it; l_0 that to its undeformed face.
-    """
-    length, at = compressed_length(bodies, chosen, count, gap, c, work)
+    """Add what one cell changes as a body is pressed into the cover above it."""
+    soft, n = gap.soft, gap.change.shape[2] - 1
+    x, y = float(gap.points[c, 0]), float(gap.points[c, 1])
+    length, at = compressed_length(bodies, chosen, count, gap, x, y, work)
     if at < 0:
         return
-    soft, i, j = gap.soft, gap.terminal[c], node[chosen[at]]
-    value = float(gap.areas[c]) / (4.0 * math.pi)
-    rest = float(soft.below[c])
-    value *= 1.0 / (rest + length / soft.eps) - 1.0 / (rest + soft.thickness / soft.eps)
-    if i >= 0:
-        matrix[i, i] += value
-    if j >= 0:
-        matrix[j, j] += value
-        if i >= 0:
-            matrix[i, j] -= value
-            matrix[j, i] -= value
+    i, body = gap.terminal[c], node[chosen[at]]
+    k, p = _strain_place(soft, length, float(soft.below[c]))
+    weight = float(gap.areas[c]) / (4.0 * math.pi * soft.thickness)
+    for col in range(n + 1):
+        value = (1.0 - p) * float(soft.change[c, k, col]) + p * float(soft.change[c, k + 1, col])
+        _add_to(matrix, gap, i, col, body, weight * value)
 
 
 @kernel
-def compressed_length(bodies, chosen, count, gap, c, work):
-    """Length of the field line through the cover at a cell [m], and the place of its body.
+def _add_to(matrix, gap, i, col, body, value):
+    """Add the charge that a cell of terminal i gains in a column of the table.
+
+    ``body`` is the row of the body above it, -1 for one at ground.
+    """
+    if col < gap.change.shape[2] - 1:
+        j = gap.columns[i, col]  # the last row, of index -1, is that of grounded sheets
+        if i >= 0 and j >= 0:
+            matrix[i, j] += 0.5 * value
+            matrix[j, i] += 0.5 * value
+    elif body >= 0:
+        if i >= 0:
+            matrix[i, body] += value
+            matrix[body, i] += value
+        matrix[body, body] -= value
+
+
+@kernel
+def _strain_place(soft, length, below):
+    """Place of a compressed length among the strains, and the share of the next one.
+
+    Densities are nearly linear in the reciprocal of the distance from the electrode.
+    """
+    strain, last = 1.0 - length / soft.thickness, soft.strains.shape[0] - 2
+    k = 0
+    while k < last and soft.strains[k + 1] < strain:
+        k += 1
+    rest = below * soft.eps
+    low = 1.0 / (rest + (1.0 - soft.strains[k]) * soft.thickness)
+    high = 1.0 / (rest + (1.0 - soft.strains[k + 1]) * soft.thickness)
+    share = (1.0 / (rest + length) - low) / (high - low)
+    return k, min(max(share, 0.0), 1.0)
+
+
+@kernel
+def compressed_length(bodies, chosen, count, gap, x, y, work):
+    """Length of the field line through the cover at (x, y) [m], and the place of its body.
 
     The place is -1 where no body is pressed into the cover there.
     """
     soft, (point, room) = gap.soft, work
-    x, y, z = float(gap.points[c, 0]), float(gap.points[c, 1]), gap.top - soft.thickness
     length, at = soft.thickness, -1
     for k in range(count):
-        off, _ = nearest(bodies[chosen[k]], x, y, z, point, room)
+        off, _ = nearest(bodies[chosen[k]], x, y, soft.bottom, point, room)
         if off < length:
             if off > 0.0:
                 dx, dy = point[0] - x, point[1] - y
-                off = _arc(off, math.sqrt(dx * dx + dy * dy), point[2] - z)
+                off = _arc(off, math.sqrt(dx * dx + dy * dy), point[2] - soft.bottom)
             if off < length:
                 length, at = max(off, soft.thickness - soft.limit), k
     return length, at
@@ -198,18 +225,7 @@ def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
     for col in range(n + 1):
         one = a * ((1.0 - p) * float(gap.change[c, k, col]) + p * float(gap.change[c, k + 1, col]))
         two = b * ((1.0 - q) * float(gap.change[c, m, col]) + q * float(gap.change[c, m + 1, col]))
-        value = one - two
-        if col < n:
-            j = gap.columns[i, col]  # the last row, of index -1, is that of grounded sheets
-            if i >= 0 and j >= 0:
-                matrix[i, j] += 0.5 * value
-                matrix[j, i] += 0.5 * value
-        elif node[body] >= 0:
-            j = node[body]
-            if i >= 0:
-                matrix[i, j] += value
-                matrix[j, i] += value
-            matrix[j, j] -= value
+        _add_to(matrix, gap, i, col, node[body], one - two)
 
 
 @compiled
@@ -217,7 +233,9 @@ def fabric_change(bodies, green, matrix):
     """Add what compression below a conducting fabric on the cover changes [m], 4π eps0 = 1.
 
     The fabric follows the bodies that are pressed into it, of whatever matter. Where it has a
-    bending length, compression falls off beside them over that.
+    bending length, compression falls off beside them over that. As a part of its area moves, the
+    matrix changes by the integral of eps E_i E_j over the volume that it sweeps (Hadamard's
+    formula), E_i the field at it with terminal i at 1 V.
 
     Args:
         bodies: Records of :data:`~capsense.elements.rigid.BODY`, shape (b,).
@@ -225,7 +243,7 @@ def fabric_change(bodies, green, matrix):
         matrix: Added to, shape (t, t).
     """
     gap, soft = green.gap, green.gap.soft
-    if soft.target == BODY:
+    if soft.top == BODY:
         return
     chosen, count = np.empty(bodies.shape[0], np.int64), 0
     for b in range(bodies.shape[0]):
@@ -236,56 +254,63 @@ def fabric_change(bodies, green, matrix):
                 count += 1
     if count == 0:
         return
-    depth = np.zeros(gap.areas.shape[0])
-    point, room = np.empty(9), np.empty(140)
-    for k in range(gap.block_radius.shape[0]):
-        x, y, reach = gap.block_center[k, 0], gap.block_center[k, 1], gap.block_radius[k]
-        for q in range(count):
-            off, _ = nearest(bodies[chosen[q]], x, y, gap.top, point, room)
-            if off < reach:
-                for c in range(gap.blocks[k], gap.blocks[k + 1]):
-                    if soft.below[c] >= 0.0:
-                        length, at = compressed_length(bodies, chosen, count, gap, c, (point, room))
-                        if at >= 0:
-                            depth[c] = soft.thickness - length
-                break
+    cells = soft.sheet_areas.shape[0]
+    depth, point, room = np.zeros(cells), np.empty(9), np.empty(140)
+    for c in range(cells):
+        x, y = float(soft.sheet_points[c, 0]), float(soft.sheet_points[c, 1])
+        length, at = compressed_length(bodies, chosen, count, gap, x, y, (point, room))
+        if at >= 0:
+            depth[c] = soft.thickness - length
     if soft.spread > 0.0:
         pressed = depth.copy()
-        _spread(pressed, gap, depth)
-    for c in range(depth.shape[0]):
-        i, j = gap.terminal[c], soft.target
-        if i < 0 or i == j or depth[c] <= 0.0:
+        _spread(pressed, soft, depth)
+    for c in range(cells):
+        if depth[c] <= 0.0:
             continue
-        rest, length = float(soft.below[c]), soft.thickness - depth[c]
-        value = float(gap.areas[c]) / (4.0 * math.pi)
-        value *= 1.0 / (rest + length / soft.eps) - 1.0 / (rest + soft.thickness / soft.eps)
-        matrix[i, i] += value
-        if j >= 0:
-            matrix[j, j] += value
-            matrix[i, j] -= value
-            matrix[j, i] -= value
+        weight = float(soft.sheet_areas[c]) / (4.0 * math.pi * soft.eps * soft.thickness)
+        for a in range(soft.sheet_terminals.shape[1]):
+            i = soft.sheet_terminals[c, a]
+            for b in range(a + 1):
+                j = soft.sheet_terminals[c, b]
+                if i >= 0 and j >= 0:
+                    value = weight * _swept(soft, c, a, b, depth[c] / soft.thickness)
+                    matrix[i, j] += value
+                    if i != j:
+                        matrix[j, i] += value
 
 
 @kernel
-def _spread(depth, gap, out):
+def _swept(soft, c, a, b, strain):
+    """Integral of two densities' product over strain at a cell of the fabric [V²].
+
+    Products times the square of the rest of the thickness are nearly constant.
+    """
+    out, density = 0.0, soft.sheet_density
+    for k in range(soft.strains.shape[0] - 1):
+        start, end = soft.strains[k], soft.strains[k + 1]
+        stop = min(end, strain)
+        if stop <= start:
+            break
+        one = float(density[c, k, a]) * float(density[c, k, b]) * (1.0 - start) ** 2
+        two = float(density[c, k + 1, a]) * float(density[c, k + 1, b]) * (1.0 - end) ** 2
+        share = (stop - start) / (end - start)
+        mean = one + 0.5 * share * (two - one)
+        out += mean * (1.0 / (1.0 - stop) - 1.0 / (1.0 - start))
+    return out
+
+
+@kernel
+def _spread(depth, soft, out):
     """Compression of the cells as a fabric carries it on: the largest of exp(-r / l) times each."""
-    soft = gap.soft
     for c in range(depth.shape[0]):
         if depth[c] <= 0.0:
             continue
-        for k in range(gap.block_radius.shape[0]):
-            x = gap.block_center[k, 0] - gap.points[c, 0]
-            y = gap.block_center[k, 1] - gap.points[c, 1]
-            far = math.sqrt(x * x + y * y) - gap.block_radius[k]
-            if far > 8.0 * soft.spread:
-                continue
-            for q in range(gap.blocks[k], gap.blocks[k + 1]):
-                if soft.below[q] >= 0.0:
-                    x = float(gap.points[q, 0] - gap.points[c, 0])
-                    y = float(gap.points[q, 1] - gap.points[c, 1])
-                    fall = math.exp(-math.sqrt(x * x + y * y) / soft.spread)
-                    out[q] = max(out[q], depth[c] * fall)
-    return out
+        for q in range(depth.shape[0]):
+            x = float(soft.sheet_points[q, 0] - soft.sheet_points[c, 0])
+            y = float(soft.sheet_points[q, 1] - soft.sheet_points[c, 1])
+            far = math.sqrt(x * x + y * y) / soft.spread
+            if far < 10.0:
+                out[q] = max(out[q], depth[c] * math.exp(-far))
 
 
 @kernel

@@ -37,6 +37,7 @@ from capsense.field.green_kernels import (
     distances,
     level_share,
     lift,
+    settle,
     source_potentials,
 )
 
@@ -81,7 +82,10 @@ def placed(bodies, cut, green):
 def _fill_leaves(bodies, cut, green, leaves, room):
     """The same; ``room`` is room to work in: two matrices and a vector of three."""
     moments, turn, middle = room
-    space = Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
+    gap = green.gap
+    space = Space(
+        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
+    )  # fmt: skip
     for j in range(cut.leaves.shape[0]):
         a, corners, points = cut.leaves[j], leaves.true[j], leaves.points[j]
         body, k = bodies[cut.body[a]], cut.node[a]
@@ -115,6 +119,7 @@ def _fill_leaves(bodies, cut, green, leaves, room):
                 corners[q, i] = points[q, i]  # before it is lifted
         leaves.beyond[j] = beyond(points, space)
         if space.cover < 1.0:
+            settle(points, space)
             lift(points, space.validity, space.box)
 
 

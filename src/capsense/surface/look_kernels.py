@@ -15,6 +15,7 @@ from capsense.field.green_kernels import (
     SHORE,
     Space,
     lift,
+    settle,
     point_potentials,
     smooth,
 )
@@ -121,6 +122,7 @@ def place(body, space, k, points, found):
         out += max(space.room[0, i] - x, x - space.room[1, i], 0.0) ** 2
     height = points[found, 2] - space.box[1, 2]
     if square < 4.0 * space.validity * space.validity and space.cover < 1.0:
+        settle(points[found : found + 1], space)
         lift(points[found : found + 1], space.validity, space.box)
         height, square = points[found, 2] - space.box[1, 2], 0.0
         for i in range(3):
@@ -177,7 +179,10 @@ def _look_into(body, green, coarser, looks, start, wanted):
         The row behind the last one that was filled, and how many points there are.
     """
     kids, extent, (points, rows, inner) = integers(body.kids), doubles(body.extent), wanted
-    space = Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
+    gap = green.gap
+    space = Space(
+        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
+    )  # fmt: skip
     looks.node[start], looks.told[start] = 0, 1.0
     row, stop, found = start - 1, start + 1, np.int64(0)
     while row + 1 < stop:

@@ -76,13 +76,14 @@ def _panels(body, cut, span):
     """
     first, stop = span
     group, weight = np.empty(stop - first, np.int64), np.empty(stop - first)
-    at = cut.leaves[stop - 1]
-    begin = at
-    while begin > 0 and cut.body[begin - 1] == cut.body[at]:
+    begin = end = cut.leaves[stop - 1]
+    while begin > 0 and cut.body[begin - 1] == cut.body[end]:
         begin -= 1
-    number, share = np.empty(at + 1 - begin, np.int64), np.empty(at + 1 - begin)
+    while end < cut.body.shape[0] and cut.body[end] == cut.body[begin]:
+        end += 1  # the last clusters may be out of reach, and have no leaf
+    number, share = np.empty(end - begin, np.int64), np.empty(end - begin)
     count = 0
-    for a in range(begin, at + 1):
+    for a in range(begin, end):
         if cut.node[a] < body.stored:
             number[a - begin], share[a - begin] = -1, 1.0
         for c in range(2):

@@ -287,7 +287,10 @@ def _score_nodes(body, green, nodes, looks, last, weight):
     """
     kids, many = integers(body.kids), 2 * nodes.shape[0]
     points, rows, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
-    space = Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
+    gap = green.gap
+    space = Space(
+        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
+    )  # fmt: skip
     for j in range(many):
         k, rows[j] = nodes[j // 2], last + j
         if j % 2 == 0:
