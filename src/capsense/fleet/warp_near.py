@@ -199,7 +199,7 @@ def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b:
             middle = middle_height(outlines, u, at, scale) - gap.top
             lowest = middle - reach_down(outlines, u, wp.transform_get_rotation(at), scale)
             near.below[b, v] = -lowest
-            out = middle >= 0.0 and lowest > -_REACH * gap.validity and lowest < 2.0 * gap.validity
+            out = middle >= 0.0 and lowest < 2.0 * gap.validity
             if lowest < 0.0:
                 near.foot[b, v] = lowest_point(outlines, u, at, scale)
     return out

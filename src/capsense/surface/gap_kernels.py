@@ -32,7 +32,7 @@ WAYS, EXACT = 30, 1e-4
 def near_bodies(bodies, green, dielectric=False):
     """Conductors, or dielectrics, with an outline within twice h0 of a flat design, (b,).
 
-    Not bodies that are mostly behind the face, or reach far behind it.
+    Not bodies that are mostly behind the face.
     """
     out, gap = np.zeros(bodies.shape[0], np.bool_), green.gap
     if gap.areas.shape[0] == 0:
@@ -42,7 +42,7 @@ def near_bodies(bodies, green, dielectric=False):
         if body.outline != 0 and (body.softness != 0.0) == dielectric:
             middle = middle_height(body) - gap.top
             lowest = (middle - reach_down(body)) / gap.validity
-            out[b] = middle >= 0.0 and -REACH[1] < lowest < 2.0
+            out[b] = middle >= 0.0 and lowest < 2.0
     return out
 
 

@@ -15,8 +15,8 @@ from capsense.field.green_kernels import (
     SHORE,
     Space,
     lift,
-    settle,
     point_potentials,
+    settle,
     smooth,
 )
 from capsense.field.grid_kernels import grid_values, to_grid
