@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
+from capsense.surface.between_kernels import Facing, add_between, facing_of, hold_apart, mark
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
 from capsense.surface.gap_kernels import (
     extent_of_body,
@@ -89,7 +90,12 @@ class Solution(NamedTuple):
 
 @compiled
 def prepared(
-    bodies: NDArray[np.void], green: Green, threshold: float, width: float
+    bodies: NDArray[np.void],
+    green: Green,
+    threshold: float,
+    width: float,
+    facing: Facing,
+    scored: NDArray[np.void],
 ) -> tuple[Cut, Leaves, Functions, System]:
     """Choose charge functions, and set up their system.
 
@@ -98,12 +104,16 @@ def prepared(
         green: Green's function of the design.
         threshold: Functions count that take up this part of an electrode's energy alone.
         width: They fade in up to so many times that.
+        facing: Conductors that are near each other.
+        scored: The records that functions are chosen by.
 
     Returns:
         The cut, its leaves, its functions and their system.
     """
-    cut = chosen(bodies, green, threshold, width)
-    cut, leaves = reached(cut, placed(bodies, cut, green))
+    cut = chosen(scored, green, threshold, width, facing)
+    leaves = placed(bodies, cut, green)
+    hold_apart(bodies, facing, leaves, green)
+    cut, leaves = reached(cut, leaves)
     rows = leaf_rows(leaves.points, leaves.beyond, green)
     pairs = leaf_pairs(leaves, green.floor)
     add_parts(bodies, cut, leaves, pairs)
@@ -188,8 +198,14 @@ def solve_lifted(
     if near.any():
         bodies = bodies.copy()  # what follows changes them
         press_out(bodies, near, green)
+    facing, scored, pressed = facing_of(bodies), bodies, near.copy()
+    if facing.first.shape[0] > 0:
+        scored = bodies.copy()
+        as_nodes(scored, near, green)
+        mark(facing, near)
+        bodies = bodies.copy()
     m, nodes, node, capacitance = as_nodes(bodies, near, green)
-    cut, leaves, functions, system = prepared(bodies, green, threshold, width)
+    cut, leaves, functions, system = prepared(bodies, green, threshold, width, facing, scored)
     if nodes > 0:
         system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
@@ -197,7 +213,8 @@ def solve_lifted(
     weights = np.zeros((m, m))
     if near.any():
         local, none = np.zeros(delta.shape), np.zeros(0)
-        local_change(bodies, near, node, green, local)
+        local_change(bodies, pressed, node, green, local)
+        add_between(bodies, facing, node, local)
         delta += local
         weights = potentials_of(delta, m, nodes, capacitance)
         delta, left = congruent(weights, delta, capacitance), congruent(weights, left, none)
