@@ -38,7 +38,7 @@ SHARE = 0.1
 """Length by which bodies are held apart, over the second-largest extent of the smaller one."""
 PANEL = 0.4
 """The same, over the larger panels of the two, at least."""
-CLUSTER = 2.0, 3.0
+CLUSTER = 4.0, 6.0
 """Extents of clusters, over that length, at which they come to be split, and are."""
 REACH = 2.5, 3.0
 """Distances between bodies, over that length, from which on none comes to be split, and none is."""
