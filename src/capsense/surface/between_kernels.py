@@ -59,7 +59,9 @@ _SAMPLES = 64
 class Facing(NamedTuple):
     """Conductors of different potentials that are near each other, p pairs of them."""
 
+    count: int
     first: NDArray[Any]
+    """Their bodies, shapes (p,)."""
     second: NDArray[Any]
     length: NDArray[Any]
     """Length L by which they are held apart [m], shape (p,)."""
@@ -102,13 +104,13 @@ def facing_of(bodies):
             first[p], second[p], length[p] = a, b, size
             weight[p] = smooth((REACH[1] - apart / size) / (REACH[1] - REACH[0]))
             p += 1
-    return Facing(first[:p], second[:p], length[:p], weight[:p], point, room)
+    return Facing(p, first[:p], second[:p], length[:p], weight[:p], point, room)
 
 
 @compiled
 def mark(facing, near):
     """Mark bodies that face another one, shape (b,)."""
-    for p in range(facing.first.shape[0]):
+    for p in range(facing.count):
         near[facing.first[p]] = near[facing.second[p]] = True
 
 
@@ -231,7 +233,7 @@ def apart(distance, length):
 def crowded(bodies, facing, b, k):
     """How far cluster k of body b has to be split since it is near another conductor, 0 to 1."""
     out, body = 0.0, bodies[b]
-    for p in range(facing.first.shape[0]):
+    for p in range(facing.count):
         if facing.first[p] == b:
             other = facing.second[p]
         elif facing.second[p] == b:
@@ -270,7 +272,7 @@ def hold_apart(bodies, facing, leaves, green):
         leaves: Clusters that are represented by themselves; their points are moved.
         green: Green's function of the design.
     """
-    for p in range(facing.first.shape[0]):
+    for p in range(facing.count):
         for side in range(2):
             b, other = facing.first[p], facing.second[p]
             if side == 1:
@@ -322,7 +324,7 @@ def add_between(bodies, facing, node, matrix):
         node: Row of each body that is a node, else -1, shape (b,).
         matrix: Added to, shape (t, t).
     """
-    for p in range(facing.first.shape[0]):
+    for p in range(facing.count):
         a, b = facing.first[p], facing.second[p]
         if _second_extent(bodies[b]) < _second_extent(bodies[a]):
             a, b = b, a

@@ -194,17 +194,18 @@ def solve_lifted(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
 ) -> Solution:
     """As :func:`solve`; of near dielectrics, nothing of what the lift removes is added."""
-    near = near_bodies(bodies, green)
-    if near.any():
+    near, facing = near_bodies(bodies, green), facing_of(bodies)
+    placed_as, scored, lifted = bodies, bodies, near.copy()
+    if near.any() or facing.count > 0:
         bodies = bodies.copy()  # what follows changes them
         press_out(bodies, near, green)
-    facing, scored, pressed = facing_of(bodies), bodies, near.copy()
-    if facing.first.shape[0] > 0:
+    if facing.count > 0:
         scored = bodies.copy()
         as_nodes(scored, near, green)
         mark(facing, near)
-        bodies = bodies.copy()
     m, nodes, node, capacitance = as_nodes(bodies, near, green)
+    if facing.count == 0:
+        scored = bodies
     cut, leaves, functions, system = prepared(bodies, green, threshold, width, facing, scored)
     if nodes > 0:
         system = with_nodes(system, functions, node, m, nodes)
@@ -213,8 +214,8 @@ def solve_lifted(
     weights = np.zeros((m, m))
     if near.any():
         local, none = np.zeros(delta.shape), np.zeros(0)
-        local_change(bodies, pressed, node, green, local)
-        add_between(bodies, facing, node, local)
+        local_change(bodies, lifted, node, green, local)
+        add_between(placed_as, facing, node, local)
         delta += local
         weights = potentials_of(delta, m, nodes, capacitance)
         delta, left = congruent(weights, delta, capacitance), congruent(weights, left, none)
