@@ -453,9 +453,7 @@ def _over_face(body, other, length, face, work):
         _on_face(body, face, u - hu, v - hv, place)
         x, y, z = place[0], place[1], place[2]
         _on_face(body, face, u + hu, v + hv, place)
-        radius = 0.55 * math.sqrt(
-            (place[0] - x) ** 2 + (place[1] - y) ** 2 + (place[2] - z) ** 2
-        )
+        radius = 0.55 * math.sqrt((place[0] - x) ** 2 + (place[1] - y) ** 2 + (place[2] - z) ** 2)
         # sides of a curved patch
         _on_face(body, face, u - hu, v, place)
         x, y, z = place[0], place[1], place[2]

@@ -112,7 +112,8 @@ def choose(bodies, looks, first, threshold, width, facing):
 
     A function fades in while its score grows from ``threshold`` to ``width`` times that. A panel
     that was looked into is left to its parts as far as the function above it would be there if it
-    were one of parts. Clusters near a conductor of another potential, ``facing`` them, are split too.
+    were one of parts. Clusters that are large for the gap to a conductor that faces them are split
+    too.
     """
     queue = _Queue(
         np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64),
