@@ -44,7 +44,7 @@ def records_of(sim: cs.Simulator, *bodies: cs.Body) -> NDArray[np.void]:
 
 
 def held(sim: cs.Simulator, *bodies: cs.Body) -> int:
-    return int(facing_of(records_of(sim, *bodies)).count)
+    return int(facing_of(records_of(sim, *bodies)).pairs)
 
 
 def largest(sim: cs.Simulator, *bodies: cs.Body) -> float:
@@ -137,7 +137,7 @@ def test_bodies_apart_are_solved_as_before(simulators):
         records = records_of(sim, cs.Body(SHEET, cs.Pose((0.038, 0.025, 0.03)), "steel",
                                           grounding="floating"),
                          cs.Body(SHEET, cs.Pose((0.038, 0.025, 0.031 + gap)), "steel"))  # fmt: skip
-        assert (facing_of(records).count == 0) == same
+        assert (facing_of(records).pairs == 0) == same
         found = solve(records, solver.green, 0.015, 2.5, False).delta
         records["outline"] = 0
         plain = solve(records, solver.green, 0.015, 2.5, False).delta

@@ -59,7 +59,8 @@ _SAMPLES = 64
 class Facing(NamedTuple):
     """Conductors of different potentials that are near each other, p pairs of them."""
 
-    count: int
+    pairs: int
+    """How many."""
     first: NDArray[Any]
     """Their bodies, shapes (p,)."""
     second: NDArray[Any]
@@ -110,7 +111,7 @@ def facing_of(bodies):
 @compiled
 def mark(facing, near):
     """Mark bodies that face another one, shape (b,)."""
-    for p in range(facing.count):
+    for p in range(facing.pairs):
         near[facing.first[p]] = near[facing.second[p]] = True
 
 
@@ -233,7 +234,7 @@ def apart(distance, length):
 def crowded(bodies, facing, b, k):
     """How far cluster k of body b has to be split since it is near another conductor, 0 to 1."""
     out, body = 0.0, bodies[b]
-    for p in range(facing.count):
+    for p in range(facing.pairs):
         if facing.first[p] == b:
             other = facing.second[p]
         elif facing.second[p] == b:
@@ -272,7 +273,7 @@ def hold_apart(bodies, facing, leaves, green):
         leaves: Clusters that are represented by themselves; their points are moved.
         green: Green's function of the design.
     """
-    for p in range(facing.count):
+    for p in range(facing.pairs):
         for side in range(2):
             b, other = facing.first[p], facing.second[p]
             if side == 1:
@@ -324,7 +325,7 @@ def add_between(bodies, facing, node, matrix):
         node: Row of each body that is a node, else -1, shape (b,).
         matrix: Added to, shape (t, t).
     """
-    for p in range(facing.count):
+    for p in range(facing.pairs):
         a, b = facing.first[p], facing.second[p]
         if _second_extent(bodies[b]) < _second_extent(bodies[a]):
             a, b = b, a

@@ -196,15 +196,15 @@ def solve_lifted(
     """As :func:`solve`; of near dielectrics, nothing of what the lift removes is added."""
     near, facing = near_bodies(bodies, green), facing_of(bodies)
     placed_as, scored, lifted = bodies, bodies, near.copy()
-    if near.any() or facing.count > 0:
+    if near.any() or facing.pairs > 0:
         bodies = bodies.copy()  # what follows changes them
         press_out(bodies, near, green)
-    if facing.count > 0:
+    if facing.pairs > 0:
         scored = bodies.copy()
         as_nodes(scored, near, green)
         mark(facing, near)
     m, nodes, node, capacitance = as_nodes(bodies, near, green)
-    if facing.count == 0:
+    if facing.pairs == 0:
         scored = bodies
     cut, leaves, functions, system = prepared(bodies, green, threshold, width, facing, scored)
     if nodes > 0:
