@@ -20,6 +20,7 @@ from capsense.elements.parts import RefinedShape, refined
 from capsense.elements.rigid import BODY, RigidShape, rigid_shape
 from capsense.elements.store import functions_of
 from capsense.scene import TriMesh
+from capsense.surface.between_kernels import facing_of
 from capsense.surface.choose_kernels import Cut, chosen
 from capsense.surface.leaf_kernels import Leaves, placed
 from capsense.surface.part_kernels import add_parts
@@ -173,7 +174,7 @@ def pack(shape: RefinedShape, gap: float, eps_r: float = math.inf) -> Array:
 
 def cut_of(bodies: Array) -> tuple[Cut, Leaves]:
     green = green_of()
-    cut = chosen(bodies, green, 0.015, 2.5)
+    cut = chosen(bodies, green, 0.015, 2.5, facing_of(bodies[:0]))
     return reached(cut, placed(bodies, cut, green))
 
 
@@ -244,7 +245,8 @@ def test_wholes_have_the_energies_that_are_stored() -> None:
     the body, but for single precision."""
     shape = shape_of(LIMB)
     bodies = pack(shape, 1e-3)
-    cut, leaves, functions, system = prepared(bodies, green_of(), 0.015, 2.5)
+    none = facing_of(bodies[:0])
+    cut, leaves, functions, system = prepared(bodies, green_of(), 0.015, 2.5, none, bodies)
     pairs = np.zeros((len(leaves.extent),) * 2, np.float32)
     add_parts(bodies, cut, leaves, pairs)
     columns = np.zeros((len(leaves.extent), functions.solved))

@@ -21,6 +21,7 @@ from capsense.field.green_kernels import (
     lift,
     pack_green,
 )
+from capsense.surface.between_kernels import facing_of
 from capsense.surface.choose_kernels import chosen
 from capsense.surface.leaf_kernels import placed
 from capsense.surface.look_kernels import place
@@ -178,7 +179,8 @@ def test_curved_designs_lift_nothing() -> None:
     """Invariant: only of flat designs the space behind is known."""
     green = green_of()._replace(cover=np.inf)
     bodies = pack(Placed(cs.Sphere(0.03), (0.0, 0.0, 0.0299)))
-    leaves = placed(bodies, chosen(bodies, green, 0.015, 2.5), green)
+    cut = chosen(bodies, green, 0.015, 2.5, facing_of(bodies[:0]))
+    leaves = placed(bodies, cut, green)
     np.testing.assert_array_equal(leaves.points, leaves.true)
     assert beyond(np.array([(0.0, 0.0, -0.009)] * 4), space_of(green)) == 0.0
 
@@ -205,7 +207,8 @@ def test_what_crosses_a_wall_is_split_there() -> None:
     """Invariant: no long cluster stays in one piece across the wall, none far outside is split."""
     bodies = pack(Placed(cs.Capsule(0.03, 0.4), (0.15, 0.0, 0.08), (0.0, np.pi / 2, 0.0)))
     green = green_of()
-    leaves = placed(bodies, chosen(bodies, green, 0.015, 2.5), green)
+    cut = chosen(bodies, green, 0.015, 2.5, facing_of(bodies[:0]))
+    leaves = placed(bodies, cut, green)
     middle, half = leaves.points.mean(axis=1)[:, 0], 0.5 * leaves.extent
     across = np.abs(middle - 0.235) < 0.4 * half
     assert leaves.extent[across].max(initial=0.0) < 0.061

@@ -39,6 +39,7 @@ from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import BODY, Clusters, RigidShape, rigid_shape, split
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green, pack_green, point_potentials, source_potentials
+from capsense.surface.between_kernels import facing_of
 from capsense.surface.choose_kernels import Cut, choose
 from capsense.surface.look_kernels import Looks
 from capsense.surface.lossy import solve_lossy
@@ -64,6 +65,11 @@ NONE = math.inf
 WIDTH = 2.5
 ALL = 1e-12
 """A threshold below which no charge function falls that counts."""
+
+
+def prepared_alone(bodies, threshold):
+    """The system of bodies that face no other conductor."""
+    return prepared(bodies, packed_green(), threshold, WIDTH, facing_of(bodies[:0]), bodies)
 
 
 @cache
@@ -247,7 +253,7 @@ def test_chosen_functions_are_solved_and_the_others_estimated(name: str, thresho
     Clusters apart meet by their second moments here, by their points in the twin.
     """
     scene = scenes()[name]
-    cut = prepared(scene.packed(), packed_green(), threshold, WIDTH)[0]
+    cut = prepared_alone(scene.packed(), threshold)[0]
     chosen = chosen_of(cut, len(scene))
     delta, left, coarse = twin.reduced(
         scene.pieces, scene.trees, chosen, exact(), packed_green().room
@@ -302,9 +308,7 @@ def test_charges_on_the_leaves(name: str) -> None:
 @pytest.mark.parametrize("name", [n for n in SOME if n in NAMES or not interpreted.ON])
 def test_charges_are_what_derivatives_follow_from(name: str, threshold: float) -> None:
     """Analytic: as ΔC = φᵀ M φ, it changes by dφᵀ x + xᵀ dφ, what is estimated included."""
-    _, _, functions, system = prepared(
-        scenes()[name].packed(), packed_green(), threshold, WIDTH
-    )  # fmt: skip
+    _, _, functions, system = prepared_alone(scenes()[name].packed(), threshold)
     way = np.random.default_rng(3).normal(size=system.phi.shape)
     way *= 0.1 * np.abs(system.phi).max()
 
@@ -933,7 +937,7 @@ def test_bodies_that_coincide_leave_a_definite_matrix(shape: cs.Shape, threshold
     """Invariant: before anything is added to its diagonal. Rings of two fingers are off by 8 %
     where there are few of them."""
     twice = Scene([body(shape, (0.0, 0.01, 0.07), TILTED)] * 2)
-    matrix = prepared(twice.packed(), packed_green(), threshold, WIDTH)[3].matrix
+    matrix = prepared_alone(twice.packed(), threshold)[3].matrix
     assert np.linalg.eigvalsh(matrix).min() > 0
     one = Scene([twice[0]]).solved(threshold)
     both = twice.solved(threshold)
@@ -960,7 +964,7 @@ def cut_of(scene: Scene, threshold: float) -> tuple[Cut, Array, Array]:
     green = packed_green()
     scores = np.full(first[-1], math.nan)
     looks, rows = score(bodies, green, threshold, np.empty(green.terminals))
-    cut = choose(bodies, looks, rows, threshold, WIDTH)
+    cut = choose(bodies, looks, rows, threshold, WIDTH, facing_of(bodies[:0]))
     for b, row in enumerate(rows[:-1]):
         fill_scores(looks, row, scores[first[b] : first[b + 1]])
     for o, (_, shape) in zip(first, scene, strict=False):
@@ -1345,7 +1349,7 @@ def test_energy_of_charge_along_a_sheet() -> None:
     plain = Scene([body(BOX, (0.01, 0.0, 0.05), TILTED, eps_r=5.0, tie=20.0)]).packed()
     thin = plain.copy()
     thin["sheet"] = 2e-3
-    before, after = (prepared(b, packed_green(), 0.05, WIDTH)[2:] for b in (plain, thin))
+    before, after = (prepared_alone(b, 0.05)[2:] for b in (plain, thin))
     functions, solved = before[0], before[0].solved
     assert 1 < solved < len(functions.cluster)
     wanted = np.where(functions.cluster < 0, 0.0, 6.0 / (4.0 * 2e-3))

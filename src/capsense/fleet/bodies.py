@@ -79,6 +79,7 @@ class FleetCheck:
     """Environments and sensors whose readings lack the first millimetres in front of a flat design:
     of conductors where matter has losses, which the readings that they are compared with lack, too.
     On Warp also of dielectrics, and where more than 8 conductors that are not at ground are near.
+    Gaps between bodies that Warp does not resolve are part of ``rms`` and ``worst``.
     """
 
 

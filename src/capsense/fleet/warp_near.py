@@ -18,11 +18,10 @@ from capsense.field.green_kernels import Gap as HostGap
 from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import lowest_point, middle_height, nearest, reach_down
-from capsense.surface.gap_kernels import EXACT, REACH, WAYS
+from capsense.surface.gap_kernels import EXACT, WAYS
 
 wp.set_module_options({"enable_backward": False})
 
-_REACH = wp.constant(REACH[1])
 _WAYS, _EXACT, _SHUT = wp.constant(WAYS), wp.constant(EXACT), wp.constant(SHUT)
 _BLOCKS = 3
 """About so many blocks are a chunk."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
 from capsense.field.green_kernels import smooth
+from capsense.surface.between_kernels import crowded
 from capsense.surface.score_kernels import DECAY, score
 
 _FULL = 0.1
@@ -68,10 +69,10 @@ class Functions(NamedTuple):
 
 
 @compiled
-def chosen(bodies, green, threshold, width):
+def chosen(bodies, green, threshold, width, facing):
     """Return the cut of a scene: see :func:`score` and :func:`choose`."""
     looks, first = score(bodies, green, threshold, np.empty(green.terminals))
-    return choose(bodies, looks, first, threshold, width)
+    return choose(bodies, looks, first, threshold, width, facing)
 
 
 class _Queue(NamedTuple):
@@ -106,12 +107,13 @@ def _with_room(queue, filled, more):
 
 
 @compiled
-def choose(bodies, looks, first, threshold, width):
+def choose(bodies, looks, first, threshold, width, facing):
     """Return the clusters whose score is above a threshold, and those directly below them.
 
     A function fades in while its score grows from ``threshold`` to ``width`` times that. A panel
     that was looked into is left to its parts as far as the function above it would be there if it
-    were one of parts.
+    were one of parts. Clusters that are large for the gap to a conductor that faces them are split
+    too.
     """
     queue = _Queue(
         np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64),
@@ -121,13 +123,13 @@ def choose(bodies, looks, first, threshold, width):
     for b in range(bodies.shape[0]):
         queue = _with_room(queue, count, 2 * bodies[b].n - 1)
         _put(queue, count, b, (np.int64(0), first[b]), looks.score[first[b]], 1.0)
-        count, more = _split(bodies[b], looks, queue, count, (threshold, width))
+        count, more = _split(bodies, b, looks, queue, count, (threshold, width), facing)
         leaves += more
     return _collect(bodies, queue, count, leaves)
 
 
 @kernel
-def _split(body, looks, queue, start, limits):
+def _split(bodies, b, looks, queue, start, limits, facing):
     """Put the clusters of a body that a scene needs in the queue, parts of panels last.
 
     The whole is there, at ``start``.
@@ -135,6 +137,7 @@ def _split(body, looks, queue, start, limits):
     Returns:
         The place behind the last one, and how many of them are leaves.
     """
+    body = bodies[b]
     kids, stop, leaves = integers(body.kids), start + 1, 0
     for parts in range(2):
         i = start - 1
@@ -145,27 +148,30 @@ def _split(body, looks, queue, start, limits):
             queue.first[i], queue.fade[i] = -1, 0.0
             if queue.above[i] > 0.0 and kids[2 * queue.node[i]] >= 0:
                 queue.first[i] = stop
-                stop = _put_parts(body, looks, queue, (i, stop), limits)
+                least = crowded(bodies, facing, b, queue.node[i])
+                stop = _put_parts(body, looks, queue, (i, stop), limits, least)
             leaves += _whole(queue.first[i], queue.above[i]) > 0.0
     return stop, leaves
 
 
 @kernel
-def _put_parts(body, looks, queue, places, limits):
+def _put_parts(body, looks, queue, places, limits, least):
     """Put the two parts of the cluster at places[0] in the queue, from places[1] on.
+
+    Its function is faded in to ``least`` at least.
 
     Returns:
         The place behind them.
     """
     kids, (i, stop), (threshold, width) = integers(body.kids), places, limits
-    queue.fade[i] = min(_faded(queue.score[i], threshold, width), queue.above[i])
+    queue.fade[i] = min(max(_faded(queue.score[i], threshold, width), least), queue.above[i])
     row = queue.row[i]
     for c in range(2):
         part, above = kids[2 * queue.node[i] + c], queue.fade[i]
         seen = looks.kids[row] + c if row >= 0 and looks.kids[row] >= 0 else -1
         if part < body.stored <= kids[2 * part]:  # a panel that has parts
             share = _faded(looks.entry[seen], threshold, width) if seen >= 0 else 0.0
-            above = min(above, share)
+            above = min(above, max(share, least))
         value = looks.score[seen] if seen >= 0 else DECAY * queue.score[i]
         stop = _put(queue, stop, queue.body[i], (part, seen), value, above)
     return stop

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from capsense._dense import eliminate, whole_lines
 from capsense.field.green_kernels import Green
+from capsense.surface.between_kernels import facing_of
 from capsense.surface.gap_kernels import fabric_change, near_bodies, press_out
 from capsense.surface.series_kernels import in_series_lossy
 from capsense.surface.solve_kernels import COARSE, GAIN, factorise, leaf_charges
@@ -87,9 +88,10 @@ def _lossy_lifted(
     """As :func:`solve_lossy`, of bodies that are lifted near the design."""
     plain = records.copy()
     plain["tie"], plain["softness"] = 0.0, 0.0
-    cut, leaves, functions, system = prepared(plain, green, threshold, width)
+    none = facing_of(plain[:0])
+    cut, leaves, functions, system = prepared(plain, green, threshold, width, none, plain)
     plain["softness"] = 1.0
-    inside = prepared(plain, green, threshold, width)[3]
+    inside = prepared(plain, green, threshold, width, none, plain)[3]
     phi, real, below, own = system
     n, m = functions.solved, green.terminals
     factor = softness[functions.body]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from capsense._jit import compiled, kernel
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
+from capsense.surface.between_kernels import Facing, add_between, facing_of, hold_apart, mark
 from capsense.surface.choose_kernels import Cut, Functions, chosen, functions_of
 from capsense.surface.gap_kernels import (
     extent_of_body,
@@ -90,7 +91,12 @@ class Solution(NamedTuple):
 
 @compiled
 def prepared(
-    bodies: NDArray[np.void], green: Green, threshold: float, width: float
+    bodies: NDArray[np.void],
+    green: Green,
+    threshold: float,
+    width: float,
+    facing: Facing,
+    scored: NDArray[np.void],
 ) -> tuple[Cut, Leaves, Functions, System]:
     """Choose charge functions, and set up their system.
 
@@ -99,12 +105,16 @@ def prepared(
         green: Green's function of the design.
         threshold: Functions count that take up this part of an electrode's energy alone.
         width: They fade in up to so many times that.
+        facing: Conductors that are near each other.
+        scored: The records that functions are chosen by.
 
     Returns:
         The cut, its leaves, its functions and their system.
     """
-    cut = chosen(bodies, green, threshold, width)
-    cut, leaves = reached(cut, placed(bodies, cut, green))
+    cut = chosen(scored, green, threshold, width, facing)
+    leaves = placed(bodies, cut, green)
+    hold_apart(bodies, facing, leaves, green)
+    cut, leaves = reached(cut, leaves)
     rows = leaf_rows(leaves.points, leaves.beyond, green)
     pairs = leaf_pairs(leaves, green.floor)
     add_parts(bodies, cut, leaves, pairs)
@@ -195,12 +205,19 @@ def solve_lifted(
     bodies: NDArray[np.void], green: Green, threshold: float, width: float, adjoint: bool
 ) -> Solution:
     """As :func:`solve`; of near dielectrics, nothing of what the lift removes is added."""
-    near = near_bodies(bodies, green)
-    if near.any():
+    near, facing = near_bodies(bodies, green), facing_of(bodies)
+    placed_as, scored, lifted = bodies, bodies, near.copy()
+    if near.any() or facing.pairs > 0:
         bodies = bodies.copy()  # what follows changes them
         press_out(bodies, near, green)
+    if facing.pairs > 0:
+        scored = bodies.copy()
+        as_nodes(scored, near, green)
+        mark(facing, near)
     m, nodes, node, capacitance = as_nodes(bodies, near, green)
-    cut, leaves, functions, system = prepared(bodies, green, threshold, width)
+    if facing.pairs == 0:
+        scored = bodies
+    cut, leaves, functions, system = prepared(bodies, green, threshold, width, facing, scored)
     if nodes > 0:
         system = with_nodes(system, functions, node, m, nodes)
     delta, left, coarse, x, shift = reduced(functions, system, adjoint)
@@ -208,7 +225,8 @@ def solve_lifted(
     weights = np.zeros((m, m))
     if near.any():
         local, none = np.zeros(delta.shape), np.zeros(0)
-        local_change(bodies, near, node, green, local)
+        local_change(bodies, lifted, node, green, local)
+        add_between(placed_as, facing, node, local)
         delta += local
         weights = potentials_of(delta, m, nodes, capacitance)
         delta, left = congruent(weights, delta, capacitance), congruent(weights, left, none)
