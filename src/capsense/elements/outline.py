@@ -11,11 +11,14 @@ import numpy as np
 
 from capsense._jit import kernel
 from capsense._simd import doubles
+from capsense.scene.geometry_kernels import Boxes
 from capsense.scene.mesh_shape import TriangleShape
 from capsense.scene.shapes import Shape, ShapeKind
 
 BOX, SPHERE, CAPSULE, CYLINDER, ELLIPSOID, MESH = (1 + int(kind) for kind in ShapeKind if kind < 6)
 """Codes of ``BODY["outline"]``; 0 where a body has none."""
+CHANGING = 1 + MESH
+"""That of the near triangles of a surface that changes: such as a mesh, but never pressed out."""
 _STEPS = 30
 """Newton steps towards the nearest point of an ellipsoid, at most."""
 
@@ -26,14 +29,18 @@ def write_outline(record: np.void, shape: Shape) -> None:
     Arrays of the shape are pointed to, so that it has to be kept.
     """
     if isinstance(shape, TriangleShape):
-        boxes = shape._boxes
-        record["outline"], record["closed"] = MESH, shape.closed
-        record["triangles"] = boxes.triangles.ctypes.data
-        record["boxes"] = boxes.corners.ctypes.data
-        record["triangle_count"], record["levels"] = len(boxes.triangles), boxes.levels
+        write_triangles(record, shape._boxes, MESH, shape.closed)
     elif int(shape.kind) < MESH - 1:
         record["outline"], record["closed"] = 1 + int(shape.kind), True
         record["sizes"] = shape.params
+
+
+def write_triangles(record: np.void, boxes: Boxes, code: int, closed: bool) -> None:
+    """Enter triangles as the outline of a body, with a code of its own; they have to be kept."""
+    record["outline"], record["closed"] = code, closed
+    record["triangles"] = boxes.triangles.ctypes.data
+    record["boxes"] = boxes.corners.ctypes.data
+    record["triangle_count"], record["levels"] = len(boxes.triangles), boxes.levels
 
 
 @kernel
@@ -67,7 +74,7 @@ def reach_down(body):
 @kernel
 def middle_height(body):
     """Height of the middle of a body's outline [m]; for meshes, that of its bounding box."""
-    if body.outline != MESH:
+    if body.outline < MESH:
         return body.position[2]
     corners, r = doubles(body.boxes), body.rotation
     return body.position[2] + 0.5 * body.scale * (
