@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled
-from capsense.elements.pieces import ChangingBody, PieceArrays
+from capsense.elements.pieces import STEP_SLOPE, ChangingBody, PieceArrays
 from capsense.scene.geometry_kernels import Boxes, enclosed
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def near_triangles(
     chosen = _within(centers, moments, body.order, rotation, position, walls, face.top + reach)
     if not len(chosen):
         return None
-    corners = _triangles_of(body.pieces, chosen)
+    corners = _triangles_of(body.pieces, body.order, chosen)
     placed = corners @ rotation.T + position
     heights = placed[..., 2]
     lowest = heights.min(axis=1)
@@ -70,22 +70,61 @@ def near_triangles(
     return enclosed(corners)
 
 
-def _triangles_of(pieces: PieceArrays, chosen: Ints) -> Array:
-    """Triangles of some pieces [m], two for each rectangle, shape (k, 3, 3)."""
+def _triangles_of(pieces: PieceArrays, order: Ints, chosen: Ints) -> Array:
+    """Triangles of some pieces [m], shape (k, 3, 3)."""
     if pieces.corners is not None:
         return pieces.corners[chosen]
-    center, moment = pieces.centers[chosen, None], 3.0 * pieces.moments[chosen]
-    own = np.diagonal(moment, axis1=1, axis2=2)
-    along = np.where(own[:, :1] > 0.0, 0, 1)  # sides stand along y and z, or x and z
-    across = np.where((own[:, :1] > 0.0) & (own[:, 1:2] > 0.0), 1, 2)
-    one, two = (
-        np.take_along_axis(moment, k[..., None], axis=2)[..., 0]
-        / np.sqrt(np.take_along_axis(own, k, axis=1))
-        for k in (along, across)
-    )  # of a piece that stands upright, and of an image's pixel, which is a parallelogram
-    one, two = one[:, None], two[:, None]
-    a, b, c, d = center - one - two, center + one - two, center + one + two, center - one + two
-    return np.concatenate([a, b, c, a, c, d], axis=1).reshape(-1, 3, 3)
+    there = np.zeros(len(pieces.areas), np.bool_)
+    there[order] = True
+    return _fans(pieces.centers, pieces.moments, there, pieces.grid, chosen)
+
+
+@compiled
+def _fans(centers, moments, there, grid, chosen):
+    """Four triangles for each of some pieces of images, see :func:`_triangles_of`.
+
+    A corner of a pixel is at one part the mean depth of the four pixels that meet there, at three
+    parts the mean of what their planes say. The mean depth of a pixel's triangles is then that of
+    a curved surface, to the second order. At the rim of a surface it is what the planes say.
+    """
+    out, corner = np.empty((chosen.shape[0], 4, 3, 3)), np.empty((4, 3))
+    views, rows, columns = grid
+    size = rows * columns
+    for c in range(chosen.shape[0]):
+        i = chosen[c]
+        z, m = centers[i, 2], moments[i]
+        pixel = i < views * size
+        first, second = (0, 1) if pixel else ((1, 2) if m[0, 0] == 0.0 else (0, 2))
+        one, two = np.sqrt(3.0 * m[first, first]), np.sqrt(3.0 * m[second, second])
+        row, column = i % size // columns, i % columns
+        for q in range(4):
+            a, b = (1 if q in (1, 2) else -1), (1 if q > 1 else -1)
+            for k in range(3):
+                arms = a * m[k, first] / one + b * m[k, second] / two
+                corner[q, k] = centers[i, k] + 3.0 * arms
+            if not pixel:
+                continue
+            count, mean, planes = 0, 0.0, 0.0
+            for p in range(4):
+                u, v = a * (p % 2), b * (p // 2)
+                j = i + u + v * columns
+                if not (0 <= column + u < columns and 0 <= row + v < rows and there[j]):
+                    continue
+                if abs(centers[j, 2] - z) > 2.0 * STEP_SLOPE * (abs(u) * one + abs(v) * two):
+                    continue
+                n = moments[j]
+                planes += centers[j, 2] + (a - 2 * u) * one * n[0, 2] / n[0, 0]
+                planes += (b - 2 * v) * two * n[1, 2] / n[1, 1]
+                mean += centers[j, 2]
+                count += 1
+            corner[q, 2] = planes / count
+            if count == 4:
+                corner[q, 2] = 0.0625 * (mean + 3.0 * planes)
+        for q in range(4):
+            for k in range(3):
+                out[c, q, 0, k] = centers[i, k]
+                out[c, q, 1, k], out[c, q, 2, k] = corner[q, k], corner[(q + 1) % 4, k]
+    return out.reshape(-1, 3, 3)
 
 
 @compiled

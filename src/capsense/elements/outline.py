@@ -96,7 +96,8 @@ def nearest(body, x, y, z, out, room):
 
     Returns:
         The distance [m], negative inside; and how many normals there are: one on a face, two at an
-        edge, none at corners and where it is not known.
+        edge, none at corners. At edges and corners of a mesh it is one too, the way to the point:
+        it turns evenly while the point passes from triangle to triangle.
     """
     dx, dy, dz = x - body.position[0], y - body.position[1], z - body.position[2]
     r, inverse = body.rotation, 1.0 / body.scale
@@ -166,7 +167,6 @@ def nearest(body, x, y, z, out, room):
     else:
         distance = _on_mesh(body, px, py, pz, out, room)
         qx, qy, qz = out[0], out[1], out[2]
-        faces = int(out[3])
     if kind not in (BOX, CYLINDER) and faces == 1:
         size = math.copysign(max(abs(distance), 1e-12), distance)
         ux, uy, uz = (px - qx) / size, (py - qy) / size, (pz - qz) / size
@@ -208,7 +208,7 @@ def _nearest_on_triangle(t, o, x, y, z):
     After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5.
 
     Returns:
-        The squared distance, the point, and whether it lies within the triangle's edges.
+        The squared distance and the point.
     """
     ax, ay, az = t[o], t[o + 1], t[o + 2]
     ux, uy, uz = t[o + 3] - ax, t[o + 4] - ay, t[o + 5] - az
@@ -221,7 +221,7 @@ def _nearest_on_triangle(t, o, x, y, z):
         vx * vx + vy * vy + vz * vz,
     )
     d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
-    s, w, inner = 0.0, 0.0, False
+    s, w = 0.0, 0.0
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     if d1 <= 0.0 and d2 <= 0.0:
         pass
@@ -238,9 +238,9 @@ def _nearest_on_triangle(t, o, x, y, z):
         s = 1.0 - w
     else:
         whole = va + vb + vc
-        s, w, inner = vb / whole, vc / whole, True
+        s, w = vb / whole, vc / whole
     qx, qy, qz = ax + s * ux + w * vx, ay + s * uy + w * vy, az + s * uz + w * vz
-    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz, inner
+    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz
 
 
 @kernel
@@ -266,8 +266,7 @@ def _on_mesh(body, x, y, z, out, room):
             for m in range(first, last):
                 found = _nearest_on_triangle(triangles, 9 * m, x, y, z)
                 if found[0] < best:
-                    best, out[0], out[1], out[2], inner = found
-                    out[3] = 1.0 if inner else 0.0
+                    best, out[0], out[1], out[2] = found
             continue
         near, far = 2 * k + 1, 2 * k + 2
         to_near = _box2(corners, 6 * near, x, y, z)

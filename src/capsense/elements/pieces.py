@@ -47,6 +47,8 @@ class PieceArrays:
     """Second central moments of area over the area [m²], shape (n, 3, 3)."""
     corners: Array | None = None
     """Corners of triangles [m], shape (n, 3, 3); None for rectangles, which moments tell."""
+    grid: tuple[int, int, int] = 0, 0, 0
+    """Images, rows and columns of the first pieces, which are pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,8 @@ def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool
     wanted = ~np.isnan(centers[..., 2])
     sheet = 0.0 if deep.any() else layers.volume / float(areas[wanted].sum())
     centers[..., 2][~wanted] = 0.0
-    pieces = PieceArrays(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
+    centers, moments = centers.reshape(-1, 3), moments.reshape(-1, 3, 3)
+    pieces = PieceArrays(centers, areas.ravel(), moments, grid=depth.shape)
     tree = _pixel_tree(len(depth), (len(wanted) - len(depth)) // 4, *front.shape[1:], dx / dy)
     return tree, pieces, wanted.ravel(), sheet
 
