@@ -68,7 +68,7 @@ class PackedBodies:
         face = Face(green.box[0, :2], green.box[1, :2], gap.top, gap.top - gap.soft.limit)
         limits = 2.0 * gap.validity, REACH[1] * gap.validity
         for record, shape in zip(self.records, self.shapes, strict=True):
-            if not isinstance(shape, ChangingBody) or record["softness"] != 0.0:
+            if not isinstance(shape, ChangingBody) or record["sheet"] != 0.0:
                 continue
             found = near_triangles(shape, record["rotation"], record["position"], face, *limits)
             if found is not None:
