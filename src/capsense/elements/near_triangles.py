@@ -27,6 +27,8 @@ class Face(NamedTuple):
     """Its upper corner [m], shape (2,)."""
     top: float
     """Its height [m]."""
+    floor: float
+    """Height down to which a cover that gives way can be compressed [m]; else that of the face."""
 
 
 def near_triangles(
@@ -34,8 +36,8 @@ def near_triangles(
 ) -> Boxes | None:
     """Triangles of a surface within ``reach`` [m] of a face; None if all are farther than ``near``.
 
-    Physics engines let bodies overlap. What is below the face counts as on it, by as much as
-    ``reach`` below it; what is deeper is behind the design, and stays there.
+    Physics engines let bodies overlap. What is less than ``reach`` below the face counts as on it,
+    or in its cover as far as that can be compressed; what is deeper is behind the design.
 
     Args:
         body: The surface.
@@ -60,12 +62,12 @@ def near_triangles(
     lowest = heights.min(axis=1)
     if lowest.min() >= face.top + near or heights.max() < face.top - reach:
         return None
-    below = (lowest < face.top) & (lowest > face.top - reach)
+    below = (lowest < face.floor) & (lowest > face.top - reach)
     if below.any():
         below &= (placed[..., :2].min(axis=1) < face.high).all(axis=1)
         below &= (placed[..., :2].max(axis=1) > face.low).all(axis=1)
         placed = placed[below]
-        placed[..., 2] = np.maximum(placed[..., 2], face.top)
+        placed[..., 2] = np.maximum(placed[..., 2], face.floor)
         corners[below] = (placed - position) @ rotation
     return enclosed(corners)
 

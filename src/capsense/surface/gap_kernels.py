@@ -318,6 +318,8 @@ def lengths(off, faces, point, x, y, green, moved):
         return least, h0
     dx, dy, dz = point[0] - x, point[1] - y, point[2] - gap.top
     across, beside = math.sqrt(dx * dx + dy * dy), 0.0
+    if across < -dz < 2.0 * gap.soft.limit:  # of a surface without an inside, in the cover
+        return least, h0
     true = _arc(math.sqrt(across * across + dz * dz), across, dz)
     for i in range(2):
         out = max(green.box[0, i] - point[i], point[i] - green.box[1, i], 0.0)

@@ -61,7 +61,7 @@ class PackedBodies:
     """Triangles near the design that records point to."""
 
     def find_near(self, green: Green) -> None:
-        """Give changing conductors that are near a flat design an outline."""
+        """Give changing bodies near a flat design an outline; not sheets of dielectrics."""
         gap = green.gap
         if not len(gap.areas):
             return
