@@ -35,10 +35,16 @@ def pad(field_cache: Path) -> cs.Simulator:
     return cs.Simulator(DESIGNS / "pad10.toml", cache_dir=field_cache)
 
 
+def lengths(sim: cs.Simulator) -> tuple[float, float]:
+    """Height of the face and validity distance [m]."""
+    gap, unit = sim._solver.green.gap, sim._solver.length
+    return unit * gap.top, unit * gap.validity
+
+
 def place(sim: cs.Simulator, mesh: trimesh.Trimesh, gap: float) -> Array:
     """Where a mesh stands over the first electrode, its lowest vertex at a height [m]."""
     middle = sim.design.electrodes[0].surface.bounds.mean(axis=0)
-    top = sim._solver.green.gap.top
+    top, _ = lengths(sim)
     return np.array([middle[0], middle[1], top + gap - mesh.vertices[:, 2].min()])
 
 
@@ -118,9 +124,9 @@ def test_pressing_a_surface_onto_the_design(pad: cs.Simulator) -> None:
 def test_one_vertex_comes_near(pad: cs.Simulator) -> None:
     """Invariant: no step as one vertex of a sheet far away comes nearer than 2 h0, or h0."""
     vertices, faces = sheet(0.0)
-    h0 = pad._solver.green.gap.validity
+    top, h0 = lengths(pad)
     vertices = vertices + place(pad, trimesh.Trimesh(vertices, faces, process=False), 4.0 * h0)
-    middle, top = len(vertices) // 2, pad._solver.green.gap.top
+    middle = len(vertices) // 2
     drawn = cs.DeformableSurface(vertices, faces, material="steel")
 
     def reading(height: float) -> float:
@@ -137,7 +143,7 @@ def test_one_vertex_comes_near(pad: cs.Simulator) -> None:
 
 def test_nothing_changes_beyond_twice_h0(pad: cs.Simulator) -> None:
     """Invariant: no outline is made there, and readings have the bits of lifted bodies."""
-    h0 = pad._solver.green.gap.validity
+    _, h0 = lengths(pad)
     for gap, near in ((2.01 * h0, False), (1.99 * h0, True)):
         scene = surface(_BALL.vertices + place(pad, _BALL, gap), _BALL.faces)
         bodies = pad._solver.pack(pad._solver.look(scene))
@@ -169,7 +175,9 @@ def test_what_hangs_beside_or_behind_stays_there() -> None:
     def heights(z: Array) -> tuple[Array, Array]:
         moved = np.column_stack([vertices[:, :2], z])
         body = ChangingBody(*mesh_pieces(SurfaceMesh(moved, rest)))
-        found = near_triangles(body, np.eye(3), np.zeros(3), face, 2e-3, 8e-3)
+        record = body.record.copy()
+        record["rotation"] = np.eye(3)
+        found = near_triangles(body, record, face, 2e-3, 8e-3)
         assert found is not None
         over = np.abs(found.triangles[..., :2]).max(axis=(1, 2)) < 0.01
         return found.triangles[over, :, 2], found.triangles[~over, :, 2]

@@ -32,7 +32,7 @@ class Face(NamedTuple):
 
 
 def near_triangles(
-    body: ChangingBody, rotation: Array, position: Array, face: Face, near: float, reach: float
+    body: ChangingBody, record: np.void, face: Face, near: float, reach: float
 ) -> Boxes | None:
     """Triangles of a surface within ``reach`` [m] of a face; None if all are farther than ``near``.
 
@@ -41,7 +41,7 @@ def near_triangles(
 
     Args:
         body: The surface.
-        rotation, position: From its frame to that of the face, shapes (3, 3) and (3,).
+        record: Where it stands in the frame of the face, and how many times as large it is.
         face: The face.
         near: Height [m] below which the surface is near.
         reach: What is farther from the face is left out.
@@ -51,13 +51,15 @@ def near_triangles(
     """
     if body.pieces is None:
         return None
-    centers, moments = body.pieces.centers, body.pieces.moments
+    scale = float(record["scale"])
+    turn, position = scale * record["rotation"], record["position"]
     walls = np.array([face.low - reach, face.high + reach])
-    chosen = _within(centers, moments, body.order, rotation, position, walls, face.top + reach)
+    chosen = _within(body.pieces.centers, body.pieces.moments, body.order, turn, scale, position,
+                     walls, face.top + reach)  # fmt: skip
     if not len(chosen):
         return None
     corners = _triangles_of(body.pieces, body.order, chosen)
-    placed = corners @ rotation.T + position
+    placed = corners @ turn.T + position
     heights = placed[..., 2]
     lowest = heights.min(axis=1)
     if lowest.min() >= face.top + near or heights.max() < face.top - reach:
@@ -68,7 +70,7 @@ def near_triangles(
         below &= (placed[..., :2].max(axis=1) > face.low).all(axis=1)
         placed = placed[below]
         placed[..., 2] = np.maximum(placed[..., 2], face.floor)
-        corners[below] = (placed - position) @ rotation
+        corners[below] = (placed - position) @ turn / scale**2
     return enclosed(corners)
 
 
@@ -130,13 +132,13 @@ def _fans(centers, moments, there, grid, chosen):
 
 
 @compiled
-def _within(centers, moments, order, rotation, position, walls, highest):
+def _within(centers, moments, order, turn, scale, position, walls, highest):
     """Pieces that reach between two walls, (2, 2), and below a height [m], in the given order."""
     out, found = np.empty(order.shape[0], np.int64), 0
-    r = rotation
+    r = turn
     for i in order:
         m, x, y, z = moments[i], centers[i, 0], centers[i, 1], centers[i, 2]
-        arm = np.sqrt(12.0 * (m[0, 0] + m[1, 1] + m[2, 2]))  # no corner is farther away
+        arm = scale * np.sqrt(12.0 * (m[0, 0] + m[1, 1] + m[2, 2]))  # no corner is farther away
         if r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + position[2] - arm > highest:
             continue
         apart = False

@@ -70,7 +70,7 @@ class PackedBodies:
         for record, shape in zip(self.records, self.shapes, strict=True):
             if not isinstance(shape, ChangingBody) or record["sheet"] != 0.0:
                 continue
-            found = near_triangles(shape, record["rotation"], record["position"], face, *limits)
+            found = near_triangles(shape, record, face, *limits)
             if found is not None:
                 self.near.append(found)
                 write_triangles(record, found, CHANGING, False)

@@ -384,9 +384,7 @@ class SurfaceSolver:
         laid = self._laid.get(key)
         if laid is None or not laid.everywhere:
             laid, offsets = self._lay_out(view, matter, bodies, laid)
-            if (
-                len(self._laid) >= _LAYOUTS or not laid.rigid
-            ):  # what changes at each step is not kept
+            if len(self._laid) >= _LAYOUTS or not laid.rigid:  # what changes is not kept
                 self._laid.clear()
             self._laid[key] = laid
         records, chosen = laid.copied(), view.met[laid.places]
