@@ -84,7 +84,10 @@ def _triangles_of(pieces: PieceArrays, order: Ints, chosen: Ints) -> Array:
 
 
 @compiled
-def _fans(centers, moments, there, grid, chosen):
+def _fans(
+    centers: Array, moments: Array, there: NDArray[np.bool_], grid: tuple[int, int, int],
+    chosen: Ints,
+) -> Array:  # fmt: skip
     """Four triangles for each of some pieces of images, see :func:`_triangles_of`.
 
     A corner of a pixel is at one part the mean depth of the four pixels that meet there, at three
@@ -132,7 +135,10 @@ def _fans(centers, moments, there, grid, chosen):
 
 
 @compiled
-def _within(centers, moments, order, turn, scale, position, walls, highest):
+def _within(
+    centers: Array, moments: Array, order: Ints, turn: Array, scale: float, position: Array,
+    walls: Array, highest: float,
+) -> Ints:  # fmt: skip
     """Pieces that reach between two walls, (2, 2), and below a height [m], in the given order."""
     out, found = np.empty(order.shape[0], np.int64), 0
     r = turn
