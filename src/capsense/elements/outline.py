@@ -11,11 +11,14 @@ import numpy as np
 
 from capsense._jit import kernel
 from capsense._simd import doubles
+from capsense.scene.geometry_kernels import Boxes
 from capsense.scene.mesh_shape import TriangleShape
 from capsense.scene.shapes import Shape, ShapeKind
 
 BOX, SPHERE, CAPSULE, CYLINDER, ELLIPSOID, MESH = (1 + int(kind) for kind in ShapeKind if kind < 6)
 """Codes of ``BODY["outline"]``; 0 where a body has none."""
+CHANGING = 1 + MESH
+"""That of the near triangles of a surface that changes: such as a mesh, but never pressed out."""
 _STEPS = 30
 """Newton steps towards the nearest point of an ellipsoid, at most."""
 
@@ -26,14 +29,18 @@ def write_outline(record: np.void, shape: Shape) -> None:
     Arrays of the shape are pointed to, so that it has to be kept.
     """
     if isinstance(shape, TriangleShape):
-        boxes = shape._boxes
-        record["outline"], record["closed"] = MESH, shape.closed
-        record["triangles"] = boxes.triangles.ctypes.data
-        record["boxes"] = boxes.corners.ctypes.data
-        record["triangle_count"], record["levels"] = len(boxes.triangles), boxes.levels
+        write_triangles(record, shape._boxes, MESH, shape.closed)
     elif int(shape.kind) < MESH - 1:
         record["outline"], record["closed"] = 1 + int(shape.kind), True
         record["sizes"] = shape.params
+
+
+def write_triangles(record: np.void, boxes: Boxes, code: int, closed: bool) -> None:
+    """Enter triangles as the outline of a body, with a code of its own; they have to be kept."""
+    record["outline"], record["closed"] = code, closed
+    record["triangles"] = boxes.triangles.ctypes.data
+    record["boxes"] = boxes.corners.ctypes.data
+    record["triangle_count"], record["levels"] = len(boxes.triangles), boxes.levels
 
 
 @kernel
@@ -67,7 +74,7 @@ def reach_down(body):
 @kernel
 def middle_height(body):
     """Height of the middle of a body's outline [m]; for meshes, that of its bounding box."""
-    if body.outline != MESH:
+    if body.outline < MESH:
         return body.position[2]
     corners, r = doubles(body.boxes), body.rotation
     return body.position[2] + 0.5 * body.scale * (
@@ -89,7 +96,8 @@ def nearest(body, x, y, z, out, room):
 
     Returns:
         The distance [m], negative inside; and how many normals there are: one on a face, two at an
-        edge, none at corners and where it is not known.
+        edge, none at corners. At edges and corners of a mesh it is one too, the way to the point:
+        it turns evenly while the point passes from triangle to triangle.
     """
     dx, dy, dz = x - body.position[0], y - body.position[1], z - body.position[2]
     r, inverse = body.rotation, 1.0 / body.scale
@@ -159,7 +167,6 @@ def nearest(body, x, y, z, out, room):
     else:
         distance = _on_mesh(body, px, py, pz, out, room)
         qx, qy, qz = out[0], out[1], out[2]
-        faces = int(out[3])
     if kind not in (BOX, CYLINDER) and faces == 1:
         size = math.copysign(max(abs(distance), 1e-12), distance)
         ux, uy, uz = (px - qx) / size, (py - qy) / size, (pz - qz) / size
@@ -201,7 +208,7 @@ def _nearest_on_triangle(t, o, x, y, z):
     After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5.
 
     Returns:
-        The squared distance, the point, and whether it lies within the triangle's edges.
+        The squared distance and the point.
     """
     ax, ay, az = t[o], t[o + 1], t[o + 2]
     ux, uy, uz = t[o + 3] - ax, t[o + 4] - ay, t[o + 5] - az
@@ -214,7 +221,7 @@ def _nearest_on_triangle(t, o, x, y, z):
         vx * vx + vy * vy + vz * vz,
     )
     d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
-    s, w, inner = 0.0, 0.0, False
+    s, w = 0.0, 0.0
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     if d1 <= 0.0 and d2 <= 0.0:
         pass
@@ -231,9 +238,9 @@ def _nearest_on_triangle(t, o, x, y, z):
         s = 1.0 - w
     else:
         whole = va + vb + vc
-        s, w, inner = vb / whole, vc / whole, True
+        s, w = vb / whole, vc / whole
     qx, qy, qz = ax + s * ux + w * vx, ay + s * uy + w * vy, az + s * uz + w * vz
-    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz, inner
+    return (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2, qx, qy, qz
 
 
 @kernel
@@ -259,8 +266,7 @@ def _on_mesh(body, x, y, z, out, room):
             for m in range(first, last):
                 found = _nearest_on_triangle(triangles, 9 * m, x, y, z)
                 if found[0] < best:
-                    best, out[0], out[1], out[2], inner = found
-                    out[3] = 1.0 if inner else 0.0
+                    best, out[0], out[1], out[2] = found
             continue
         near, far = 2 * k + 1, 2 * k + 2
         to_near = _box2(corners, 6 * near, x, y, z)

@@ -45,6 +45,10 @@ class PieceArrays:
     """[m²], shape (n,)."""
     moments: Array
     """Second central moments of area over the area [m²], shape (n, 3, 3)."""
+    corners: Array | None = None
+    """Corners of triangles [m], shape (n, 3, 3); None for rectangles, which moments tell."""
+    grid: tuple[int, int, int] = 0, 0, 0
+    """Images, rows and columns of the first pieces, which are pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +117,7 @@ def _pieces(vertices: Array, faces: Ints, face: Ints, shares: Array) -> tuple[Pi
     normals /= np.maximum(double, 1e-300)[:, None]
     areas = np.maximum(double, max(_LEAST_AREA * float(double.mean()), 1e-300)) / 2
     arms = corners - centers[:, None]
-    return PieceArrays(centers, areas, arms.transpose(0, 2, 1) @ arms / 12), normals
+    return PieceArrays(centers, areas, arms.transpose(0, 2, 1) @ arms / 12, corners), normals
 
 
 def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool_], float]:
@@ -150,7 +154,8 @@ def layer_pieces(layers: Layers) -> tuple[Clusters, PieceArrays, NDArray[np.bool
     wanted = ~np.isnan(centers[..., 2])
     sheet = 0.0 if deep.any() else layers.volume / float(areas[wanted].sum())
     centers[..., 2][~wanted] = 0.0
-    pieces = PieceArrays(centers.reshape(-1, 3), areas.ravel(), moments.reshape(-1, 3, 3))
+    centers, moments = centers.reshape(-1, 3), moments.reshape(-1, 3, 3)
+    pieces = PieceArrays(centers, areas.ravel(), moments, grid=depth.shape)
     tree = _pixel_tree(len(depth), (len(wanted) - len(depth)) // 4, *front.shape[1:], dx / dy)
     return tree, pieces, wanted.ravel(), sheet
 
@@ -252,6 +257,7 @@ class ChangingBody:
         charge: Array | None = None,
     ) -> None:
         self.sheet = sheet
+        self.pieces = surface if isinstance(surface, PieceArrays) else None
         n = len(surface.areas)
         self._kids, self._panel, self._function = tree.kids, tree.panel, tree.function
         if wanted is not None and not wanted.all():
@@ -295,6 +301,11 @@ class ChangingBody:
     def impedance(self) -> Array32 | None:
         """What the inside has beyond ``record["inside"]`` times the energy, if that is known."""
         return None
+
+    @cached_property
+    def order(self) -> Ints:
+        """The pieces that count, those of a cluster one after another, shape (n,)."""
+        return tree_kernels.in_order(self._kids, self._panel)
 
     @property
     def radius(self) -> float:

@@ -355,3 +355,21 @@ def prune(kids, panel, wanted, new_kids, new_panel, function, room):
                 new_kids[k, c] = made
                 made += 1
     return count
+
+
+@compiled
+def in_order(kids, panel):
+    """The panels of a binary tree of clusters, those of a cluster side by side, shape (n,)."""
+    out, found = np.empty((kids.shape[0] + 1) // 2, np.int64), 0
+    stack, top = np.empty(kids.shape[0], np.int64), 1
+    stack[0] = 0
+    while top > 0:
+        top -= 1
+        k = stack[top]
+        if panel[k] >= 0:
+            out[found] = panel[k]
+            found += 1
+            continue
+        stack[top], stack[top + 1] = kids[k, 1], kids[k, 0]
+        top += 2
+    return out

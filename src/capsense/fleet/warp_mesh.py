@@ -38,7 +38,7 @@ class Hit:
 
     off: wp.float32  # distance [m], negative inside
     way: wp.vec3  # to the nearest point [m]
-    faces: wp.int32  # normals: one on a face, two at an edge, none where it is not known
+    faces: wp.int32  # normals: one on a face or a mesh, two at an edge, none at a corner
     first: wp.vec3
     second: wp.vec3
 
@@ -52,7 +52,7 @@ def _box2(outlines: Outlines, k: int, p: wp.vec3):
 
 @wp.func
 def _to_triangle(outlines: Outlines, m: int, p: wp.vec3):
-    """Way to the nearest point of a triangle, and whether it lies within the triangle's edges.
+    """Way to the nearest point of a triangle.
 
     After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5. Within the edges it is
     the way to the plane, which rounding spoils the least.
@@ -71,7 +71,6 @@ def _to_triangle(outlines: Outlines, m: int, p: wp.vec3):
     vb = d5 * d2 - d1 * d6
     va = d3 * d6 - d5 * d4
     way = a
-    inner = int(0)
     if d1 <= 0.0 and d2 <= 0.0:
         way = a
     elif d3 >= 0.0 and d4 <= d3:
@@ -88,8 +87,7 @@ def _to_triangle(outlines: Outlines, m: int, p: wp.vec3):
     else:
         normal = wp.normalize(wp.cross(u, v))
         way = wp.dot(normal, a) * normal
-        inner = 1
-    return way, inner
+    return way
 
 
 @wp.func
@@ -112,12 +110,11 @@ def to_mesh(outlines: Outlines, u: int, p: wp.vec3):
                 start = wp.int32((q * whole) >> wp.int64(levels - 1))
                 stop = wp.int32(((q + wp.int64(1)) * whole) >> wp.int64(levels - 1))
                 for m in range(start, stop):
-                    way, inner = _to_triangle(outlines, outlines.first[u] + m, p)
+                    way = _to_triangle(outlines, outlines.first[u] + m, p)
                     square = wp.dot(way, way)
                     if square < best:
                         best = square
                         hit.way = way
-                        hit.faces = inner
             else:
                 near = 2 * k + 1
                 far = 2 * k + 2
@@ -128,6 +125,7 @@ def to_mesh(outlines: Outlines, u: int, p: wp.vec3):
                 room[top + 1] = near
                 top += 2
     hit.off = wp.sqrt(best)
+    hit.faces = 1
     if outlines.closed[u] != 0 and _inside(outlines, u, p) != 0:
         hit.off = -hit.off
     return hit

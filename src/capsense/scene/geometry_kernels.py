@@ -33,12 +33,21 @@ class Boxes(NamedTuple):
 
 def boxed(triangles: Array) -> Boxes:
     """Put triangles, corners [m] of shape (m, 3, 3), into a tree of boxes."""
-    levels = 1 + max(0, math.ceil(math.log2(len(triangles) / _LEAF)))
     order = np.arange(len(triangles))
-    _sort(triangles.mean(axis=1), levels, order)
-    boxes = Boxes(np.ascontiguousarray(triangles[order]), levels, np.empty((2**levels - 1, 2, 3)))
+    _sort(triangles.mean(axis=1), _levels(len(triangles)), order)
+    return enclosed(np.ascontiguousarray(triangles[order]))
+
+
+def enclosed(triangles: Array) -> Boxes:
+    """The tree of triangles, (m, 3, 3), that are already in its order."""
+    levels = _levels(len(triangles))
+    boxes = Boxes(triangles, levels, np.empty((2**levels - 1, 2, 3)))
     _enclose(boxes)
     return boxes
+
+
+def _levels(count: int) -> int:
+    return 1 + max(0, math.ceil(math.log2(count / _LEAF)))
 
 
 @compiled
@@ -56,7 +65,7 @@ def _sort(centers: Array, levels: int, order: NDArray[np.int64]) -> None:
             part[:] = part[np.argsort(centers[part, wide])]
 
 
-@kernel
+@compiled
 def _enclose(boxes: Boxes) -> None:
     """Fill in the corners of the boxes."""
     count, levels = len(boxes.triangles), boxes.levels

@@ -18,7 +18,7 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles
-from capsense.elements.outline import middle_height, nearest, reach_down
+from capsense.elements.outline import CHANGING, middle_height, nearest, reach_down
 from capsense.field.green_kernels import lift, smooth
 from capsense.field.soft import BODY
 
@@ -39,7 +39,11 @@ def near_bodies(bodies, green, dielectric=False):
         return out
     for b in range(bodies.shape[0]):
         body = bodies[b]
-        if body.outline != 0 and (body.softness != 0.0) == dielectric:
+        if body.outline == 0 or (body.softness != 0.0) != dielectric:
+            continue
+        if body.outline == CHANGING:  # it has this outline only where it is near
+            out[b] = True
+        else:
             middle = middle_height(body) - gap.top
             lowest = (middle - reach_down(body)) / gap.validity
             out[b] = middle >= 0.0 and lowest < 2.0
@@ -56,7 +60,7 @@ def press_out(bodies, near, green):
     """
     gap, point, room = green.gap, np.empty(9), np.empty(140)
     for b in range(bodies.shape[0]):
-        if not near[b]:
+        if not near[b] or bodies[b].outline == CHANGING:
             continue
         below = gap.top - (middle_height(bodies[b]) - reach_down(bodies[b]))
         if below <= 0.0 or middle_height(bodies[b]) < gap.top:
@@ -339,6 +343,8 @@ def lengths(off, faces, point, x, y, green, moved):
         return least, h0
     dx, dy, dz = point[0] - x, point[1] - y, point[2] - gap.top
     across, beside = math.sqrt(dx * dx + dy * dy), 0.0
+    if across < -dz < 2.0 * gap.soft.limit:  # of a surface without an inside, in the cover
+        return least, h0
     true = _arc(math.sqrt(across * across + dz * dz), across, dz)
     for i in range(2):
         out = max(green.box[0, i] - point[i], point[i] - green.box[1, i], 0.0)

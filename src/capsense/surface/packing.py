@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from operator import is_
 
@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 
 from capsense.cover import Touch
 from capsense.elements.matter import Matter
+from capsense.elements.near_triangles import Face, near_triangles
+from capsense.elements.outline import CHANGING, write_triangles
 from capsense.elements.pieces import ChangingBody
 from capsense.elements.rigid import BODY, RigidShape
+from capsense.field.green_kernels import Green
 from capsense.scene import Scene
+from capsense.scene.geometry_kernels import Boxes
 from capsense.scene.scene import PackedScene
 from capsense.scene.shapes import Shape
+from capsense.surface.gap_kernels import REACH
 from capsense.surface.touch import Pressed
 
 Array = NDArray[np.float64]
@@ -52,6 +57,23 @@ class PackedBodies:
     """What they press onto the cover, if the design has one."""
     pressed: Sequence[Pressed] = ()
     """Those that touch the cover."""
+    near: list[Boxes] = field(default_factory=list)
+    """Triangles near the design that records point to."""
+
+    def find_near(self, green: Green) -> None:
+        """Give changing bodies near a flat design an outline; not sheets of dielectrics."""
+        gap = green.gap
+        if not len(gap.areas):
+            return
+        face = Face(green.box[0, :2], green.box[1, :2], gap.top, gap.top - gap.soft.limit)
+        limits = 2.0 * gap.validity, REACH[1] * gap.validity
+        for record, shape in zip(self.records, self.shapes, strict=True):
+            if not isinstance(shape, ChangingBody) or record["sheet"] != 0.0:
+                continue
+            found = near_triangles(shape, record, face, *limits)
+            if found is not None:
+                self.near.append(found)
+                write_triangles(record, found, CHANGING, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +90,11 @@ class Laid:
     shapes: list[RigidShape | ChangingBody]
     everywhere: bool = False
     """Whether each body is solved for as a whole wherever it stands."""
+
+    @cached_property
+    def rigid(self) -> bool:
+        """Whether no body changes its shape."""
+        return all(isinstance(shape, RigidShape) for shape in self.shapes)
 
     def copied(self) -> NDArray[np.void]:
         """The records anew, from bytes: NumPy takes ten times as long to copy their fields."""

@@ -384,8 +384,7 @@ class SurfaceSolver:
         laid = self._laid.get(key)
         if laid is None or not laid.everywhere:
             laid, offsets = self._lay_out(view, matter, bodies, laid)
-            rigid = all(isinstance(shape, RigidShape) for shape in laid.shapes)
-            if len(self._laid) >= _LAYOUTS or not rigid:  # what changes at each step is not kept
+            if len(self._laid) >= _LAYOUTS or not laid.rigid:  # what changes is not kept
                 self._laid.clear()
             self._laid[key] = laid
         records, chosen = laid.copied(), view.met[laid.places]
@@ -395,11 +394,13 @@ class SurfaceSolver:
         for i, at in offsets:
             shift[i] = rotation[i] @ at
             records["position"][i] += shift[i]
-        packed_bodies = PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
+        out = PackedBodies(records, chosen, laid.matter, laid.shapes, shift)
+        if not laid.rigid:
+            out.find_near(self.green)
         if self._contact is None:
-            return packed_bodies
+            return out
         touch, pressed = self._contact.press(records, chosen, view.scene.bodies, time)
-        return replace(packed_bodies, touch=touch, pressed=pressed)
+        return replace(out, touch=touch, pressed=pressed)
 
     def _lay_out(
         self, view: View, matter: Matter, bodies: list[Shape], laid: Laid | None
