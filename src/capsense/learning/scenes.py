@@ -323,7 +323,7 @@ def _limb(table: ScenarioTable) -> list[Body]:
     bodies = limb.bodies(root, bent, degrees=True, material=material, grounding=grounding)
     name = table.string("name")
     short = len(limb.name) + 1
-    return [Body(b.shape, b.pose, b.material, b.grounding, f"{name}_{str(b.name)[short:]}")
+    return [Body(b.shape, b.pose, b.material, b.grounding, f"{name}_{str(b.name)[short:]}", b.force)
             for b in bodies]  # fmt: skip
 
 
