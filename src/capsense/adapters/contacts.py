@@ -55,8 +55,8 @@ def pressed(
     """
     out, forces = list(bodies), dict[int, float]()
     world, turn = sensor.inverse(), sensor.rotation.T
-    spare = cover.thickness
-    low, high = cover.lower - [0.0, 0.0, spare], cover.upper + [0.0, 0.0, spare]
+    spare = np.array([0.0, 0.0, cover.thickness])
+    low, high = cover.lower - spare, cover.upper + spare
     for contact in contacts:
         if contact.force <= 0.0 and contact.gap > 0.0:
             continue

@@ -42,9 +42,9 @@ _SCALAR_LAST = [1, 2, 3, 0]
 _TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
 """MuJoCo's cameras look along -z: half a turn about x."""
 _ONLY = {
-    "geometry": (
-        "materials", "grounding", "exclude", "hull", "groups", "exclude_own", "contact_forces",
-    ),  # fmt: skip
+    "geometry": tuple(
+        "materials grounding exclude hull groups exclude_own contact_forces".split(),
+    ),
     "depth_camera": ("camera", "back"),
 }
 

@@ -323,7 +323,9 @@ class ModelSource(WorldSource):
             if sides[0] == sides[1]:
                 continue
             mujoco.mj_contactForce(model, data, k, force)
-            normal = found.frame[k, :3] * (1.0 if sides[0] else -1.0)  # MuJoCo's is out of the first
+            normal = found.frame[k, :3] * (
+                1.0 if sides[0] else -1.0
+            )  # MuJoCo's is out of the first
             other = two if sides[0] else one
             out.append(Contact(other, found.pos[k], normal, float(force[0]), float(found.dist[k])))
         return out

@@ -59,7 +59,6 @@ class FleetReading:
     """Change of the matrices as each body moves along the sensor frame's x, y, z [F/m] and turns
     about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
 
-
     touch: FleetTouch | None = None
     """What is pressed onto the cover, if the design has one; without relaxation and hysteresis."""
 

@@ -246,9 +246,7 @@ class CpuCore:
     def __init__(self, solver: SurfaceSolver, terminals: Terminals, table: BodyTable) -> None:
         self._solver, self._terminals, self._table = solver, terminals, table
 
-    def step(
-        self, bodies: Array, sensors: Array, forces: Array, jacobian: bool
-    ) -> FleetReading:
+    def step(self, bodies: Array, sensors: Array, forces: Array, jacobian: bool) -> FleetReading:
         """The reading of poses, shapes (e, b, 7) and (e, s, 7), and forces [N], shape (e, b).
 
         Raises:

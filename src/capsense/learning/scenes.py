@@ -125,7 +125,7 @@ class Spec(DataSet):
             "touch_force": pa.list_(number, electrodes),
             "touch_compression": pa.list_(number, electrodes),
         }  # fmt: skip
-        missing = () if channels else ("code",)
+        missing: tuple[str, ...] = () if channels else ("code",)
         missing += () if self.design.cover is not None else ("touch",)
         names = [name for name in COLUMNS if not name.startswith(missing)]
         schema = pa.schema(
@@ -230,7 +230,6 @@ class Spec(DataSet):
             return [body if body.force is None else self._on_cover(body, table)]
         except (SceneError, MeshError) as error:
             raise table.error(str(error)) from None
-
 
     def _on_cover(self, body: Body, table: ScenarioTable) -> Body:
         """A body that is pressed onto the cover, at the height at which it begins to touch it.

@@ -118,8 +118,8 @@ def _parquet(recording: Recording, path: Path) -> int:
     with pq.ParquetWriter(path, schema) as writer:
         while batch := list(islice(steps, _BATCH)):
             values = np.array([v for _, v in batch])
-            columns = [[s.clock for s, _ in batch], *values.T, *(values - levels).T]
-            columns += list(zip(*(touch_values(s.reading, session.design) for s, _ in batch)))
+            touch = np.array([touch_values(s.reading, session.design) for s, _ in batch])
+            columns = [[s.clock for s, _ in batch], *values.T, *(values - levels).T, *touch.T]
             columns.append([s.episode for s, _ in batch])
             arrays = [pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema))

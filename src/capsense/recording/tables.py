@@ -64,9 +64,7 @@ def touch_values(reading: Reading, design: Design) -> list[float]:
     return [*touch.force.tolist(), *touch.compression.tolist(), touch.total]
 
 
-def csv_row(
-    time: float, values: Array, levels: Array, touch: Sequence[float] = ()
-) -> list[str]:
+def csv_row(time: float, values: Array, levels: Array, touch: Sequence[float] = ()) -> list[str]:
     """A row of ``readings.csv``.
 
     Args:
