@@ -42,8 +42,9 @@ _SCALAR_LAST = [1, 2, 3, 0]
 _TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
 """MuJoCo's cameras look along -z: half a turn about x."""
 _ONLY = {
-    "geometry": tuple(
-        "materials grounding exclude hull groups exclude_own contact_forces".split(),
+    "geometry": (
+        *("materials", "grounding", "exclude", "exclude_own"),
+        *("hull", "groups", "contact_forces"),
     ),
     "depth_camera": ("camera", "back"),
 }

@@ -349,7 +349,8 @@ def _draw_touch(run: Run, peak: int, upper: Axes, lower: Axes) -> None:
         axes.set_ylim(bottom=0.0)
     lines = upper.get_lines()[:m][::-1][:MAX_LINES]
     upper.legend(
-        lines, [str(line.get_label()) for line in lines], loc="lower left", bbox_to_anchor=(-0.02, 1.0),
+        lines, [str(line.get_label()) for line in lines],
+        loc="lower left", bbox_to_anchor=(-0.02, 1.0),
         ncols=5 if m > 6 else 6, handlelength=1.4, columnspacing=0.8, title="touch",
         alignment="left", title_fontproperties={"size": 10, "weight": "bold"}, **LEGEND,
     )  # fmt: skip
