@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import as_whole, checked_frequency, shorten
+from capsense.cover import NONE
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.elements.wide import WIDE
@@ -145,6 +146,12 @@ class Fleet:
         return vars(self)
 
     def _on_warp(self, budget: int) -> WarpCore:
+        cover = self.design.cover
+        if cover is not None and cover.top != NONE:
+            raise SceneError(
+                f"the cover {cover.name!r} of design {self.design.name!r} has a conducting top, "
+                'which fleets on Warp do not know; make the fleet with device="cpu"'
+            )
         try:
             from capsense.fleet.warp_core import WarpCore, known_device
         except ImportError as error:
@@ -345,6 +352,11 @@ class Fleet:
             )
         shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
         held = self._forces(forces, jacobian)
+        if jacobian and self._warp is not None and self.design.cover is not None:
+            raise SceneError(
+                "a Jacobian is asked for of a design with a cover, which fleets on Warp do not "
+                'have; make the fleet with device="cpu"'
+            )
         if self._warp is None:
             if sensors is None:
                 sensors = np.broadcast_to(WORLD, shapes[1])

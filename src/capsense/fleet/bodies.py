@@ -60,7 +60,8 @@ class FleetReading:
     about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
 
     touch: FleetTouch | None = None
-    """What is pressed onto the cover, if the design has one; without relaxation and hysteresis."""
+    """What is pressed onto the cover, if the design has one; without relaxation and hysteresis.
+    None on Warp."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,11 @@ class GapLaw:
     log_ratio: wp.float32
     terminals: wp.int32
     slots: wp.int32  # conductors near the design that can be nodes
+    cover: wp.float32  # thickness of a cover that gives way [m], 0 for none
+    eps: wp.float32  # its relative permittivity
+    limit: wp.float32  # its largest compression [m]
     points: wp.array(dtype=wp.vec2)
+    below: wp.array(dtype=wp.float32)  # between it and a cell, thickness over eps [m], or -1
     areas: wp.array(dtype=wp.float32)
     series: wp.array(dtype=wp.float32)
     columns: wp.array2d(dtype=wp.int32)
@@ -83,6 +87,7 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
     out, cells = GapLaw(), len(gap.areas)
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
+    out.cover, out.eps, out.limit = gap.soft.thickness, gap.soft.eps, gap.soft.limit
     owners = gap.terminal[gap.blocks[:-1]] if cells else np.zeros(0, np.int64)
     each = [np.flatnonzero(owners == t)[::_BLOCKS] for t in (*range(terminals), -1)]  # as they lie
     first = np.concatenate(each)
@@ -90,7 +95,8 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
     span = np.cumsum([0, *map(len, each)])
     for name, values, kind in (
         ("points", gap.points, wp.vec2), ("areas", gap.areas, wp.float32),
-        ("series", gap.series, wp.float32), ("columns", gap.columns, wp.int32),
+        ("series", gap.series, wp.float32), ("below", gap.soft.below, wp.float32),
+        ("columns", gap.columns, wp.int32),
         ("change", gap.change, wp.float32), ("blocks", gap.blocks, wp.int32),
         ("center", gap.block_center, wp.vec2), ("radius", gap.block_radius, wp.float32),
         ("chunks", [*first, len(owners)], wp.int32), ("owner", owner, wp.int32),
@@ -268,7 +274,7 @@ def _overlap(outlines: Outlines, gap: GapLaw, near: NearBodies, b: int, v: int, 
 
 @wp.kernel
 def press_out(gap: GapLaw, near: NearBodies):
-    """Move near bodies that overlap the face up until they touch it."""
+    """Move near bodies that overlap the face up until they touch it, or press a cover flat."""
     v = wp.tid()
     for k in range(near.count[v]):
         b = near.body[k, v]
@@ -277,7 +283,8 @@ def press_out(gap: GapLaw, near: NearBodies):
             for p in range(gap.owner.shape[0]):
                 deepest = wp.max(deepest, near.depth[p, b, v])
             at = near.pose[b, v]
-            up = wp.vec3(0.0, 0.0, wp.min(deepest, near.below[b, v]))
+            rise = wp.max(wp.min(deepest, near.below[b, v]) - gap.limit, 0.0)
+            up = wp.vec3(0.0, 0.0, rise)
             near.pose[b, v] = wp.transform(
                 wp.transform_get_translation(at) + up, wp.transform_get_rotation(at)
             )
