@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 
 from capsense.errors import CapSenseError
 
-MAX_LENGTH = 5.0
+MAX_LENGTH = 10.0
 """No length in a file may exceed this [m]."""
-MIN_LENGTH = 1e-6
+MIN_LENGTH = 1e-8
 """No size in a file may be smaller than this [m]."""
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 """Metres to the unit of a geometry file."""

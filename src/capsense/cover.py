@@ -8,7 +8,7 @@ whole, the same everywhere under a body.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,13 @@ class Cover:
     def limit(self) -> float:
         """Largest compression [m]: what is pressed in further counts as that far."""
         return float(self.law.strain[-1]) * self.thickness
+
+    def measured_in(self, unit: float) -> Cover:
+        """The same cover with lengths in a unit [m]; pressures stay in Pa."""
+        return replace(
+            self, lower=self.lower / unit, upper=self.upper / unit,
+            bending_length=self.bending_length / unit,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,7 +121,8 @@ class Skin:
         domain, rotation = simulator.design.domain, pose.rotation
         middle = (centre - pose.position) @ rotation
         reach = half @ np.abs(rotation)
-        seen = ((middle - reach < domain.upper) & (middle + reach > domain.lower)).all(axis=1)
+        lower, upper = domain.sight
+        seen = ((middle - reach < upper) & (middle + reach > lower)).all(axis=1)
         inverse = pose.inverse()
         bodies = [scene.bodies[i] for i in np.flatnonzero(seen).tolist()]
         return Scene([body.moved(inverse @ body.pose) for body in bodies])

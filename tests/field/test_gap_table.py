@@ -116,7 +116,7 @@ def test_charges_are_those_of_design_and_plane_solved_anew():
     solution, densities = _solved(PAD)
     n, height = solution.model.panels.size, 8e-4
     plane = plane_panels(solution, 8 * UNIT)
-    change = PlaneResponse(solution, plane).at(height, densities)
+    change = PlaneResponse(solution, plane).at(height, densities).change
     text = PAD + (
         '[[conductor]]\nname = "plane"\nrole = "shield"\nshape = "rectangle"\n'
         f"size = [{np.ptp(plane.edges[..., 0])}, {np.ptp(plane.edges[..., 1])}]\n"

@@ -210,7 +210,7 @@ class MujocoSensor(GeometrySensor):
 
     def check(self) -> list[str]:
         domain, sensor = self._design.domain, self.pose
-        walls = np.array([domain.lower, domain.upper])
+        walls = domain.sight
         near = [
             g for g in range(self.model.ngeom) if _reaches(self.model, self.data, g, sensor, walls)
         ]

@@ -154,7 +154,7 @@ class World:
             boxes.mean(axis=1), 0.5 * (boxes[:, 1] - boxes[:, 0]),
             np.array([edge * _thickness(s) for s in self.solids]),
         )  # fmt: skip
-        self._lower, self._upper = self.domain.lower, self.domain.upper
+        self._lower, self._upper = self.domain.sight
         self._placed = Placed(np.empty((n, 3)), np.empty((n, 4)), np.zeros(n, dtype=np.bool_))
 
     def scene(

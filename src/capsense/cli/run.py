@@ -135,12 +135,12 @@ def absent_bodies(scenario: Scenario) -> list[str]:
     """Names of the bodies that never enter the domain, looked for at up to 500 samples."""
     import numpy as np
 
-    domain = scenario.design.domain
+    lower, upper = scenario.design.domain.sight
     seen = np.zeros(len(scenario.bodies), dtype=bool)
     stride = max(1, scenario.count // 500)
     for time in scenario.times[::stride]:
         bounds = scenario.scene_at(float(time)).pack().bounds
-        inside = (bounds[:, 0] < domain.upper) & (bounds[:, 1] > domain.lower)
+        inside = (bounds[:, 0] < upper) & (bounds[:, 1] > lower)
         seen |= inside.all(axis=1)
         if seen.all():
             break

@@ -28,6 +28,7 @@ from capsense.design.geometry import (
     Surface,
     boundary_segments,
     in_plane_of,
+    length_unit,
     read_placement,
 )
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role, check_design
@@ -156,9 +157,12 @@ def parse_design(
         electrodes += read_imprint_group(table, where, domain)
     layers = [_read_layer(t, where) for t in items("layer")]
     stack = tuple(layers)
-    electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack)) for e in electrodes]
+    unit = length_unit([e.surface.area for e in electrodes]) if electrodes else 1.0
+    electrodes = [Electrode(e.name, snap_to_layers(e.surface, stack, unit)) for e in electrodes]
     conductors = [_read_conductor(t, where, domain, electrodes) for t in items("conductor")]
-    conductors = [Conductor(c.name, c.role, snap_to_layers(c.surface, stack)) for c in conductors]
+    conductors = [
+        Conductor(c.name, c.role, snap_to_layers(c.surface, stack, unit)) for c in conductors
+    ]
     cover = None
     covers = items("cover")
     for table in covers:
@@ -300,16 +304,20 @@ def _read_material(table: DesignTable) -> tuple[str, float]:
     raise table.error('missing key: give material = "…" or eps_r = a number')
 
 
-def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
-    """Move a horizontal sheet that lies within a micrometre of a layer's face exactly onto it."""
+def snap_to_layers(surface: Surface, layers: tuple[Layer, ...], unit: float = 1.0) -> Surface:
+    """Move a horizontal sheet that all but lies on a layer's face exactly onto it.
+
+    It is nearer to it than ``TOUCH``, a micrometre in designs whose length unit [m] is one.
+    """
+    touch = TOUCH * unit
     levels = [float(z) for layer in layers for z in (layer.lower[2], layer.upper[2])]
-    if np.ptp(surface.bounds[:, 2]) > TOUCH:
+    if np.ptp(surface.bounds[:, 2]) > touch:
         return surface
     facets, moved = [], 0.0
     for facet in surface.facets:
         z = float(facet.origin[2])
         off = min((level - z for level in levels), key=abs, default=math.inf)
-        if abs(off) <= TOUCH:
+        if abs(off) <= touch:
             moved = off or moved
             facet = Facet(facet.polygon, facet.origin + np.array([0.0, 0.0, off]), facet.axes)
         facets.append(facet)
@@ -317,9 +325,9 @@ def snap_to_layers(surface: Surface, layers: tuple[Layer, ...]) -> Surface:
 
 
 SLIVER = 1e-5
-"""Remainders narrower than this [m] are dropped: no board house would etch them."""
+"""Remainders narrower than this, over the length unit, are dropped: none would be etched."""
 GRID = 1e-9
-"""Coordinates of cut outlines are snapped to this grid [m]."""
+"""Coordinates of cut outlines are snapped to this grid, over the length unit."""
 
 
 def cut_clearance(table: DesignTable, surface: Surface, electrodes: Sequence[Electrode]) -> Surface:
@@ -334,6 +342,8 @@ def cut_clearance(table: DesignTable, surface: Surface, electrodes: Sequence[Ele
             nothing of it remains.
     """
     clearance = table.length("clearance")
+    areas = [electrode.surface.area for electrode in electrodes]
+    grid, sliver = (length_unit(areas) * x if areas else x for x in (GRID, SLIVER))
     facets: list[Facet] = []
     cut = False
     for facet in surface.facets:
@@ -348,10 +358,10 @@ def cut_clearance(table: DesignTable, surface: Surface, electrodes: Sequence[Ele
             continue
         cut = True
         rest = shapely.difference(
-            facet.polygon, shapely.union_all(gaps, grid_size=GRID), grid_size=GRID
+            facet.polygon, shapely.union_all(gaps, grid_size=grid), grid_size=grid
         )
         for piece in shapely.get_parts(rest):
-            if isinstance(piece, Polygon) and not piece.buffer(-SLIVER / 2).is_empty:
+            if isinstance(piece, Polygon) and not piece.buffer(-sliver / 2).is_empty:
                 facets.append(Facet(orient(piece), facet.origin, facet.axes))
     if not cut:
         return surface

@@ -41,6 +41,11 @@ class Facet:
         uv = np.asarray(uv, dtype=float)
         return self.origin + uv @ self.axes[:2]
 
+    def measured_in(self, unit: float) -> Facet:
+        """The same facet with lengths in a unit [m]."""
+        outline = shapely.transform(self.polygon, lambda uv: measured(uv, unit))
+        return Facet(outline, measured(self.origin, unit), self.axes)
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -75,6 +80,29 @@ class Surface:
     def area(self) -> float:
         """Area [m²] of one side of the sheet."""
         return float(sum(f.polygon.area for f in self.facets))
+
+    def measured_in(self, unit: float) -> Surface:
+        """The same sheet with lengths in a unit [m]."""
+        facets = tuple(facet.measured_in(unit) for facet in self.facets)
+        return Surface(facets, measured(self.rims, unit))
+
+
+def measured(values: Array, unit: float) -> Array:
+    """Lengths [m] in a unit [m], to 12 decimals, so that those of scaled designs are the same."""
+    return np.asarray(np.round(np.asarray(values, float) / unit, 12) + 0.0)
+
+
+SIDE = 0.03
+"""Side of the mean electrode [m] of designs that are solved in metres."""
+
+
+def length_unit(areas: Sequence[float]) -> float:
+    """Length that a design is solved in [m], by the areas of its electrodes [m²].
+
+    It makes their mean area that of a square of 30 mm, so that all lengths in the solver are ratios
+    to the electrodes.
+    """
+    return float(f"{math.sqrt(sum(areas) / len(areas)) / SIDE:.12g}") if any(areas) else 1.0
 
 
 def box_facets(lower: Array, upper: Array) -> tuple[Facet, ...]:

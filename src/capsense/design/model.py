@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from itertools import combinations
@@ -24,6 +24,8 @@ from capsense.design.geometry import (
     coplanar_overlap,
     enters_box,
     find_contact,
+    length_unit,
+    measured,
     ring_vertices,
 )
 from capsense.errors import DesignError
@@ -32,6 +34,8 @@ Array = NDArray[np.float64]
 
 _INFINITY = 1e5
 """How many box sizes below an open domain its ground lies."""
+_SIGHT = 10.0
+"""How many box sizes beyond an open domain bodies still count."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Domain:
     """The grounded box around a sensor, centred in x and y, its floor at z = −backplane.
 
     An open domain has no walls: ground is at infinity, and the box only says where bodies are
-    looked for.
+    mostly. They count far beyond it.
     """
 
     size: tuple[float, float, float] = (0.5, 0.5, 0.5)
@@ -63,6 +67,20 @@ class Domain:
     def upper(self) -> Array:
         """Upper corner of the box [m] in the sensor frame, shape (3,)."""
         return self.lower + np.array(self.size)
+
+    @property
+    def sight(self) -> Array:
+        """Corners of the box beyond which bodies do not count [m], shape (2, 3): the walls.
+
+        Of an open domain it reaches so much farther that what lies beyond it changes nothing.
+        """
+        beyond = _SIGHT * max(self.size) if self.open else 0.0
+        return np.array([self.lower - beyond, self.upper + beyond])
+
+    def measured_in(self, unit: float) -> Domain:
+        """The same domain with lengths in a unit [m]."""
+        x, y, z, depth = measured(np.array([*self.size, self.backplane]), unit).tolist()
+        return Domain((x, y, z), depth, self.open)
 
 
 class Role(StrEnum):
@@ -117,6 +135,13 @@ class Layer:
             return inside(points, self.surface.triangles)
         return np.asarray(((points > self.lower) & (points < self.upper)).all(axis=-1))
 
+    def measured_in(self, unit: float) -> Layer:
+        """The same part with lengths in a unit [m]."""
+        return replace(
+            self, lower=measured(self.lower, unit), upper=measured(self.upper, unit),
+            facets=tuple(facet.measured_in(unit) for facet in self.facets),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class Design:
@@ -139,8 +164,13 @@ class Design:
 
         Names, description, file formatting, ``build`` and the mechanics of a cover do not enter:
         the field in the empty domain does not depend on them. The order of electrodes does, since
-        it is the order of matrix rows. Coordinates count to a nanometre.
+        it is the order of matrix rows. Coordinates count to a billionth
+        of the :attr:`unit`.
         """
+        if self.unit != 1.0:
+            return hashlib.sha256(
+                f"{self.in_units.content_hash()} times {self.unit!r}".encode()
+            ).hexdigest()
         lines = ["capsense design 1"]
         lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")
         lines += ["open"] * self.domain.open
@@ -160,6 +190,32 @@ class Design:
             for k in self.layers
         ]
         return hashlib.sha256("\n".join(lines + sorted(others)).encode()).hexdigest()
+
+    @cached_property
+    def unit(self) -> float:
+        """Length that it is solved in [m], see :func:`~capsense.design.geometry.length_unit`."""
+        areas = [electrode.surface.area for electrode in self.electrodes]
+        return length_unit(areas) if areas else 1.0
+
+    @cached_property
+    def in_units(self) -> Design:
+        """The same design with all lengths in its :attr:`unit`."""
+        unit = self.unit
+        if unit == 1.0:
+            return self
+        out = replace(
+            self, domain=self.domain.measured_in(unit),
+            electrodes=tuple(
+                replace(e, surface=e.surface.measured_in(unit)) for e in self.electrodes
+            ),
+            layers=tuple(layer.measured_in(unit) for layer in self.layers),
+            conductors=tuple(
+                replace(c, surface=c.surface.measured_in(unit)) for c in self.conductors
+            ),
+            cover=None if self.cover is None else self.cover.measured_in(unit),
+        )  # fmt: skip
+        out.__dict__["unit"] = 1.0  # but for rounding
+        return out
 
     @property
     def sheets(self) -> tuple[Electrode | Conductor, ...]:
@@ -201,19 +257,20 @@ def check_design(design: Design, *, source: str = "design") -> None:
     """
     if not design.electrodes:
         raise DesignError(f"{source}: design has no electrode; add an [[electrode]] table")
+    unit, design = design.unit, design.in_units
     _unique_names(design.sheets, source)
     _unique_names(design.layers, source)
     for sheet in design.sheets:
-        _inside_domain(sheet, design.domain, source)
+        _inside_domain(sheet, design.domain, unit, source)
     for layer in design.layers:
-        _layer_inside_domain(layer, design.domain, source)
+        _layer_inside_domain(layer, design.domain, unit, source)
     for lower, upper in combinations(design.layers, 2):
-        _apart(lower, upper, source)
+        _apart(lower, upper, unit, source)
     for one, other in combinations(design.sheets, 2):
-        _no_short(one, other, source)
+        _no_short(one, other, unit, source)
     for sheet in design.sheets:
         for layer in design.layers:
-            _not_crossing(sheet, layer, source)
+            _not_crossing(sheet, layer, unit, source)
 
 
 def _label(item: Electrode | Conductor | Layer) -> str:
@@ -232,36 +289,37 @@ def _unique_names(items: Sequence[Electrode | Conductor | Layer], source: str) -
 
 
 def _at(point: Array) -> str:
-    return "(" + ", ".join(f"{x:.6g}" for x in np.round(point, 9) + 0.0) + ") m"
+    return "(" + ", ".join(f"{x:.6g}" for x in np.round(point, 12) + 0.0) + ") m"
 
 
-def _beyond(bounds: Array, domain: Domain, margin: float) -> Iterator[tuple[str, str]]:
+def _beyond(bounds: Array, domain: Domain, margin: float, unit: float) -> Iterator[tuple[str, str]]:
     """What bounds, shape (2, 3), do that are not ``margin`` inside, and where, in words."""
     walls = np.array([domain.lower, domain.upper])
     room = (bounds - walls) * [[1.0], [-1.0]]
     for axis, side in zip(*np.nonzero(margin > room.T), strict=True):
         name, value, wall = "xyz"[axis], bounds[side, axis], walls[side, axis]
         verb = "touches" if abs(value - wall) < TOUCH else "leaves"
-        yield verb, f"it reaches {name} = {value:.6g} m and the wall is at {name} = {wall:.6g} m"
+        at = f"it reaches {name} = {unit * value:.6g} m"
+        yield verb, f"{at} and the wall is at {name} = {unit * wall:.6g} m"
 
 
-def _inside_domain(sheet: Electrode | Conductor, domain: Domain, source: str) -> None:
-    for verb, where in _beyond(sheet.surface.bounds, domain, TOUCH):
+def _inside_domain(sheet: Electrode | Conductor, domain: Domain, unit: float, source: str) -> None:
+    for verb, where in _beyond(sheet.surface.bounds, domain, TOUCH, unit):
         raise DesignError(
             f"{source}: {_label(sheet)}: {verb} the grounded box: {where}; move it inside (center, "
             "z, size) or enlarge domain size or backplane; lengths are metres"
         )
 
 
-def _layer_inside_domain(layer: Layer, domain: Domain, source: str) -> None:
-    for _, where in _beyond(np.array([layer.lower, layer.upper]), domain, -TOUCH):
+def _layer_inside_domain(layer: Layer, domain: Domain, unit: float, source: str) -> None:
+    for _, where in _beyond(np.array([layer.lower, layer.upper]), domain, -TOUCH, unit):
         raise DesignError(
             f"{source}: {_label(layer)}: leaves the domain: {where}; reduce its size or z, or "
             "enlarge domain size or backplane; lengths are metres"
         )
 
 
-def _apart(one: Layer, other: Layer, source: str) -> None:
+def _apart(one: Layer, other: Layer, unit: float, source: str) -> None:
     low, high = np.maximum(one.lower, other.lower), np.minimum(one.upper, other.upper)
     if not np.all(high - low > TOUCH):
         return
@@ -271,17 +329,20 @@ def _apart(one: Layer, other: Layer, source: str) -> None:
         point = overlap(one.surface, other.surface)
         if point is not None:
             raise DesignError(
-                f"{source}: {_label(other)}: overlaps {_label(one)} at {_at(point)}; move one of "
-                "them or cut it back in CAD, so that they share no more than flat faces"
+                f"{source}: {_label(other)}: overlaps {_label(one)} at {_at(unit * point)}; move "
+                "one of them or cut it back in CAD, so that they share no more than flat faces"
             )
     else:
         raise DesignError(
-            f"{source}: {_label(other)}: overlaps {_label(one)} over {_at(high - low)} at "
-            f"{_at((low + high) / 2)}; change z, size or center so that they only share a face"
+            f"{source}: {_label(other)}: overlaps {_label(one)} over {_at(unit * (high - low))} at "
+            f"{_at(unit * (low + high) / 2)}; change z, size or center so that they only share a "
+            "face"
         )
 
 
-def _no_short(one: Electrode | Conductor, other: Electrode | Conductor, source: str) -> None:
+def _no_short(
+    one: Electrode | Conductor, other: Electrode | Conductor, unit: float, source: str
+) -> None:
     alike = (
         isinstance(one, Conductor)
         and isinstance(other, Conductor)
@@ -295,35 +356,39 @@ def _no_short(one: Electrode | Conductor, other: Electrode | Conductor, source: 
         area = coplanar_overlap(one.surface, other.surface)
         if area > TOUCH**2:
             raise DesignError(
-                f"{source}: {_label(other)}: lies on {_label(one)} over {area * 1e6:.6g} mm² "
-                f"at {_at(point)}; cut one of them back, they may only share edges"
+                f"{source}: {_label(other)}: lies on {_label(one)} over "
+                f"{unit**2 * area * 1e6:.6g} mm² at {_at(unit * point)}; "
+                "cut one of them back, they may only share edges"
             )
         return
     fix = "move them apart (center, z) or reduce their size"
     if isinstance(one, Electrode) and isinstance(other, Conductor):
         fix = f"set clearance = 0.0005 on {_label(other)} or move it to another z"
     raise DesignError(
-        f"{source}: {_label(one)}: touches or overlaps {_label(other)} at {_at(point)}, a short "
-        f"circuit; {fix}"
+        f"{source}: {_label(one)}: touches or overlaps {_label(other)} at {_at(unit * point)}, a "
+        f"short circuit; {fix}"
     )
 
 
-def _not_crossing(sheet: Electrode | Conductor, layer: Layer, source: str) -> None:
+def _not_crossing(sheet: Electrode | Conductor, layer: Layer, unit: float, source: str) -> None:
     low, high = sheet.surface.bounds
     if layer.facets:
-        _not_through(sheet, layer, source)
+        _not_through(sheet, layer, unit, source)
         return
     within = np.all(low >= layer.lower - TOUCH) and np.all(high <= layer.upper + TOUCH)
     if within or not enters_box(sheet.surface, layer.lower, layer.upper):
         return
+    span, other = (f"{_at(unit * a)} to {_at(unit * b)}" for a, b in (
+        (low, high), (layer.lower, layer.upper),
+    ))  # fmt: skip
     raise DesignError(
-        f"{source}: {_label(sheet)}: crosses the surface of {_label(layer)}: it spans {_at(low)} "
-        f"to {_at(high)}, the layer {_at(layer.lower)} to {_at(layer.upper)}; put it on a face of "
-        f"the layer (such as z = {layer.upper[2]:g}), or wholly inside or outside"
+        f"{source}: {_label(sheet)}: crosses the surface of {_label(layer)}: it spans {span}, the "
+        f"layer {other}; put it on a face of the layer (such as "
+        f"z = {unit * layer.upper[2]:g}), or wholly inside or outside"
     )
 
 
-def _not_through(sheet: Electrode | Conductor, part: Layer, source: str) -> None:
+def _not_through(sheet: Electrode | Conductor, part: Layer, unit: float, source: str) -> None:
     from capsense.design.solid import crossing
 
     low, high = sheet.surface.bounds
@@ -332,7 +397,7 @@ def _not_through(sheet: Electrode | Conductor, part: Layer, source: str) -> None
     point = crossing(sheet.surface.triangles, part.surface.triangles)
     if point is not None:
         raise DesignError(
-            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at {_at(point)}, and "
-            "partly outside; put it wholly inside or outside, or flat on a flat face; where both "
-            "are curved leave a gap of 0.2 mm, for they are made of flat pieces"
+            f"{source}: {_label(sheet)}: is partly inside of {_label(part)}, at "
+            f"{_at(unit * point)}, and partly outside; put it wholly inside or outside, or flat on "
+            "a flat face; where both are curved leave a gap of 0.2 mm: they are made of flat pieces"
         )

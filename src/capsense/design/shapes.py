@@ -23,7 +23,6 @@ from shapely.geometry import LineString, Polygon, box
 from shapely.geometry.polygon import orient
 
 from capsense.design.geometry import (
-    TOUCH,
     DesignTable,
     Facet,
     Placement,
@@ -35,13 +34,14 @@ from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
 
-CHORD_ERROR = 1e-5
-"""Arcs are replaced by chords that leave them by at most this [m] ..."""
+CHORD_ERROR = 1 / 3000
+"""Arcs are replaced by chords that leave them by at most this, over the longer side of what they
+are part of ..."""
 MAX_SEGMENTS = 64
 """... or by this many chords to the circle, whichever is coarser."""
 
 
-def circle_segments(radius: float, error: float = CHORD_ERROR) -> int:
+def circle_segments(radius: float, error: float) -> int:
     """Chords to the full circle of a radius [m]: a multiple of 4 from 8 to 64.
 
     ``error`` is how far they may leave the circle [m].
@@ -54,7 +54,7 @@ def circle_segments(radius: float, error: float = CHORD_ERROR) -> int:
 
 def _circle(radius: float) -> Polygon:
     """A regular polygon with the area of the circle, which is what capacitance feels most."""
-    n = circle_segments(radius)
+    n = circle_segments(radius, 2 * CHORD_ERROR * radius)
     angle = 2 * math.pi * np.arange(n) / n
     r = radius * math.sqrt((2 * math.pi / n) / math.sin(2 * math.pi / n))
     return Polygon(np.column_stack([r * np.cos(angle), r * np.sin(angle)]))
@@ -62,7 +62,8 @@ def _circle(radius: float) -> Polygon:
 
 def _rounded(outline: Polygon, radius: float) -> Polygon:
     """Round the convex corners of an outline."""
-    segments = circle_segments(radius) // 4
+    x0, y0, x1, y1 = outline.bounds
+    segments = circle_segments(radius, CHORD_ERROR * max(x1 - x0, y1 - y0)) // 4
     return outline.buffer(-radius, join_style="mitre").buffer(radius, quad_segs=segments)
 
 
@@ -100,7 +101,7 @@ def polygon(table: DesignTable) -> list[Polygon]:
             f"points describe no simple outline: {reason} m; list the corners once, in order, "
             "without crossing, and keep holes inside"
         )
-    if shape.area < 1e-12:
+    if shape.area < 1e-9 * shape.length**2:
         raise table.error(
             f"points enclose an area of {shape.area:g} m²; give corners that enclose an area"
         )
@@ -129,7 +130,7 @@ def _slot(sx: float, sy: float) -> Polygon:
         return _circle(radius)
     end = (half, 0.0) if sx > sy else (0.0, half)
     line = LineString([(-end[0], -end[1]), end])
-    return line.buffer(radius, quad_segs=circle_segments(radius) // 4)
+    return line.buffer(radius, quad_segs=circle_segments(radius, CHORD_ERROR * max(sx, sy)) // 4)
 
 
 def stripes(table: DesignTable) -> list[Polygon]:
@@ -268,8 +269,8 @@ def planar_surface(table: DesignTable, shape: str, placement: Placement) -> Surf
     return place_polygons(polygons, placement)
 
 
-STRIP_ERROR = 1e-4
-"""A strip leaves the round surface by about this much [m], unless that takes too many strips."""
+STRIP_ERROR = 1 / 450
+"""A strip leaves the round surface by about this part of its radius."""
 
 
 def read_bend(table: DesignTable) -> float:
@@ -278,9 +279,14 @@ def read_bend(table: DesignTable) -> float:
     return table.length("radius")
 
 
+_LEVEL = 3e-5
+"""Level sheets rise by no more than this part of their extent."""
+
+
 def is_level(surface: Surface) -> bool:
     """Whether a sheet is flat and parallel to the electrode plane."""
-    return bool(np.ptp(surface.bounds[:, 2]) <= TOUCH)
+    across = np.ptp(surface.bounds, axis=0)
+    return bool(across[2] <= _LEVEL * across.max())
 
 
 def bend_sheet(item: str, surface: Surface, radius: float) -> Surface:
@@ -295,12 +301,12 @@ def bend_sheet(item: str, surface: Surface, radius: float) -> Surface:
     """
     low, high = surface.bounds
     own = radius + float(low[2])
-    if own <= TOUCH:
+    if own <= 0.0:
         raise DesignError(
             f"{item}: at z = {low[2]:.6g} m it lies at or below the axis of [bend] radius = "
             f"{radius:g}; raise it or enlarge the radius"
         )
-    limit = math.pi * radius - TOUCH
+    limit = math.pi * radius
     if max(-low[0], high[0]) > limit:
         raise DesignError(
             f"{item}: reaches from x = {low[0]:.6g} to {high[0]:.6g} m, more than the way round "
@@ -319,7 +325,7 @@ def bend_sheet(item: str, surface: Surface, radius: float) -> Surface:
 def _bend_polygon(polygon: Polygon, radius: float, own: float) -> tuple[list[Facet], list[Array]]:
     """Strips of a polygon [m] in the sensor's x and y, and the parts of its outline."""
     x0, y0, x1, y1 = polygon.bounds
-    count = math.ceil((x1 - x0) / radius * circle_segments(own, STRIP_ERROR) / (2 * math.pi))
+    count = math.ceil((x1 - x0) / radius * circle_segments(own, STRIP_ERROR * own) / (2 * math.pi))
     stops = np.linspace(x0, x1, max(1, count) + 1)
     half = (stops[1] - stops[0]) / (2 * radius)
     distance = own * half / math.tan(half)  # of the strip's middle from the axis
@@ -358,7 +364,7 @@ def _lines(geometry: shapely.Geometry) -> Sequence[shapely.Geometry]:
 def cylinder_surface(table: DesignTable, placement: Placement) -> Surface:
     """The closed surface of a cylinder: ``radius`` and ``length`` [m], about its own z axis."""
     radius, length = table.length("radius"), table.length("length")
-    count = circle_segments(radius, STRIP_ERROR)
+    count = circle_segments(radius, STRIP_ERROR * radius)
     half = math.pi / count
     width, distance = 2 * radius * half, radius * half / math.tan(half)
     facets: list[Facet] = []

@@ -38,7 +38,7 @@ _UNSEEN = TriMesh | Layers | SurfaceMesh
 _ALONG = np.linspace(0.0, 1.0, 33)
 """Where along the axis of a capsule its distance from a shape with edges is taken."""
 _TOUCH = 1e-6
-"""Conductors nearer than this [m] touch."""
+"""Conductors nearer than this, over the length unit, touch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +48,12 @@ class Matter:
     eps: Complex
     """Complex relative permittivity, infinite for conductors, shape (n,)."""
     ground: Array
-    """Capacitance to ground [F], infinite for grounded bodies, 0 for floating ones, shape (n,)."""
+    """Capacitance to ground [F] over ``unit``; infinite for grounded bodies, 0 for floating ones,
+    shape (n,)."""
     group: Ints
     """First of the conductors that a body touches, directly or not; else itself, shape (n,)."""
+    unit: float = 1.0
+    """Length unit of what follows from ``ground`` [m]."""
 
     @cached_property
     def conducting(self) -> NDArray[np.bool_]:
@@ -116,13 +119,14 @@ class Matter:
         if not self.some_free:
             return self
         seen = self.conducting & (packed.kinds[chosen] < ShapeKind.MESH)
-        low, high = packed.bounds[chosen, 0] - 0.5 * _TOUCH, packed.bounds[chosen, 1] + 0.5 * _TOUCH
-        near = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2)
-        near &= seen[:, None] & seen & (self.free[:, None] | self.free)
-        first, second = np.nonzero(np.triu(near, 1))
+        near = _TOUCH * self.unit
+        low, high = packed.bounds[chosen, 0] - 0.5 * near, packed.bounds[chosen, 1] + 0.5 * near
+        close = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2)
+        close &= seen[:, None] & seen & (self.free[:, None] | self.free)
+        first, second = np.nonzero(np.triu(close, 1))
         apart = parted(
             chosen[np.stack([first, second], axis=1)],
-            packed.kinds, packed.params, packed.rotation, packed.position, _TOUCH,
+            packed.kinds, packed.params, packed.rotation, packed.position, near,
         )  # fmt: skip
         first, second = first[~apart], second[~apart]
         ends, radius = _axes(packed, chosen)
@@ -132,9 +136,9 @@ class Matter:
             if group[a] == group[b]:
                 continue
             if math.isnan(gap):
-                meet = touch(scene[int(chosen[a])], scene[int(chosen[b])])
+                meet = touch(scene[int(chosen[a])], scene[int(chosen[b])], near)
             else:
-                meet = gap <= _TOUCH
+                meet = gap <= near
             if meet:
                 group[group == max(group[a], group[b])] = min(group[a], group[b])
         return _grouped(self, tuple(group.tolist()))
@@ -169,18 +173,20 @@ class Matter:
                 records["sheet"][k] = shape.sheet
 
 
-def matter_of(bodies: Sequence[Body], frequency: float) -> Matter:
-    """Look up what bodies are made of, at a frequency [Hz]."""
-    return _matter(tuple([(b.material, b.grounding) for b in bodies]), frequency)
+def matter_of(bodies: Sequence[Body], frequency: float, unit: float = 1.0) -> Matter:
+    """Look up what bodies are made of, at a frequency [Hz], with lengths in a unit [m]."""
+    return _matter(tuple([(b.material, b.grounding) for b in bodies]), frequency, unit)
 
 
 @lru_cache(maxsize=64)
-def _matter(bodies: tuple[tuple[Material, Grounding], ...], frequency: float) -> Matter:
+def _matter(
+    bodies: tuple[tuple[Material, Grounding], ...], frequency: float, unit: float
+) -> Matter:
     eps = np.array([material.complex_permittivity(frequency) for material, _ in bodies], complex)
     eps[np.abs(eps) >= CONDUCTING] = np.inf
     known = {"grounded": np.inf, "floating": 0.0}
     ground = [known[tie] if isinstance(tie, str) else tie for _, tie in bodies]
-    return Matter(eps, np.array(ground, float), np.arange(len(bodies)))
+    return Matter(eps, np.array(ground, float) / unit, np.arange(len(bodies)), unit)
 
 
 @lru_cache(maxsize=64)
@@ -195,7 +201,9 @@ def _repeated(matter: Matter, places: tuple[int, ...]) -> Matter:
     at = np.array(places, dtype=np.int64)
     first: dict[int, int] = {}
     group = [first.setdefault(g, k) for k, g in enumerate(matter.group[at].tolist())]
-    return Matter(matter.eps[at], matter.ground[at], np.array(group, dtype=np.int64))
+    return replace(
+        matter, eps=matter.eps[at], ground=matter.ground[at], group=np.array(group, np.int64)
+    )
 
 
 def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBody]) -> Array:
@@ -203,22 +211,23 @@ def sizes_of(records: NDArray[np.void], shapes: Sequence[RigidShape | ChangingBo
     return records["scale"] * np.array([s.capacitance for s in shapes])
 
 
-def touch(first: Body, second: Body) -> bool:
-    """Whether two solids meet; of two with edges, as far as the corners of one tell."""
+def touch(first: Body, second: Body, near: float = _TOUCH) -> bool:
+    """Whether two solids meet, nearer than so much [m]; of two with edges, as far as the corners of
+    one tell."""
     if isinstance(first.shape, _UNSEEN) or isinstance(second.shape, _UNSEEN):
         return False
     ends, others = _axis(first), _axis(second)
     if ends is not None and others is not None:
         apart = segment_distance(ends[0], others[0])
-        return bool(apart <= ends[1] + others[1] + _TOUCH)
+        return bool(apart <= ends[1] + others[1] + near)
     for axis, other in ((ends, second), (others, first)):
         if axis is not None:
             points = axis[0][0] + _ALONG[:, None] * (axis[0][1] - axis[0][0])
             off = other.shape.signed_distance(other.pose.inverse().apply(points))
-            return bool(off.min() <= axis[1] + _TOUCH)
+            return bool(off.min() <= axis[1] + near)
     for one, other in ((first, second), (second, first)):
         points = other.pose.inverse().apply(one.pose.apply(_surface_points(one)))
-        if (other.shape.signed_distance(points) <= _TOUCH).any():
+        if (other.shape.signed_distance(points) <= near).any():
             return True
     return False
 

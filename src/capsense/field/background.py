@@ -20,7 +20,7 @@ from capsense.field.green import GreenFunction, build_green
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-NUMERICS = 16
+NUMERICS = 17
 """Raise it when the same design and settings give other fields than before: it is part of the cache
 key, and fields of the old numerics are then no longer used."""
 
@@ -96,6 +96,8 @@ def build_background(
 ) -> BackgroundField:
     """Solve the empty domain of a design by boundary elements and fit its Green's function.
 
+    All of it is done in the length unit of the design, so that scaled designs have the same fields.
+
     ``progress`` is called with a stage's name and the fraction done, which never falls.
 
     Raises:
@@ -111,17 +113,19 @@ def build_background(
         else:
             tell(stage, _STAGES.get(stage, 0.0))
 
-    names = tuple(terminals(design))
+    names, unit, name = tuple(terminals(design)), design.unit, design.name
+    design = design.in_units
     solution = BoundarySolution(design, Accuracy(settings.panel_scale), begin)
     densities = solution.densities(np.eye(len(names)))
     capacitance = solution.terminal_charges(densities)
-    capacitance = 0.5 * (capacitance + capacitance.T)
+    capacitance = 0.5 * unit * (capacitance + capacitance.T)
     if not (np.isfinite(densities).all() and np.isfinite(capacitance).all()):
-        raise FieldError(f"the background field of design {design.name!r} is not finite")
+        raise FieldError(f"the background field of design {name!r} is not finite")
     green = build_green(solution, densities, begin)
     if has_even_face(design):
-        table = gap_table_of(solution, settings.panel_scale, green.clearance, begin)
+        table = gap_table_of(solution, settings.panel_scale, green, begin)
         green = replace(green, gap=table)
+    green = replace(green, unit=unit)
     tell("done", 1.0)
     return BackgroundField(capacitance, names, len(densities), green)
 

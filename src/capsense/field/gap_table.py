@@ -4,7 +4,8 @@ A compact Green's function does not resolve distances smaller than the spacing o
 boundary elements of the design do. A grounded plane is put in front of them, at some distances z,
 by a Schur complement of their factorised system. From its charges follows T_ij(p, z): what the
 plane changes in the charge density on terminal i at its point p, with terminal j, or the plane
-itself, at 1 V. The validity distance h0 is not measured: it is the smallest distance of the fit.
+itself, at 1 V. They also tell the validity distance h0, from which on the Green's function gives
+the plane, and plates of the electrodes' size and less, the energy that they have.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -35,18 +36,25 @@ from capsense.field.boundary import (
 )
 from capsense.field.panels import PLANE_TOL, Grading, concatenate, cut_facet, make_panels
 
+if TYPE_CHECKING:
+    from capsense.field.green import GreenFunction
+
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 UNIT = 4 * math.pi * EPS0
-_HEIGHTS = 0.03 * 2.1 ** np.arange(7)
+_HEIGHTS = 0.03 * 2.1 ** np.arange(8)
 """Distances of the plane, over the clearance of the Green's function."""
+_SOUGHT = 0.25
+"""The validity distance is sought from the first of these on that is larger than this."""
+_EXACT = 0.02
+"""Largest relative error of a plate's energy from the validity distance on."""
+_PLATE = 0.5
+"""Side of the small plates, over that of the electrodes."""
 _OFF = 3.0
 """Panels of the plane beside the sheets, over the size of those above them."""
 _MOST = 3500
 """About the most boundary elements that a table is made from."""
-_VALIDITY = 1.0
-"""The validity distance, over the clearance of the Green's function."""
 _FLAT = 3e-3
 """Sheets of a flat design rise by less than this, over their width."""
 _BLOCK = 6
@@ -198,6 +206,20 @@ def moved(panels: Panels, height: float) -> Panels:
     )
 
 
+class Plane(NamedTuple):
+    """A grounded plane in front of a design."""
+
+    change: Array
+    """What it changes in the free charge density on the design with each of t terminals, or the
+    plane itself, at 1 V [C/m²], shape (n, t + 1)."""
+    free: Array
+    """Mean potentials of its panels by charges of each of them without the design, (m, m) …"""
+    grounded: Array
+    """… and with it at ground, (m, m): 4π eps0 = 1."""
+    potential: Array
+    """Their mean potentials with each terminal at 1 V, (m, t)."""
+
+
 class PlaneResponse:
     """The boundary elements of a design with a plane in front of it.
 
@@ -213,13 +235,13 @@ class PlaneResponse:
         """Panels of sheets between two media."""
         self._gradient = kernels.normal_gradient_matrix(self._rows, model.floor, model.panels)
 
-    def at(self, height: float, densities: Array) -> Array:
-        """What the plane changes in the free charge density on the design [C/m²], (n, t + 1).
+    def at(self, height: float, densities: Array) -> Plane:
+        """What a plane does.
 
         Args:
             height: Height of the plane [m].
             densities: Densities of the design without it, with each of t terminals at 1 V [C/m²],
-                shape (n, t). In the last column of the result, the plane is at 1 V instead.
+                shape (n, t).
         """
         solution, model = self.solution, self.solution.model
         plane, n, m = moved(self.plane, height), model.panels.size, self.plane.size
@@ -231,7 +253,8 @@ class PlaneResponse:
         onto, own = blocks((n, n + m), (0, n)), blocks((n, n + m), (n, n + m))
         answer = solution.solve(blocks((0, n), (n, n + m)))
         sides = np.concatenate([-onto @ densities, np.full((m, 1), UNIT)], axis=1)
-        on_plane = np.linalg.solve(own - onto @ answer, sides)
+        grounded = own - onto @ answer
+        on_plane = np.linalg.solve(grounded, sides)
         total = -answer @ on_plane
         out = 0.5 * (model.eps_front + model.eps_back)[:, None] * total
         if len(self._rows):
@@ -241,13 +264,13 @@ class PlaneResponse:
                 + kernels.normal_gradient_block(self._rows, model.floor, both, n) @ on_plane
             )
             out[self._rows] -= jump * gradient / (4 * math.pi)
-        return out
+        return Plane(out, own / plane.areas, grounded / plane.areas, -sides[:, :-1] / UNIT)
 
 
 def gap_table_of(
     solution: BoundarySolution,
     panel_scale: float,
-    unit: float,
+    green: GreenFunction,
     progress: Callable[[str], None] = lambda _: None,
 ) -> GapTable:
     """The table of a design, from coarser boundary elements where it has many.
@@ -257,7 +280,7 @@ def gap_table_of(
     Args:
         solution: The factorised boundary elements of the design.
         panel_scale: Size of their panels, as :class:`~capsense.field.boundary.Accuracy` has it.
-        unit: Smallest distance that its Green's function was fitted at [m].
+        green: The Green's function that was fitted to them, in their lengths.
         progress: Called with what is being done.
     """
     count = solution.model.panels.size
@@ -265,36 +288,97 @@ def gap_table_of(
         scale = max(panel_scale, 1.0) * (count / _MOST) ** (1 / POWER)
         solution = BoundarySolution(solution.design, Accuracy(scale))
     densities = solution.densities(np.eye(solution.model.n_terminals))
-    return build_gap_table(solution, densities, unit, progress)
+    return build_gap_table(solution, densities, green.clearance, green, progress)
 
 
 def build_gap_table(
     solution: BoundarySolution,
     densities: Array,
     unit: float,
+    green: GreenFunction | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> GapTable:
-    """Work out what a plane near a flat design changes.
+    """Work out what a plane near a flat design changes, and from where on its G is valid.
 
     Args:
         solution: The factorised boundary elements of the design.
         densities: With each of its t terminals at 1 V [C/m²], shape (n, t).
-        unit: Smallest distance that its Green's function was fitted at [m].
+        unit: Smallest distance that its Green's function was fitted at.
+        green: That, in the same lengths. Without it, it counts as valid from there on.
         progress: Called with what is being done.
     """
     model = solution.model
-    validity = _VALIDITY * unit
     plane, top, heights = (
         plane_panels(solution, _MARGIN * unit),
         top_of(solution.design),
         np.asarray(unit * _HEIGHTS, float),
     )
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
-    response = PlaneResponse(solution, plane)
+    response, errors = PlaneResponse(solution, plane), np.full(len(heights), np.inf)
     for k, height in enumerate(heights):
         progress(f"response to a plane: {k + 1} of {len(heights)}")
-        changes[k] = response.at(top + height, densities)[: model.sheet_panels]
+        found = response.at(top + height, densities)
+        changes[k] = found.change[: model.sheet_panels]
+        if green is not None and height >= _SOUGHT * unit:
+            errors[k] = energy_error(found, moved(plane, top + height), green, solution.design)
+    validity = unit if green is None else valid_from(heights, errors)
     return _cells_of(model, changes, heights, top, validity)
+
+
+def energy_error(found: Plane, plane: Panels, green: GreenFunction, design: Design) -> float:
+    """Largest relative error that a Green's function makes of a plate's energy.
+
+    Plates are all of the plane, and for each electrode squares of its size and of ``_PLATE`` of it
+    in front of its middle. Infinite where the plane's energies by it are not definite.
+    """
+    m = plane.size
+    share = plane.weights / plane.weights.sum(axis=1, keepdims=True)
+
+    def means(of: Callable[[Array], Array]) -> Array:
+        values = of(plane.quad.reshape(-1, 3)).reshape(*share.shape, -1)
+        return np.asarray(np.einsum("mqk,mq->mk", values, share))
+
+    modes, potential = means(green.psi), means(green.phi0)
+    compact = found.free - modes @ modes.T
+    matrices = [0.5 * (a + a.T) for a in (compact, found.grounded)]
+    try:
+        np.linalg.cholesky(matrices[0])
+    except np.linalg.LinAlgError:
+        return math.inf
+    plates: list[tuple[Ints, slice]] = [(np.arange(m), slice(0, len(design.electrodes)))]
+    for i, electrode in enumerate(design.electrodes):
+        low, high = electrode.surface.bounds[:, :2]
+        off = np.abs(plane.centers[:, :2] - 0.5 * (low + high)) / (0.5 * (high - low))
+        plates += [(np.flatnonzero((off < x).all(axis=1)), slice(i, i + 1)) for x in (1.0, _PLATE)]
+    worst = 0.0
+    for some, columns in plates:
+        if len(some):
+            one, two = (
+                (
+                    phi[some, columns] * np.linalg.solve(a[np.ix_(some, some)], phi[some, columns])
+                ).sum(0)
+                for a, phi in zip(matrices, (potential, found.potential), strict=True)
+            )
+            worst = max(worst, float(np.abs(one / two - 1.0).max()))
+    return worst
+
+
+def valid_from(heights: Array, errors: Array) -> float:
+    """Distance from which on errors stay below ``_EXACT``, or below the least that they reach.
+
+    Between heights, errors follow a power law.
+    """
+    largest = 0.5 * float(heights[-1])  # the table reaches twice as far
+    if not np.isfinite(errors).any():
+        return largest
+    limit = max(_EXACT, 1.25 * float(errors.min()))
+    last = int(np.flatnonzero(errors <= limit)[-1])
+    above = np.flatnonzero(errors[:last] > limit)
+    first = int(above[-1]) + 1 if len(above) else 0
+    if first == 0 or not math.isfinite(errors[first - 1]):
+        return min(float(heights[first]), largest)
+    x, y = np.log(heights[first - 1 : first + 1]), np.log(errors[first - 1 : first + 1])
+    return min(float(np.exp(np.interp(-math.log(limit), -y, x))), largest)
 
 
 def _cells_of(

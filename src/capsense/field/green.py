@@ -14,6 +14,7 @@ that there are three representations of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -53,8 +54,9 @@ _MIDDLE = 0.05
 class GreenFunction:
     """The grounded Green's function of a design and the potentials of its terminals.
 
-    All tables are single precision and contiguous. With b_s(p) = 1/|p − s| − 1/|p − s*|, s* the
-    image of s in the floor, ψ_k(p) = Σ_s b_s(p) modes[s, k] and φ⁰_i(p) = Σ_s b_s(p) phi[s, i].
+    Lengths are in the design's ``unit``, those that functions take and give in metres. All tables
+    are single precision and contiguous. With b_s(p) = 1/|p − s| − 1/|p − s*|, s* the image of s in
+    the floor, ψ_k(p) = Σ_s b_s(p) modes[s, k] and φ⁰_i(p) = Σ_s b_s(p) phi[s, i].
     """
 
     floor: float
@@ -89,6 +91,8 @@ class GreenFunction:
 
     It overstates by far what it costs a capacitance, which sees averages over bodies.
     """
+    unit: float = 1.0
+    """Length unit of all other fields [m]."""
     gap: GapTable | None = None
     """What bodies in the first millimetres add, of a flat design."""
 
@@ -99,11 +103,11 @@ class GreenFunction:
 
     def distance(self, points: Array) -> Array:
         """Distance from ``box`` [m], zero inside, shape (n, 3) -> (n,)."""
-        return outside(self.box, points)
+        return self.unit * outside(self.box, points / self.unit)
 
     def shares(self, points: Array) -> Array:
         """Share of each representation, smoothsteps between them, shape (n, 3) -> (3, n)."""
-        distance = self.distance(points)
+        distance = self.distance(points) / self.unit
         up_to = [np.zeros(len(points))]  # of a representation and those before
         for start, end in self.blends:
             t = np.clip((end - distance) / (end - start), 0.0, 1.0)
@@ -111,8 +115,9 @@ class GreenFunction:
         return np.diff([*up_to, np.ones(len(points))], axis=0)
 
     def psi(self, points: Array) -> Array:
-        """Modes at points [m], shape (n, 3) -> (n, modes)."""
-        return self._sum(points, self.near_modes, self.middle_modes, self.far_modes)
+        """Modes at points [m], [1/m^½], shape (n, 3) -> (n, modes)."""
+        modes = self._sum(points, self.near_modes, self.middle_modes, self.far_modes)
+        return modes / math.sqrt(self.unit)
 
     def phi0(self, points: Array) -> Array:
         """Potential [V] of each terminal at 1 V, others at 0, shape (n, 3) -> (n, terminals)."""
@@ -124,13 +129,13 @@ class GreenFunction:
         sources_of = self.near_sources, self.middle_sources, self.far_sources
         for sources, table, part in zip(sources_of, tables, self.shares(points), strict=True):
             here = np.flatnonzero(part)
-            values = basis(points[here], sources, self.floor) @ table.astype(np.float64)
+            values = basis(points[here] / self.unit, sources, self.floor) @ table.astype(np.float64)
             out[here, : table.shape[1]] += part[here, None] * values
         return out
 
     def g(self, p: Array, q: Array) -> Array:
         """Potential at p of the design's answer to unit charges at q [1/m], (n, 3), (m, 3)."""
-        images = q * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * self.floor]
+        images = q * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * self.unit * self.floor]
         return -1 / _distances(p, images) - self.psi(p) @ self.psi(q).T
 
 
@@ -221,7 +226,7 @@ def build_green(
         raise FieldError(f"the Green's function of design {design.name!r} is not finite")
     numbers = {
         "floor": floor, "box": design_box(design), "blends": np.array(settings.blends),
-        "clearance": surface.clearance(settings), "misfit": misfit,
+        "clearance": surface.clearance(settings), "misfit": misfit, "unit": 1.0,
     }  # fmt: skip
     return from_arrays({**dict(zip(TABLES, tables, strict=True)), **numbers})
 

@@ -47,7 +47,8 @@ _AWAY = 1e3
 """Coordinates of sources without charge [m]."""
 MARGIN = 0.03
 """What lies nearer than this to the ceiling and the side walls, over the domain's shortest side, is
-left out: at ground, the walls take nearly all of what would meet it. An open domain has none."""
+left out: at ground, the walls take nearly all of what would meet it. An open domain has none, and
+bodies count far beyond it (``Domain.sight``)."""
 
 
 class Level(NamedTuple):
@@ -204,7 +205,7 @@ def _packed(green: GreenFunction, design: Design) -> Green:
     walls = np.array([design.domain.lower, design.domain.upper])
     extent = float(min(design.domain.size))
     margin = 0.0 if design.domain.open else MARGIN * extent
-    room = walls + margin * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
+    room = design.domain.sight + margin * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, -1.0]])
     terminals = green.near_phi.shape[1]
     lead = 8 * -(-terminals // 8)
 

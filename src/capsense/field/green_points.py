@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 
 _OPEN = 0.3
 """Bodies can be where the openness is larger."""
-_PER_WIDTH = 0.5
+_PER_WIDTH = 0.2
 """Largest spacing of near point charges, over the width of the narrowest electrode."""
-_SPACING = 2.4e-3
+_SPACING = 1.5e-3
 """Smallest distance of neighbouring point charges, near representation [m]."""
 _RIM = 0.45
 """Behind free rims, which bodies can pass, the openness is larger."""
@@ -65,9 +65,9 @@ class GreenSettings:
     """How many more there are all over the domain, where potentials are small."""
     far_training: int = 3000
     """Points that the middle and the far representation are fitted at, to the near one."""
-    clearance: tuple[float, float] = (1.2e-3, 2e-3)
-    """Smallest distance of these points from the design [m]: half the spacing of the near charges,
-    or a quarter of an electrode's widest panel if that is more, between these bounds."""
+    clearance: tuple[float, float] = (0.5, 0.25)
+    """Smallest distance of these points from the design, over the spacing of the near charges, or
+    over the width of an electrode's widest panel if that is more."""
     blends: tuple[tuple[float, float], ...] = ((0.0035, 0.005), (0.012, 0.018))
     """Distances where the middle representation starts and the near one ends [m], and where the far
     one starts and the middle one ends."""
@@ -124,13 +124,13 @@ class Surroundings:
 
     def spacing(self, count: int, least: float) -> float:
         """Distance of neighbours among up to ``count`` points near electrodes [m]."""
-        least = min(least, _PER_WIDTH * least / _SPACING * self.narrowest)
+        least *= min(1.0, _PER_WIDTH * self.narrowest / _SPACING)
         return max(least, float(np.sqrt(self.weights.sum() / count)))
 
     def clearance(self, settings: GreenSettings) -> float:
         """Smallest distance of points of the fit from the design [m]."""
         spacing = self.spacing(settings.near_sources, settings.near_spacing)
-        return float(np.clip(max(0.5 * spacing, 0.25 * self.widest), *settings.clearance))
+        return max(settings.clearance[0] * spacing, settings.clearance[1] * self.widest)
 
     def sources(self, count: int, spacing: float, depth: float) -> Array:
         """Up to ``count`` points evenly spread behind the surfaces [m], shape (s, 3)."""
@@ -281,24 +281,27 @@ def outside(box: Array, points: Array) -> Array:
 
 
 _RAYS = 48
-_FLOOR_REACH = 0.05
-"""A floor nearer than this along a ray [m] counts as closed in proportion."""
+_FLOOR_REACH = 5.0, 0.5
+"""A floor nearer along a ray than so many times the backplane, but no more than this part of the
+domain's shortest side, counts as closed in proportion."""
 
 
 def openness(design: Design, points: Array) -> Array:
     """Share of the directions in which a point has a free view, shape (n, 3) -> (n,).
 
     A ray that meets a conductor has none, one that reaches a side wall or the ceiling has a free
-    view, and one that meets the floor after a distance d counts min(1, d / 50 mm). In front of a
-    sheet it is more than one half; behind a sheet that lies a few millimetres above the floor
-    below 0.2; inside a closed housing 0. Layers are transparent.
+    view, and one that meets the floor counts as ``_FLOOR_REACH`` says. In front of a sheet it is
+    more than one half; behind one that lies near the floor about a quarter; inside a closed housing
+    0. Layers are transparent.
     """
     triangles = np.concatenate([body.surface.triangles for body in design.sheets])
     k = np.arange(_RAYS) + 0.5
     z, turn = 1 - 2 * k / _RAYS, k * math.pi * (3 - math.sqrt(5))
     side = np.sqrt(1 - z * z)
     rays = np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
-    floor = design.domain.floor
+    domain = design.domain
+    reach = min(_FLOOR_REACH[0] * domain.backplane, _FLOOR_REACH[1] * min(domain.size))
+    floor = domain.floor, reach
     out = np.empty(len(points))
     return filled(_fill_views, out, np.ascontiguousarray(points), rays, triangles, floor)
 
@@ -311,7 +314,13 @@ def free_path(design: Design, points: Array, rays: Array) -> Array:
 
 @kernel
 def _fill_views(
-    start: int, stop: int, points: Array, rays: Array, triangles: Array, floor: float, out: Array
+    start: int,
+    stop: int,
+    points: Array,
+    rays: Array,
+    triangles: Array,
+    floor: tuple[float, float],
+    out: Array,
 ) -> None:
     for i in range(start, stop):
         total = 0.0
@@ -319,6 +328,6 @@ def _fill_views(
             if first_hit(points[i], rays[r], triangles, False) == math.inf:
                 view = 1.0
                 if rays[r, 2] < 0.0:
-                    view = min(1.0, (floor - points[i, 2]) / rays[r, 2] / _FLOOR_REACH)
+                    view = min(1.0, (floor[0] - points[i, 2]) / rays[r, 2] / floor[1])
                 total += max(view, 0.0)
         out[i] = total / len(rays)

@@ -104,7 +104,10 @@ def on_device(values: Any) -> bool:
 
 
 class Bodies(NamedTuple):
-    """What stands in every environment; e environments, b places for bodies."""
+    """What stands in every environment; e environments, b places for bodies.
+
+    Lengths are over the solver's ``length``.
+    """
 
     shapes: NDArray[Any]
     """Shapes, of size 1, as records of ``elements.rigid.BODY``, shape (u,)."""
@@ -245,14 +248,15 @@ class BodyTable:
             raise SceneError(
                 f"{type(body.shape).__name__} is not rigid; a fleet takes primitives and TriMesh"
             )
-        matter = matter_of([body], self._solver.excitation_frequency)
-        window, _ = windowed(body.shape, np.zeros(3), self._solver.reach)
+        matter, length = self._solver.matter_of([body]), self._solver.length
+        whole = body.shape.measured_in(length)
+        window, _ = windowed(whole, np.zeros(3), self._solver.reach)
         shape, size = self._solver.functions_of(window, bool(matter.conducting[0]))
         tie = complex(matter.ties(np.array([size * shape.capacitance]))[0])
         neutral = int(np.isinf(tie.real))
         soft = complex(matter.softness[0])
         number = self._number(shape, soft != 0.0)
-        cut = 0.5 * np.ptp(body.shape.bounds(), axis=0) - 0.5 * np.ptp(window.bounds(), axis=0)
+        cut = 0.5 * np.ptp(whole.bounds(), axis=0) - 0.5 * np.ptp(window.bounds(), axis=0)
         return number, size, soft, 0.0 if neutral else tie, neutral, cut
 
     def _number(self, shape: RigidShape | ChangingBody, soft: bool) -> int:

@@ -40,14 +40,15 @@ class Sensor(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Where everything is: position [m] and quaternion (x, y, z, w) in the world's frame."""
+    """Where everything is: position, over the solver's ``length``, and quaternion (x, y, z, w) in
+    the world's frame."""
 
     bodies: NDArray[Any]
     """Shape (e, b, 7)."""
     sensors: NDArray[Any]
     """Shape (e, s, 7)."""
     middle: NDArray[Any]
-    """Middle of the domain in the sensor frame [m], shape (3,)."""
+    """Middle of the domain in the sensor frame, shape (3,)."""
     forces: NDArray[Any]
     """Normal forces that press bodies onto the cover [N], NaN for none, shape (e, b)."""
 
@@ -234,6 +235,15 @@ def _placed(
     return True
 
 
+def _in_units(solver: SurfaceSolver, bodies: Array, sensors: Array, forces: Array) -> Poses:
+    """Poses, (e, b, 7) and (e, s, 7), with lengths as the solver's kernels take them.
+
+    Forces are (e, b), in N.
+    """
+    length = np.array([solver.length] * 3 + [1.0] * 4)
+    return Poses(bodies / length, sensors / length, solver.middle, forces)
+
+
 class CpuCore:
     """Solves all sensors of all environments.
 
@@ -254,7 +264,7 @@ class CpuCore:
         """
         (e, b, _), s = bodies.shape, sensors.shape[1]
         solver, terminals = self._solver, self._terminals
-        where = Poses(bodies, sensors, solver.middle, forces)
+        where = _in_units(solver, bodies, sensors, forces)
         green, cover = solver.green, solver.cover
         m = green.terminals
         slope = np.zeros((e if jacobian else 0, s, b, m, m, 6))
@@ -274,16 +284,20 @@ class CpuCore:
                 f"{len(failed)} of {e} environments have no solution, the first is {failed[0]}: "
                 "look for bodies that coincide"
             )
-        change = terminals.screened(UNIT * found.delta)
-        slopes = terminals.slope(change, UNIT * slope) if jacobian else None
-        change = terminals.change(change if loss is None else change - 1j * UNIT * loss)
+        unit = solver.unit
+        change = terminals.screened(unit * found.delta)
+        slope[..., :3] *= UNIT
+        slope[..., 3:] *= unit
+        slopes = terminals.slope(change, slope) if jacobian else None
+        change = terminals.change(change if loss is None else change - 1j * unit * loss)
         shields = (terminals.empty + change.real)[..., :n, n:].sum(axis=-1)
         change = change[..., :n, :n]
         omega = 2 * np.pi * solver.excitation_frequency
         return FleetReading(
-            terminals.empty[:n, :n] + change.real, change.real, UNIT * found.error, shields,
+            terminals.empty[:n, :n] + change.real, change.real, unit * found.error, shields,
             conductance=None if loss is None else -omega * change.imag, jacobian=slopes,
-            touch=FleetTouch(found.force, found.deepest, found.total) if own[2] else None,
+            touch=FleetTouch(found.force, solver.length * found.deepest, found.total)
+            if own[2] else None,
         )  # fmt: skip
 
     def lifted(
@@ -301,7 +315,7 @@ class CpuCore:
             nodes: How many such conductors can be nodes; None for a fleet on the CPU.
         """
         solver, table = self._solver, self._table.bodies
-        where = Poses(bodies, sensors, solver.middle, self._table.forces)
+        where = _in_units(solver, bodies, sensors, self._table.forces)
         green = solver.green
         sight = green.room, SHORE * green.extent
         records = np.empty(table.choice.shape[1], BODY)

@@ -54,7 +54,7 @@ class WarpCore:
         table = solver.green.gap
         slots = min(places, _NODES) if len(table.areas) else 0
         self.green = pack_response(solver, slots, device)
-        self.circuit = pack_circuit(terminals, device)
+        self.circuit = pack_circuit(solver, terminals, device)
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
         self.gap = warp_near.pack_gap(table, self.green.terminals, slots, device)
         self.outlines: Any = None

@@ -94,6 +94,7 @@ class Response:
     room0: wp.vec3
     room1: wp.vec3
     middle: wp.vec3
+    length: wp.float32  # of what kernels take for a length of one [m]; poses are in metres
 
 
 @wp.struct
@@ -203,6 +204,7 @@ def stand(
     body = _unit(bodies[e, b])
     turn = wp.quat_inverse(wp.transform_get_rotation(frame))
     off = wp.transform_get_translation(body) - wp.transform_get_translation(frame)
+    off = off / green.length
     at = wp.transform(wp.quat_rotate(turn, off), turn * wp.transform_get_rotation(body))
     slack = places.slack[e, b]
     off = wp.transform_point(wp.transform_inverse(at), green.middle)

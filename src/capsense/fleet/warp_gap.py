@@ -13,11 +13,11 @@ import warp as wp
 from capsense.fleet.warp_cut import Response, lift, smooth
 from capsense.fleet.warp_mesh import Hit, Outlines
 from capsense.fleet.warp_near import GapLaw, NearBodies, may_meet, nearest_of
-from capsense.surface.gap_kernels import LEAST, REACH
+from capsense.surface.gap_kernels import REACH
 
 wp.set_module_options({"enable_backward": False})
 
-_REACH0, _REACH1, _LEAST = wp.constant(REACH[0]), wp.constant(REACH[1]), wp.constant(LEAST)
+_REACH0, _REACH1 = wp.constant(REACH[0]), wp.constant(REACH[1])
 _PI = wp.constant(math.pi)
 
 
@@ -64,7 +64,7 @@ def _support(hit: Hit, ratio: float, back: wp.vec3, far: float):
 def lengths(gap: GapLaw, green: Response, hit: Hit, x: wp.vec3):
     """Lengths of the field lines from a place on the face to a body, and to the lifted body [m]."""
     h0 = gap.validity
-    least = _LEAST * h0
+    least = gap.least
     if hit.off <= 0.0:
         return least, h0
     across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])

@@ -33,6 +33,7 @@ class GapLaw:
     """The table of a design, see ``gap_table.GapTable``: c cells in q blocks in p chunks."""
 
     validity: wp.float32
+    least: wp.float32  # field lines are no shorter
     top: wp.float32
     lowest: wp.float32  # the first of the heights of the table [m]
     log_ratio: wp.float32
@@ -87,6 +88,7 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
     out, cells = GapLaw(), len(gap.areas)
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
+    out.least = gap.least
     out.cover, out.eps, out.limit = gap.soft.thickness, gap.soft.eps, gap.soft.limit
     owners = gap.terminal[gap.blocks[:-1]] if cells else np.zeros(0, np.int64)
     each = [np.flatnonzero(owners == t)[::_BLOCKS] for t in (*range(terminals), -1)]  # as they lie

@@ -29,7 +29,8 @@ class Circuit:
 
     electrodes: wp.int32
     driven: wp.int32
-    unit: wp.float32  # 4π eps0 [F/m]
+    unit: wp.float32  # capacitance that kernels take for one [F]
+    metre: wp.float32  # the same of a metre: 4π eps0 [F]
     omega: wp.float32  # angular frequency [rad/s]
     rest: wp.array2d(dtype=wp.float64)  # matrix of all in the empty domain [F], (t, t)
     empty: wp.array2d(dtype=wp.float64)  # that of the driven ones, the others eliminated, (k, k)
@@ -263,4 +264,4 @@ def slopes(
                 total += total[2] * slopes.lift[b, v]
         force = wp.spatial_top(total)
         torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
-        out[v, b, i, j] = circuit.unit * wp.spatial_vector(force, torque)
+        out[v, b, i, j] = wp.spatial_vector(circuit.metre * force, circuit.unit * torque)

@@ -40,6 +40,7 @@ def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     out.far, out.passes = count, width // warp_cut.WIDTH
     out.first, out.lead = green.lead, lead
     out.terminals, out.middle = green.terminals, wp.vec3(*solver.middle)
+    out.length = solver.length
     out.extent, out.validity = green.extent, green.gap.validity
     out.floor, out.cover = green.floor, min(green.cover, 1e3)
     out.blend0, out.blend1 = green.blends[-1].tolist()
@@ -49,10 +50,11 @@ def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     return out
 
 
-def pack_circuit(terminals: Terminals, device: Any) -> Any:
+def pack_circuit(solver: SurfaceSolver, terminals: Terminals, device: Any) -> Any:
     """The terminals of a design."""
     out = network.Circuit()
-    out.electrodes, out.driven, out.unit = terminals.electrodes, terminals.driven, UNIT
+    out.electrodes, out.driven = terminals.electrodes, terminals.driven
+    out.unit, out.metre = solver.unit, UNIT
     for name in ("rest", "empty"):
         setattr(out, name, wp.array(getattr(terminals, name), dtype=wp.float64, device=device))
     bound = np.minimum(terminals.bound, np.finfo(np.float32).max).astype(np.float32)

@@ -80,6 +80,13 @@ class Layers(Shape):
         first, last = read_only(low[:slots]), read_only(high[:slots])
         self.__dict__.update(front=first, back=last, size=wide, _reach=reach)
 
+    def _measured_in(self, unit: float) -> Layers:
+        out = object.__new__(Layers)
+        ends = {name: read_only(getattr(self, name) / unit) for name in ("front", "back")}
+        size = self.size[0] / unit, self.size[1] / unit
+        out.__dict__.update(ends, size=size, _reach=self._reach / [1.0, 1.0, unit])
+        return out
+
     @property
     def resolution(self) -> tuple[int, int]:
         """Rows and columns of the image."""

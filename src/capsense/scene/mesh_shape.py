@@ -140,6 +140,12 @@ class TriMesh(TriangleShape):
         v, f, flaw = clean_surface(vertices, faces)
         self.__dict__.update(vertices=read_only(v), faces=read_only(f), _flaw=flaw)
 
+    def _measured_in(self, unit: float) -> TriMesh:
+        out = object.__new__(TriMesh)
+        vertices = read_only(np.round(self.vertices / unit, 12))  # the same of scaled ones
+        out.__dict__.update(vertices=vertices, faces=self.faces, _flaw=self._flaw)
+        return out
+
     @property
     def closed(self) -> bool:
         """Whether the mesh has an inside."""
@@ -227,6 +233,14 @@ class RestSurface(Frozen):
         """Whether the surface has an inside: it has no rim, and its faces wind alike."""
         return is_closed(self.faces, len(self.vertices))
 
+    def measured_in(self, unit: float) -> RestSurface:
+        """The same with lengths in a unit [m]; the last one is kept."""
+        held: tuple[float, RestSurface] | None = self.__dict__.get("_measured")
+        if held is None or held[0] != unit:
+            rest = RestSurface(self.vertices / unit, self.faces, self.thickness / unit)
+            held = self.__dict__["_measured"] = unit, rest
+        return held[1]
+
     @cached_property
     def used(self) -> NDArray[np.int64]:
         """Vertices that faces name, ascending."""
@@ -261,6 +275,9 @@ class SurfaceMesh(TriangleShape):
                 f"{rest.vertices.shape}; make a new one to change its faces"
             )
         self.__dict__.update(vertices=read_only(v), faces=rest.faces, rest=rest)
+
+    def _measured_in(self, unit: float) -> SurfaceMesh:
+        return SurfaceMesh(self.vertices / unit, self.rest.measured_in(unit))
 
     @property
     def closed(self) -> bool:

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -62,6 +62,19 @@ class Shape(Frozen, ABC):
     def packed(self) -> tuple[float, ...]:
         """``params`` and the centre of the local bounding box [m], six numbers."""
         return (*self.params.tolist(), *self.bounds().mean(axis=0).tolist())
+
+    def measured_in(self, unit: float) -> Self:
+        """The same shape with lengths in a unit [m]; the last one is kept."""
+        if unit == 1.0:
+            return self
+        held: tuple[float, Self] | None = self.__dict__.get("_measured")
+        if held is None or held[0] != unit:
+            held = self.__dict__["_measured"] = unit, self._measured_in(unit)
+        return held[1]
+
+    @abstractmethod
+    def _measured_in(self, unit: float) -> Self:
+        """As :meth:`measured_in`, each time anew."""
 
     @property
     @abstractmethod
@@ -131,6 +144,13 @@ class _Primitive(Shape):
             check = _size if f.type == "float" else _sizes
             checked = check(type(self).__name__, f.name, getattr(self, f.name))
             object.__setattr__(self, f.name, checked)
+
+    def _measured_in(self, unit: float) -> Self:
+        lengths = [getattr(self, f.name) for f in fields(self)]  # type: ignore[arg-type]
+        return type(self)(*(
+            tuple(x / unit for x in each) if isinstance(each, tuple) else each / unit
+            for each in lengths
+        ))  # fmt: skip
 
     @cached_property
     def packed(self) -> tuple[float, ...]:

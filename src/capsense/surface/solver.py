@@ -23,7 +23,7 @@ from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import SHORE, pack_green
 from capsense.field.green_points import narrowest_width
-from capsense.scene import Scene, TriMesh
+from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import TOUCH, Sheets
 from capsense.scene.geometry_kernels import overlapping
 from capsense.scene.shapes import Shape, ShapeKind
@@ -129,35 +129,42 @@ class SurfaceSolver:
         _keep_memory()
         self.excitation_frequency = excitation_frequency
         self.preset = preset or Preset()
+        self.length = green.unit
+        """Length that kernels take for one [m]: all of theirs are ratios to the electrodes."""
+        self.unit = UNIT * self.length
+        """What they take for a capacitance of one [F]."""
+        metres = design
+        design = metres.in_units if self.length == metres.unit else metres
         self.green = pack_green(green, design)
         self._function = green
         walls = np.array([design.domain.lower, design.domain.upper])
         self.middle, self.reach = walls.mean(axis=0), float(np.linalg.norm(np.ptp(walls, axis=0)))
-        """Middle and diagonal of the domain [m], as :func:`windowed` takes them."""
+        """Middle and diagonal of the domain, over ``length``, as :func:`windowed` takes them."""
         self._sight = self.green.room + SHORE * self.green.extent * np.array([[-1.0], [1.0]])
-        """Corners of the box beyond which no charge is [m], shape (2, 3)."""
+        """Corners of the box beyond which no charge is, over ``length``, shape (2, 3)."""
         self._last: tuple[View, Solution] | None = None
         self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         gap = self.green.gap
-        touch = gap.least if len(gap.areas) else TOUCH
+        touch = self.length * gap.least if len(gap.areas) else self.length * TOUCH
         self._contact = (
-            CoverContact(design.cover, gap, self.green.electrodes)
+            CoverContact(design.cover, gap, self.green.electrodes, self.length)
             if design.cover is not None
             else None
         )
         self.cover = no_foundation() if self._contact is None else self._contact.foundation
         """The cover as kernels take it; without pressures where there is none."""
-        self._sheets = Sheets([e.surface.triangles for e in design.electrodes], touch)
+        self._sheets = Sheets([e.surface.triangles for e in metres.electrodes], touch)
         coarsest, width = self.preset.coarsest, narrowest_width(design)
         self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2
-        """Bodies of so much surface or more [m²] get panels of a few millimetres; None for none."""
+        """Bodies of so much surface or more, over ``length``², get small panels; None for none."""
         finest = self.preset.finest
         if finest is not None:
             finest = min(finest, _RESOLVED * width)
             finest = max(finest, _SMOOTH * self.green.gap.validity)
         self._finest = finest
-        """Panels of other bodies have parts where they are longer than this [m]; None for none."""
+        """Panels of other bodies have parts where they are longer, over ``length``; None for none.
+        """
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies lay bodies out anew, as records point to arrays, and take no shapes along."""
@@ -178,7 +185,7 @@ class SurfaceSolver:
             change = self._change(view, bodies, np.zeros((self.green.terminals,) * 2), 0.0, 0)
         else:
             self._last = view, solution
-            matrix, error = UNIT * solution.delta, UNIT * solution.error
+            matrix, error = self.unit * solution.delta, self.unit * solution.error
             change = self._change(view, bodies, matrix, error, solution.size)
         return replace(change, jacobian=slope)
 
@@ -216,7 +223,7 @@ class SurfaceSolver:
                 delta, doubt, size = solve_each(
                     records, first, self.green, self.preset.threshold, self.preset.width
                 )
-            delta, doubt = UNIT * delta, UNIT * doubt
+            delta, doubt = self.unit * delta, self.unit * doubt
             sound = np.isfinite(delta).all(axis=(1, 2))
             for i, (k, view, bodies) in enumerate(plain):
                 if sound[i]:
@@ -245,7 +252,8 @@ class SurfaceSolver:
         if self._last is None:
             return out
         view, solution = self._last
-        out += potential_change(self._function, solution, points)
+        function = replace(self._function, unit=1.0)
+        out += potential_change(function, solution, points / self.length)
         for place in np.flatnonzero(view.matter.conducting).tolist():
             body = view.scene[int(view.met[place])]
             if body.shape.kind in (ShapeKind.MESH, ShapeKind.LAYERS):
@@ -261,8 +269,9 @@ class SurfaceSolver:
             return None
         _, solution = self._last
         area = np.maximum(solution.extent, 1e-9)[:, None] ** 2
-        density = UNIT * np.abs(solution.charge[:, : self.green.terminals]) / area
-        return Charges(solution.points.mean(axis=1), density, float(np.median(solution.extent)))
+        density = UNIT / self.length * np.abs(solution.charge[:, : self.green.terminals]) / area
+        points, pitch = solution.points.mean(axis=1), float(np.median(solution.extent))
+        return Charges(self.length * points, density, self.length * pitch)
 
     def reset(self) -> None:
         """Forget the last scene, and what covers remember of their contacts."""
@@ -273,9 +282,13 @@ class SurfaceSolver:
     def look(self, scene: Scene) -> View:
         """Find the bodies of a scene that reach into the domain."""
         packed = scene.pack()
-        met = overlapping(packed.bounds, *self._sight)
-        matter = matter_of([scene[k] for k in met.tolist()], self.excitation_frequency)
+        met = overlapping(packed.bounds, *(self.length * self._sight))
+        matter = self.matter_of([scene[k] for k in met.tolist()])
         return View(scene, packed, met, matter)
+
+    def matter_of(self, bodies: Sequence[Body]) -> Matter:
+        """What bodies are made of, with lengths as kernels take them."""
+        return matter_of(bodies, self.excitation_frequency, self.length)
 
     def solution(
         self, view: View, *, jacobian: bool = False, time: float | None = None
@@ -324,6 +337,7 @@ class SurfaceSolver:
             solution, bodies.records, self.green, preset.threshold, preset.width
         )
         slope[..., 3:] += np.cross(bodies.offsets[:, None, None], slope[..., :3])
+        slope[..., 3:] *= self.length
         np.add.at(out, bodies.chosen, slope)
         for pressed in bodies.pressed:
             if pressed.held:
@@ -361,6 +375,7 @@ class SurfaceSolver:
                     solve(records, self.green, preset.threshold, preset.width, False).delta
                 )
             out[..., way] = UNIT * (found[0] - found[1]) / (2.0 * change)
+        out[..., 3:] *= self.length
         return out
 
     def pack(self, view: View, time: float | None = None) -> PackedBodies:
@@ -378,7 +393,7 @@ class SurfaceSolver:
             self._laid[key] = laid
         records, chosen = laid.copied(), view.met[laid.places]
         records["rotation"] = rotation = packed.rotation[chosen]
-        records["position"] = packed.position[chosen]
+        records["position"] = packed.position[chosen] / self.length
         shift = np.zeros((len(chosen), 3))
         for i, at in offsets:
             shift[i] = rotation[i] @ at
@@ -411,7 +426,8 @@ class SurfaceSolver:
                 places.append(place)
         if laid is None or (laid.places, laid.found) != (places, found):
             laid = laid_out(matter, places, found)
-        return replace(laid, everywhere=same(solved, bodies)), offsets
+        whole = [body.measured_in(self.length) for body in bodies]
+        return replace(laid, everywhere=same(solved, whole)), offsets
 
     def _joined(self, view: View) -> Matter:
         """What bodies are made of, with conductors that touch as one.
@@ -420,7 +436,7 @@ class SurfaceSolver:
         """
         if not view.matter.some_free:
             return view.matter
-        whole = matter_of(list(view.scene), self.excitation_frequency)
+        whole = self.matter_of(list(view.scene))
         used = np.union1d(view.met, np.flatnonzero(whole.free))
         places = np.searchsorted(used, view.met)
         joined = whole.repeated(used.tolist()).joined(view.scene, view.packed, used)
@@ -435,14 +451,15 @@ class SurfaceSolver:
 
         Returns:
             Parts, the share of the usual panels that each is given, and where the only one is in
-            the body's frame [m] if that is not its origin.
+            the body's frame if that is not its origin; over ``length``.
         """
         k, matter = int(view.met[place]), view.matter
-        shape = view.packed.shapes[k]
+        shape = view.packed.shapes[k].measured_in(self.length)
+        position = view.packed.position[k] / self.length
         if not isinstance(shape, TriMesh):
             if not longer(shape, self.reach):
                 return (shape,), 1.0, None
-            middle = (self.middle - view.packed.position[k]) @ view.packed.rotation[k]
+            middle = (self.middle - position) @ view.packed.rotation[k]
             part, at = windowed(shape, middle, self.reach)
             return (part,), 1.0, at
         if (
@@ -453,7 +470,7 @@ class SurfaceSolver:
             return (shape,), 1.0, None
         rotation = view.packed.rotation[k]
         low, high = shape.piece_bounds
-        middle = view.packed.position[k] + 0.5 * (low + high) @ rotation.T
+        middle = position + 0.5 * (low + high) @ rotation.T
         half = 0.5 * (high - low) @ np.abs(rotation.T)
         low, high = self._sight
         near = ((middle + half > low) & (middle - half < high)).all(axis=1)
@@ -462,7 +479,8 @@ class SurfaceSolver:
     def functions_of(
         self, shape: Shape, conducting: bool, share: float = 1.0
     ) -> tuple[RigidShape | ChangingBody, float]:
-        """Charge functions of a body from a share of the usual panels, and its size."""
+        """Charge functions of a body from a share of the usual panels, and its size; its lengths
+        are over ``length``."""
         panels = round(share * self.preset.panels)
         return functions_of(
             shape, panels, conducting=conducting, largest=self._largest, finest=self._finest

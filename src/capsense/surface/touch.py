@@ -35,21 +35,22 @@ class Pressed:
     elastic: float
     """What its force would be without relaxation and hysteresis [N]."""
     depth: float
-    """How much lower it stands than its pose says [m]."""
+    """How much lower it stands than its pose says, in the length unit."""
 
 
 class CoverContact:
     """How bodies are pressed into a cover, step by step.
 
     Args:
-        cover: The cover.
-        gap: Cells of the design's gap table.
+        cover: The cover, in a length unit.
+        gap: Cells of the design's gap table, in the same unit.
         electrodes: How many of its terminals are electrodes, the first ones.
+        unit: The length unit [m].
     """
 
-    def __init__(self, cover: Cover, gap: Gap, electrodes: int) -> None:
-        self.cover, self._electrodes = cover, electrodes
-        self.foundation = foundation(cover, gap, electrodes)
+    def __init__(self, cover: Cover, gap: Gap, electrodes: int, unit: float) -> None:
+        self.cover, self._electrodes, self._unit = cover, electrodes, unit
+        self.foundation = foundation(cover, gap, electrodes, unit)
         """The cover as the kernels take it."""
         self._states: dict[str | int, Viscosity] = {}
 
@@ -101,7 +102,7 @@ class CoverContact:
             for name, state in self._states.items():
                 if name not in touching:
                     state.force(0.0, time)
-        return Touch(force, deepest, total), found
+        return Touch(force, self._unit * deepest, total), found
 
     def lower(self, records: NDArray[np.void], pressed: Pressed) -> None:
         """Put a body that a force holds to the height at which it is carried.
@@ -132,7 +133,7 @@ class CoverContact:
     def _depth(
         self, height: Array, area: float, force: float, state: Viscosity | None, time: float | None
     ) -> float:
-        """How far a body has to be lowered for a force to be carried [m]."""
+        """How far a body has to be lowered for a force to be carried, in the length unit."""
         if state is not None and time is not None:
             force = state.elastic(force, time)
         return depth_of_force(height, area, force, self.foundation)

@@ -24,35 +24,37 @@ _BISECTIONS = 200
 
 
 class Foundation(NamedTuple):
-    """A cover as an elastic foundation, and the cells of the electrodes below it."""
+    """A cover as an elastic foundation, and the cells of the electrodes below it; lengths are in the
+    unit that the design is solved in."""
 
     lower: NDArray[Any]
-    """Lower corner [m], shape (3,)."""
+    """Lower corner, shape (3,)."""
     upper: NDArray[Any]
-    """Upper corner, undeformed [m], shape (3,)."""
+    """Upper corner, undeformed, shape (3,)."""
     strain: NDArray[Any]
     stress: NDArray[Any]
-    """Table of strains and pressures [Pa], shape (n,) each."""
+    """Table of strains and pressures [N per square unit], shape (n,) each."""
     points: NDArray[Any]
-    """Cells of the electrodes [m], shape (c, 2)."""
+    """Cells of the electrodes, shape (c, 2)."""
     areas: NDArray[Any]
-    """Their areas [m²], shape (c,)."""
+    """Their areas, shape (c,)."""
     owner: NDArray[Any]
     """Electrode of each, shape (c,)."""
 
 
-def foundation(cover: Cover, gap: Gap, electrodes: int) -> Foundation:
+def foundation(cover: Cover, gap: Gap, electrodes: int, unit: float) -> Foundation:
     """The foundation of a cover, for the cells of a gap table below it.
 
     Args:
-        cover: The cover.
-        gap: Cells of the design's gap table.
+        cover: The cover, in a length unit.
+        gap: Cells of the design's gap table, in the same unit.
         electrodes: How many of its terminals are electrodes, the first ones.
+        unit: The length unit [m].
     """
     some = (gap.terminal >= 0) & (gap.terminal < electrodes) & (gap.soft.below >= 0.0)
     return Foundation(
         np.array(cover.lower, float), np.array(cover.upper, float),
-        np.array(cover.law.strain, float), np.array(cover.law.stress, float),
+        np.array(cover.law.strain, float), unit**2 * np.array(cover.law.stress, float),
         np.array(gap.points[some], np.float64), np.array(gap.areas[some], np.float64),
         np.array(gap.terminal[some], np.int64),
     )  # fmt: skip
@@ -131,7 +133,7 @@ def extents(bodies: NDArray[np.void]) -> NDArray[Any]:
 
 @kernel
 def pressure(strain: float, cover: Foundation) -> float:
-    """Pressure at a strain [Pa]; past the table its last slope continues."""
+    """Pressure at a strain [N per square unit]; past the table its last slope continues."""
     if strain <= 0.0:
         return 0.0
     k = 1
@@ -146,9 +148,9 @@ def contact_force(height: NDArray[Any], area: float, depth: float, cover: Founda
     """Force that holds a body at a depth [N].
 
     Args:
-        height: Height of its underside over the cover's face at cells [m], infinite beside it.
-        area: Area of a cell [m²].
-        depth: How far it is lowered [m].
+        height: Height of its underside over the cover's face at cells, infinite beside it.
+        area: Area of a cell.
+        depth: How far it is lowered.
         cover: The cover.
     """
     thickness, total = cover.upper[2] - cover.lower[2], 0.0
@@ -159,7 +161,7 @@ def contact_force(height: NDArray[Any], area: float, depth: float, cover: Founda
 
 @compiled
 def depth_of_force(height: NDArray[Any], area: float, force: float, cover: Foundation) -> float:
-    """How far a body has to be lowered for a force to be carried [m].
+    """How far a body has to be lowered for a force to be carried.
 
     Without a force, to where it just touches, if it is in the cover. Arguments as of
     :func:`contact_force`.
@@ -185,7 +187,7 @@ def depth_of_force(height: NDArray[Any], area: float, force: float, cover: Found
 def heights(
     bodies: NDArray[np.void], spans: NDArray[Any], held: bool, cover: Foundation
 ) -> tuple[NDArray[Any], float]:
-    """Heights of a body's underside over the cover's face [m], and the area of a cell [m²].
+    """Heights of a body's underside over the cover's face, and the area of a cell.
 
     Of the cells that it may be pressed into; where a force holds it, of those that are at most the
     cover's thickness higher than the lowest one.
@@ -225,7 +227,7 @@ def heights(
 
 @compiled
 def _grid(low: NDArray[Any], high: NDArray[Any], points: NDArray[Any], size: NDArray[Any]) -> None:
-    """Fill in the middles of n² equal cells of a rectangle [m], (n², 2), and their size, (2,)."""
+    """Fill in the middles of n² equal cells of a rectangle, (n², 2), and their size, (2,)."""
     count = int(math.sqrt(points.shape[0]))
     for i in range(2):
         size[i] = (high[i] - low[i]) / count
@@ -244,7 +246,7 @@ def electrode_forces(
         bodies: Records of its parts, shape (r,).
         cover: The cover.
         force: Added to, shape (m,).
-        deepest: Raised [m], shape (m,).
+        deepest: Raised, shape (m,).
     """
     top = cover.upper[2]
     thickness = top - cover.lower[2]
@@ -277,7 +279,7 @@ def press(
         bodies: Records, whose heights are changed, shape (b,).
         forces: Normal forces on them [N], NaN for none, shape (b,).
         cover: The cover.
-        force, deepest: Set to forces [N] and largest compressions [m] above electrodes, (m,) each.
+        force, deepest: Set to forces [N] and largest compressions above electrodes, (m,) each.
 
     Returns:
         The force that the whole cover carries [N].

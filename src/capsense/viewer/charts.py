@@ -245,8 +245,9 @@ class Plane:
         self.points = self._grid(*coarse)
         """Where potentials are taken [m], shape (n, 3)."""
         points, self._fine = self._grid(*fine), fine
-        away = cKDTree(green.near_sources).query(points, distance_upper_bound=NEAR)[0]
-        self._drawn = ~(away < NEAR).reshape(len(fine[0]), len(fine[1]))
+        near = NEAR * green.unit
+        away = cKDTree(green.unit * green.near_sources).query(points, distance_upper_bound=near)[0]
+        self._drawn = ~(away < near).reshape(len(fine[0]), len(fine[1]))
         self.drawn = points[self._drawn.ravel()]
         """Where they are drawn [m], shape (m, 3)."""
 
