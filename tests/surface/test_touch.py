@@ -136,7 +136,9 @@ def test_jacobian(sim, held):
             at = cs.Pose(np.array(body.pose.position) + sign * step)
             ends.append(sim.step(cs.Scene([body.moved(at)])).delta)
         found = (ends[0] - ends[1]) / 4e-6
-        np.testing.assert_allclose(slope[..., axis], found, atol=0.02 * np.abs(found).max() + 1e-12)
+        np.testing.assert_allclose(
+            slope[..., axis], found, atol=0.02 * np.abs(found).max() + 1e-12
+        )
     if held:
         np.testing.assert_array_equal(slope[..., 2], 0.0)
 
@@ -220,7 +222,9 @@ def test_hysteresis(simulators):
     """Monotonicity: under the same force, a cover that is unloaded is compressed more."""
     sim = simulators(design(hysteresis=0.4))
     forces = [0.0, 0.1, 0.3, 0.5, 0.3, 0.1, 0.0]
-    found = [sim.step(ball(0.0, force=f), time=0.1 * k).delta[0, 0] for k, f in enumerate(forces)]
+    found = [
+        sim.step(ball(0.0, force=f), time=0.1 * k).delta[0, 0] for k, f in enumerate(forces)
+    ]
     assert found[4] > 1.02 * found[2]
     assert found[5] > 1.02 * found[1]
     assert found[6] == pytest.approx(found[0], rel=1e-3)

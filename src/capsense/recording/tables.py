@@ -294,6 +294,7 @@ class RunWriter:
         """What ``summary.json`` holds."""
         scenario, n = self.scenario, self.count
         stats = [r.stats for r in self.run.readings]
+        touches = [r.touch for r in self.run.readings if r.touch is not None]
         design, columns = scenario.design, self.run.values.T
         return {
             "scenario": scenario.name, "design": design.name,
@@ -315,6 +316,11 @@ class RunWriter:
                     scenario.channels, self.run.levels, columns, strict=True
                 )
             ],
+            "touch": None if not touches else {
+                "largest_force_N": np.max([t.force for t in touches], axis=0).tolist(),
+                "largest_compression_m": np.max([t.compression for t in touches], axis=0).tolist(),
+                "largest_total_N": max(t.total for t in touches),
+            },
             "columns": dict(column_meanings(scenario.channels, design)), "versions": versions(),
         }  # fmt: skip
 

@@ -24,8 +24,10 @@ _BISECTIONS = 200
 
 
 class Foundation(NamedTuple):
-    """A cover as an elastic foundation, and the cells of the electrodes below it; lengths are in the
-    unit that the design is solved in."""
+    """A cover as an elastic foundation, and the cells of the electrodes below it.
+
+    Lengths are in the length unit of the design.
+    """
 
     lower: NDArray[Any]
     """Lower corner, shape (3,)."""
