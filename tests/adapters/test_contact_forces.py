@@ -56,10 +56,11 @@ class MujocoBall:
 class PybulletBall:
     """The same in Bullet."""
 
-    def __init__(self, simulator: cs.Simulator, **options: Any) -> None:
+    def __init__(self, simulator: cs.Simulator, substeps: int = 0, **options: Any) -> None:
         import pybullet as p
 
         self._p, self._id = p, p.connect(p.DIRECT)
+        p.setPhysicsEngineParameter(numSubSteps=substeps, physicsClientId=self._id)
         p.setGravity(0, 0, -GRAVITY, physicsClientId=self._id)
         p.setTimeStep(0.001, physicsClientId=self._id)
         box = p.createCollisionShape(
@@ -129,6 +130,16 @@ def test_the_foam_carries_what_rests_on_it(world: Callable[..., Any]) -> None:
     assert away.touch is not None
     assert away.touch.total == 0.0
     assert away.delta[0, 0] < 0.5 * found[0][0]
+
+
+def test_substeps_of_bullet_count(simulator: cs.Simulator) -> None:
+    pytest.importorskip("pybullet")
+    ball = PybulletBall(simulator, substeps=4)
+    ball.rest()
+    touch = ball.sensor.read().touch
+    ball.close()
+    assert touch is not None
+    assert touch.total == pytest.approx(MASS * GRAVITY, rel=0.02)
 
 
 def test_without_contact_forces_the_overlap_counts(world: Callable[..., Any]) -> None:

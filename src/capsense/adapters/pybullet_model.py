@@ -159,12 +159,15 @@ class ClientSource(WorldSource):
         points = p.getContactPoints(
             bodyA=own.body, linkIndexA=own.link, physicsClientId=self.client
         )
+        # Bullet divides the impulse of the last substep by the whole step
+        steps = p.getPhysicsEngineParameters(physicsClientId=self.client)["numSubSteps"]
         out = []
         for point in points or ():
             other = numbers.get((point[2], point[4]))  # Bullet's normal is out of the second
             if other is not None:
                 normal = -np.array(point[7])
-                out.append(Contact(other, point[6], normal, float(point[9]), float(point[8])))
+                force = max(steps, 1) * float(point[9])
+                out.append(Contact(other, point[6], normal, force, float(point[8])))
         return out
 
     def robot(self, frame: int) -> set[int]:
