@@ -13,8 +13,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # threads of several processes wait for
 
 import interpreted
 import pytest
+import tiny_field
 
 import capsense as cs
+from capsense.field.background import BackgroundField
+from capsense.field.cache import load_or_build
 
 if interpreted.ON:
     interpreted.start()
@@ -69,6 +72,24 @@ def simulators(field_cache: Path) -> Simulators:
         return made[key]
 
     return get
+
+
+@pytest.fixture(scope="session")
+def foam(field_cache: Path) -> tuple[cs.Design, BackgroundField]:
+    """Two discs under a foam that gives way, and a rough field of it."""
+    design = cs.load_design(_HERE / "data/foam.toml")
+    with tiny_field.few_sources():
+        return design, load_or_build(design, tiny_field.SETTINGS, cache_dir=field_cache)
+
+
+@pytest.fixture
+def foam_field(
+    foam: tuple[cs.Design, BackgroundField], monkeypatch: pytest.MonkeyPatch
+) -> cs.Design:
+    """The design of :func:`foam`; whoever asks for its field meanwhile gets the rough one."""
+    for module in ("capsense.fleet", "capsense.simulator"):
+        monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: foam[1])
+    return foam[0]
 
 
 LAYERS = {

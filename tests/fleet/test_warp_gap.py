@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny_field
@@ -235,3 +237,28 @@ def test_gradient_of_a_body_that_is_pressed_out():
     scale = np.abs(slope[0, ..., :2]).max()
     assert np.abs(slope[1, ..., 2]).max() < 1e-3 * scale
     np.testing.assert_allclose(slope[1, ..., :2], slope[0, ..., :2], rtol=0, atol=2e-2 * scale)
+
+
+@pytest.mark.parametrize("grounding", ["grounded", "floating"])
+def test_bodies_are_pressed_into_a_cover(foam_field, grounding):
+    """Differential: overlaps up to past full compression, as on the CPU."""
+    some = Fleet(foam_field, [cs.Body(cs.Sphere(0.01))], 1)
+    scenes = near_scenes(some, 12, (-3e-3, 1e-3), grounding, seed=7)
+    fleet = fleet_of(foam_field, scenes, device="warp:cpu")
+    found = misses(fleet, scenes.poses, scenes.bodies)
+    assert found[0].max() < 1e-4, scenes.names[int(found[0].argmax())]
+    fleet.step(scenes.poses)
+    assert fleet.step(scenes.poses).touch is None
+
+
+def test_what_warp_does_not_know_of_covers(foam_field):
+    ball = cs.Body(cs.Sphere(0.01))
+    fleet = Fleet(foam_field, [ball], 1, device="warp:cpu", budget=32)
+    poses = np.zeros((1, 1, 7))
+    poses[..., 6], poses[..., 2] = 1.0, 0.012
+    for more, what in (({"forces": [[0.5]]}, "forces"), ({"jacobian": True}, "Jacobian")):
+        with pytest.raises(cs.SceneError, match=f'{what}.*device="cpu"'):
+            fleet.step(poses, **more)
+    topped = replace(foam_field, cover=replace(foam_field.cover, top="ground"))
+    with pytest.raises(cs.SceneError, match=r'conducting top.*device="cpu"'):
+        Fleet(topped, [ball], 1, device="warp:cpu")

@@ -7,7 +7,15 @@ import re
 import numpy as np
 import pytest
 
-from capsense.viewer.charts import MAX_NUMBERS, MAX_POINTS, WINDOW, heat_map, strip
+from capsense.cover import Touch
+from capsense.viewer.charts import (
+    MAX_NUMBERS,
+    MAX_POINTS,
+    WINDOW,
+    heat_map,
+    strip,
+    touch_table,
+)
 
 
 def test_strip_is_the_end_of_a_history() -> None:
@@ -60,3 +68,13 @@ def test_heat_map_of_many() -> None:
     found = cells(heat_map([f"E{k}" for k in range(n)], np.eye(n)))
     assert len(found) == n * n
     assert {text for *_, text in found} == {"&nbsp;"}
+
+
+def test_touch_is_a_row_for_each_electrode() -> None:
+    touch = Touch(np.array([0.512, 0.0]), np.array([1e-3, 0.0]), 0.5)
+    page = touch_table(["A<", "B"], touch, 2e-3)
+    assert "A&lt;" in page
+    assert re.findall(r"<td>([^<]*) N</td>", page) == ["0.512", "0"]
+    assert re.findall(r">([^<]*) mm</td>", page) == ["1.00", "0.00"]
+    assert re.findall(r"width:([\d.]+)%\">", page)[-2:] == ["50.0", "0.0"]
+    assert "0.5 N in total" in page

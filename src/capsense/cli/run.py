@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -218,9 +218,19 @@ def _run_report(summary: dict[str, Any], folder: Path) -> str:
         blocks.append(table(header, [_channel_row(c) for c in channels[:_MAX_ROWS]]))
         if len(channels) > _MAX_ROWS:
             blocks.append(f"and {len(channels) - _MAX_ROWS} more in summary.json")
+    if summary["touch"] is not None:
+        blocks.append(_touch_table(summary["electrodes"], summary["touch"]))
     written = [name for name in FILES if (folder / name).exists()]
     blocks.append(f"wrote {', '.join(written)} to {folder}")
     return "\n\n".join(blocks)
+
+
+def _touch_table(electrodes: Sequence[str], touch: dict[str, Any]) -> str:
+    """The largest forces on the cover, and its largest compressions."""
+    pairs = zip(touch["largest_force_N"], touch["largest_compression_m"], strict=True)
+    rows = [[n, f"{f:.4g}", f"{1e3 * d:.3f}"] for n, (f, d) in zip(electrodes, pairs, strict=True)]
+    rows = [*rows[:_MAX_ROWS], ["whole cover", f"{touch['largest_total_N']:.4g}", ""]]
+    return table(("touch", "largest force [N]", "largest compression [mm]"), rows)
 
 
 _STEP_TIMES = (("median", "median"), ("95 % below", "p95"), ("longest", "max"))

@@ -13,11 +13,11 @@ import warp as wp
 from capsense.fleet.warp_cut import Response, lift, smooth
 from capsense.fleet.warp_mesh import Hit, Outlines
 from capsense.fleet.warp_near import GapLaw, NearBodies, may_meet, nearest_of
-from capsense.surface.gap_kernels import LEAST, REACH
+from capsense.surface.gap_kernels import REACH
 
 wp.set_module_options({"enable_backward": False})
 
-_REACH0, _REACH1, _LEAST = wp.constant(REACH[0]), wp.constant(REACH[1]), wp.constant(LEAST)
+_REACH0, _REACH1 = wp.constant(REACH[0]), wp.constant(REACH[1])
 _PI = wp.constant(math.pi)
 
 
@@ -64,7 +64,7 @@ def _support(hit: Hit, ratio: float, back: wp.vec3, far: float):
 def lengths(gap: GapLaw, green: Response, hit: Hit, x: wp.vec3):
     """Lengths of the field lines from a place on the face to a body, and to the lifted body [m]."""
     h0 = gap.validity
-    least = _LEAST * h0
+    least = gap.least
     if hit.off <= 0.0:
         return least, h0
     across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])
@@ -163,6 +163,44 @@ def _add_cell(
             near.part[p, to, v] = near.part[p, to, v] + value
 
 
+@wp.func
+def _add_compressed(
+    outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, c: int, p: int, v: int
+):  # fmt: skip
+    """Add what one cell changes as a body is pressed into the cover above it.
+
+    ``met`` is as of :func:`met_by`.
+    """
+    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top - gap.cover)
+    length = gap.cover
+    body = int(-1)
+    for k in range(near.count[v]):
+        if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
+            hit = nearest_of(outlines, near, near.body[k, v], v, x)
+            off = hit.off
+            if off < length:
+                if off > 0.0:
+                    across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])
+                    off = _arc(off, across, hit.way[2])
+                if off < length:
+                    length = wp.max(off, gap.cover - gap.limit)
+                    body = k
+    if body < 0:
+        return
+    rest = gap.below[c]
+    value = 1.0 / (rest + length / gap.eps) - 1.0 / (rest + gap.cover / gap.eps)
+    value *= gap.areas[c] / (4.0 * _PI)
+    columns = gap.columns.shape[1]
+    own = gap.owner[p]
+    if own >= 0:
+        for col in range(columns):
+            if gap.columns[own, col] == own:
+                near.part[p, col, v] = near.part[p, col, v] + value
+    slot = near.slot[near.body[body, v], v]
+    if slot >= 0:
+        near.part[p, columns + slot, v] = near.part[p, columns + slot, v] - value
+
+
 @wp.kernel
 def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: NearBodies):
     """Local change by near bodies of a chunk's cells [m], as ``gap_kernels.local_change``."""
@@ -181,6 +219,8 @@ def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: NearBod
                 x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
                 best, high, body = nearest_cell(outlines, gap, green, near, met, x, v)
                 _add_cell(gap, near, c, p, best, high, body, v)
+                if gap.cover > 0.0 and gap.below[c] >= 0.0:
+                    _add_compressed(outlines, gap, near, met, c, p, v)
 
 
 @wp.func

@@ -32,12 +32,17 @@ class GapLaw:
     """The table of a design, see ``gap_table.GapTable``: c cells in q blocks in p chunks."""
 
     validity: wp.float32
+    least: wp.float32  # field lines are no shorter
     top: wp.float32
     lowest: wp.float32  # the first of the heights of the table [m]
     log_ratio: wp.float32
     terminals: wp.int32
     slots: wp.int32  # conductors near the design that can be nodes
+    cover: wp.float32  # thickness of a cover that gives way [m], 0 for none
+    eps: wp.float32  # its relative permittivity
+    limit: wp.float32  # its largest compression [m]
     points: wp.array(dtype=wp.vec2)
+    below: wp.array(dtype=wp.float32)  # between it and a cell, thickness over eps [m], or -1
     areas: wp.array(dtype=wp.float32)
     series: wp.array(dtype=wp.float32)
     columns: wp.array2d(dtype=wp.int32)
@@ -82,6 +87,8 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
     out, cells = GapLaw(), len(gap.areas)
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
+    out.least = gap.least
+    out.cover, out.eps, out.limit = gap.soft.thickness, gap.soft.eps, gap.soft.limit
     owners = gap.terminal[gap.blocks[:-1]] if cells else np.zeros(0, np.int64)
     each = [np.flatnonzero(owners == t)[::_BLOCKS] for t in (*range(terminals), -1)]  # as they lie
     first = np.concatenate(each)
@@ -89,7 +96,8 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
     span = np.cumsum([0, *map(len, each)])
     for name, values, kind in (
         ("points", gap.points, wp.vec2), ("areas", gap.areas, wp.float32),
-        ("series", gap.series, wp.float32), ("columns", gap.columns, wp.int32),
+        ("series", gap.series, wp.float32), ("below", gap.soft.below, wp.float32),
+        ("columns", gap.columns, wp.int32),
         ("change", gap.change, wp.float32), ("blocks", gap.blocks, wp.int32),
         ("center", gap.block_center, wp.vec2), ("radius", gap.block_radius, wp.float32),
         ("chunks", [*first, len(owners)], wp.int32), ("owner", owner, wp.int32),
@@ -267,7 +275,7 @@ def _overlap(outlines: Outlines, gap: GapLaw, near: NearBodies, b: int, v: int, 
 
 @wp.kernel
 def press_out(gap: GapLaw, near: NearBodies):
-    """Move near bodies that overlap the face up until they touch it."""
+    """Move near bodies that overlap the face up until they touch it, or press a cover flat."""
     v = wp.tid()
     for k in range(near.count[v]):
         b = near.body[k, v]
@@ -276,7 +284,8 @@ def press_out(gap: GapLaw, near: NearBodies):
             for p in range(gap.owner.shape[0]):
                 deepest = wp.max(deepest, near.depth[p, b, v])
             at = near.pose[b, v]
-            up = wp.vec3(0.0, 0.0, wp.min(deepest, near.below[b, v]))
+            rise = wp.max(wp.min(deepest, near.below[b, v]) - gap.limit, 0.0)
+            up = wp.vec3(0.0, 0.0, rise)
             near.pose[b, v] = wp.transform(
                 wp.transform_get_translation(at) + up, wp.transform_get_rotation(at)
             )

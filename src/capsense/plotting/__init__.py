@@ -302,7 +302,8 @@ def plot_run(run: Run, across: str = "time [s]") -> Figure:
     """Draw a run, with this label on the axis of time; see :func:`plot`."""
     values = run.values
     families = _families(run, values)
-    columns = len(families)
+    touched = run.design.cover is not None
+    columns = len(families) + touched
     figure = Figure(figsize=(4.4 * columns + 4.4, 7.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
     grid = figure.add_gridspec(2, columns + 1, width_ratios=[1.0] * columns + [0.95])
     peak = _strongest(values, run.levels)
@@ -313,6 +314,12 @@ def plot_run(run: Run, across: str = "time [s]") -> Figure:
         lower = figure.add_subplot(grid[1, column], sharex=shared)
         _draw_family(family, np.array(run.times), peak, upper, lower)
         dress(lower, across)
+    if touched:
+        upper, lower = (
+            figure.add_subplot(grid[row, columns - 1], sharex=shared) for row in range(2)
+        )
+        _draw_touch(run, peak, upper, lower)
+        dress(lower, across)
     colours = [style_of(k)[0] for k in range(len(run.design.electrodes))]
     if run.channels[0].excitation is Excitation.MUTUAL:
         colours = [PLAIN_ELECTRODE] * len(colours)
@@ -320,6 +327,36 @@ def plot_run(run: Run, across: str = "time [s]") -> Figure:
     draw_views(run, peak, colours, views[0], views[1])
     figure.suptitle(run.title, fontsize=13, fontweight="bold", color=INK)
     return figure
+
+
+def _draw_touch(run: Run, peak: int, upper: Axes, lower: Axes) -> None:
+    """Draw what the cover carries above each electrode, and how far it is compressed."""
+    from capsense.recording.tables import touch_values
+
+    m, times = len(run.design.electrodes), np.array(run.times)
+    rows = np.array([touch_values(r, run.design) for r in run.readings])
+    marker = "o" if len(times) < 3 else ""
+    for axes, signals in ((upper, rows[:, :m]), (lower, 1e3 * rows[:, m:-1])):
+        for k in range(m - 1, -1, -1):
+            colour, dash = style_of(k)
+            axes.plot(
+                times, signals[:, k], color=colour, ls=dash, marker=marker, lw=1.6,
+                label=run.design.electrode_names[k],
+            )  # fmt: skip
+        if len(times) > 1:
+            axes.axvline(times[peak], color=INK, lw=0.7, ls=":", zorder=1)
+        axes.margins(x=0.01)
+        axes.set_ylim(bottom=0.0)
+    lines = upper.get_lines()[:m][::-1][:MAX_LINES]
+    upper.legend(
+        lines, [str(line.get_label()) for line in lines],
+        loc="lower left", bbox_to_anchor=(-0.02, 1.0),
+        ncols=5 if m > 6 else 6, handlelength=1.4, columnspacing=0.8, title="touch",
+        alignment="left", title_fontproperties={"size": 10, "weight": "bold"}, **LEGEND,
+    )  # fmt: skip
+    dress(upper, y="force on the cover [N]")
+    upper.tick_params(labelbottom=False)
+    dress(lower, y="compression of the cover [mm]")
 
 
 def _families(run: Run, values: Array) -> list[_Family]:

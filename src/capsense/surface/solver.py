@@ -39,6 +39,7 @@ from capsense.surface.step import (
     solve_each,
 )
 from capsense.surface.touch import CoverContact, Pressed
+from capsense.surface.touch_kernels import no_foundation
 
 Array = NDArray[np.float64]
 
@@ -151,6 +152,8 @@ class SurfaceSolver:
             if design.cover is not None
             else None
         )
+        self.cover = no_foundation() if self._contact is None else self._contact.foundation
+        """The cover as kernels take it; without pressures where there is none."""
         self._sheets = Sheets([e.surface.triangles for e in metres.electrodes], touch)
         coarsest, width = self.preset.coarsest, narrowest_width(design)
         self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2

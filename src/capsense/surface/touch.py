@@ -8,24 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.cover import (
-    Cover,
-    Touch,
-    Viscosity,
-    compression,
-    contact_force,
-    depth_of_force,
-)
+from capsense.cover import Cover, Touch, Viscosity
 from capsense.field.green_kernels import Gap
 from capsense.scene.scene import Body
-from capsense.surface.touch_kernels import extents, undersides
+from capsense.surface.touch_kernels import (
+    contact_force,
+    depth_of_force,
+    electrode_forces,
+    extents,
+    foundation,
+    heights,
+    is_over,
+)
 
 Array = NDArray[np.float64]
-
-_COARSE, _FINE = 16, 32
-"""Cells along each side of the grid that finds a contact, and of that which it is integrated on."""
-_EXACT = 1e-4
-"""How exactly heights are found, over the cover's thickness."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +50,8 @@ class CoverContact:
 
     def __init__(self, cover: Cover, gap: Gap, electrodes: int, unit: float) -> None:
         self.cover, self._electrodes, self._unit = cover, electrodes, unit
-        some = (gap.terminal >= 0) & (gap.terminal < electrodes) & (gap.soft.below >= 0.0)
-        self._points = np.ascontiguousarray(gap.points[some], np.float64)
-        self._areas, self._owner = unit**2 * gap.areas[some].astype(float), gap.terminal[some]
+        self.foundation = foundation(cover, gap, electrodes, unit)
+        """The cover as the kernels take it."""
         self._states: dict[str | int, Viscosity] = {}
 
     def reset(self) -> None:
@@ -86,22 +81,22 @@ class CoverContact:
         for k, rows in self._near(spans, chosen, bodies):
             body = bodies[k]
             held = body.force is not None
-            height, area = self._heights(records[rows], spans[rows], held)
+            height, area = heights(records[rows], spans[rows], held, self.foundation)
             if not np.isfinite(height).any():
                 continue
             state = self._state(body.name or k, time)
             touching.add(body.name or k)
-            depth, law, t = 0.0, self.cover.law, self.cover.thickness
+            depth = 0.0
             if held:
                 depth = self._depth(height, area, float(body.force or 0.0), state, time)
                 records["position"][rows, 2] -= depth
-            elastic = contact_force(height, area, depth, t, law)
+            elastic = contact_force(height, area, depth, self.foundation)
             now = elastic if state is None or time is None else state.force(elastic, time)
             found.append(Pressed(rows, held, elastic, depth))
             if elastic > 0.0:
-                own, deep = self._electrode_forces(records[rows])
+                own = np.zeros(self._electrodes)
+                electrode_forces(records[rows], self.foundation, own, deepest)
                 force += own * (now / elastic)
-                deepest = np.maximum(deepest, deep)
                 total += now
         if time is not None:
             for name, state in self._states.items():
@@ -114,7 +109,7 @@ class CoverContact:
 
         ``records`` are its own, at the height of its pose; see :class:`Pressed`.
         """
-        height, area = self._heights(records, extents(records), True)
+        height, area = heights(records, extents(records), True, self.foundation)
         if np.isfinite(height).any():
             records["position"][:, 2] -= self._depth(height, area, pressed.elastic, None, None)
 
@@ -125,9 +120,8 @@ class CoverContact:
         bodies: Sequence[Body] | Mapping[int, Body],
     ) -> list[tuple[int, NDArray[np.intp]]]:
         """Bodies that may touch the cover, and their records."""
-        low, high, top = self.cover.lower, self.cover.upper, self.cover.upper[2]
-        over = (spans[:, 0] < high[0]) & (spans[:, 1] > low[0])
-        over &= (spans[:, 2] < high[1]) & (spans[:, 3] > low[1]) & (spans[:, 5] >= top)
+        top = self.cover.upper[2]
+        over = np.array([is_over(span, self.foundation) for span in spans], bool)
         out = []
         for k in np.unique(chosen[over]).tolist():
             rows = np.flatnonzero(over & (chosen == k))
@@ -136,49 +130,13 @@ class CoverContact:
                 out.append((k, rows))
         return out
 
-    def _heights(self, rows: NDArray[np.void], spans: Array, held: bool) -> tuple[Array, Array]:
-        """Heights of a body's underside over the cover's face, and areas of the cells [m²].
-
-        Of the cells that it may be pressed into; where a force holds it, of those that are at most
-        the cover's thickness higher than the lowest one.
-        """
-        cover, top = self.cover, float(self.cover.upper[2])
-        exact = _EXACT * cover.thickness
-        low = np.maximum(spans[:, [0, 2]].min(axis=0), cover.lower[:2])
-        high = np.minimum(spans[:, [1, 3]].max(axis=0), cover.upper[:2])
-        points, size = _grid(low, high, _COARSE)
-        highest = float(spans[:, 5].max()) if held else top
-        height = undersides(rows, points, highest, exact)
-        if not np.isfinite(height).any():  # it may be smaller than a cell, or just touch
-            fine = points
-        else:
-            limit = height.min() + cover.thickness if held else top
-            fine = points[height < limit]
-        low = np.maximum(low, fine.min(axis=0) - size)
-        high = np.minimum(high, fine.max(axis=0) + size)
-        points, size = _grid(low, high, _FINE)
-        height = undersides(rows, points, highest, exact) - top
-        return height, np.full(len(height), self._unit**2 * size.prod())
-
     def _depth(
-        self, height: Array, area: Array, force: float, state: Viscosity | None, time: float | None
+        self, height: Array, area: float, force: float, state: Viscosity | None, time: float | None
     ) -> float:
         """How far a body has to be lowered for a force to be carried, in the length unit."""
         if state is not None and time is not None:
             force = state.elastic(force, time)
-        if force <= 0.0:  # to where it just touches, if it is in the cover
-            return min(0.0, float(height.min()))
-        return depth_of_force(height, area, force, self.cover.thickness, self.cover.law)
-
-    def _electrode_forces(self, rows: NDArray[np.void]) -> tuple[Array, Array]:
-        """Elastic forces [N] and largest compressions above the electrodes, (m,) each."""
-        cover, top = self.cover, float(self.cover.upper[2])
-        height = undersides(rows, self._points, top, _EXACT * cover.thickness) - top
-        strain = np.maximum(-height, 0.0) / cover.thickness
-        force = np.bincount(self._owner, self._areas * cover.law.pressure(strain), self._electrodes)
-        deep = np.zeros(self._electrodes)
-        np.maximum.at(deep, self._owner, compression(height, 0.0, cover.thickness, cover.law))
-        return force.astype(float), deep
+        return depth_of_force(height, area, force, self.foundation)
 
     def _state(self, name: str | int, time: float | None) -> Viscosity | None:
         """What is remembered of a body's contact; None where nothing is."""
@@ -189,11 +147,3 @@ class CoverContact:
         if state is None or time < state.time:
             state = self._states[name] = Viscosity(cover)
         return state
-
-
-def _grid(low: Array, high: Array, count: int) -> tuple[Array, Array]:
-    """Middles of count² equal cells of a rectangle [m], and their size, (count², 2) and (2,)."""
-    size = (high - low) / count
-    steps = np.arange(count) + 0.5
-    x, y = (low[i] + size[i] * steps for i in range(2))
-    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2), size

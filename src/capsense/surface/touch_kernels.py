@@ -1,18 +1,73 @@
-"""Undersides of bodies over the cover of a flat design, compiled."""
+"""Contact mechanics of the cover of a flat design, compiled: undersides, forces and depths."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense._jit import compiled
+from capsense._jit import compiled, kernel
+from capsense.cover import Cover
 from capsense.elements.outline import middle_height, nearest, reach_down
+from capsense.field.green_kernels import Gap
 
 STEPS = 60
 """Steps up to a surface at most."""
+_COARSE, _FINE = 16, 32
+"""Cells along each side of the grid that finds a contact, and of that which it is integrated on."""
+_EXACT = 1e-4
+"""How exactly heights are found, over the cover's thickness."""
+_BISECTIONS = 200
+"""Bisections at most; double precision is reached before."""
+
+
+class Foundation(NamedTuple):
+    """A cover as an elastic foundation, and the cells of the electrodes below it.
+
+    Lengths are in the length unit of the design.
+    """
+
+    lower: NDArray[Any]
+    """Lower corner, shape (3,)."""
+    upper: NDArray[Any]
+    """Upper corner, undeformed, shape (3,)."""
+    strain: NDArray[Any]
+    stress: NDArray[Any]
+    """Table of strains and pressures [N per square unit], shape (n,) each."""
+    points: NDArray[Any]
+    """Cells of the electrodes, shape (c, 2)."""
+    areas: NDArray[Any]
+    """Their areas, shape (c,)."""
+    owner: NDArray[Any]
+    """Electrode of each, shape (c,)."""
+
+
+def foundation(cover: Cover, gap: Gap, electrodes: int, unit: float) -> Foundation:
+    """The foundation of a cover, for the cells of a gap table below it.
+
+    Args:
+        cover: The cover, in a length unit.
+        gap: Cells of the design's gap table, in the same unit.
+        electrodes: How many of its terminals are electrodes, the first ones.
+        unit: The length unit [m].
+    """
+    some = (gap.terminal >= 0) & (gap.terminal < electrodes) & (gap.soft.below >= 0.0)
+    return Foundation(
+        np.array(cover.lower, float), np.array(cover.upper, float),
+        np.array(cover.law.strain, float), unit**2 * np.array(cover.law.stress, float),
+        np.array(gap.points[some], np.float64), np.array(gap.areas[some], np.float64),
+        np.array(gap.terminal[some], np.int64),
+    )  # fmt: skip
+
+
+def no_foundation() -> Foundation:
+    """What designs without a cover have."""
+    none = np.zeros(0)
+    return Foundation(
+        np.zeros(3), np.zeros(3), none, none, np.zeros((0, 2)), none, np.zeros(0, np.int64)
+    )
 
 
 @compiled
@@ -76,3 +131,178 @@ def extents(bodies: NDArray[np.void]) -> NDArray[Any]:
         out[b, 5] = middle_height(body)
         out[b, 4] = out[b, 5] - reach_down(body)
     return out
+
+
+@kernel
+def pressure(strain: float, cover: Foundation) -> float:
+    """Pressure at a strain [N per square unit]; past the table its last slope continues."""
+    if strain <= 0.0:
+        return 0.0
+    k = 1
+    while k < cover.strain.shape[0] - 1 and strain > cover.strain[k]:
+        k += 1
+    slope = (cover.stress[k] - cover.stress[k - 1]) / (cover.strain[k] - cover.strain[k - 1])
+    return cover.stress[k - 1] + slope * (strain - cover.strain[k - 1])
+
+
+@compiled
+def contact_force(height: NDArray[Any], area: float, depth: float, cover: Foundation) -> float:
+    """Force that holds a body at a depth [N].
+
+    Args:
+        height: Height of its underside over the cover's face at cells, infinite beside it.
+        area: Area of a cell.
+        depth: How far it is lowered.
+        cover: The cover.
+    """
+    thickness, total = cover.upper[2] - cover.lower[2], 0.0
+    for k in range(height.shape[0]):
+        total += pressure((depth - height[k]) / thickness, cover)
+    return total * area
+
+
+@compiled
+def depth_of_force(height: NDArray[Any], area: float, force: float, cover: Foundation) -> float:
+    """How far a body has to be lowered for a force to be carried.
+
+    Without a force, to where it just touches, if it is in the cover. Arguments as of
+    :func:`contact_force`.
+    """
+    low = height.min()
+    if force <= 0.0:
+        return min(0.0, low)
+    high = low + cover.upper[2] - cover.lower[2]
+    while contact_force(height, area, high, cover) < force:
+        high = low + 2.0 * (high - low)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        if contact_force(height, area, middle, cover) < force:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@compiled
+def heights(
+    bodies: NDArray[np.void], spans: NDArray[Any], held: bool, cover: Foundation
+) -> tuple[NDArray[Any], float]:
+    """Heights of a body's underside over the cover's face, and the area of a cell.
+
+    Of the cells that it may be pressed into; where a force holds it, of those that are at most the
+    cover's thickness higher than the lowest one.
+
+    Args:
+        bodies: Records of its parts, shape (r,).
+        spans: Their extents, shape (r, 6).
+        held: Whether a force holds it.
+        cover: The cover.
+    """
+    top = cover.upper[2]
+    thickness = top - cover.lower[2]
+    exact, highest = _EXACT * thickness, top
+    low, high, size = np.empty(2), np.empty(2), np.empty(2)
+    for i in range(2):
+        low[i] = max(spans[:, 2 * i].min(), cover.lower[i])
+        high[i] = min(spans[:, 2 * i + 1].max(), cover.upper[i])
+    if held:
+        highest = spans[:, 5].max()
+    points = np.empty((_COARSE * _COARSE, 2))
+    _grid(low, high, points, size)
+    height = undersides(bodies, points, highest, exact)
+    limit = height.min() + thickness if held else top
+    start, end = np.full(2, np.inf), np.full(2, -np.inf)
+    found = np.isfinite(height).any()
+    for k in range(points.shape[0]):
+        if not found or height[k] < limit:  # it may be smaller than a cell, or just touch
+            for i in range(2):
+                start[i] = min(start[i], points[k, i])
+                end[i] = max(end[i], points[k, i])
+    for i in range(2):
+        low[i], high[i] = max(low[i], start[i] - size[i]), min(high[i], end[i] + size[i])
+    fine = np.empty((_FINE * _FINE, 2))
+    _grid(low, high, fine, size)
+    return undersides(bodies, fine, highest, exact) - top, size[0] * size[1]
+
+
+@compiled
+def _grid(low: NDArray[Any], high: NDArray[Any], points: NDArray[Any], size: NDArray[Any]) -> None:
+    """Fill in the middles of n² equal cells of a rectangle, (n², 2), and their size, (2,)."""
+    count = int(math.sqrt(points.shape[0]))
+    for i in range(2):
+        size[i] = (high[i] - low[i]) / count
+    for k in range(points.shape[0]):
+        points[k, 0] = low[0] + size[0] * (k // count + 0.5)
+        points[k, 1] = low[1] + size[1] * (k % count + 0.5)
+
+
+@compiled
+def electrode_forces(
+    bodies: NDArray[np.void], cover: Foundation, force: NDArray[Any], deepest: NDArray[Any]
+) -> None:
+    """Add the elastic forces of a body above electrodes [N], and raise the largest compressions.
+
+    Args:
+        bodies: Records of its parts, shape (r,).
+        cover: The cover.
+        force: Added to, shape (m,).
+        deepest: Raised, shape (m,).
+    """
+    top = cover.upper[2]
+    thickness = top - cover.lower[2]
+    limit = cover.strain[-1] * thickness
+    height = undersides(bodies, cover.points, top, _EXACT * thickness)
+    for k in range(height.shape[0]):
+        depth = top - height[k]
+        if depth > 0.0:
+            i = cover.owner[k]
+            force[i] += cover.areas[k] * pressure(depth / thickness, cover)
+            deepest[i] = max(deepest[i], min(depth, limit))
+
+
+@compiled
+def is_over(span: NDArray[Any], cover: Foundation) -> bool:
+    """Whether a body of an extent (6,) is over the cover, and not mostly behind its face."""
+    low, high = cover.lower, cover.upper
+    across = span[0] < high[0] and span[1] > low[0] and span[2] < high[1] and span[3] > low[1]
+    return across and span[5] >= high[2] and np.isfinite(span[5])
+
+
+@compiled
+def press(
+    bodies: NDArray[np.void], forces: NDArray[Any], cover: Foundation, force: NDArray[Any],
+    deepest: NDArray[Any],
+) -> float:  # fmt: skip
+    """Lower or raise bodies of one part that forces hold, without relaxation and hysteresis.
+
+    Args:
+        bodies: Records, whose heights are changed, shape (b,).
+        forces: Normal forces on them [N], NaN for none, shape (b,).
+        cover: The cover.
+        force, deepest: Set to forces [N] and largest compressions above electrodes, (m,) each.
+
+    Returns:
+        The force that the whole cover carries [N].
+    """
+    force[:], deepest[:] = 0.0, 0.0
+    total, spans = 0.0, extents(bodies)
+    for b in range(bodies.shape[0]):
+        held = not math.isnan(forces[b])
+        if not is_over(spans[b], cover):
+            continue
+        if not (held and forces[b] > 0.0) and spans[b, 4] >= cover.upper[2]:
+            continue
+        height, area = heights(bodies[b : b + 1], spans[b : b + 1], held, cover)
+        if not np.isfinite(height).any():
+            continue
+        depth = 0.0
+        if held:
+            depth = depth_of_force(height, area, forces[b], cover)
+            bodies[b].position[2] -= depth
+        elastic = contact_force(height, area, depth, cover)
+        if elastic > 0.0:
+            electrode_forces(bodies[b : b + 1], cover, force, deepest)
+            total += elastic
+    return total

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from capsense._style import COLOURS
+from capsense.cover import Touch
 from capsense.scenario import Channel
 
 if TYPE_CHECKING:
@@ -135,6 +136,33 @@ def heat_map(names: Sequence[str], delta: Array) -> str:
         '<div style="padding:0 0.6em 0.6em"><div style="font-size:13px;text-align:center">'
         "ΔC, Maxwell matrix [fF]</div>"
         f'<table class="matrix" style="{style}"><tr>{head}</tr>{"".join(rows)}</table></div>'
+    )
+
+
+def touch_table(names: Sequence[str], touch: Touch, limit: float) -> str:
+    """What is pressed onto the cover above each electrode, as an HTML table with bars.
+
+    Args:
+        names: Of the electrodes.
+        touch: What a reading tells.
+        limit: Largest compression of the cover [m], which is a whole bar.
+    """
+    rows = []
+    for name, force, depth in zip(names, touch.force, touch.compression, strict=True):
+        bar = (
+            f'<div style="background:rgba(213,94,0,0.75);height:0.8em;border-radius:2px;'
+            f'width:{100 * min(depth / limit, 1.0):.1f}%"></div>'
+        )
+        rows.append(
+            f'<tr><th style="text-align:left">{html.escape(name)}</th><td>{force:.3g} N</td>'
+            f'<td style="padding-left:1em">{1e3 * depth:.2f} mm</td>'
+            f'<td style="width:45%;padding-left:0.6em">{bar}</td></tr>'
+        )
+    style = "width:100%;border-collapse:collapse;font-size:11px;text-align:right;line-height:1.7"
+    return (
+        '<div style="padding:0 0.6em 0.6em"><div style="font-size:13px;text-align:center">'
+        f"touch: force and compression, {touch.total:.3g} N in total</div>"
+        f'<table class="touch" style="{style}">{"".join(rows)}</table></div>'
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from capsense.errors import MissingDependencyError, ServerError
 from capsense.scene import Scene
-from capsense.viewer.charts import PlaneControls, heat_map, make_charts, strip
+from capsense.viewer.charts import PlaneControls, heat_map, make_charts, strip, touch_table
 from capsense.viewer.player import Playback, Player
 from capsense.viewer.scene_drawing import SceneDrawing
 
@@ -212,6 +212,8 @@ class LiveView:
         self._charts = make_charts(gui, tab, source.channels)
         with tab:
             self._matrix = gui.add_html("")
+            cover = source.design.cover
+            self._touch = None if cover is None else (gui.add_html(""), cover.limit)
         panel.dock_left()
         self._own = [k for k, c in enumerate(source.channels) if c.row == c.column]
         self._loudest = 1e-21
@@ -250,6 +252,9 @@ class LiveView:
                 self.status.content = status(player, frame, self._loudest)
                 self._stage.show_signals(own / self._loudest)
                 self._matrix.content = heat_map(frame.reading.electrode_names, frame.reading.delta)
+                if self._touch is not None and frame.reading.touch is not None:
+                    names, (table, limit) = frame.reading.electrode_names, self._touch
+                    table.content = touch_table(names, frame.reading.touch, limit)
         self._paint()
 
     def stop(self) -> None:
