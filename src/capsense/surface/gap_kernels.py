@@ -268,7 +268,7 @@ def fabric_change(bodies, green, matrix):
 
 @kernel
 def _spread(depth, gap, out):
-    """Compression of the cells as a fabric carries it on: the largest of exp(-r / l) times each."""
+    """Raise ``out`` to the compression that a fabric carries on: exp(-r / l) of each cell's."""
     soft = gap.soft
     for c in range(depth.shape[0]):
         if depth[c] <= 0.0:
@@ -285,7 +285,6 @@ def _spread(depth, gap, out):
                     y = float(gap.points[q, 1] - gap.points[c, 1])
                     fall = math.exp(-math.sqrt(x * x + y * y) / soft.spread)
                     out[q] = max(out[q], depth[c] * fall)
-    return out
 
 
 @kernel

@@ -141,7 +141,7 @@ class SurfaceSolver:
         gap = self.green.gap
         touch = gap.least if len(gap.areas) else TOUCH
         self._contact = (
-            CoverContact(design.cover, gap, self.green.electrodes)
+            CoverContact(design.cover, [e.surface for e in design.electrodes])
             if design.cover is not None
             else None
         )
