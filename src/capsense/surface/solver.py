@@ -23,6 +23,7 @@ from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import SHORE, pack_green
 from capsense.field.green_points import narrowest_width
+from capsense.field.panels import PLANE_TOL
 from capsense.scene import Scene, TriMesh
 from capsense.scene.contact import TOUCH, Sheets
 from capsense.scene.geometry_kernels import overlapping
@@ -145,7 +146,12 @@ class SurfaceSolver:
             if design.cover is not None
             else None
         )
-        self._sheets = Sheets([e.surface.triangles for e in design.electrodes], touch)
+        bare = [
+            e.surface.triangles
+            for e in design.electrodes
+            if not len(gap.areas) or e.surface.bounds[1, 2] > gap.top - PLANE_TOL
+        ]
+        self._sheets = Sheets(bare, touch) if bare else None
         coarsest, width = self.preset.coarsest, narrowest_width(design)
         self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2
         """Bodies of so much surface or more [m²] get panels of a few millimetres; None for none."""
@@ -227,7 +233,7 @@ class SurfaceSolver:
 
         Covered electrodes are not touched: what overlaps their cover is pressed onto it.
         """
-        if len(self.green.gap.areas) and self.green.cover > 0.0:
+        if self._sheets is None:
             return False
         near = set(overlapping(view.packed.bounds, *self._sheets.bounds).tolist())
         return bool(near) and any(
