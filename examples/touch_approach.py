@@ -1,4 +1,4 @@
-"""A fist comes from 200 mm, presses a soft pad as far as it goes, holds, lets go and leaves.
+"""A fist comes from 200 mm, presses a soft pad nearly flat, holds, lets go and leaves.
 
 Run it: ``python examples/touch_approach.py [FOLDER]``. The pad, ``dual_pad``, has electrodes for
 proximity and one for pressure below foam with a grounded fabric. Capacitances and the codes of an
@@ -20,10 +20,12 @@ RATE = 50.0
 """Readings per second [Hz]."""
 FAR, NEAR = 0.2, 1e-4
 """Distances [m] at which the approach begins, and from which on it counts as touch."""
-FORCE = 14.0
-"""Largest force [N]: the foam is then compressed by nearly all of its thickness."""
+FORCE = 11.0
+"""Largest force [N]: held by it, the foam is compressed by over nine tenths of its thickness."""
 CUES = np.cumsum([2.0, 1.0, 2.0, 1.0, 2.0])
 """Times [s] at which the fist touches, presses, lets go, is off and is away."""
+FOAM = 0.002
+"""Thickness of the foam [m]."""
 RADIUS = 0.04
 """Of the fist [m]."""
 
@@ -88,6 +90,7 @@ def check(record: Record) -> None:
     time, near, key = record.time, record.delta[:, 0], record.delta[:, 1]
     coming, down = time < touch, (time >= touch) & (time <= pressed)
     assert np.all(np.diff(near[coming]) > 0.0), "it comes nearer"
+    assert record.compression.max() > 0.9 * FOAM, "it is pressed nearly flat"
     assert near[coming][-1] > 100.0 * key[coming].max(), "the fabric screens the pressure electrode"
     assert np.all(np.diff(key[down]) > 0.0), "it is pressed harder"
     held = (time > pressed) & (time < release)
@@ -128,14 +131,18 @@ def draw(record: Record, folder: Path) -> None:
                 axes[row, 1].plot(newtons[touch], value[touch], **look)
     axes[0, 0].set_xscale("log")
     axes[0, 0].invert_xaxis()
+    axes[0, 0].set_xticks([100.0, 10.0, 1.0, 0.1], ["100", "10", "1", "0.1"])
     axes[0, 0].set_yscale("symlog", linthresh=1.0)
+    axes[0, 0].set_ylim(-0.5, 4e4)
     axes[1, 0].set_yscale("symlog", linthresh=1e3)
+    axes[1, 0].set_ylim(-1e3, 2e7)
+    axes[1, 0].set_yticks([0.0, *10.0 ** np.arange(3, 8)])
     dress(axes[0, 0], "", "change of capacitance [fF]", "It comes nearer, and leaves")
     dress(axes[0, 1], "", "", "It presses, holds, and lets go")
     dress(axes[1, 0], "distance from the pad [mm]", "change of code [counts of the FDC1004]")
     dress(axes[1, 1], "force [N]")
-    axes[0, 0].legend(**LEGEND)
-    axes[1, 0].legend(**LEGEND)
+    axes[0, 0].legend(loc="upper left", ncols=2, **LEGEND)
+    axes[1, 0].legend(loc="upper left", ncols=2, **LEGEND)
     figure.savefig(folder / "touch_approach.png", dpi=110)
 
 
