@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
+from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -245,6 +246,8 @@ def _read(kind: Any, data: Any) -> Any:
         return kind(**given)  # what older recordings lack has a default
     if kind is Polygon:
         return Polygon(data[0], data[1:])
+    if get_origin(kind) is UnionType:  # of something and None
+        return None if data is None else _read(get_args(kind)[0], data)
     if get_origin(kind) is tuple:
         of = get_args(kind)[0]
         return tuple(_read(of, item) for item in data)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import suggest
+from capsense.adapters.contacts import Contact
 from capsense.adapters.placement import FAR, blind, buried, far_off, felt, placement, turned_round
 from capsense.adapters.rules import Rules
 from capsense.adapters.world import Frames, SoftSolid, Solid, World
@@ -56,8 +57,9 @@ class AttachedSensor(ABC):
         call, with their time stamps, as ``reading.counts``.
 
         Args:
-            time: Time of the state [s], for the readout; by default the simulator's own, where it
-                tells it (MuJoCo does, PyBullet does not).
+            time: Time of the state [s], for the readout and for a cover's relaxation and
+                hysteresis; by default the simulator's own, where it tells it (MuJoCo does, PyBullet
+                does not).
             view: What :meth:`view` has just given, if that was asked already.
 
         Raises:
@@ -68,11 +70,29 @@ class AttachedSensor(ABC):
         """
         with self._one:
             world = self.view() if view is None else view
-            if self.readout is None:
-                return self.simulator.step(world)
-            now = self._time() if time is None else float(time)
-            reading = self.simulator.step(world)
+            now = self._now_or_given(time)
+            reading = self.simulator.step(world, time=now)
+            if self.readout is None or now is None:
+                return reading
             return replace(reading, counts=self.readout.sample(now, reading))
+
+    def _now_or_given(self, time: float | None) -> float | None:
+        """The time of a reading [s]; None where nothing needs it that the simulator can tell.
+
+        Raises:
+            SceneError: A readout needs it, and the simulator does not tell it.
+        """
+        if time is not None:
+            return float(time)
+        if self.readout is not None:
+            return self._time()
+        cover = self._design.cover
+        if cover is None or not (cover.relaxation or cover.hysteresis):
+            return None
+        try:
+            return self._time()
+        except SceneError:
+            return None
 
     def use_readout(self, readout: Readout | str | Path | None) -> None:
         """Read through a chip from now on: it starts at the simulator's time, or at 0 s.
@@ -243,6 +263,10 @@ class WorldSource(ABC):
             SceneError: One is not supported.
         """
 
+    def contacts(self, frame: int) -> Sequence[Contact]:
+        """Contacts of the body that a frame carries, with others, that the simulator knows of."""
+        return ()
+
     @abstractmethod
     def robot(self, frame: int) -> set[int]:
         """The frames of the robot that a frame belongs to."""
@@ -260,6 +284,9 @@ class GeometrySensor(AttachedSensor):
 
     world: World
     """Everything it may see."""
+    contact_forces = True
+    """Whether the forces of the simulator's contacts press bodies onto the design's cover; of
+    bodies without contact the overlap with the cover counts."""
     _carrier: int
     """The frame that carries it."""
 
@@ -280,7 +307,10 @@ class GeometrySensor(AttachedSensor):
         """
         with self._one:
             frames = self._now(links)  # may take over another world
-            return self.world.scene(frames)
+            cover = self._design.cover
+            if cover is None or not self.contact_forces:
+                return self.world.scene(frames)
+            return self.world.scene(frames, self.source.contacts(self._carrier), cover)
 
     @property
     def pose(self) -> Pose:

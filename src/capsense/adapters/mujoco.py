@@ -42,7 +42,9 @@ _SCALAR_LAST = [1, 2, 3, 0]
 _TO_CAMERA = Pose((0, 0, 0), (1, 0, 0, 0))
 """MuJoCo's cameras look along -z: half a turn about x."""
 _ONLY = {
-    "geometry": ("materials", "grounding", "exclude", "hull", "groups", "exclude_own"),
+    "geometry": (
+        "materials", "grounding", "exclude", "hull", "groups", "exclude_own", "contact_forces",
+    ),  # fmt: skip
     "depth_camera": ("camera", "back"),
 }
 
@@ -52,6 +54,9 @@ class MujocoSkinOptions(AttachOptions, total=False):
 
     groups: Collection[int] | None
     """See only geoms of these groups (MuJoCo's 0 to 5); default all."""
+    contact_forces: bool
+    """Whether the forces of MuJoCo's contacts press geoms onto the design's cover, True by default;
+    of geoms without contact, the overlap with the cover counts."""
 
 
 class MujocoOptions(MujocoSkinOptions, total=False):
@@ -130,6 +135,7 @@ def attach(
     else:
         source = ModelSource(model, data, rules, other.get("groups"))
         sensor = MujocoSensor(source, number, make_simulator(design))
+        sensor.contact_forces = bool(other.get("contact_forces", True))
     sensor.use_readout(sensor.readout if readout is None else readout)
     sensor.warn()
     return sensor
@@ -176,6 +182,8 @@ def attach_skin(
     source = ModelSource(model, data, rules, other.get("groups"))
     simulators = simulators_of(sites, design)
     sensors = {site: MujocoSensor(source, k, simulators[site]) for site, k in numbers.items()}
+    for sensor in sensors.values():
+        sensor.contact_forces = bool(other.get("contact_forces", True))
     skin = AttachedSkin(sensors, readout, threads)
     skin.warn()
     return skin

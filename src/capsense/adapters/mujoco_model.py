@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters import WorldSource
+from capsense.adapters.contacts import Contact
 from capsense.adapters.meshes import Terrain, height_field, primitive, solid_mesh
 from capsense.adapters.rules import Names, Rules, Tie, matches, read_grounding, read_material
 from capsense.adapters.world import HalfSpace, SoftSolid, Solid
@@ -306,6 +307,26 @@ class ModelSource(WorldSource):
                 stacklevel=2,
             )
         self._chosen = True
+
+    def contacts(self, frame: int) -> list[Contact]:
+        import mujoco
+
+        model, data, out = self.model, self.data, []
+        weld, count = model.body_weldid, int(data.ncon)
+        force, found = np.empty(6), data.contact
+        bodies = np.where(found.geom >= 0, model.geom_bodyid[found.geom], -1)
+        for k in range(count):
+            one, two = bodies[k].tolist()
+            if min(one, two) < 0 or found.efc_address[k] < 0:
+                continue  # of flexes, or without a force of its own
+            sides = [weld[b] == weld[frame] for b in (one, two)]
+            if sides[0] == sides[1]:
+                continue
+            mujoco.mj_contactForce(model, data, k, force)
+            normal = found.frame[k, :3] * (1.0 if sides[0] else -1.0)  # MuJoCo's is out of the first
+            other = two if sides[0] else one
+            out.append(Contact(other, found.pos[k], normal, float(force[0]), float(found.dist[k])))
+        return out
 
     def robot(self, frame: int) -> set[int]:
         root = self.model.body_rootid

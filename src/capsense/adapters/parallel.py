@@ -157,7 +157,7 @@ def _with_share(bodies: Body | Sequence[Body | None], count: int) -> Body | Sequ
     """Bodies with one of ``count`` equal shares of their capacitance to ground."""
     some = [bodies] if isinstance(bodies, Body) else bodies
     made = {
-        id(b): Body(b.shape, b.pose, b.material, b.grounding / count, b.name)
+        id(b): Body(b.shape, b.pose, b.material, b.grounding / count, b.name, b.force)
         for b in some
         if b is not None and not isinstance(b.grounding, str)
     }

@@ -58,7 +58,7 @@ _NEAR = 1e-4
 _CAMERA = Pose((0.0, 0.0, -_WITHDRAWN), (1.0, 0.0, 0.0, 0.0))
 """The OpenGL camera, which looks along its −z, in the sensor frame."""
 _ONLY = {
-    "geometry": ("grounding", "hull", "shapes"),
+    "geometry": ("grounding", "hull", "shapes", "contact_forces"),
     "depth_camera": ("size", "resolution", "back"),
 }
 
@@ -69,11 +69,14 @@ class PybulletSkinOptions(AttachOptions, total=False):
     shapes: Shapes
     """``"collision"``, the default: what Bullet collides with, where a mesh is the convex hull of
     each of its connected parts; or ``"visual"``: what it draws, meshes as they are."""
+    contact_forces: bool
+    """Whether the forces of Bullet's contacts press links onto the design's cover, True by default;
+    of links without contact, the overlap with the cover counts."""
 
 
 class PybulletOptions(PybulletSkinOptions, ImageOptions, total=False):
-    """Keywords of :func:`attach`; ``grounding``, ``hull`` and ``shapes`` are for geometry only,
-    ``size``, ``resolution`` and ``back`` for depth cameras only."""
+    """Keywords of :func:`attach`; ``grounding``, ``hull``, ``shapes`` and ``contact_forces`` are
+    for geometry only, ``size``, ``resolution`` and ``back`` for depth cameras only."""
 
 
 def attach(
@@ -136,6 +139,7 @@ def attach(
         sensor = PybulletDepthSensor(number, mount, simulator, rules, image)
     else:
         sensor = PybulletSensor(ClientSource(number, rules, shapes), mount, simulator)
+        sensor.contact_forces = bool(other.get("contact_forces", True))
     sensor.use_readout(sensor.readout if readout is None else readout)
     sensor.warn()
     return sensor
@@ -185,6 +189,8 @@ def attach_skin(
     source = ClientSource(number, rules, shapes)
     simulators = simulators_of(places, design)
     sensors = {k: PybulletSensor(source, mount, simulators[k]) for k, mount in places.items()}
+    for sensor in sensors.values():
+        sensor.contact_forces = bool(other.get("contact_forces", True))
     skin = AttachedSkin(sensors, readout, threads)
     skin.warn()
     return skin

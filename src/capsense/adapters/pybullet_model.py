@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.adapters import WorldSource
+from capsense.adapters.contacts import Contact
 from capsense.adapters.meshes import (
     UnusableShape,
     is_flat,
@@ -148,6 +149,22 @@ class ClientSource(WorldSource):
         notes, self._notes = self._notes, []
         if notes:
             warnings.warn("sensor: " + ";\n".join(dict.fromkeys(notes)), stacklevel=2)
+        return out
+
+    def contacts(self, frame: int) -> list[Contact]:
+        import pybullet as p
+
+        own = self._links[frame]
+        numbers = {(link.body, link.link): k for k, link in enumerate(self._links)}
+        points = p.getContactPoints(
+            bodyA=own.body, linkIndexA=own.link, physicsClientId=self.client
+        )
+        out = []
+        for point in points or ():
+            other = numbers.get((point[2], point[4]))  # Bullet's normal is out of the second
+            if other is not None:
+                normal = -np.array(point[7])
+                out.append(Contact(other, point[6], normal, float(point[9]), float(point[8])))
         return out
 
     def robot(self, frame: int) -> set[int]:

@@ -79,6 +79,7 @@ class ImageOptions(TypedDict, total=False):
 
 DEFAULTS: Mapping[str, object] = {
     "exclude_own": True, "back": "fill", "resolution": 64, "shapes": "collision",
+    "contact_forces": True,
 }  # fmt: skip
 """Options whose default is not None, empty or False."""
 

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
+from capsense.adapters.contacts import Contact, pressed
 from capsense.adapters.meshes import Terrain
 from capsense.adapters.rules import Tie
+from capsense.cover import Cover
 from capsense.design.model import Domain
 from capsense.errors import SceneError
 from capsense.scene import Body, Box, Material, Pose, Scene, Shape
@@ -155,8 +157,15 @@ class World:
         self._lower, self._upper = self.domain.lower, self.domain.upper
         self._placed = Placed(np.empty((n, 3)), np.empty((n, 4)), np.zeros(n, dtype=np.bool_))
 
-    def scene(self, frames: Frames) -> Scene:
+    def scene(
+        self, frames: Frames, contacts: Sequence[Contact] = (), cover: Cover | None = None
+    ) -> Scene:
         """The solids that reach into the domain, in the sensor frame.
+
+        Args:
+            frames: Where everything is.
+            contacts: Contacts of the sensor's carrier, whose forces press solids onto the cover.
+            cover: The design's cover.
 
         Raises:
             SceneError: A frame stands at no finite place.
@@ -180,6 +189,9 @@ class World:
             self._near(i, b.moved(Pose(*p)))
             for i, b, p in zip(seen.tolist(), bodies, poses, strict=True)
         ]
+        if contacts and cover is not None:
+            sensor = Pose(frames.sensor_position, frames.sensor_quaternion)
+            parts = pressed(parts, self._layout.frame[seen].tolist(), contacts, sensor, cover)
         return Scene(parts + self._soft_bodies(frames) if self.soft else parts)
 
     def names(self, frames: set[int]) -> set[str | None]:
@@ -228,7 +240,8 @@ class World:
         if key not in self._tied:
             b = self._bodies[index]
             assert not isinstance(b.grounding, str)
-            self._tied[key] = Body(b.shape, b.pose, b.material, b.grounding / count, b.name)
+            grounding = b.grounding / count
+            self._tied[key] = Body(b.shape, b.pose, b.material, grounding, b.name, b.force)
         return self._tied[key]
 
 

@@ -24,6 +24,8 @@ from capsense.fleet.bodies import (
     BodyTable,
     FleetCheck,
     FleetReading,
+    FleetTouch,
+    checked_forces,
     checked_poses,
     compare,
     on_device,
@@ -41,7 +43,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-__all__ = ["Fleet", "FleetCheck", "FleetReading"]
+__all__ = ["Fleet", "FleetCheck", "FleetReading", "FleetTouch"]
 
 _PANELS = 5
 """Panels of a shape for each cluster that a body is cut into on Warp."""
@@ -264,6 +266,7 @@ class Fleet:
         poses: ArrayLike,
         sensors: ArrayLike | None = None,
         *,
+        forces: ArrayLike | None = None,
         time: Any = None,
         jacobian: bool = False,
     ) -> FleetReading:
@@ -278,20 +281,24 @@ class Fleet:
                 shape (e, b, 7).
             sensors: The same of the sensors' frames, shape (e, s, 7). Without it, every sensor's
                 frame is the world's.
+            forces: Normal forces that press bodies onto the design's cover [N], NaN for none,
+                where their overlap counts, shape (e, b); by default those of the bodies themselves.
+                On the CPU only. The cover is elastic, without relaxation and hysteresis.
             time: Time of the scenes [s], not before that of the last step; a readout needs it. On
                 Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
                 graphs.
             jacobian: Whether to work out ``reading.jacobian`` as well.
 
         Raises:
-            SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long.
+            SceneError: Poses are of a wrong shape, not finite, or their quaternions not 1 long;
+                there are forces and no cover, or a Jacobian is asked for with forces.
             SolveError: Some environments have no solution; the message names the first.
             ReadoutError: A readout is given no time, or time went back.
         """
         if self._chips is not None and time is None:
             raise ReadoutError("a readout needs the time; write step(poses, time=…), in seconds")
         with self._one:
-            reading = self.solved(poses, sensors, jacobian=jacobian)
+            reading = self.solved(poses, sensors, forces=forces, jacobian=jacobian)
             if self._chips is None:
                 return reading
             matrix = reading.delta
@@ -300,9 +307,36 @@ class Fleet:
                 time = np.asarray(time).item() if hasattr(time, "__dlpack__") else time
             return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
+    def _forces(self, forces: ArrayLike | None, jacobian: bool) -> Array:
+        """Forces on the bodies [N], shape (e, b).
+
+        Raises:
+            SceneError: They are wrong, or cannot be taken into account.
+        """
+        shape = self.count, self.places
+        out = self.table.forces if forces is None else checked_forces(forces, shape)
+        if np.isnan(out).all():
+            return out
+        if self.design.cover is None:
+            if forces is None:  # as a simulator does
+                return np.full(shape, np.nan)
+            raise SceneError(
+                f"forces press bodies onto a cover, which design {self.design.name!r} does not "
+                "have; add a [[cover]] to it, or leave them out"
+            )
+        if self._warp is not None:
+            raise SceneError('forces are taken on the CPU only; make the fleet with device="cpu"')
+        if jacobian:
+            raise SceneError(
+                "a Jacobian is asked for of bodies that forces hold, which fleets do not have; "
+                "leave the forces out, or take a Simulator"
+            )
+        return out
+
     def solved(
-        self, poses: ArrayLike, sensors: ArrayLike | None = None, *, jacobian: bool = False
-    ) -> FleetReading:
+        self, poses: ArrayLike, sensors: ArrayLike | None = None, *,
+        forces: ArrayLike | None = None, jacobian: bool = False,
+    ) -> FleetReading:  # fmt: skip
         """The same as :meth:`step`, without chips and their time."""
         if jacobian and self.table.lossy:
             raise SceneError(
@@ -310,12 +344,14 @@ class Fleet:
                 "them a conductor's or a lossless material"
             )
         shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
+        held = self._forces(forces, jacobian)
         if self._warp is None:
             if sensors is None:
                 sensors = np.broadcast_to(WORLD, shapes[1])
             return self._cpu.step(
                 checked_poses("poses", poses, shapes[0]),
                 checked_poses("sensors", sensors, shapes[1]),
+                held,
                 jacobian,
             )
         for name, each in (("poses", poses), ("sensors", sensors)):

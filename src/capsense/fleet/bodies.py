@@ -60,6 +60,22 @@ class FleetReading:
     about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
 
 
+    touch: FleetTouch | None = None
+    """What is pressed onto the cover, if the design has one; without relaxation and hysteresis."""
+
+
+@dataclass(frozen=True, eq=False)
+class FleetTouch:
+    """What bodies press onto the covers of all sensors, see :class:`~capsense.cover.Touch`."""
+
+    force: Array
+    """Force that the cover carries above each electrode [N], shape (e, s, n)."""
+    compression: Array
+    """Largest compression of the cover above each electrode [m], shape (e, s, n)."""
+    total: Array
+    """Force that the whole cover carries [N], shape (e, s)."""
+
+
 @dataclass(frozen=True)
 class FleetCheck:
     """Errors of some environments against :class:`Simulator`, over each one's largest entry."""
@@ -135,6 +151,8 @@ class BodyTable:
         )  # fmt: skip
         self.given = np.full(shape, None, object)
         """The bodies themselves, shape (e, b)."""
+        self.forces: Array = np.full(shape, np.nan)
+        """Normal forces that press them onto a cover [N], NaN for none, shape (e, b)."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is good in one process only: numbers of objects, and pointers to arrays."""
@@ -193,6 +211,9 @@ class BodyTable:
         for column, part in zip(table[2:-2], zip(*values, strict=True), strict=True):
             column[rows, place] = part
         self.given[rows, place] = each
+        self.forces[rows, place] = [
+            np.nan if body is None or body.force is None else body.force for body in each
+        ]
 
     def hide(self, sensor: int, places: Sequence[int]) -> None:
         """See :meth:`Fleet.hide`."""
@@ -371,6 +392,23 @@ def require_no_gradient(what: str, values: Any) -> None:
             f"{what} is a tensor that requires gradients, which step does not follow; give "
             f"{what}.detach(), or write capsense.fleet.autograd.change(fleet, poses)"
         )
+
+
+def checked_forces(forces: ArrayLike, shape: tuple[int, int]) -> Array:
+    """Normal forces on bodies [N], NaN for none, on the host.
+
+    Raises:
+        SceneError: They have another shape, or one is negative or infinite.
+    """
+    require_no_gradient("forces", forces)
+    out = np.array(forces, float, order="C")
+    if out.shape != shape:
+        raise SceneError(f"forces has shape {out.shape}; give {shape}, NaN for no force")
+    wrong = np.argwhere((out < 0.0) | np.isinf(out))
+    if len(wrong):
+        place = tuple(wrong[0].tolist())
+        raise SceneError(f"forces{list(place)} is {out[place]} N; give 0 or more, NaN for none")
+    return out
 
 
 def checked_poses(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

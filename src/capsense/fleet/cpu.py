@@ -17,11 +17,12 @@ from capsense.elements.rigid import BODY, HALF_SPACE
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
 from capsense.field.green_kernels import SHORE, Green
-from capsense.fleet.bodies import Bodies, BodyTable, FleetReading
+from capsense.fleet.bodies import Bodies, BodyTable, FleetReading, FleetTouch
 from capsense.surface.gap_kernels import near_bodies
 from capsense.surface.lossy import solve_lossy
 from capsense.surface.solver import SurfaceSolver
 from capsense.surface.step import slopes_of, solve
+from capsense.surface.touch_kernels import Foundation, press
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,8 @@ class Sensor(NamedTuple):
     threshold: float
     width: float
     """As :func:`capsense.surface.step.solve` takes them."""
+    cover: Foundation
+    """Its cover; without pressures where it has none."""
 
 
 class Poses(NamedTuple):
@@ -45,6 +48,8 @@ class Poses(NamedTuple):
     """Shape (e, s, 7)."""
     middle: NDArray[Any]
     """Middle of the domain in the sensor frame [m], shape (3,)."""
+    forces: NDArray[Any]
+    """Normal forces that press bodies onto the cover [N], NaN for none, shape (e, b)."""
 
 
 class Found(NamedTuple):
@@ -60,6 +65,13 @@ class Found(NamedTuple):
     shape (e, s, b, m, m, 6); no environments where it is not asked for."""
     lossy: NDArray[Any]
     """Where nothing was solved, as matter has losses, shape (e, s)."""
+    force: NDArray[Any]
+    """Forces that the cover carries above electrodes [N], shape (e, s, n); no electrodes where
+    there is no cover."""
+    deepest: NDArray[Any]
+    """Its largest compressions there [m], the same shape."""
+    total: NDArray[Any]
+    """Force that the whole cover carries [N], shape (e, s)."""
 
 
 @compiled
@@ -79,6 +91,11 @@ def _step_rows(
                 b = place[c]
                 if bodies.softness[e, b].imag != 0.0 or bodies.tie[e, b].imag != 0.0:
                     found.lossy[e, s] = True
+            if sensor.cover.strain.shape[0] > 0 and count > 0:
+                found.total[e, s] = press(
+                    room[:count], poses.forces[e][place[:count]], sensor.cover,
+                    found.force[e, s], found.deepest[e, s],
+                )  # fmt: skip
             if count == 0 or found.lossy[e, s]:
                 continue
             out = solve(room[:count], green, sensor.threshold, sensor.width, slopes)
@@ -229,22 +246,27 @@ class CpuCore:
     def __init__(self, solver: SurfaceSolver, terminals: Terminals, table: BodyTable) -> None:
         self._solver, self._terminals, self._table = solver, terminals, table
 
-    def step(self, bodies: Array, sensors: Array, jacobian: bool) -> FleetReading:
-        """The reading of poses, shapes (e, b, 7) and (e, s, 7).
+    def step(
+        self, bodies: Array, sensors: Array, forces: Array, jacobian: bool
+    ) -> FleetReading:
+        """The reading of poses, shapes (e, b, 7) and (e, s, 7), and forces [N], shape (e, b).
 
         Raises:
             SolveError: Some environments have no solution.
         """
         (e, b, _), s = bodies.shape, sensors.shape[1]
         solver, terminals = self._solver, self._terminals
-        where = Poses(bodies, sensors, solver.middle)
-        green = solver.green
+        where = Poses(bodies, sensors, solver.middle, forces)
+        green, cover = solver.green, solver.cover
         m = green.terminals
         slope = np.zeros((e if jacobian else 0, s, b, m, m, 6))
+        n = terminals.electrodes
+        own = e, s, n if len(cover.strain) else 0
         found = Found(
-            np.zeros((e, s, m, m)), np.zeros((e, s)), slope, np.zeros((e, s), np.bool_)
+            np.zeros((e, s, m, m)), np.zeros((e, s)), slope, np.zeros((e, s), np.bool_),
+            np.zeros(own), np.zeros(own), np.zeros((e, s)),
         )  # fmt: skip
-        sensor = Sensor(green, solver.preset.threshold, solver.preset.width)
+        sensor = Sensor(green, solver.preset.threshold, solver.preset.width, cover)
         with first_use():
             in_parts(_step_rows, e, self._table.bodies, where, sensor, found)
             loss = self._lossy(where, found)
@@ -254,7 +276,7 @@ class CpuCore:
                 f"{len(failed)} of {e} environments have no solution, the first is {failed[0]}: "
                 "look for bodies that coincide"
             )
-        n, change = terminals.electrodes, terminals.screened(UNIT * found.delta)
+        change = terminals.screened(UNIT * found.delta)
         slopes = terminals.slope(change, UNIT * slope) if jacobian else None
         change = terminals.change(change if loss is None else change - 1j * UNIT * loss)
         shields = (terminals.empty + change.real)[..., :n, n:].sum(axis=-1)
@@ -263,6 +285,7 @@ class CpuCore:
         return FleetReading(
             terminals.empty[:n, :n] + change.real, change.real, UNIT * found.error, shields,
             conductance=None if loss is None else -omega * change.imag, jacobian=slopes,
+            touch=FleetTouch(found.force, found.deepest, found.total) if own[2] else None,
         )  # fmt: skip
 
     def lifted(
@@ -280,7 +303,8 @@ class CpuCore:
             nodes: How many such conductors can be nodes; None for a fleet on the CPU.
         """
         solver, table = self._solver, self._table.bodies
-        where, green = Poses(bodies, sensors, solver.middle), solver.green
+        where = Poses(bodies, sensors, solver.middle, self._table.forces)
+        green = solver.green
         sight = green.room, SHORE * green.extent
         records = np.empty(table.choice.shape[1], BODY)
         place = np.empty(len(records), np.int64)
@@ -319,6 +343,9 @@ class CpuCore:
                 place,
             )
             at = place[:count]
+            if len(solver.cover.strain):
+                unused = np.empty((2, found.force.shape[-1]))
+                press(records[:count], where.forces[e][at], solver.cover, *unused)
             soft, lone = bodies.softness[e, at], records["neutral"][:count] != 0
             ties = np.where(bodies.tie[e, at].imag != 0, bodies.tie[e, at], records["tie"][:count])
             out = solve_lossy(

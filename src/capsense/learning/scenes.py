@@ -12,6 +12,7 @@ import numpy as np
 from numpy.random import Generator
 
 from capsense._validate import read_toml
+from capsense.cover import Cover
 from capsense.design import Design
 from capsense.errors import MeshError, ScenarioError, SceneError, SolveError
 from capsense.humans import Build, arm, leg
@@ -60,8 +61,12 @@ COLUMNS = {
     "eps_r": "relative permittivity of that",
     "sigma": "conductivity of that, S/m",
     "bodies": "how many bodies the scene holds",
+    "touch_force": "force that the cover carries above each electrode, M, N",
+    "touch_compression": "largest compression of the cover above each electrode, M, m",
+    "touch_total": "force that the whole cover carries, N",
 }
-"""Columns, and what they are; those of a readout only where one is given."""
+"""Columns, and what they are; those of a readout only where one is given, those of touch only where
+the design has a cover."""
 _TRIES = 1000
 """A scene is drawn so many times at most until nothing touches the sensor."""
 
@@ -88,6 +93,7 @@ class Spec(DataSet):
             "shard_size": self.shard_size, "seed": self.seed, "preset": self.preset,
             "readout": self.readout, "clearance": self.clearance, "bodies": list(self.bodies),
             "files": files_named(_texts([*self.bodies, self.readout]), self.folder),
+            **({} if self.design.cover is None else {"cover": mechanics(self.design.cover)}),
         }  # fmt: skip
 
     def file(self, shard: int) -> str:
@@ -116,8 +122,12 @@ class Spec(DataSet):
             "code": pa.list_(pa.int64(), channels), "code_delta": pa.list_(number, channels),
             "closest_point": three, "normal": three, "axis": three,
             "body": pa.string(), "material": pa.string(), "bodies": pa.int64(),
+            "touch_force": pa.list_(number, electrodes),
+            "touch_compression": pa.list_(number, electrodes),
         }  # fmt: skip
-        names = [name for name in COLUMNS if channels or not name.startswith("code")]
+        missing = () if channels else ("code",)
+        missing += () if self.design.cover is not None else ("touch",)
+        names = [name for name in COLUMNS if not name.startswith(missing)]
         schema = pa.schema(
             pa.field(n, kinds.get(n, number), metadata={"meaning": COLUMNS[n]}) for n in names
         )
@@ -162,6 +172,12 @@ class Spec(DataSet):
             empty = settled(readout, simulator.empty, 0.0)
             held = settled(readout, reading, settling(readout))
             row |= {"code": held.code, "code_delta": held.capacitance - empty.capacitance}
+        if reading.touch is not None:
+            touch = reading.touch
+            row |= {
+                "touch_force": touch.force, "touch_compression": touch.compression,
+                "touch_total": touch.total,
+            }  # fmt: skip
         if near is not None:
             matter = near.body.material
             row |= {
@@ -190,7 +206,8 @@ class Spec(DataSet):
         for _ in range(_TRIES):
             scene = Scene(b for raw in self.bodies for b in self._drawn(raw, rng))
             near = self.outline.nearest(scene)
-            if near is None or self.outline.gap(scene) >= self.clearance:
+            free = [b for b in scene if b.force is None]
+            if near is None or self.outline.gap(free) >= self.clearance:
                 return scene, near, rng
         raise ScenarioError(
             f"{self.source}: scene {number} came within clearance = {self.clearance:g} m of the "
@@ -209,9 +226,27 @@ class Spec(DataSet):
             if data.get("shape") in LIMBS:
                 return _limb(table)
             table.raw("pose", "{ position = [x, y, z] }")
-            return [read_body(table, table.string("name"), self.folder).body]
+            body = read_body(table, table.string("name"), self.folder).body
+            return [body if body.force is None else self._on_cover(body, table)]
         except (SceneError, MeshError) as error:
             raise table.error(str(error)) from None
+
+
+    def _on_cover(self, body: Body, table: ScenarioTable) -> Body:
+        """A body that is pressed onto the cover, at the height at which it begins to touch it.
+
+        Raises:
+            ScenarioError: The design has no cover.
+        """
+        cover = self.design.cover
+        if cover is None:
+            raise table.error(
+                f"force = {body.force:g} presses it onto a cover, which design "
+                f"{self.design.name!r} does not have; leave it out"
+            )
+        up = body.shape.to_trimesh().vertices @ body.pose.rotation[2]
+        x, y, _ = body.pose.position
+        return body.moved(Pose((x, y, float(cover.upper[2] - up.min())), body.pose.quaternion))
 
 
 def load_spec(path: str | Path) -> Spec:
@@ -249,6 +284,15 @@ def load_spec(path: str | Path) -> Spec:
     for number in range(min(10, spec.count)):
         spec.scene(number)
     return spec
+
+
+def mechanics(cover: Cover) -> dict[str, Any]:
+    """How a cover gives way, which a design's hash does not tell."""
+    return {
+        "strain": cover.law.strain.tolist(), "stress": cover.law.stress.tolist(),
+        "relaxation": cover.relaxation, "hysteresis": cover.hysteresis,
+        "bending_length": cover.bending_length,
+    }  # fmt: skip
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -323,7 +367,7 @@ def _limb(table: ScenarioTable) -> list[Body]:
     bodies = limb.bodies(root, bent, degrees=True, material=material, grounding=grounding)
     name = table.string("name")
     short = len(limb.name) + 1
-    return [Body(b.shape, b.pose, b.material, b.grounding, f"{name}_{str(b.name)[short:]}")
+    return [Body(b.shape, b.pose, b.material, b.grounding, f"{name}_{str(b.name)[short:]}", b.force)
             for b in bodies]  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from capsense.recording.tables import (
     counts_columns,
     csv_row,
     replacing,
+    touch_values,
     write_counts,
 )
 from capsense.scenario.model import read_channels
@@ -96,9 +97,11 @@ def _csv(recording: Recording, path: Path) -> int:
     session, levels, n = recording.session, _levels(recording.session), 0
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow([*(name for name, _ in column_meanings(session.channels)), "episode"])
+        meanings = column_meanings(session.channels, session.design)
+        rows.writerow([*(name for name, _ in meanings), "episode"])
         for step, values in _values(recording):
-            rows.writerow([*csv_row(step.clock, values, levels), step.episode])
+            touch = touch_values(step.reading, session.design)
+            rows.writerow([*csv_row(step.clock, values, levels, touch), step.episode])
             n += 1
     return n
 
@@ -107,7 +110,8 @@ def _parquet(recording: Recording, path: Path) -> int:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    levels, meanings = _levels(recording.session), column_meanings(recording.session.channels)
+    session, levels = recording.session, _levels(recording.session)
+    meanings = column_meanings(session.channels, session.design)
     fields = [pa.field(name, pa.float64(), metadata={"meaning": text}) for name, text in meanings]
     schema = pa.schema([*fields, pa.field("episode", pa.int64())])
     n, steps = 0, _values(recording)
@@ -115,6 +119,7 @@ def _parquet(recording: Recording, path: Path) -> int:
         while batch := list(islice(steps, _BATCH)):
             values = np.array([v for _, v in batch])
             columns = [[s.clock for s, _ in batch], *values.T, *(values - levels).T]
+            columns += list(zip(*(touch_values(s.reading, session.design) for s, _ in batch)))
             columns.append([s.episode for s, _ in batch])
             arrays = [pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema))

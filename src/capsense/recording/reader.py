@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from capsense.codec import CHANGING, design_from_json, read_body, read_rest, read_shape
+from capsense.cover import Touch
 from capsense.errors import RecordingError, SceneError
 from capsense.reading import Reading, StepStats
 from capsense.readout.conversions import Counts
@@ -132,6 +134,7 @@ class _Builder:
         self._rests: dict[int, RestSurface] = {}
         self._bodies: dict[int, Body] = {}
         self._counts: Counts | None = None
+        self._touch: Any = None
         self._next = 0
 
     def take(self, record: Any, type_name: str) -> Step | None:
@@ -147,6 +150,8 @@ class _Builder:
                 self._bodies[m.id] = read_body(m, self._shapes)
             case "Counts":
                 self._counts = _counts(m)
+            case "Touch":
+                self._touch = m
             case "Step":
                 if record.sequence != self._next:
                     raise RecordingError(
@@ -162,17 +167,24 @@ class _Builder:
         counts, self._counts = self._counts, None
         if counts is not None:
             reading = replace(reading, counts=counts)
-        return Step(self._next - 1, m.episode, m.time, stamp, self._scene(m), reading)
+        touch, self._touch = self._touch, None
+        forces: list[float] | None = None
+        if touch is not None:
+            reading = replace(reading, touch=_touch(touch, len(reading.electrode_names)))
+            forces = touch.body_forces.tolist()
+        return Step(self._next - 1, m.episode, m.time, stamp, self._scene(m, forces), reading)
 
-    def _scene(self, m: Any) -> Scene:
+    def _scene(self, m: Any, forces: list[float] | None) -> Scene:
         bodies = []
+        forces = [math.nan] * len(m.bodies) if forces is None else forces
         try:
-            for number, p in zip(m.bodies.tolist(), m.poses, strict=True):
+            for number, p, force in zip(m.bodies.tolist(), m.poses, forces, strict=True):
                 q = p.orientation
                 pose = Pose.from_unit(
                     (p.position.x, p.position.y, p.position.z), (q.x, q.y, q.z, q.w)
                 )
-                bodies.append(self._bodies[number].moved(pose))
+                body = self._bodies[number].moved(pose)
+                bodies.append(body if math.isnan(force) else body.pressed(force))
             scene = Scene(bodies)
         except (KeyError, ValueError, SceneError) as error:
             raise RecordingError(
@@ -186,6 +198,14 @@ class _Builder:
         for number in [n for n in used if isinstance(self._bodies[n].shape, CHANGING)]:
             shape = self._bodies.pop(number).shape
             self._shapes = {n: s for n, s in self._shapes.items() if s is not shape}
+
+
+def _touch(m: Any, electrodes: int) -> Touch | None:
+    if not len(m.force):
+        return None
+    if len(m.force) != electrodes or len(m.compression) != electrodes:
+        raise RecordingError(f"a touch is not one of {electrodes} electrodes; it is damaged")
+    return Touch(m.force, m.compression, m.total)
 
 
 def _counts(m: Any) -> Counts:
@@ -309,7 +329,7 @@ def replay(
             simulator.reset()
             if readout is not None:
                 readout.reset()
-        reading = simulator.step(step.scene)
+        reading = simulator.step(step.scene, time=step.time)
         compare.readings(step.index, step.time, step.reading, reading)
         held += 0 if step.reading.counts is None else len(step.reading.counts)
         if readout is not None:
@@ -332,13 +352,21 @@ class _Comparison:
         pairs = [f"({a}, {b}) [F]" for a in electrodes for b in electrodes]
         self._names = [f"{what}{pair}" for what in ("C", "delta") for pair in pairs]
         self._names += [f"shield coupling of {n} [F]" for n in electrodes]
+        self._touch = [f"force on {n} [N]" for n in electrodes]
+        self._touch += [*(f"compression above {n} [m]" for n in electrodes), "total force [N]"]
         self._tolerance = tolerance
         self.first: Difference | None = None
         self.largest = 0.0
         self.differing: set[int] = set()
 
     def readings(self, index: int, time: float, recorded: Reading, replayed: Reading) -> None:
-        """Compare two readings."""
+        """Compare two readings; what is pressed on bit by bit, unless there is a tolerance."""
+        if self._tolerance == 0 and recorded.touch is not None and replayed.touch is not None:
+            pairs = zip(_touch_row(recorded.touch), _touch_row(replayed.touch), strict=True)
+            for name, (a, b) in zip(self._touch, pairs, strict=True):
+                if a != b:
+                    self._differs(index, time, name, a, b)
+                    break
         was, now = (
             np.concatenate([r.capacitance.ravel(), r.delta.ravel(), shield_coupling(r)])
             for r in (recorded, replayed)
@@ -371,6 +399,11 @@ class _Comparison:
             self.differing.add(index)
         if self.first is None:
             self.first = Difference(index, time, what, was, now)
+
+
+def _touch_row(touch: Touch) -> list[float]:
+    """Forces [N], compressions [m], and the total force [N]."""
+    return [*touch.force.tolist(), *touch.compression.tolist(), touch.total]
 
 
 def _changed(session: Session) -> dict[str, tuple[str, str]]:

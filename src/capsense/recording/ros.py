@@ -42,7 +42,7 @@ Topics = list[tuple[str, Any]]
 """Messages in the order in which they are written, each with its topic."""
 
 PACKAGE = "capsense_msgs/msg"
-OWN = ("Shape", "Body", "Step", "Counts", "Signal", "Signals")
+OWN = ("Shape", "Body", "Step", "Counts", "Touch", "Signal", "Signals")
 """Messages of ``capsense_msgs``."""
 _LASTING = {"markers": 1, "electrodes": 1, "shapes": 1000, "bodies": 1000}
 WORLD = "world"
@@ -244,6 +244,7 @@ class StepMessages:
                 baseline=np.empty(0) if counts.baseline is None else counts.baseline,
                 touched=np.empty(0, bool) if counts.touched is None else counts.touched,
             )  # fmt: skip
+        self._touch(header, scene, reading, out)
         self._light_up(stamp, reading, out)
         names = [c.column_name for c in self._channels]
         values = read_channels(self._channels, reading)
@@ -265,6 +266,20 @@ class StepMessages:
             error_estimate=reading.stats.solver_error, wall_time=reading.stats.wall_time,
         )  # fmt: skip
         return out
+
+    def _touch(self, header: Any, scene: Scene, reading: Reading, out: Topics) -> None:
+        """What is pressed onto a cover, and by which forces, if there is anything to say."""
+        touch, forces = reading.touch, [b.force for b in scene]
+        if touch is None and all(force is None for force in forces):
+            return
+        fields: dict[str, Any] = {}
+        if touch is not None:
+            fields = {"force": touch.force, "compression": touch.compression, "total": touch.total}
+        self._add(
+            out, "touch", f"{PACKAGE}/Touch", header=header,
+            electrodes=list(self._design.electrode_names),
+            body_forces=np.array([np.nan if f is None else f for f in forces], float), **fields,
+        )  # fmt: skip
 
     def _header(self, stamp: int, frame: str | None = None) -> tuple[tuple[int, int], str]:
         """A header; ``stamp`` in ns, in the sensor's frame by default."""

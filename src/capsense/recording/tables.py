@@ -7,6 +7,7 @@ import csv
 import errno
 import io
 import json
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -30,25 +31,51 @@ from capsense.scene import Scene
 Array = NDArray[np.float64]
 
 
-def column_meanings(channels: Sequence[Channel]) -> list[tuple[str, str]]:
-    """Columns of ``readings.csv``, each with what it is."""
+def column_meanings(channels: Sequence[Channel], design: Design) -> list[tuple[str, str]]:
+    """Columns of ``readings.csv``, each with what it is; of a cover, also what it carries."""
     change = "change from the empty scene"
     return [
         ("time_s", "time since the start, s"),
         *((f"{c.column_name}_F", f"{c.meaning}, F") for c in channels),
         *((f"d{c.column_name}_F", f"{c.meaning}, {change}, F") for c in channels),
+        *touch_meanings(design),
     ]
 
 
-def csv_row(time: float, values: Array, levels: Array) -> list[str]:
+def touch_meanings(design: Design) -> list[tuple[str, str]]:
+    """Columns of what is pressed onto the cover of a design, each with what it is."""
+    if design.cover is None:
+        return []
+    names = design.electrode_names
+    return [
+        *((f"force_{n}_N", f"force that the cover carries above {n}, N") for n in names),
+        *((f"compression_{n}_m", f"largest compression of the cover above {n}, m") for n in names),
+        ("force_total_N", "force that the whole cover carries, N"),
+    ]
+
+
+def touch_values(reading: Reading, design: Design) -> list[float]:
+    """A row of :func:`touch_meanings`; NaN where a reading does not tell."""
+    touch = reading.touch
+    if design.cover is None:
+        return []
+    if touch is None:
+        return [math.nan] * (2 * len(design.electrode_names) + 1)
+    return [*touch.force.tolist(), *touch.compression.tolist(), touch.total]
+
+
+def csv_row(
+    time: float, values: Array, levels: Array, touch: Sequence[float] = ()
+) -> list[str]:
     """A row of ``readings.csv``.
 
     Args:
         time: [s].
         values: Capacitance of each channel [F], shape (K,).
         levels: The same with an empty scene [F], shape (K,).
+        touch: What :func:`touch_values` gives.
     """
-    return [f"{time:.12g}", *(f"{v:.10g}" for v in (*values, *(values - levels)))]
+    return [f"{time:.12g}", *(f"{v:.10g}" for v in (*values, *(values - levels), *touch))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +127,7 @@ class Run:
         n, m = len(self.times), len(self.empty.delta)
         names, positions, quaternions = self.poses()
         stats = [r.stats for r in self.readings]
-        return {
+        out = {
             "time": np.array(self.times),
             "capacitance": np.reshape([r.capacitance for r in self.readings], (n, m, m)),
             "delta": np.reshape([r.delta for r in self.readings], (n, m, m)),
@@ -118,6 +145,13 @@ class Run:
             "error_estimate": np.array([s.solver_error for s in stats]),
             "step_time": np.array([s.wall_time for s in stats]),
         }
+        if self.design.cover is not None:
+            rows = np.reshape([touch_values(r, self.design) for r in self.readings], (n, 2 * m + 1))
+            out |= {
+                "touch_force": rows[:, :m], "touch_compression": rows[:, m:-1],
+                "touch_total": rows[:, -1],
+            }  # fmt: skip
+        return out
 
 
 def counts_columns(counts: Counts) -> dict[str, NDArray[Any]]:
@@ -214,7 +248,7 @@ class RunWriter:
         names = tuple(str(b.body.name) for b in scenario.bodies)
         self.run = Run(scenario.name, scenario.design, scenario.channels, empty, names)
         self._file = (folder / FILES[0]).open("wb", buffering=0)
-        self._write_row([name for name, _ in column_meanings(scenario.channels)])
+        self._write_row([name for name, _ in column_meanings(scenario.channels, scenario.design)])
 
     def _write_row(self, row: Sequence[object]) -> None:
         """Write a whole row or nothing of it."""
@@ -236,7 +270,8 @@ class RunWriter:
             OSError: The row could not be written; neither it nor the sample is there then.
         """
         run = self.run
-        self._write_row(csv_row(sample.time, np.array(sample.values), run.levels))
+        touch = touch_values(sample.reading, run.design)
+        self._write_row(csv_row(sample.time, np.array(sample.values), run.levels, touch))
         run.times.append(sample.time)
         run.readings.append(sample.reading)
         run.scenes.append(sample.scene)
@@ -282,7 +317,7 @@ class RunWriter:
                     scenario.channels, self.run.levels, columns, strict=True
                 )
             ],
-            "columns": dict(column_meanings(scenario.channels)), "versions": versions(),
+            "columns": dict(column_meanings(scenario.channels, design)), "versions": versions(),
         }  # fmt: skip
 
     def write_summary(self, summary: dict[str, Any]) -> None:

@@ -39,7 +39,9 @@ class ScenarioTable(_validate.Table):
 
 
 MESH_KEYS = ("file", "unit")
-BODY_KEYS = ("name", "shape", "material", "grounding", "pose", "trajectory")
+BODY_KEYS = ("name", "shape", "material", "grounding", "pose", "trajectory", "force")
+MAX_FORCE = 1e6
+"""No body is pressed onto a cover by more than this [N]."""
 TRAJECTORY_KEYS = ("waypoints", "speed", "dwell", "euler", "quaternion", "closed")
 MAX_GROUNDING = 1e-6
 """No body is tied to ground by more than this [F]."""
@@ -76,7 +78,8 @@ def read_body(table: ScenarioTable, name: str, folder: Path) -> MovingBody:
         pose = trajectory.pose_at(0.0)
     else:
         pose = read_pose(ScenarioTable(table.data["pose"], table.source, f"{table.item}: pose"))
-    return MovingBody(Body(shape, pose, material, grounding, name), trajectory)
+    force = table.number("force", 0.0, MAX_FORCE, unit="N") if "force" in table else None
+    return MovingBody(Body(shape, pose, material, grounding, name, force), trajectory)
 
 
 def _read_shape(table: ScenarioTable, shape: str, folder: Path) -> Shape:

@@ -359,6 +359,6 @@ def play(scenario: Scenario, simulator: Simulator) -> Iterator[Sample]:
     simulator.reset()
     for index, time in enumerate(scenario.times.tolist()):
         scene = scenario.scene_at(time)
-        reading = simulator.step(scene)
+        reading = simulator.step(scene, time=time)
         values = tuple(c.read(reading) for c in scenario.channels)
         yield Sample(index, time, scene, reading, values)

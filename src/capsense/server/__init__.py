@@ -20,6 +20,7 @@ from enum import IntEnum, IntFlag
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capsense.cover import Touch
 from capsense.errors import ProtocolError
 
 MAGIC = b"CSNS"
@@ -57,6 +58,14 @@ class Flag(IntFlag):
     """Permittivity codes, one byte a pixel."""
     FLOATS = 2
     """Relative permittivities, float32."""
+
+
+class ReadingFlag(IntFlag):
+    """What a reading holds beside capacitances."""
+
+    NONE = 0
+    TOUCH = 1
+    """Forces [N] and compressions [m] of the cover above the electrodes, and the total force."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +106,8 @@ class ReadingMessage:
     """Time the step took [s]."""
     conversions: NDArray[np.void]
     """What the readout has reported since the last reading, type :data:`CONVERSION`."""
+    touch: Touch | None = None
+    """What is pressed onto the design's cover, where the sensor was opened with ``touch``."""
 
 
 def pack_depth(
@@ -174,6 +185,10 @@ def unpack_depth(message: bytes, max_pixels: int = 2**32) -> DepthMessage:
 
 def pack_reading(reading: ReadingMessage) -> bytes:
     """The message of a reading."""
+    touch, flag = b"", ReadingFlag.NONE
+    if reading.touch is not None:
+        flag, t = ReadingFlag.TOUCH, reading.touch
+        touch = np.hstack([t.force, t.compression, t.total]).astype("<f8").tobytes()
     parts = (
         _SUMMARY.pack(
             reading.iterations, reading.dropped & 0xFFFFFFFF, reading.solver_error,
@@ -181,10 +196,10 @@ def pack_reading(reading: ReadingMessage) -> bytes:
         ),
         *(np.ascontiguousarray(a, "<f8").tobytes()
           for a in (reading.capacitance, reading.delta, reading.self_capacitance)),
-        reading.conversions.tobytes(),
+        reading.conversions.tobytes(), touch,
     )  # fmt: skip
     header = HEADER.pack(
-        MAGIC, PROTOCOL, Kind.READING, 0, reading.sensor, len(reading.delta),
+        MAGIC, PROTOCOL, Kind.READING, flag, reading.sensor, len(reading.delta),
         len(reading.conversions), sum(map(len, parts)), reading.sequence, reading.time,
     )  # fmt: skip
     return b"".join((header, *parts))
@@ -196,8 +211,12 @@ def unpack_reading(message: bytes) -> ReadingMessage:
     Raises:
         ProtocolError: The message is not one of this protocol and version, or is cut or padded.
     """
-    _, sensor, m, count, sequence, time = _open(message, Kind.READING)
-    _check_size(message, _SUMMARY.size + 8 * m * (2 * m + 1) + CONVERSION.itemsize * count)
+    flags, sensor, m, count, sequence, time = _open(message, Kind.READING)
+    if flags not in (ReadingFlag.NONE, ReadingFlag.TOUCH):
+        raise ProtocolError(f"flags of a reading are {flags:#x}; 0 and 1 are known")
+    size = _SUMMARY.size + 8 * m * (2 * m + 1) + CONVERSION.itemsize * count
+    end = HEADER.size + size
+    _check_size(message, size + (8 * (2 * m + 1) if flags else 0))
     at = HEADER.size
     iterations, dropped, error, wall = _SUMMARY.unpack_from(message, at)
     at += _SUMMARY.size
@@ -206,8 +225,14 @@ def unpack_reading(message: bytes) -> ReadingMessage:
     return ReadingMessage(
         sensor, sequence, time, numbers[: m * m].reshape(m, m),
         numbers[m * m : 2 * m * m].reshape(m, m), numbers[2 * m * m :], iterations, dropped,
-        error, wall, conversions,
+        error, wall, conversions, _touch(np.frombuffer(message, "<f8", 2 * m + 1, end)) if flags
+        else None,
     )  # fmt: skip
+
+
+def _touch(numbers: NDArray[np.float64]) -> Touch:
+    force, compression = numbers[:-1].reshape(2, -1)
+    return Touch(force, compression, float(numbers[-1]))
 
 
 def _open(message: bytes, kind: Kind) -> tuple[int, int, int, int, int, float]:

@@ -118,14 +118,16 @@ class Client:
 
         Args:
             sensor: Its number; by default the first that is free.
-            options: ``design``, ``camera``, ``material``, ``grounding`` and ``back``, as in the
-                protocol's ``open``.
+            options: ``design``, ``camera``, ``material``, ``grounding``, ``back`` and ``touch``, as
+                in the protocol's ``open``; ``touch`` is on by default, where the server knows it.
 
         Raises:
             ProtocolError: The server refused.
         """
         if sensor is None:
             sensor = next(k for k in range(len(self.sensors) + 1) if k not in self.sensors)
+        if self.welcome.get("touch"):
+            options = {"touch": True, **options}
         answer = self.ask("opened", type="open", sensor=sensor, **options)
         self.sensors[sensor] = RemoteSensor(self, answer, options)
         return self.sensors[sensor]
@@ -270,17 +272,23 @@ class RemoteSensor:
         """
         return self._control("scene", time, body=list(body))
 
-    def step_poses(self, poses: Mapping[str, Any], time: float = 0.0) -> ReadingMessage:
+    def step_poses(
+        self, poses: Mapping[str, Any], time: float = 0.0, *,
+        forces: Mapping[str, float | None] | None = None,
+    ) -> ReadingMessage:  # fmt: skip
         """Move bodies of the last scene and wait for the reading.
 
         Args:
             poses: Name of a body to ``{"position": [x, y, z], "quaternion": [x, y, z, w]}``.
             time: [s].
+            forces: Name of a body to the normal force that presses it onto the design's cover [N],
+                or None to let its overlap count; others keep theirs.
 
         Raises:
             ProtocolError: The server answered an error.
         """
-        return self._control("poses", time, poses=dict(poses))
+        more = {"forces": dict(forces)} if forces else {}
+        return self._control("poses", time, poses=dict(poses), **more)
 
     def send(self, depth: ArrayLike, eps_r: ArrayLike | None = None, time: float = 0.0) -> int:
         """Send a depth image, as :meth:`step` does, but do not wait; returns its number."""

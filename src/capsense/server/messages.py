@@ -19,7 +19,14 @@ from capsense.errors import (
     SceneError,
     SolveError,
 )
-from capsense.scenario import ScenarioTable, read_bodies, read_grounding, read_material, read_pose
+from capsense.scenario import (
+    MAX_FORCE,
+    ScenarioTable,
+    read_bodies,
+    read_grounding,
+    read_material,
+    read_pose,
+)
 from capsense.scene import Body, DepthFrame, Material, Pose
 from capsense.scene.camera import OrthographicCamera
 from capsense.scene.materials import Grounding
@@ -79,6 +86,8 @@ class Open:
     """Of frames without permittivities."""
     grounding: Grounding
     back: Literal["fill"] | float
+    touch: bool = False
+    """Whether readings are to hold what is pressed onto a cover."""
     table: Mapping[str, Any] = field(default_factory=dict, compare=False)
     """The message itself."""
 
@@ -117,6 +126,8 @@ class PosesMessage:
     sequence: int
     time: float
     poses: Mapping[str, Pose]
+    forces: Mapping[str, float | None] = field(default_factory=dict)
+    """Normal forces that press bodies onto a cover [N]; None for none. Others keep theirs."""
 
 
 def parse(text: str) -> MessageTable:
@@ -174,7 +185,7 @@ def read_open(table: MessageTable) -> Open:
         ProtocolError: A key, type or number is wrong.
         CapSenseError: A camera, material or grounding is wrong.
     """
-    table.only(("type", "sensor", "design", "camera", "material", "grounding", "back"))
+    table.only(("type", "sensor", "design", "camera", "material", "grounding", "back", "touch"))
     options = ScenarioTable({"material": "steel", **table.data}, "message", "open")
     back: Literal["fill"] | float = "fill"
     if table.data.get("back", "fill") != "fill":
@@ -182,7 +193,7 @@ def read_open(table: MessageTable) -> Open:
     camera = _read_camera(MessageTable(table.data.get("camera", {}), "message", "camera"))
     return Open(
         _sensor(table), table.text("design"), camera, read_material(options),
-        read_grounding(options), back, table.data,
+        read_grounding(options), back, table.boolean("touch", False), table.data,
     )  # fmt: skip
 
 
@@ -240,7 +251,7 @@ def read_poses(table: MessageTable, max_bodies: int) -> PosesMessage:
         ProtocolError: A key, type or number is wrong, or there are too many bodies.
         ScenarioError: A pose is wrong.
     """
-    table.only(("type", "sensor", "sequence", "time", "poses"))
+    table.only(("type", "sensor", "sequence", "time", "poses", "forces"))
     raw = MessageTable(
         table.raw("poses", '{"name": {"position": [x, y, z]}}'), "message", "poses"
     ).data
@@ -250,7 +261,14 @@ def read_poses(table: MessageTable, max_bodies: int) -> PosesMessage:
         name: read_pose(ScenarioTable(pose, "message", f"pose of {name!r}"))
         for name, pose in raw.items()
     }
-    return PosesMessage(*_address(table), poses)
+    given = MessageTable(table.data.get("forces", {}), "message", "forces")
+    if len(given.data) > max_bodies:
+        raise ProtocolError(f"{len(given.data)} forces; this server takes {max_bodies}", "limit")
+    forces = {
+        name: None if value is None else given.number(name, 0.0, MAX_FORCE, unit="N")
+        for name, value in given.data.items()
+    }
+    return PosesMessage(*_address(table), poses, forces)
 
 
 def read_sensor(table: MessageTable) -> int:

@@ -121,9 +121,9 @@ class ServedSensor:
         self._check_time(frame.time)
         try:
             if isinstance(frame, BodiesMessage):
-                reading = self.simulator.step(Scene(frame.bodies))
+                reading = self.simulator.step(Scene(frame.bodies), time=frame.time)
             else:
-                reading = self.simulator.step(self.options.seen(frame))
+                reading = self.simulator.step(self.options.seen(frame), time=frame.time)
         except Exception:
             self.simulator.reset()  # a step that failed is no starting point for the next one
             raise
@@ -135,7 +135,7 @@ class ServedSensor:
                 frame.sensor, frame.sequence, frame.time, reading.capacitance, reading.delta,
                 reading.self_capacitance, reading.stats.iterations, self.dropped,
                 reading.stats.solver_error, reading.stats.wall_time,
-                _conversions(reading.counts),
+                _conversions(reading.counts), reading.touch if self.options.touch else None,
             )
         )  # fmt: skip
 
@@ -157,12 +157,14 @@ class ServedSensor:
         self.watchers.clear()
 
     def _moved(self, message: PosesMessage) -> BodiesMessage:
-        for name in message.poses:
+        for name in (*message.poses, *message.forces):
             if name not in self._bodies:
                 known = ", ".join(self._bodies) or "none"
                 raise ProtocolError(f"the last scene has no body {name!r}; it has {known}", "scene")
         moved = {name: self._bodies[name].moved(pose) for name, pose in message.poses.items()}
-        bodies = tuple({**self._bodies, **moved}.values())
+        now = {**self._bodies, **moved}
+        now |= {name: now[name].pressed(force) for name, force in message.forces.items()}
+        bodies = tuple(now.values())
         return BodiesMessage(message.sensor, message.sequence, message.time, bodies, self._tables)
 
     def _check_time(self, time: float) -> None:
@@ -188,13 +190,14 @@ class ServedSensor:
 def scene_message(frame: BodiesMessage) -> str:
     """The ``scene`` that is these bodies where they stand."""
     bodies = [
-        {key: value for key, value in table.items() if key != "pose"}
+        {key: value for key, value in table.items() if key not in ("pose", "force")}
         | {
             "pose": {
                 "position": list(map(float, body.pose.position)),
                 "quaternion": list(map(float, body.pose.quaternion)),
             }
         }
+        | ({} if body.force is None else {"force": body.force})
         for table, body in zip(frame.tables, frame.bodies, strict=True)
     ]
     address = {"sensor": frame.sensor, "sequence": frame.sequence, "time": frame.time}

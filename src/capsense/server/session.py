@@ -258,7 +258,7 @@ class ClientSession:
         await self._tell(
             "welcome", protocol=PROTOCOL, server=f"capsense {self._server.version}",
             designs=self._server.design_names,
-            limits={name: getattr(self._limits, name) for name in told},
+            limits={name: getattr(self._limits, name) for name in told}, touch=True,
         )  # fmt: skip
 
     async def _pace(self, cost: float) -> None:

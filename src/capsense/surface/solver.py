@@ -40,6 +40,7 @@ from capsense.surface.step import (
     solve_each,
 )
 from capsense.surface.touch import CoverContact, Pressed
+from capsense.surface.touch_kernels import no_foundation
 
 Array = NDArray[np.float64]
 
@@ -146,6 +147,8 @@ class SurfaceSolver:
             if design.cover is not None
             else None
         )
+        self.cover = no_foundation() if self._contact is None else self._contact.foundation
+        """The cover as kernels take it; without pressures where there is none."""
         bare = [
             e.surface.triangles
             for e in design.electrodes

@@ -134,7 +134,7 @@ class ScenarioSource(Seekable):
     def frame(self, index: int, plane: Plane | None = None) -> Frame:
         time = float(self.times[index])
         scene = self._scenario.scene_at(time)
-        reading = self._simulator.step(scene)
+        reading = self._simulator.step(scene, time=time)
         if plane is None:
             return Frame(index, time, scene, reading)
         found = self._simulator.potentials(plane.points)
@@ -313,6 +313,7 @@ class Watched(Stream):
         coupling = answer.self_capacitance - np.diag(answer.capacitance)
         stats = StepStats(answer.solver_error, answer.wall_time, iterations=answer.iterations)
         reading = reading_of(self.design, answer.capacitance, answer.delta, coupling, stats)
+        reading = replace(reading, touch=answer.touch)
         self._count += 1
         return Frame(self._count - 1, time.monotonic() - self._began, self._scene, reading)
 
@@ -331,6 +332,6 @@ def _alike(old: Scene, new: Scene) -> Scene:
     def known(body: Body) -> Body:
         b = before.get(body.name, body)
         same = (b.shape, b.material, b.grounding) == (body.shape, body.material, body.grounding)
-        return b.moved(body.pose) if same else body
+        return b.moved(body.pose).pressed(body.force) if same else body
 
     return Scene([known(body) for body in new])
