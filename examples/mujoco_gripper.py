@@ -31,9 +31,9 @@ FILM = 1e-4
 
 MODEL = f"""
 <mujoco>
-  <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10"/>
+  <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="10"/>
   <default>
-    <geom friction="1 0.02 0.001"/>
+    <geom friction="1 0.02 0.001" solref="0.004 1"/>
     <default class="finger">
       <joint type="slide" range="0 0.06" damping="20" armature="0.1"/>
       <position kp="2000" dampratio="1"/>
@@ -97,7 +97,8 @@ def story(design: cs.Simulator | str = "gripper_pad") -> list[Row]:
     rows: list[Row] = []
     target, start, state = np.zeros(3), float(data.body("block").xpos[2]), "closes"
     for step in range(round(SECONDS * RATE)):
-        readings = [pads.read()[site] for site in SITES]
+        both = pads.read()
+        readings = [both[site] for site in SITES]
         change = np.array([reading.delta[0, 0] for reading in readings])
         force = np.array([reading.touch.total if reading.touch else 0.0 for reading in readings])
         if state == "closes":
