@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import runpy
 from pathlib import Path
@@ -65,3 +66,14 @@ def test_steel_bar_triangle() -> None:
     assert min(v for t, v in loss if abs(t - line_ends) < 0.2) < 0.002
     again = trajectory.duration
     assert deepest(again, again + line_ends) == pytest.approx(deepest(0.0, line_ends), rel=0.02)
+
+
+def test_touch_approach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fist from 200 mm to full pressure and back; the example checks itself and draws a plot."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    module = importlib.import_module("touch_approach")
+    monkeypatch.setattr(module, "RATE", 20.0)
+    record = module.main(tmp_path)
+    assert (tmp_path / "touch_approach.png").stat().st_size > 10_000
+    code = record.codes.of("press").code
+    assert code.max() - np.median(code[:5]) > 1e6

@@ -71,6 +71,16 @@ def test_skin_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert 5_000 < (tmp_path / name).stat().st_size < 400_000
 
 
+def test_gripper(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two fingers grasp a block by touch; the example checks itself and prints a table."""
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    module = example("mujoco_gripper", monkeypatch)
+    rows = module.main()
+    assert {row.state for row in rows} == {"closes", "lifts", "holds"}
+    assert len(capsys.readouterr().out.splitlines()) == 1 + -(-len(rows) // 5)
+
+
 @pytest.mark.parametrize("page", ["mujoco", "pybullet", "humans", "skins"])
 def test_pages_run(page: str) -> None:
     """The first snippet of a page runs as it stands and feels an arm."""

@@ -40,8 +40,9 @@ def pressed(
 ) -> list[Body]:
     """Return bodies with the normal forces that press them onto a cover.
 
-    A contact counts if it lies over the cover, no farther from its faces than its thickness: the
-    simulator's surface of the sensor may be that of the cover or of the electrodes. Its force is
+    A contact counts if it lies over the cover, no farther from its faces than its thickness and
+    the overlap of the surfaces, between which simulators put it: the simulator's surface of the
+    sensor may be that of the cover or of the electrodes. Its force is
     the part along the sensor's z, and goes to the body of its frame that is nearest to it. Contacts
     that carry no force and do not overlap, as within a margin, do not count. A body without contact
     keeps ``force=None``, so that its overlap with the cover counts.
@@ -55,14 +56,13 @@ def pressed(
     """
     out, forces = list(bodies), dict[int, float]()
     world, turn = sensor.inverse(), sensor.rotation.T
-    spare = np.array([0.0, 0.0, cover.thickness])
-    low, high = cover.lower - spare, cover.upper + spare
     for contact in contacts:
         if contact.force <= 0.0 and contact.gap > 0.0:
             continue
         at = world.apply(np.array(contact.position))
         own = [k for k, frame in enumerate(frames) if frame == contact.frame]
-        if not own or (at < low).any() or (at > high).any():
+        spare = np.array([0.0, 0.0, cover.thickness + max(0.0, -contact.gap)])
+        if not own or (at < cover.lower - spare).any() or (at > cover.upper + spare).any():
             continue
         up = float(turn[2] @ np.asarray(contact.normal))
         if up <= 0.0:

@@ -9,7 +9,7 @@ from shapely.geometry import box
 
 from capsense._validate import shorten
 from capsense.cover import GROUND, NONE, TOPS, Cover, StressStrain
-from capsense.design.geometry import DesignTable, Facet, Surface, boundary_segments
+from capsense.design.geometry import TOUCH, DesignTable, Facet, Surface, boundary_segments
 from capsense.design.model import Conductor, Domain, Electrode, Layer, Role
 from capsense.errors import DesignError
 
@@ -38,7 +38,7 @@ def read_cover(
     sheets: Sequence[Electrode | Conductor],
     layers: Sequence[Layer],
 ) -> tuple[Cover, Layer, Conductor | None]:
-    """Read a cover that lies on the highest sheet or layer of a flat design.
+    """Read a cover that lies on the highest sheet or layer below it, in a flat design.
 
     Args:
         table: The ``[[cover]]`` table.
@@ -62,7 +62,6 @@ def read_cover(
             "a cover lies on flat, level electrodes, and some of this design are not; describe it "
             "as a rigid [[layer]] instead"
         )
-    top = float(bounds[:, 1, 2].max())
     thickness = table.length("thickness")
     low, high = bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0)
     if "size" in table:
@@ -76,6 +75,17 @@ def read_cover(
         )
     low = np.maximum(low, domain.lower[:2])
     high = np.minimum(high, domain.upper[:2])
+    below = ((bounds[:, 0, :2] < high - TOUCH) & (bounds[:, 1, :2] > low + TOUCH)).all(axis=1)
+    if not below.any():
+        raise table.error(
+            "nothing lies below it; move it over the electrodes (size, center); lengths are metres"
+        )
+    top = float(bounds[below, 1, 2].max())
+    if bounds[:, 1, 2].max() > top + thickness + TOUCH:
+        raise table.error(
+            f"its face is at z = {top + thickness:g} m, and something beside it reaches "
+            f"z = {bounds[:, 1, 2].max():g} m; nothing may be higher than a cover that gives way"
+        )
     lower, upper = np.array([*low, top]), np.array([*high, top + thickness])
     kind = table.choice("top", TOPS, NONE)
     bending = table.length("bending_length", 0.0, zero=True)

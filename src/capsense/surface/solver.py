@@ -23,6 +23,7 @@ from capsense.field.background import Change, Charges
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import SHORE, pack_green
 from capsense.field.green_points import narrowest_width
+from capsense.field.panels import PLANE_TOL
 from capsense.scene import Body, Scene, TriMesh
 from capsense.scene.contact import TOUCH, Sheets
 from capsense.scene.geometry_kernels import overlapping
@@ -148,13 +149,18 @@ class SurfaceSolver:
         gap = self.green.gap
         touch = self.length * gap.least if len(gap.areas) else self.length * TOUCH
         self._contact = (
-            CoverContact(design.cover, gap, self.green.electrodes, self.length)
+            CoverContact(design.cover, [e.surface for e in design.electrodes], self.length)
             if design.cover is not None
             else None
         )
         self.cover = no_foundation() if self._contact is None else self._contact.foundation
         """The cover as kernels take it; without pressures where there is none."""
-        self._sheets = Sheets([e.surface.triangles for e in metres.electrodes], touch)
+        bare = [
+            m.surface.triangles
+            for m, e in zip(metres.electrodes, design.electrodes, strict=True)
+            if not len(gap.areas) or e.surface.bounds[1, 2] > gap.top - PLANE_TOL
+        ]
+        self._sheets = Sheets(bare, touch) if bare else None
         coarsest, width = self.preset.coarsest, narrowest_width(design)
         self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2
         """Bodies of so much surface or more, over ``length``², get small panels; None for none."""
@@ -237,7 +243,7 @@ class SurfaceSolver:
 
         Covered electrodes are not touched: what overlaps their cover is pressed onto it.
         """
-        if len(self.green.gap.areas) and self.green.cover > 0.0:
+        if self._sheets is None:
             return False
         near = set(overlapping(view.packed.bounds, *self._sheets.bounds).tolist())
         return bool(near) and any(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.cover import Cover, Touch, Viscosity
-from capsense.field.green_kernels import Gap
+from capsense.design.geometry import Surface
 from capsense.scene.scene import Body
 from capsense.surface.touch_kernels import (
     contact_force,
@@ -43,14 +43,13 @@ class CoverContact:
 
     Args:
         cover: The cover, in a length unit.
-        gap: Cells of the design's gap table, in the same unit.
-        electrodes: How many of its terminals are electrodes, the first ones.
+        electrodes: The electrodes of the design, which are level, in the same unit.
         unit: The length unit [m].
     """
 
-    def __init__(self, cover: Cover, gap: Gap, electrodes: int, unit: float) -> None:
-        self.cover, self._electrodes, self._unit = cover, electrodes, unit
-        self.foundation = foundation(cover, gap, electrodes, unit)
+    def __init__(self, cover: Cover, electrodes: Sequence[Surface], unit: float) -> None:
+        self.cover, self._electrodes, self._unit = cover, len(electrodes), unit
+        self.foundation = foundation(cover, electrodes, unit)
         """The cover as the kernels take it."""
         self._states: dict[str | int, Viscosity] = {}
 
@@ -81,12 +80,12 @@ class CoverContact:
         for k, rows in self._near(spans, chosen, bodies):
             body = bodies[k]
             held = body.force is not None
-            height, area = heights(records[rows], spans[rows], held, self.foundation)
+            height, grid = heights(records[rows], spans[rows], held, self.foundation)
             if not np.isfinite(height).any():
                 continue
             state = self._state(body.name or k, time)
             touching.add(body.name or k)
-            depth = 0.0
+            depth, area = 0.0, float(grid[2] * grid[3])
             if held:
                 depth = self._depth(height, area, float(body.force or 0.0), state, time)
                 records["position"][rows, 2] -= depth
@@ -95,7 +94,7 @@ class CoverContact:
             found.append(Pressed(rows, held, elastic, depth))
             if elastic > 0.0:
                 own = np.zeros(self._electrodes)
-                electrode_forces(records[rows], self.foundation, own, deepest)
+                electrode_forces(height, grid, depth, self.foundation, own, deepest)
                 force += own * (now / elastic)
                 total += now
         if time is not None:
@@ -109,8 +108,9 @@ class CoverContact:
 
         ``records`` are its own, at the height of its pose; see :class:`Pressed`.
         """
-        height, area = heights(records, extents(records), True, self.foundation)
+        height, grid = heights(records, extents(records), True, self.foundation)
         if np.isfinite(height).any():
+            area = float(grid[2] * grid[3])
             records["position"][:, 2] -= self._depth(height, area, pressed.elastic, None, None)
 
     def _near(

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from capsense._jit import compiled, kernel
 from capsense.cover import Cover
+from capsense.design.geometry import Surface
 from capsense.elements.outline import middle_height, nearest, reach_down
-from capsense.field.green_kernels import Gap
 
 STEPS = 60
 """Steps up to a surface at most."""
@@ -19,12 +21,14 @@ _COARSE, _FINE = 16, 32
 """Cells along each side of the grid that finds a contact, and of that which it is integrated on."""
 _EXACT = 1e-4
 """How exactly heights are found, over the cover's thickness."""
+_RASTER = 32
+"""Cells along each side of the raster that an electrode's outline is kept on."""
 _BISECTIONS = 200
 """Bisections at most; double precision is reached before."""
 
 
 class Foundation(NamedTuple):
-    """A cover as an elastic foundation, and the cells of the electrodes below it.
+    """A cover as an elastic foundation, and the outlines of the electrodes below it.
 
     Lengths are in the length unit of the design.
     """
@@ -36,38 +40,39 @@ class Foundation(NamedTuple):
     strain: NDArray[Any]
     stress: NDArray[Any]
     """Table of strains and pressures [N per square unit], shape (n,) each."""
-    points: NDArray[Any]
-    """Cells of the electrodes, shape (c, 2)."""
-    areas: NDArray[Any]
-    """Their areas, shape (c,)."""
-    owner: NDArray[Any]
-    """Electrode of each, shape (c,)."""
+    low: NDArray[Any]
+    """Lower corner of each electrode, shape (m, 2)."""
+    high: NDArray[Any]
+    """Upper corner, shape (m, 2)."""
+    sums: NDArray[Any]
+    """Its area below and left of the corners of a raster of it, shape (m, n + 1, n + 1)."""
 
 
-def foundation(cover: Cover, gap: Gap, electrodes: int, unit: float) -> Foundation:
-    """The foundation of a cover, for the cells of a gap table below it.
-
-    Args:
-        cover: The cover, in a length unit.
-        gap: Cells of the design's gap table, in the same unit.
-        electrodes: How many of its terminals are electrodes, the first ones.
-        unit: The length unit [m].
-    """
-    some = (gap.terminal >= 0) & (gap.terminal < electrodes) & (gap.soft.below >= 0.0)
+def foundation(cover: Cover, electrodes: Sequence[Surface], unit: float) -> Foundation:
+    """The foundation of a cover on level electrodes, in a length unit [m], as kernels take it."""
+    sums = np.zeros((len(electrodes), _RASTER + 1, _RASTER + 1))
+    bounds = np.array([surface.bounds[:, :2] for surface in electrodes], float)
+    for k, surface in enumerate(electrodes):
+        points, size = np.empty((_RASTER**2, 2)), np.empty(2)
+        _grid(bounds[k, 0], bounds[k, 1], points, size)
+        inside, area = np.zeros(len(points), bool), 0.0
+        for facet in surface.facets:
+            outline = shapely.transform(facet.polygon, lambda uv, f=facet: f.to_sensor(uv)[:, :2])
+            inside |= shapely.contains_xy(outline, points[:, 0], points[:, 1])
+            area += outline.area
+        cells = inside.reshape(_RASTER, _RASTER) * (area / max(int(inside.sum()), 1))
+        sums[k, 1:, 1:] = cells.cumsum(axis=0).cumsum(axis=1)
     return Foundation(
         np.array(cover.lower, float), np.array(cover.upper, float),
         np.array(cover.law.strain, float), unit**2 * np.array(cover.law.stress, float),
-        np.array(gap.points[some], np.float64), np.array(gap.areas[some], np.float64),
-        np.array(gap.terminal[some], np.int64),
+        np.ascontiguousarray(bounds[:, 0]), np.ascontiguousarray(bounds[:, 1]), sums,
     )  # fmt: skip
 
 
 def no_foundation() -> Foundation:
     """What designs without a cover have."""
-    none = np.zeros(0)
-    return Foundation(
-        np.zeros(3), np.zeros(3), none, none, np.zeros((0, 2)), none, np.zeros(0, np.int64)
-    )
+    none, few = np.zeros(0), np.zeros((0, 2))
+    return Foundation(np.zeros(3), np.zeros(3), none, none, few, few, np.zeros((0, 1, 1)))
 
 
 @compiled
@@ -188,11 +193,12 @@ def depth_of_force(height: NDArray[Any], area: float, force: float, cover: Found
 @compiled
 def heights(
     bodies: NDArray[np.void], spans: NDArray[Any], held: bool, cover: Foundation
-) -> tuple[NDArray[Any], float]:
-    """Heights of a body's underside over the cover's face, and the area of a cell.
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Heights of a body's underside over the cover's face, and the grid that they are on.
 
-    Of the cells that it may be pressed into; where a force holds it, of those that are at most the
-    cover's thickness higher than the lowest one.
+    The grid is its lower corner and the size of its cells [m], shape (4,). It covers what the body
+    may be pressed into; where a force holds it, what is at most the cover's thickness higher than
+    its lowest point.
 
     Args:
         bodies: Records of its parts, shape (r,).
@@ -224,7 +230,8 @@ def heights(
         low[i], high[i] = max(low[i], start[i] - size[i]), min(high[i], end[i] + size[i])
     fine = np.empty((_FINE * _FINE, 2))
     _grid(low, high, fine, size)
-    return undersides(bodies, fine, highest, exact) - top, size[0] * size[1]
+    grid = np.array([low[0], low[1], size[0], size[1]])
+    return undersides(bodies, fine, highest, exact) - top, grid
 
 
 @compiled
@@ -240,26 +247,56 @@ def _grid(low: NDArray[Any], high: NDArray[Any], points: NDArray[Any], size: NDA
 
 @compiled
 def electrode_forces(
-    bodies: NDArray[np.void], cover: Foundation, force: NDArray[Any], deepest: NDArray[Any]
-) -> None:
+    height: NDArray[Any], grid: NDArray[Any], depth: float, cover: Foundation,
+    force: NDArray[Any], deepest: NDArray[Any],
+) -> None:  # fmt: skip
     """Add the elastic forces of a body above electrodes [N], and raise the largest compressions.
 
     Args:
-        bodies: Records of its parts, shape (r,).
+        height: As of :func:`heights`.
+        grid: The same.
+        depth: How far the body is lowered [m].
         cover: The cover.
         force: Added to, shape (m,).
         deepest: Raised, shape (m,).
     """
-    top = cover.upper[2]
-    thickness = top - cover.lower[2]
+    thickness = cover.upper[2] - cover.lower[2]
     limit = cover.strain[-1] * thickness
-    height = undersides(bodies, cover.points, top, _EXACT * thickness)
     for k in range(height.shape[0]):
-        depth = top - height[k]
-        if depth > 0.0:
-            i = cover.owner[k]
-            force[i] += cover.areas[k] * pressure(depth / thickness, cover)
-            deepest[i] = max(deepest[i], min(depth, limit))
+        pressed = depth - height[k]
+        if pressed <= 0.0:
+            continue
+        x, y = grid[0] + grid[2] * (k // _FINE), grid[1] + grid[3] * (k % _FINE)
+        load = pressure(pressed / thickness, cover)
+        for i in range(cover.low.shape[0]):
+            area = _area_in(i, x, y, x + grid[2], y + grid[3], cover)
+            if area > 0.0:
+                force[i] += area * load
+                deepest[i] = max(deepest[i], min(pressed, limit))
+
+
+@kernel
+def _area_in(i: int, x0: float, y0: float, x1: float, y1: float, cover: Foundation) -> float:
+    """Area of an electrode in a rectangle [m²]."""
+    if x0 >= cover.high[i, 0] or x1 <= cover.low[i, 0]:
+        return 0.0
+    if y0 >= cover.high[i, 1] or y1 <= cover.low[i, 1]:
+        return 0.0
+    upper = _area_up_to(i, x1, y1, cover) - _area_up_to(i, x0, y1, cover)
+    return upper - _area_up_to(i, x1, y0, cover) + _area_up_to(i, x0, y0, cover)
+
+
+@kernel
+def _area_up_to(i: int, x: float, y: float, cover: Foundation) -> float:
+    """Area of an electrode below and left of a point [m²]; linear in the cells of its raster."""
+    sums, count = cover.sums, cover.sums.shape[1] - 1
+    u = (x - cover.low[i, 0]) / (cover.high[i, 0] - cover.low[i, 0])
+    v = (y - cover.low[i, 1]) / (cover.high[i, 1] - cover.low[i, 1])
+    u, v = count * min(max(u, 0.0), 1.0), count * min(max(v, 0.0), 1.0)
+    a, b = min(int(u), count - 1), min(int(v), count - 1)
+    u, v = u - a, v - b
+    low = (1.0 - v) * sums[i, a, b] + v * sums[i, a, b + 1]
+    return (1.0 - u) * low + u * ((1.0 - v) * sums[i, a + 1, b] + v * sums[i, a + 1, b + 1])
 
 
 @compiled
@@ -294,15 +331,15 @@ def press(
             continue
         if not (held and forces[b] > 0.0) and spans[b, 4] >= cover.upper[2]:
             continue
-        height, area = heights(bodies[b : b + 1], spans[b : b + 1], held, cover)
+        height, grid = heights(bodies[b : b + 1], spans[b : b + 1], held, cover)
         if not np.isfinite(height).any():
             continue
-        depth = 0.0
+        depth, area = 0.0, grid[2] * grid[3]
         if held:
             depth = depth_of_force(height, area, forces[b], cover)
             bodies[b].position[2] -= depth
         elastic = contact_force(height, area, depth, cover)
         if elastic > 0.0:
-            electrode_forces(bodies[b : b + 1], cover, force, deepest)
+            electrode_forces(height, grid, depth, cover, force, deepest)
             total += elastic
     return total
