@@ -164,6 +164,19 @@ def _add_cell(
 
 
 @wp.func
+def strain_place(gap: GapLaw, length: float, below: float):
+    """Place of a compressed length among the strains, and the share of the next one."""
+    strain = 1.0 - length / gap.cover
+    k = int(0)
+    while k < gap.strains.shape[0] - 2 and gap.strains[k + 1] < strain:
+        k += 1
+    rest = below * gap.eps
+    low = 1.0 / (rest + (1.0 - gap.strains[k]) * gap.cover)
+    high = 1.0 / (rest + (1.0 - gap.strains[k + 1]) * gap.cover)
+    return k, wp.clamp((1.0 / (rest + length) - low) / (high - low), 0.0, 1.0)
+
+
+@wp.func
 def _add_compressed(
     outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, c: int, p: int, v: int
 ):  # fmt: skip
@@ -187,18 +200,17 @@ def _add_compressed(
                     body = k
     if body < 0:
         return
-    rest = gap.below[c]
-    value = 1.0 / (rest + length / gap.eps) - 1.0 / (rest + gap.cover / gap.eps)
-    value *= gap.areas[c] / (4.0 * _PI)
+    k, share = strain_place(gap, length, gap.below[c])
+    weight = gap.areas[c] / (4.0 * _PI * gap.cover)
     columns = gap.columns.shape[1]
-    own = gap.owner[p]
-    if own >= 0:
-        for col in range(columns):
-            if gap.columns[own, col] == own:
-                near.part[p, col, v] = near.part[p, col, v] + value
     slot = near.slot[near.body[body, v], v]
-    if slot >= 0:
-        near.part[p, columns + slot, v] = near.part[p, columns + slot, v] - value
+    for col in range(columns + 1):
+        value = (1.0 - share) * gap.pressed[c, k, col] + share * gap.pressed[c, k + 1, col]
+        to = col
+        if col == columns:
+            to = wp.where(slot < 0, -1, columns + slot)
+        if to >= 0:
+            near.part[p, to, v] = near.part[p, to, v] + weight * value
 
 
 @wp.kernel

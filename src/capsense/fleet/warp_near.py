@@ -47,6 +47,8 @@ class GapLaw:
     series: wp.array(dtype=wp.float32)
     columns: wp.array2d(dtype=wp.int32)
     change: wp.array3d(dtype=wp.float32)
+    strains: wp.array(dtype=wp.float32)  # of the cover, and what they change, see ``Soft``
+    pressed: wp.array3d(dtype=wp.float32)
     blocks: wp.array(dtype=wp.int32)  # first cell of each, and their number, (q + 1,)
     center: wp.array(dtype=wp.vec2)
     radius: wp.array(dtype=wp.float32)
@@ -98,7 +100,8 @@ def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
         ("points", gap.points, wp.vec2), ("areas", gap.areas, wp.float32),
         ("series", gap.series, wp.float32), ("below", gap.soft.below, wp.float32),
         ("columns", gap.columns, wp.int32),
-        ("change", gap.change, wp.float32), ("blocks", gap.blocks, wp.int32),
+        ("change", gap.change, wp.float32), ("strains", gap.soft.strains, wp.float32),
+        ("pressed", gap.soft.change, wp.float32), ("blocks", gap.blocks, wp.int32),
         ("center", gap.block_center, wp.vec2), ("radius", gap.block_radius, wp.float32),
         ("chunks", [*first, len(owners)], wp.int32), ("owner", owner, wp.int32),
         ("span", span, wp.int32),
