@@ -26,7 +26,7 @@ from capsense.field.boundary import terminals
 from capsense.field.cache import default_settings, load_or_build
 from capsense.reading import Reading, StepStats
 from capsense.scene import Scene
-from capsense.scene.contact import warn_of_contact
+from capsense.scene.contact import warn_of_contact, warn_of_doubt
 from capsense.scene.depth import DepthFrame
 from capsense.scene.shapes import as_points
 
@@ -41,6 +41,10 @@ PresetName = Literal["standard", "learning", "fine"]
 
 _TURNS = 6
 """Parts of a batch, for each thread, at least: no thread then waits long for another."""
+
+
+_DOUBTFUL, _SEEN = 0.1, 1e-4
+"""Estimated errors are warned of above this part of a change, and of the largest capacitance."""
 
 
 class _Solver(Protocol):
@@ -146,7 +150,7 @@ class Simulator:
         self._background = background
         self._solver, rest = self._make_solver()
         self._one = OneAtATime()
-        self._contact_told = False
+        self._contact_told = self._doubt_told = False
         self._idle: deque[_Solver] = deque()  # for the threads of batches
         self._names = self.design.electrode_names
         self._terminals = Terminals(self.design, rest)
@@ -279,6 +283,8 @@ class Simulator:
         total = terminals.empty + change
         error = min(error, float(np.abs(total).max()))
         stats = StepStats(error, seconds, found.unknowns, found.iterations)
+        if not self._doubt_told and not math.isinf(found.error):
+            self._tell_of_doubt(scene, np.abs(np.diag(change.real)), error, found.reason)
         reading = self._reading(change.real, total.real, stats, slope, found.touch)
         if not reading.delta.any():
             scene.warn_of_units(max(self.design.domain.size))
@@ -288,6 +294,17 @@ class Simulator:
         return replace(
             reading, conductance=-2 * np.pi * self.excitation_frequency * change.imag[:n, :n]
         )
+
+    def _tell_of_doubt(self, scene: Scene, own: Array, error: float, reason: str) -> None:
+        """Warn once where an estimated error is a large part of the change of an electrode [F]."""
+        own = own[: self._terminals.electrodes]
+        most = int(own.argmax())
+        if error <= _DOUBTFUL * own[most] or error <= _SEEN * self.baseline.max():
+            return
+        self._doubt_told = True
+        electrode = self.design.electrodes[most]
+        share = error / max(own[most], 1e-300)
+        warn_of_doubt(scene, (electrode.name, electrode.surface.triangles), share, reason)
 
     def _reading(
         self,

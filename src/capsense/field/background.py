@@ -150,6 +150,8 @@ class Change:
     (bodies, terminals, terminals, 6)."""
     touch: Touch | None = None
     """What its bodies press onto the cover, if the design has one."""
+    reason: str = ""
+    """What most of the error comes from, in words."""
 
 
 @dataclass(frozen=True, eq=False)

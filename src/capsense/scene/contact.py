@@ -182,6 +182,34 @@ def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array]) -> None:
         )
 
 
+def warn_of_doubt(scene: Scene, electrode: tuple[str, Array], share: float, reason: str) -> None:
+    """Warn that the estimated error of a reading is large.
+
+    Args:
+        scene: The bodies.
+        electrode: Name of the one that changes most, and its triangles [m], shape (t, 3, 3).
+        share: Estimated error over its change.
+        reason: What most of the error comes from, or nothing.
+    """
+    name, triangles = electrode
+    points = points_on(triangles, _FEW)
+    near = {
+        body.name or f"bodies[{k}]": float(body.shape.signed_distance(
+            body.pose.inverse().apply(points)
+        ).min())
+        for k, body in enumerate(scene)
+        if body.shape.kind != ShapeKind.LAYERS
+    }  # fmt: skip
+    what = min(near, key=lambda body: near[body]) if near else "what the camera sees"
+    far = f", {1e3 * max(near[what], 0.0):.2g} mm away," if near else ""
+    warnings.warn(
+        f"the estimated error of electrode {name} is {share:.0%} of what {what}{far} changes"
+        f'{reason and ": " + reason}; move it away, or take preset "fine". This is said once; '
+        "reading.stats.solver_error has the estimate",
+        stacklevel=4,
+    )
+
+
 def points_on(corners: Array, count: int = 100) -> Array:
     """Corners of triangles (t, 3, 3), and some ``count`` points spread evenly [m], shape (n, 3)."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -193,7 +193,19 @@ class SurfaceSolver:
             self._last = view, solution
             matrix, error = self.unit * solution.delta, self.unit * solution.error
             change = self._change(view, bodies, matrix, error, solution.size)
+            change = replace(change, reason=self._reason(bodies, solution))
         return replace(change, jacobian=slope)
+
+    def _reason(self, bodies: PackedBodies, solution: Solution) -> str:
+        """What most of the estimated error comes from, in words."""
+        if solution.shift > 0.0:
+            return "bodies lie within each other or within the sensor"
+        close = f"nearer than {2e3 * self.length * self.green.gap.validity:.2g} mm"
+        if (solution.near & (bodies.records["softness"] != 0.0)).any():
+            return f"what a dielectric adds that is {close} is only estimated there"
+        if solution.near.any():
+            return f"a conductor is {close}, and its panels are coarse for that"
+        return f"{solution.size} charge functions resolve it, and more would change it"
 
     def _change(
         self, view: View, bodies: PackedBodies, matrix: NDArray[Any], error: float, size: int
