@@ -99,7 +99,7 @@ BAD: dict[str, tuple[tuple[tuple[str, Any], ...], tuple[str, ...]]] = {
     "size of three": (((A + "size", [0.1, 0.1, 0.1]),), ('electrode "A"', "0.1", "[x, y]")),
     "negative size": (((A + "size", [-0.03, 0.03]),), ('electrode "A"', "-0.03", "positive")),
     "zero size": (((A + "size", [0, 0.03]),), ('electrode "A"', "size = 0", "positive")),
-    "tiny size": (((A + "size", [3e-8, 0.03]),), ('electrode "A"', "3e-08", "metres")),
+    "tiny size": (((A + "size", [3e-9, 0.03]),), ('electrode "A"', "3e-09", "metres")),
     "string": (((A + "size", ["30 mm", 0.03]),), ('electrode "A"', "'30 mm'", "number")),
     "boolean": (((B + "radius", True),), ('electrode "B"', "radius = True", "number")),
     "infinite": (((B + "radius", INF),), ('electrode "B"', "inf", "finite")),

@@ -96,10 +96,12 @@ def test_round_shapes() -> None:
 
 @pytest.mark.parametrize("radius", [1e-6, 1e-4, 2.8e-3, 0.02, 0.2])
 def test_arcs_stay_within_the_chord_error_or_64_segments(radius: float) -> None:
-    """Chords leave the arc by at most 10 µm, unless there are 64 to the circle."""
-    n = circle_segments(radius)
-    assert n % 4 == 0
-    assert n == 64 or radius * (1 - math.cos(math.pi / n)) <= CHORD_ERROR
+    """Chords leave the arc by no more than they may, unless there are 64 to the circle."""
+    for error in (1e-6, CHORD_ERROR * 0.03, 0.01 * radius):
+        n = circle_segments(radius, error)
+        assert n % 4 == 0
+        assert n in (8, 64) or radius * (1 - math.cos(math.pi / n)) <= error
+    assert circle_segments(radius, CHORD_ERROR * radius) == 64
 
 
 def test_ring_encloses_a_disc_without_contact() -> None:
@@ -236,7 +238,7 @@ def test_clearance_is_cut_around_electrodes_and_leads() -> None:
     }
     got = design(patch, conductor=[{**POUR, "clearance": 0.0005}]).conductors[0].surface
     want = 0.1**2 - 0.011**2 - (0.05 - 0.0055) * 0.002
-    assert got.area == pytest.approx(want, rel=1e-9)
+    assert got.area == pytest.approx(want, rel=1e-8)
     assert len(got.facets) == 1
 
 
@@ -251,7 +253,8 @@ def test_clearance_may_leave_several_pieces_and_holes() -> None:
 
 @pytest.mark.parametrize(("width", "pieces"), [(8e-6, 1), (1.2e-5, 2)])
 def test_slivers_that_a_clearance_leaves_are_dropped(width: float, pieces: int) -> None:
-    """Limits: what is left beside the gap is narrower, or wider, than 10 µm."""
+    """Limits: what is left beside the gap is narrower, or wider, than 1e-5 of the length unit."""
+    width *= math.sqrt(0.01 * 0.2) / 0.03
     stripe = {"shape": "rectangle", "size": [0.01, 0.2], "center": [0.05 - 0.006 - width, 0]}
     got = design(stripe, conductor=[{**POUR, "clearance": 0.001}]).conductors[0].surface
     assert len(got.facets) == pieces

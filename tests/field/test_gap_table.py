@@ -19,10 +19,10 @@ from capsense.field.gap_table import (
     build_gap_table,
     from_arrays,
     has_even_face,
-    is_flat,
     plane_panels,
     to_arrays,
 )
+from capsense.field.green_points import is_flat
 
 UNIT = 1.2e-3
 PAD = """

@@ -130,7 +130,7 @@ def _slot(sx: float, sy: float) -> Polygon:
         return _circle(radius)
     end = (half, 0.0) if sx > sy else (0.0, half)
     line = LineString([(-end[0], -end[1]), end])
-    return line.buffer(radius, quad_segs=circle_segments(radius, CHORD_ERROR * max(sx, sy)) // 4)
+    return line.buffer(radius, quad_segs=circle_segments(radius, 2 * CHORD_ERROR * radius) // 4)
 
 
 def stripes(table: DesignTable) -> list[Polygon]:

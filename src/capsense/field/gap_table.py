@@ -34,6 +34,7 @@ from capsense.field.boundary import (
     BoundaryModel,
     BoundarySolution,
 )
+from capsense.field.green_points import is_flat
 from capsense.field.panels import PLANE_TOL, Grading, concatenate, cut_facet, make_panels
 from capsense.field.pressed_table import PressedTable, pressed_table_of
 
@@ -56,8 +57,6 @@ _OFF = 3.0
 """Panels of the plane beside the sheets, over the size of those above them."""
 _MOST = 3500
 """About the most boundary elements that a table is made from."""
-_FLAT = 3e-3
-"""Sheets of a flat design rise by less than this, over their width."""
 _BLOCK = 6
 """Cells lie in blocks of so many in a row."""
 _DEEP = 3.0
@@ -131,15 +130,6 @@ def from_arrays(arrays: Mapping[str, Any]) -> GapTable | None:
             parts[name] = np.ascontiguousarray(parts[name], np.float32)
         values["pressed"] = PressedTable(**parts)
     return GapTable(**{**values, **numbers, "change": change})
-
-
-def is_flat(design: Design) -> bool:
-    """Whether all sheets of a design are flat and level."""
-    return all(
-        np.ptp(body.surface.bounds[:, 2])
-        <= _FLAT * np.ptp(body.surface.bounds[:, :2], axis=0).max()
-        for body in design.sheets
-    )
 
 
 def has_even_face(design: Design) -> bool:

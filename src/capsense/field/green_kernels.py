@@ -29,8 +29,9 @@ from capsense._simd import (
     wide_splat,
 )
 from capsense.design.model import Design
-from capsense.field.gap_table import GapTable, is_flat
+from capsense.field.gap_table import GapTable
 from capsense.field.green import LEVELS, GreenFunction
+from capsense.field.green_points import is_flat
 from capsense.field.grid_kernels import Grid, grid_over
 from capsense.field.soft import Soft, no_soft, pack_soft
 

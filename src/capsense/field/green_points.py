@@ -27,6 +27,10 @@ _PER_WIDTH = 0.2
 """Largest spacing of near point charges, over the width of the narrowest electrode."""
 _SPACING = 1.5e-3
 """Smallest distance of neighbouring point charges, near representation [m]."""
+_NEAR_FLOOR = 5.0
+"""No body is below a flat design in a domain that is more than so many times its backplane wide."""
+_FLAT = 3e-3
+"""Sheets of a flat design rise by less than this, over their width."""
 _RIM = 0.45
 """Behind free rims, which bodies can pass, the openness is larger."""
 
@@ -226,12 +230,22 @@ def reachable_points(surface: Surroundings, sources: Array, clearance: float, co
     reached = ((points > lower + margin) & (points < upper - margin)).all(axis=1)
     for layer in design.layers:
         reached &= ~layer.contains(points)
-    points = points[reached]
+    points = points[reached & ~_shut(design, points)]
     distance, nearest = surface.tree.query(points)
     apart = distance > clearance * surface.coarseness[nearest] ** 0.5
     apart &= cKDTree(sources).query(points)[0] > 0.6 * distance
     points = points[apart]
     return points[openness(design, points) > _OPEN]
+
+
+def _shut(design: Design, points: Array) -> NDArray[np.bool_]:
+    """Which points lie between a flat design and a floor near it, where no body can be, (n,)."""
+    domain = design.domain
+    if domain.open or not is_flat(design) or _NEAR_FLOOR * domain.backplane >= min(domain.size):
+        return np.zeros(len(points), np.bool_)
+    box = design_box(design)
+    beside = (points[:, :2] < box[0, :2]) | (points[:, :2] > box[1, :2])
+    return np.asarray((points[:, 2] < box[1, 2]) & ~beside.any(axis=1))
 
 
 def wall_sources(design: Design, settings: GreenSettings) -> Array:
@@ -264,6 +278,15 @@ def far_points(
         points = points[away]
     points = points[np.random.default_rng(1).permutation(len(points))[:count]]
     return _with_wide(surface, points, settings)
+
+
+def is_flat(design: Design) -> bool:
+    """Whether all sheets of a design are flat and level."""
+    return all(
+        np.ptp(body.surface.bounds[:, 2])
+        <= _FLAT * np.ptp(body.surface.bounds[:, :2], axis=0).max()
+        for body in design.sheets
+    )
 
 
 def design_box(design: Design) -> Array:
