@@ -217,7 +217,11 @@ def reachable_points(surface: Surroundings, sources: Array, clearance: float, co
     front = surface.normals[chosen] + 0.5 * random.normal(size=(4 * count, 3))
     rims = np.concatenate([body.surface.rims for body in design.sheets])
     length = np.linalg.norm(rims[:, 1] - rims[:, 0], axis=1)
-    ends = rims[random.choice(len(rims), 2 * count, p=length / length.sum())]
+    if len(rims):
+        ends = rims[random.choice(len(rims), 2 * count, p=length / length.sum())]
+    else:  # closed surfaces have none
+        corners = design.sheets[0].surface.triangles
+        ends = corners[random.choice(len(corners), 2 * count)][:, :2]
     along = ends[:, 0] + random.uniform(size=(2 * count, 1)) * (ends[:, 1] - ends[:, 0])
     points = np.concatenate(
         [
