@@ -121,8 +121,8 @@ def same_functions(count: int) -> Iterator[list[Array]]:
     favoured: list[Array] = []
     pack = SurfaceSolver.pack
 
-    def packed(solver: SurfaceSolver, view: View) -> PackedBodies:
-        out = pack(solver, view)
+    def packed(solver: SurfaceSolver, view: View, time: float | None = None) -> PackedBodies:
+        out = pack(solver, view, time)
         shapes[:] = out.shapes
         return out
 
