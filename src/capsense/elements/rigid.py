@@ -65,6 +65,7 @@ BODY = np.dtype(
         ("triangle_count", np.int64), ("levels", np.int64),
         ("scale", np.float64),  # the body is so many times as large as the shape
         ("rotation", np.float64, (3, 3)), ("position", np.float64, 3),
+        ("sunk", np.float64),  # how far below that it stands in a cover [m], once it is pressed out
         ("neutral", np.int64),  # whether it carries no net charge
         ("group", np.int64),  # bodies that touch are one conductor, named by its first body
         ("tie", np.float64),  # energy of a group's net charge beyond that of its field [1/m]

@@ -103,11 +103,12 @@ def place_of(gap: GapLaw, length: float):
 @wp.func
 def met_by(outlines: Outlines, gap: GapLaw, near: NearBodies, q: int, grounded: bool, v: int):
     """A bit for every near body that may count in a block of cells; nodes alone on pours."""
-    x = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top)
-    reach = _REACH1 * gap.validity + gap.radius[q]
     met = wp.int64(0)
     for k in range(near.count[v]):
         b = near.body[k, v]
+        sunk = near.sunk[b, v]
+        x = wp.vec3(gap.center[q][0], gap.center[q][1], gap.top + sunk)
+        reach = _REACH1 * (gap.validity + sunk) + gap.radius[q]
         if (near.slot[b, v] >= 0 or not grounded) and may_meet(near, b, v, x, reach):
             hit = nearest_of(outlines, near, b, v, x)
             if hit.off < reach:
@@ -131,9 +132,14 @@ def nearest_cell(
         if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
             hit = nearest_of(outlines, near, near.body[k, v], v, x)
             true, lifted = lengths(gap, green, hit, x)
+            sunk = near.sunk[near.body[k, v], v]
+            if sunk > 0.0:  # it stands lower than where it is solved for
+                lower = x + wp.vec3(0.0, 0.0, sunk)
+                hit = nearest_of(outlines, near, near.body[k, v], v, lower)
+                true, other = lengths(gap, green, hit, x)
             if true < best:
                 best = true
-                high = lifted
+                high = wp.max(true, lifted)
                 body = k
     return best, high, body
 
@@ -143,8 +149,11 @@ def _add_cell(
     gap: GapLaw, near: NearBodies, c: int, p: int, best: float, high: float, body: int, v: int
 ):  # fmt: skip
     """Add what one cell changes, of lengths as of :func:`nearest_cell`."""
-    weight = 1.0 - smooth((best / gap.validity - _REACH0) / (_REACH1 - _REACH0))
-    if body < 0 or high <= best or weight <= 0.0:
+    if body < 0 or high <= best:
+        return
+    scale = gap.validity + near.sunk[near.body[body, v], v]
+    weight = 1.0 - smooth((best / scale - _REACH0) / (_REACH1 - _REACH0))
+    if weight <= 0.0:
         return
     weight *= gap.areas[c] / (4.0 * _PI)
     k, s = place_of(gap, best)
@@ -189,7 +198,8 @@ def _add_compressed(
     body = int(-1)
     for k in range(near.count[v]):
         if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
-            hit = nearest_of(outlines, near, near.body[k, v], v, x)
+            b = near.body[k, v]
+            hit = nearest_of(outlines, near, b, v, x + wp.vec3(0.0, 0.0, near.sunk[b, v]))
             off = hit.off
             if off < length:
                 if off > 0.0:

@@ -78,6 +78,7 @@ class NearBodies:
     count: wp.array(dtype=wp.int32)  # bodies that are near, (v,)
     body: wp.array2d(dtype=wp.int32)  # these, in its first rows, (b, v)
     below: wp.array2d(dtype=wp.float32)  # how far a near body reaches below the face [m], (b, v)
+    sunk: wp.array2d(dtype=wp.float32)  # how much lower it stands, in a cover [m], (b, v)
     foot: wp.array2d(dtype=wp.vec3)  # its lowest point [m], (b, v)
     depth: wp.array3d(dtype=wp.float32)  # how far it overlaps cells of a chunk [m], (p, b, v)
     capacitance: wp.array2d(dtype=wp.float32)  # of nodes to ground [m], (slots, v)
@@ -278,16 +279,18 @@ def _overlap(outlines: Outlines, gap: GapLaw, near: NearBodies, b: int, v: int, 
 
 @wp.kernel
 def press_out(gap: GapLaw, near: NearBodies):
-    """Move near bodies that overlap the face up until they touch it, or press a cover flat."""
+    """Move near bodies that overlap the face up until they touch it."""
     v = wp.tid()
     for k in range(near.count[v]):
         b = near.body[k, v]
+        near.sunk[b, v] = 0.0
         if near.below[b, v] > 0.0:
             deepest = float(0.0)
             for p in range(gap.owner.shape[0]):
                 deepest = wp.max(deepest, near.depth[p, b, v])
             at = near.pose[b, v]
-            rise = wp.max(wp.min(deepest, near.below[b, v]) - gap.limit, 0.0)
+            rise = wp.max(wp.min(deepest, near.below[b, v]), 0.0)
+            near.sunk[b, v] = wp.min(rise, gap.limit)
             up = wp.vec3(0.0, 0.0, rise)
             near.pose[b, v] = wp.transform(
                 wp.transform_get_translation(at) + up, wp.transform_get_rotation(at)

@@ -55,8 +55,8 @@ def press_out(bodies, near, green):
     """Move near bodies that overlap the face of the design up until they touch it.
 
     Physics engines let hard bodies overlap. What lies inside of a body that way is in contact with
-    it. A cover that gives way is compressed as far as it can be. Bodies whose middle is behind the
-    face stay where they are.
+    it. A cover that gives way is compressed: ``sunk`` keeps how far below its place a body stands
+    in it. Bodies whose middle is behind the face stay where they are.
     """
     gap, point, room = green.gap, np.empty(9), np.empty(140)
     for b in range(bodies.shape[0]):
@@ -87,7 +87,9 @@ def press_out(bodies, near, green):
                         break
                     depth -= off
                 deepest = max(deepest, depth)
-        bodies[b].position[2] += max(0.0, min(deepest, below) - gap.soft.limit)
+        up = max(0.0, min(deepest, below))
+        bodies[b].position[2] += up
+        bodies[b].sunk += min(up, gap.soft.limit)
 
 
 @kernel
@@ -118,14 +120,15 @@ def local_change(bodies, near, node, green, matrix):
     gap = green.gap
     chosen, count = np.empty(bodies.shape[0], np.int64), 0
     point, room, moved = np.empty(9), np.empty(140), np.empty((1, 3))
-    reach = REACH[1] * gap.validity
     for k in range(gap.block_radius.shape[0]):
         x, y, z = gap.block_center[k, 0], gap.block_center[k, 1], gap.top
         grounded, count = gap.terminal[gap.blocks[k]] < 0, 0
         for b in range(bodies.shape[0]):
             if near[b] and (node[b] >= 0 or not grounded):
-                off, _ = nearest(bodies[b], x, y, z, point, room)
-                if off < reach + gap.block_radius[k]:
+                sunk = bodies[b].sunk
+                reach = REACH[1] * (gap.validity + sunk) + gap.block_radius[k]
+                off, _ = nearest(bodies[b], x, y, z + sunk, point, room)
+                if off < reach:
                     chosen[count] = b
                     count += 1
         if count == 0:
@@ -196,11 +199,12 @@ def compressed_length(bodies, chosen, count, gap, x, y, work):
     soft, (point, room) = gap.soft, work
     length, at = soft.thickness, -1
     for k in range(count):
-        off, _ = nearest(bodies[chosen[k]], x, y, soft.bottom, point, room)
+        bottom = soft.bottom + bodies[chosen[k]].sunk
+        off, _ = nearest(bodies[chosen[k]], x, y, bottom, point, room)
         if off < length:
             if off > 0.0:
                 dx, dy = point[0] - x, point[1] - y
-                off = _arc(off, math.sqrt(dx * dx + dy * dy), point[2] - soft.bottom)
+                off = _arc(off, math.sqrt(dx * dx + dy * dy), point[2] - bottom)
             if off < length:
                 length, at = max(off, soft.thickness - soft.limit), k
     return length, at
@@ -215,10 +219,17 @@ def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
     for k in range(count):
         off, faces = nearest(bodies[chosen[k]], x, y, z, point, room)
         true, high = lengths(off, faces, point, x, y, green, moved)
+        sunk = bodies[chosen[k]].sunk
+        if sunk > 0.0:  # it stands lower than where it is solved for
+            off, faces = nearest(bodies[chosen[k]], x, y, z + sunk, point, room)
+            point[2] -= sunk
+            true, _ = lengths(off, faces, point, x, y, green, moved)
         if true < best:
-            best, lifted, body = true, high, chosen[k]
-    h0 = gap.validity
-    weight = 1.0 - smooth((best / h0 - REACH[0]) / (REACH[1] - REACH[0]))
+            best, lifted, body = true, max(true, high), chosen[k]
+    if body < 0:
+        return
+    scale = gap.validity + bodies[body].sunk
+    weight = 1.0 - smooth((best / scale - REACH[0]) / (REACH[1] - REACH[0]))
     if lifted <= best or weight <= 0.0:
         return
     i, n, depth = gap.terminal[c], gap.change.shape[2] - 1, float(gap.series[c])

@@ -136,9 +136,7 @@ def test_jacobian(sim, held):
             at = cs.Pose(np.array(body.pose.position) + sign * step)
             ends.append(sim.step(cs.Scene([body.moved(at)])).delta)
         found = (ends[0] - ends[1]) / 4e-6
-        np.testing.assert_allclose(
-            slope[..., axis], found, atol=0.02 * np.abs(found).max() + 1e-12
-        )
+        np.testing.assert_allclose(slope[..., axis], found, atol=0.02 * np.abs(found).max() + 1e-12)
     if held:
         np.testing.assert_array_equal(slope[..., 2], 0.0)
 
@@ -160,7 +158,7 @@ def skin(simulators):
 def test_a_grounded_fabric_shows_pressure_alone(skin):
     """Analytic: nothing in front is seen; pressed flat, the cover is a plate capacitor."""
     near = skin.step(plate(-1e-3))
-    assert np.abs(near.delta).max() < 2e-17
+    assert np.abs(near.delta).max() < 1e-3 * near.capacitance[0, 0]
     for material in ("steel", "wood"):
         change = np.diag(skin.step(plate(1e-3, material=material)).delta)
         wanted = EPS0 * EPS * np.pi * 9e-6 * (1 / 1e-3 - 1 / 2e-3)
@@ -171,7 +169,7 @@ def test_a_stiff_fabric_carries_compression_on(simulators, skin):
     """Monotonicity: with a bending length, the neighbour is compressed as well."""
     stiff = simulators(design(top="ground", bending_length=3e-3))
     plain, wide = (np.diag(s.step(ball(1e-3)).delta) for s in (skin, stiff))
-    assert plain[1] < 1e-17
+    assert abs(plain[1]) < 0.01 * plain[0]
     assert wide[0] > plain[0]
     assert 0.0 < wide[1] < 0.5 * wide[0]
 
@@ -222,9 +220,7 @@ def test_hysteresis(simulators):
     """Monotonicity: under the same force, a cover that is unloaded is compressed more."""
     sim = simulators(design(hysteresis=0.4))
     forces = [0.0, 0.1, 0.3, 0.5, 0.3, 0.1, 0.0]
-    found = [
-        sim.step(ball(0.0, force=f), time=0.1 * k).delta[0, 0] for k, f in enumerate(forces)
-    ]
+    found = [sim.step(ball(0.0, force=f), time=0.1 * k).delta[0, 0] for k, f in enumerate(forces)]
     assert found[4] > 1.02 * found[2]
     assert found[5] > 1.02 * found[1]
     assert found[6] == pytest.approx(found[0], rel=1e-3)
