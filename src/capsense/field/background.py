@@ -107,9 +107,10 @@ def build_background(
     tell = (lambda stage, fraction: None) if progress is None else progress
 
     def begin(stage: str) -> None:
-        plane = re.fullmatch(r"response to a plane: (\d+) of (\d+)", stage)
-        if plane:
-            tell(stage, 0.6 + 0.4 * (int(plane[1]) - 1) / int(plane[2]))
+        count = re.fullmatch(r"response to (?:a )?(plane|compression): (\d+) of (\d+)", stage)
+        if count:
+            start, share = (0.6, 0.3) if count[1] == "plane" else (0.9, 0.1)
+            tell(stage, start + share * (int(count[2]) - 1) / int(count[3]))
         else:
             tell(stage, _STAGES.get(stage, 0.0))
 

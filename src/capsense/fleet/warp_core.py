@@ -77,7 +77,8 @@ class WarpCore:
             "below local": (size, size, views), "volts": (slots, t, views),
         })  # fmt: skip
         self.near = struct(warp_near.NearBodies, {
-            "count": (views,), "body below sunk foot": (places, views), "depth": (chunks, places, views),
+            "count": (views,), "body below sunk foot": (places, views),
+            "depth": (chunks, places, views),
             "capacitance": (slots, views),
             "part": (chunks, table.columns.shape[1] + slots, views),
         })  # fmt: skip

@@ -136,7 +136,7 @@ def nearest_cell(
             if sunk > 0.0:  # it stands lower than where it is solved for
                 lower = x + wp.vec3(0.0, 0.0, sunk)
                 hit = nearest_of(outlines, near, near.body[k, v], v, lower)
-                true, other = lengths(gap, green, hit, x)
+                true, _high = lengths(gap, green, hit, x)
             if true < best:
                 best = true
                 high = wp.max(true, lifted)
