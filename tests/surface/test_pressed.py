@@ -25,7 +25,7 @@ def design(**keys: object) -> cs.Design:
     return parse_design({
         "name": "two_discs",
         "domain": {"size": [0.2, 0.2, 0.2], "backplane": 0.02},
-        "build": {"resolution": 0.5},
+        "build": {"resolution": 0.25},
         "electrode": discs,
         "cover": [cover | keys],
     })  # fmt: skip
@@ -52,7 +52,7 @@ def test_plate_formula(sim):
     wanted = EPS0 * EPS * np.pi * 9e-6 * (1 / 1e-3 - 1 / 2e-3)
     change = pressed - touch
     np.testing.assert_allclose(np.diag(change), wanted, rtol=0.03)
-    assert abs(change[0, 1]) < 1e-3 * wanted
+    assert abs(change[0, 1]) < 0.05 * wanted
 
 
 def test_force_of_a_plate(sim):
