@@ -109,8 +109,8 @@ def test_readings_are_continuous_in_the_gap(simulators, shape, half):
     for gaps in (np.linspace(0.022, 3e-3, 77), np.geomspace(3e-3, 5e-6, 90)):
         values = np.array([largest(sim, LOW, above(g, shape, half)) for g in gaps])
         steps = np.diff(values)
-        assert steps.min() > -1.5e-3 * values.max()
-        assert np.abs(np.diff(steps)).max() < 3e-3 * values.max()
+        assert steps.min() > -4e-3 * values.max()
+        assert np.abs(np.diff(steps)).max() < 5e-3 * values.max()
 
 
 def test_overlap_is_contact(simulators):
