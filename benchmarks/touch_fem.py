@@ -151,7 +151,7 @@ def scene(
     else:
         top = "ground" if case.fabric else "none"
         design["cover"] = [{"name": "cover", "thickness": t, "eps_r": case.eps_r,
-                            "modulus": MODULUS, "top": top}]  # fmt: skip
+                            "size": [SIDE, SIDE], "modulus": MODULUS, "top": top}]  # fmt: skip
     design |= {"conductor": conductors} if conductors else {}
     design |= {"layer": layers} if layers else {}
     if depth is None:

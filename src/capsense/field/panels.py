@@ -114,13 +114,18 @@ def _cells(region: shapely.Geometry, size: float) -> list[Polygon]:
     return list(cut[shapely.area(cut) > 1e-6 * size * size * 1e-3])
 
 
+_SPIKE = 1e-6
+"""Corners that stand out by less than this, over the root of their panel's area, are left out: cuts
+along an outline that they touch leave spikes."""
+
+
 def make_panels(facet: Facet, polygons: list[Polygon]) -> Panels:
     """Turn pieces of a facet into panels."""
     edges: list[Array] = []
     counts: list[int] = []
     centers, diameters, quads, weights = [], [], [], []
     for polygon in polygons:
-        polygon = orient(polygon)
+        polygon = orient(polygon.simplify(_SPIKE * math.sqrt(polygon.area)))
         rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
         flat = np.concatenate([np.stack([r[:-1], r[1:]], axis=1) for r in rings])
         edges.append(facet.to_sensor(flat))
