@@ -25,9 +25,9 @@ def test_a_field_is_that_of_its_boundary_elements() -> None:
     """Differential: mutual capacitances are the means of both ways."""
     design, told = tiny_design(), []
     field = build_background(design, SETTINGS, lambda stage, part: told.append((stage, part)))
-    solution = BoundarySolution(design, Accuracy(SETTINGS.panel_scale))
+    solution = BoundarySolution(design.in_units, Accuracy(SETTINGS.panel_scale))
     densities = solution.densities(np.eye(2))
-    charges = solution.terminal_charges(densities)
+    charges = design.unit * solution.terminal_charges(densities)
     np.testing.assert_array_equal(field.capacitance, field.capacitance.T)
     np.testing.assert_allclose(field.capacitance, 0.5 * (charges + charges.T), rtol=1e-12)
     assert field.terminals == ("A", "B")

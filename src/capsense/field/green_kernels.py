@@ -95,9 +95,9 @@ class Gap(NamedTuple):
     """The cover, if it gives way."""
 
 
-LEAST_LENGTH = 0.025
-"""Least length of a field line, over the validity distance h0, or over thickness by permittivity of
-what covers the electrodes, where that is less."""
+LEAST_LENGTH, _THIN = 0.8, 0.03
+"""Least length of a field line, over the lowest height of the gap table, or over the second times
+the thickness by permittivity of what covers the electrodes, where that is less."""
 
 
 def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
@@ -113,7 +113,7 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
             0.5 * clearance, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
             np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros(0, np.float32),
             np.zeros((0, 0), np.int64), np.zeros((0, 2, 1), np.float32), np.zeros(1, np.int64),
-            np.zeros((0, 2)), none, LEAST_LENGTH * clearance, no_soft(0),
+            np.zeros((0, 2)), none, 0.0, no_soft(0),
         )  # fmt: skip
     count = len(table.areas)
     blocks = np.append(table.blocks, count)
@@ -123,10 +123,10 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     center = np.stack([np.bincount(number, x) / size for x in points.T], axis=1)
     radius = np.zeros(len(size))
     np.maximum.at(radius, number, np.linalg.norm(points - center[number], axis=1))
-    least = table.validity
+    least = float(table.heights[0])
     if cover_of(design) > 0.0:
         most = max([1.0, *(layer.eps_r for layer in design.layers)])
-        least = min(least, cover_of(design) / most)
+        least = min(least, _THIN * cover_of(design) / most)
     return Gap(
         table.validity, table.top, table.heights, math.log(table.heights[1] / table.heights[0]),
         np.ascontiguousarray(points, np.float32), np.ascontiguousarray(table.areas, np.float32),
