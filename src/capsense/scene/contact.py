@@ -194,12 +194,10 @@ def warn_of_doubt(scene: Scene, electrode: tuple[str, Array], share: float, reas
     name, triangles = electrode
     points = points_on(triangles, _FEW)
     near = {
-        body.name or f"bodies[{k}]": float(body.shape.signed_distance(
-            body.pose.inverse().apply(points)
-        ).min())
+        body.name or f"bodies[{k}]": float(distances(body, points, each=False).min())
         for k, body in enumerate(scene)
         if body.shape.kind != ShapeKind.LAYERS
-    }  # fmt: skip
+    }
     what = min(near, key=lambda body: near[body]) if near else "what the camera sees"
     far = f", {1e3 * max(near[what], 0.0):.2g} mm away," if near else ""
     warnings.warn(
