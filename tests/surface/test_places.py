@@ -32,7 +32,10 @@ Array = np.ndarray
 
 def space_of(green: Green) -> Space:
     """What places of single points need."""
-    return Space(green.box, green.room, green.extent, green.cover, green.gap.validity)
+    gap = green.gap
+    return Space(
+        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
+    )  # fmt: skip
 
 
 BOX = np.array([[-0.05, -0.04, -0.001], [0.05, 0.04, 0.0]])
