@@ -125,8 +125,11 @@ def make_panels(facet: Facet, polygons: list[Polygon]) -> Panels:
     counts: list[int] = []
     centers, diameters, quads, weights = [], [], [], []
     for polygon in polygons:
-        polygon = orient(polygon.simplify(_SPIKE * math.sqrt(polygon.area)))
+        polygon = orient(polygon)
         rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
+        if _quadrature(polygon, rings)[1].min() < _SPIKE**1.5 * polygon.area:
+            polygon = orient(polygon.simplify(_SPIKE * math.sqrt(polygon.area)))
+            rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
         flat = np.concatenate([np.stack([r[:-1], r[1:]], axis=1) for r in rings])
         edges.append(facet.to_sensor(flat))
         counts.append(len(flat))
