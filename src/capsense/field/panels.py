@@ -126,14 +126,15 @@ def make_panels(facet: Facet, polygons: list[Polygon]) -> Panels:
     centers, diameters, quads, weights = [], [], [], []
     for polygon in polygons:
         polygon = orient(polygon)
-        rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
-        if _quadrature(polygon, rings)[1].min() < _SPIKE**1.5 * polygon.area:
+        rings = _rings(polygon)
+        points, w = _quadrature(polygon, rings)
+        if w.min() < _SPIKE**1.5 * polygon.area:
             polygon = orient(polygon.simplify(_SPIKE * math.sqrt(polygon.area)))
-            rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
+            rings = _rings(polygon)
+            points, w = _quadrature(polygon, rings)
         flat = np.concatenate([np.stack([r[:-1], r[1:]], axis=1) for r in rings])
         edges.append(facet.to_sensor(flat))
         counts.append(len(flat))
-        points, w = _quadrature(polygon, rings)
         center = w @ points / w.sum()
         centers.append(facet.to_sensor(center))
         diameters.append(2 * np.sqrt(((flat[:, 0] - center) ** 2).sum(axis=1)).max())
@@ -148,6 +149,11 @@ def make_panels(facet: Facet, polygons: list[Polygon]) -> Panels:
         quad=_joined([points[None] for points in quads]),
         weights=_joined([w[None] for w in weights]),
     )
+
+
+def _rings(polygon: Polygon) -> list[Array]:
+    """Corners of the outline and of each hole, the first one again at the end."""
+    return [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
 
 
 def _quadrature(polygon: Polygon, rings: list[Array]) -> tuple[Array, Array]:
