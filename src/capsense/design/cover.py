@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from shapely.geometry import box
 
 from capsense._validate import shorten
 from capsense.cover import GROUND, NONE, TOPS, Cover, StressStrain
-from capsense.design.geometry import TOUCH, DesignTable, Facet, Surface, boundary_segments
+from capsense.design.geometry import TOUCH, DesignTable, level_rectangle
 from capsense.design.model import Conductor, Domain, Electrode, Layer, Role
 from capsense.errors import DesignError
 
@@ -103,8 +102,7 @@ def read_cover(
     if kind == NONE:
         return cover, layer, None
     role = Role.GROUND if kind == GROUND else Role.FLOATING
-    facet = Facet(box(*low, *high), np.array([0.0, 0.0, upper[2]]), np.eye(3))
-    return cover, layer, Conductor(f"{name} top", role, Surface((facet,), boundary_segments(facet)))
+    return cover, layer, Conductor(f"{name} top", role, level_rectangle(low, high, upper[2]))
 
 
 def _law(table: DesignTable) -> StressStrain:

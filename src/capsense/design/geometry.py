@@ -41,6 +41,11 @@ class Facet:
         uv = np.asarray(uv, dtype=float)
         return self.origin + uv @ self.axes[:2]
 
+    @property
+    def footprint(self) -> Polygon:
+        """The outline as seen along z, in the sensor's x and y [m]."""
+        return shapely.transform(self.polygon, lambda uv: self.to_sensor(uv)[:, :2])
+
     def measured_in(self, unit: float) -> Facet:
         """The same facet with lengths in a unit [m]."""
         outline = shapely.transform(self.polygon, lambda uv: measured(uv, unit))
@@ -103,6 +108,12 @@ def length_unit(areas: Sequence[float]) -> float:
     to the electrodes.
     """
     return float(f"{math.sqrt(sum(areas) / len(areas)) / SIDE:.12g}") if any(areas) else 1.0
+
+
+def level_rectangle(low: Array, high: Array, z: float) -> Surface:
+    """A horizontal rectangle between two corners [m], shape (2,) each, at a height [m]."""
+    facet = Facet(box(*low, *high), np.array([0.0, 0.0, z]), np.eye(3))
+    return Surface((facet,), boundary_segments(facet))
 
 
 def box_facets(lower: Array, upper: Array) -> tuple[Facet, ...]:

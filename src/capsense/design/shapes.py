@@ -315,8 +315,7 @@ def bend_sheet(item: str, surface: Surface, radius: float) -> Surface:
     facets: list[Facet] = []
     rims: list[Array] = []
     for facet in surface.facets:
-        flat = shapely.transform(facet.polygon, lambda uv, f=facet: f.to_sensor(uv)[:, :2])
-        parts, edges = _bend_polygon(flat, radius, own)
+        parts, edges = _bend_polygon(facet.footprint, radius, own)
         facets += parts
         rims += edges
     return Surface(tuple(facets), np.concatenate(rims))

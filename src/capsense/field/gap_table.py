@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -35,7 +35,14 @@ from capsense.field.boundary import (
     BoundarySolution,
 )
 from capsense.field.green_points import is_flat
-from capsense.field.panels import PLANE_TOL, Grading, concatenate, cut_facet, make_panels
+from capsense.field.panels import (
+    PLANE_TOL,
+    Grading,
+    concatenate,
+    cut_facet,
+    make_panels,
+    samples,
+)
 from capsense.field.pressed_table import PressedTable, pressed_table_of
 
 if TYPE_CHECKING:
@@ -186,7 +193,7 @@ def plane_panels(solution: BoundarySolution, reach: float) -> Panels:
                     parts.append(make_panels(facet, pieces))
 
     for (facet, _), grading in sheets:
-        outline = shapely.transform(facet.polygon, lambda uv, f=facet: f.to_sensor(uv)[:, :2])
+        outline = facet.footprint
         if not rest.intersects(outline):
             continue
         add(rest.intersection(outline), grading)
@@ -440,37 +447,3 @@ def _columns_of(density: Array, terminal: Ints, areas: Array, terminals: int) ->
     n = max(1, int(wanted.sum(axis=1).max()))
     best = np.argsort(-worth, axis=1, kind="stable")[:, :n]
     return np.where(np.take_along_axis(wanted, best, axis=1), best, -1)
-
-
-def samples(panels: Panels, count: int, size: float) -> tuple[Ints, Array, Array]:
-    """Points no farther apart than ``size`` [m] all over the first panels, and their areas.
-
-    Returns:
-        Panel, position [m] and area [m²] of each, shapes (s,), (s, 3), (s,).
-    """
-    of, points, areas = [], [], []
-    for p in range(count):
-        ends = panels.edges[panels.first[p] : panels.first[p + 1]]
-        corners = np.concatenate([np.repeat(panels.centers[p][None, None], len(ends), 0), ends], 1)
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = 0.5 * cross @ panels.normals[p]
-        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        for triangle, a, longest in zip(corners, area, sides.max(axis=1), strict=True):
-            n = max(1, math.ceil(longest / size))
-            points.append(_split_points(n) @ triangle)
-            areas.append(np.full(n * n, a / (n * n)))
-            of.append(np.full(n * n, p))
-    return np.concatenate(of), np.concatenate(points), np.concatenate(areas)
-
-
-@cache
-def _split_points(n: int) -> Array:
-    """Barycentric coordinates of the centroids of n² equal parts of a triangle, (n², 3)."""
-    out = []
-    for i in range(n):
-        for j in range(n - i):
-            k = n - 1 - i - j
-            out.append([i + 1 / 3, j + 1 / 3, k + 1 / 3])
-            if k > 0:
-                out.append([i + 2 / 3, j + 2 / 3, k - 1 / 3])
-    return np.array(out) / n

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import shapely
@@ -22,6 +23,7 @@ from capsense.design.model import Design, Layer
 from capsense.field.bem_kernels import Panels
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 # Degree-2 rule on a triangle: three points of weight 1/3.
 _TRIANGLE_RULE = np.array([[2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3, 1 / 6], [1 / 6, 1 / 6, 2 / 3]])
@@ -266,3 +268,37 @@ def walls(design: Design) -> list[Facet]:
     if design.domain.open:
         return []
     return [f for f in box_facets(design.domain.lower, design.domain.upper) if f.axes[2, 2] > -0.5]
+
+
+def samples(panels: Panels, count: int, size: float) -> tuple[Ints, Array, Array]:
+    """Points no farther apart than ``size`` [m] all over the first panels, and their areas.
+
+    Returns:
+        Panel, position [m] and area [m²] of each, shapes (s,), (s, 3), (s,).
+    """
+    of, points, areas = [], [], []
+    for p in range(count):
+        ends = panels.edges[panels.first[p] : panels.first[p + 1]]
+        corners = np.concatenate([np.repeat(panels.centers[p][None, None], len(ends), 0), ends], 1)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = 0.5 * cross @ panels.normals[p]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        for triangle, a, longest in zip(corners, area, sides.max(axis=1), strict=True):
+            n = max(1, math.ceil(longest / size))
+            points.append(_split_points(n) @ triangle)
+            areas.append(np.full(n * n, a / (n * n)))
+            of.append(np.full(n * n, p))
+    return np.concatenate(of), np.concatenate(points), np.concatenate(areas)
+
+
+@cache
+def _split_points(n: int) -> Array:
+    """Barycentric coordinates of the centroids of n² equal parts of a triangle, (n², 3)."""
+    out = []
+    for i in range(n):
+        for j in range(n - i):
+            k = n - 1 - i - j
+            out.append([i + 1 / 3, j + 1 / 3, k + 1 / 3])
+            if k > 0:
+                out.append([i + 2 / 3, j + 2 / 3, k - 1 / 3])
+    return np.array(out) / n

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from shapely.geometry import box
 
 from capsense.constants import EPS0
 from capsense.cover import NONE, Cover
-from capsense.design.geometry import Facet, Surface, boundary_segments
+from capsense.design.geometry import level_rectangle
 from capsense.design.model import Conductor, Design, Role
 from capsense.field.boundary import POWER, Accuracy, BoundarySolution, terminals
-from capsense.field.panels import PLANE_TOL
+from capsense.field.panels import PLANE_TOL, samples
 
 if TYPE_CHECKING:
     from capsense.field.gap_table import GapTable
@@ -68,9 +67,7 @@ def pressed_design(design: Design, cover: Cover, strain: float) -> Design:
     layers = [
         replace(la, upper=top) if la.name == cover.name else la for la in design.layers
     ]  # fmt: skip
-    low, high = cover.lower[:2], cover.upper[:2]
-    facet = Facet(box(*low, *high), np.array([0.0, 0.0, top[2]]), np.eye(3))
-    surface = Surface((facet,), boundary_segments(facet))
+    surface = level_rectangle(cover.lower[:2], cover.upper[:2], top[2])
     if cover.top == NONE:
         conductors = [*design.conductors, Conductor(_PLANE, Role.SHIELD, surface)]
     else:
@@ -148,8 +145,6 @@ def _cell_means(
     solution: BoundarySolution, owner: Ints, density: Array, table: GapTable, far: float
 ) -> Array:
     """Mean densities on the cells of a gap table, of panels of the same terminals."""
-    from capsense.field.gap_table import samples
-
     size = 0.5 * float(np.sqrt(np.median(table.areas)))
     panel, points, area = samples(solution.model.panels, solution.model.sheet_panels, size)
     some = owner[panel] > -9
@@ -174,8 +169,6 @@ def _on_fabric(
     found: list[BoundarySolution], free: list[Array], cover: Cover
 ) -> tuple[Single, Single, Ints, Single]:
     """Cells of a fabric, and the densities on them."""
-    from capsense.field.gap_table import samples
-
     extent = cover.upper[:2] - cover.lower[:2]
     size = max(_CELL * cover.thickness, float(np.sqrt(extent.prod() / _CELLS)))
     count = np.maximum(1, np.ceil(extent / size)).astype(int)

@@ -71,11 +71,7 @@ def pack_soft(table: GapTable, design: Design) -> Soft:
         behind = over & (points[:, 2] < height - PLANE_TOL)
         for facet in sheet.surface.facets:
             if behind.any() and abs(facet.axes[2, 2]) > 0.5:
-                outline = shapely.transform(
-                    facet.polygon, lambda uv, f=facet: f.to_sensor(uv)[:, :2]
-                )
-                behind_it = behind & shapely.contains_xy(outline, points[:, 0], points[:, 1])
-                over &= ~behind_it
+                over &= ~(behind & shapely.contains_xy(facet.footprint, *points[:, :2].T))
     below = np.zeros(len(points))
     for layer in design.layers:
         if layer.name == cover.name:

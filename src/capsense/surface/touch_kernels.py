@@ -57,7 +57,7 @@ def foundation(cover: Cover, electrodes: Sequence[Surface], unit: float) -> Foun
         _grid(bounds[k, 0], bounds[k, 1], points, size)
         inside, area = np.zeros(len(points), bool), 0.0
         for facet in surface.facets:
-            outline = shapely.transform(facet.polygon, lambda uv, f=facet: f.to_sensor(uv)[:, :2])
+            outline = facet.footprint
             inside |= shapely.contains_xy(outline, points[:, 0], points[:, 1])
             area += outline.area
         cells = inside.reshape(_RASTER, _RASTER) * (area / max(int(inside.sum()), 1))
