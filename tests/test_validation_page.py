@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from benchmark_modules import imported
 
 from capsense.reproduce import STUDIES
 
@@ -22,13 +21,8 @@ MODULES = ("validation", "validation_results")
 @pytest.fixture(scope="module")
 def parts() -> Iterator[dict[str, ModuleType]]:
     """The benchmark's modules."""
-    before = set(sys.modules)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "benchmarks"))
-        yield {name: import_module(name) for name in MODULES}
-    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
-    for name in (set(sys.modules) - before) & own:
-        sys.modules.pop(name)
+    with imported(*MODULES) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 import tomllib
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from benchmark_modules import imported
 
 from capsense.design import parse_design
 
@@ -23,13 +22,8 @@ FILES = ("near_map.json", "near_held_out.json")
 @pytest.fixture(scope="module")
 def parts() -> Iterator[dict[str, ModuleType]]:
     """The benchmark's modules."""
-    before = set(sys.modules)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "benchmarks"))
-        yield {name: import_module(name) for name in MODULES}
-    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
-    for name in (set(sys.modules) - before) & own:
-        sys.modules.pop(name)
+    with imported(*MODULES) as found:
+        yield found
 
 
 @pytest.mark.parametrize("name", FILES)

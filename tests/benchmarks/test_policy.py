@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-ROOT = Path(__file__).parents[2]
+from benchmark_modules import imported
 
 
 @pytest.fixture(scope="module")
@@ -19,13 +16,8 @@ def policy() -> Iterator[Any]:
     """The benchmark's module."""
     pytest.importorskip("gymnasium", reason="Gymnasium is not installed")
     pytest.importorskip("mujoco", reason="MuJoCo is not installed")
-    before = set(sys.modules)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "benchmarks"))
-        yield import_module("policy")
-    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
-    for name in (set(sys.modules) - before) & own:
-        sys.modules.pop(name)
+    with imported("policy") as found:
+        yield found["policy"]
 
 
 @pytest.mark.parametrize("kind", ["field", "distance"])

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmark_modules import imported
 
 import capsense as cs
 
@@ -21,13 +20,8 @@ MODULES = ("step_scenes", "steps", "accuracy_map")
 @pytest.fixture(scope="module")
 def parts() -> Iterator[dict[str, ModuleType]]:
     """The benchmarks' modules."""
-    before = set(sys.modules)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "benchmarks"))
-        yield {name: import_module(name) for name in MODULES}
-    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
-    for name in (set(sys.modules) - before) & own:
-        sys.modules.pop(name)
+    with imported(*MODULES) as found:
+        yield found
 
 
 def lowest(scene: cs.Scene) -> float:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmark_modules import imported
 
 from capsense.constants import EPS0
 from capsense.design import parse_design
@@ -24,13 +23,8 @@ MODULES = ("touch_fem", "touch_reference")
 @pytest.fixture(scope="module")
 def parts() -> Iterator[dict[str, ModuleType]]:
     """The benchmark's modules."""
-    before = set(sys.modules)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "benchmarks"))
-        yield {name: import_module(name) for name in MODULES}
-    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
-    for name in (set(sys.modules) - before) & own:
-        sys.modules.pop(name)
+    with imported(*MODULES) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")
