@@ -150,13 +150,15 @@ class Simulator:
         self._background = background
         self._solver, rest = self._make_solver()
         self._one = OneAtATime()
-        self._contact_told = self._doubt_told = False
+        self._contact_told = False
         self._idle: deque[_Solver] = deque()  # for the threads of batches
         self._names = self.design.electrode_names
         self._terminals = Terminals(self.design, rest)
         n = self._terminals.electrodes
         self.baseline: Array = read_only(self._terminals.empty[:n, :n].copy())
         """Maxwell matrix of the electrodes in the empty domain [F], shape (M, M)."""
+        self._doubtful = _SEEN * float(self.baseline.max())
+        """Smaller estimated errors are not warned of [F]; infinite once one was."""
         self.readout: Readout | None = None
         """The chip that turns capacitances into counts, if any."""
         self.use_readout(readout)
@@ -283,7 +285,7 @@ class Simulator:
         total = terminals.empty + change
         error = min(error, float(np.abs(total).max()))
         stats = StepStats(error, seconds, found.unknowns, found.iterations)
-        if not self._doubt_told and not math.isinf(found.error):
+        if self._doubtful < error and not math.isinf(found.error):
             self._tell_of_doubt(scene, np.abs(np.diag(change.real)), error, found.reason)
         reading = self._reading(change.real, total.real, stats, slope, found.touch)
         if not reading.delta.any():
@@ -295,16 +297,18 @@ class Simulator:
             reading, conductance=-2 * np.pi * self.excitation_frequency * change.imag[:n, :n]
         )
 
-    def _tell_of_doubt(self, scene: Scene, own: Array, error: float, reason: str) -> None:
+    def _tell_of_doubt(
+        self, scene: Scene, own: Array, error: float, reason: Callable[[], str]
+    ) -> None:
         """Warn once where an estimated error is a large part of the change of an electrode [F]."""
         own = own[: self._terminals.electrodes]
         most = int(own.argmax())
-        if error <= _DOUBTFUL * own[most] or error <= _SEEN * self.baseline.max():
+        if error <= _DOUBTFUL * own[most]:
             return
-        self._doubt_told = True
+        self._doubtful = math.inf
         electrode = self.design.electrodes[most]
         share = error / max(own[most], 1e-300)
-        warn_of_doubt(scene, (electrode.name, electrode.surface.triangles), share, reason)
+        warn_of_doubt(scene, (electrode.name, electrode.surface.triangles), share, reason())
 
     def _reading(
         self,

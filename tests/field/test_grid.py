@@ -128,7 +128,7 @@ def test_potentials_of_a_design(design: str) -> None:
     points = inside(500, low, high)
     points = points[points[:, 2] > green.box[1, 2] + 0.01]
     found = values_at(points, green.grid)[:, : green.terminals]
-    wanted = background.phi0(points)
+    wanted = background.phi0(points * background.unit)
     off = np.abs(found - wanted).max(axis=1)
     near = np.maximum(wanted.max(axis=1), 0.02)
     assert (off / near).max() < 0.06

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from reference_scenes import DATA, FEMTO, body_of_json
 
 import capsense as cs
-from capsense.surface.between_kernels import SHARE, apart, facing_of, local_capacitance
+from capsense.field.green_kernels import held_off
+from capsense.surface.between_kernels import SHARE, facing_of, local_capacitance
 from capsense.surface.step import solve
 
 Array = NDArray[np.float64]
@@ -79,7 +80,7 @@ def test_local_capacitance_of_plates(simulators, gap):
     facing = facing_of(records)
     length = float(facing.length[0])
     c = local_capacitance(records[0], records[1], length, facing.point, facing.room)
-    plate = 0.06**2 * (1.0 / gap - 1.0 / apart(gap, length)) / (4.0 * math.pi)
+    plate = 0.06**2 * (1.0 / gap - 1.0 / held_off(gap, length)) / (4.0 * math.pi)
     assert plate < c < 1.05 * plate
 
 
@@ -97,7 +98,7 @@ def test_local_capacitance_of_a_ball_and_a_plate(simulators, gap, mesh):
     angle = np.linspace(0.0, 0.5 * math.pi, 200_001)
     z = gap + radius * (1.0 - np.cos(angle))
     arc = np.where(angle > 0.0, angle / np.sin(np.maximum(angle, 1e-9)), 1.0)
-    change = (1.0 / z - 1.0 / np.array([apart(d, length) for d in z])) / arc
+    change = (1.0 / z - 1.0 / np.array([held_off(d, length) for d in z])) / arc
     wanted = np.trapezoid(change * 2.0 * math.pi * radius**2 * np.sin(angle), angle)
     assert c == pytest.approx(wanted / (4.0 * math.pi), rel=0.02)
 
@@ -171,3 +172,17 @@ def test_jacobian_between_bodies(simulators):
     k = int(np.abs(slope).argmax())
     assert slope[k] < 0.0
     assert found[k] == pytest.approx(slope[k], rel=0.02)
+
+
+def test_surfaces_that_change_have_no_such_pairs(simulators):
+    """Of a sheet near the design the outline is that of a part, without sizes; a ball floats."""
+    sim = simulators("six_patch_bare")
+    corners = np.array([[-0.02, -0.02], [0.02, -0.02], [0.02, 0.02], [-0.02, 0.02]])
+    vertices = np.column_stack([corners, np.full(4, 1e-3)])
+    sheet = cs.DeformableSurface(vertices, [[0, 1, 2], [0, 2, 3]], material="steel").body()
+    ball = cs.Body(cs.Sphere(0.01), cs.Pose((0.0, 0.0, 0.012)), "steel", grounding="floating")
+    scene = cs.Scene([sheet, ball])
+    bodies = sim._solver.pack(sim._solver.look(scene))
+    assert (bodies.records["outline"] != 0).all()
+    assert facing_of(bodies.records).pairs == 0
+    assert np.isfinite(sim.step(scene).delta).all()

@@ -151,8 +151,8 @@ class Change:
     (bodies, terminals, terminals, 6)."""
     touch: Touch | None = None
     """What its bodies press onto the cover, if the design has one."""
-    reason: str = ""
-    """What most of the error comes from, in words."""
+    reason: Callable[[], str] = str
+    """Tells what most of the error comes from; nothing, if that is not known."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -347,6 +347,14 @@ def beyond(points, space):
 
 
 @kernel
+def held_off(distance, length):
+    """A distance that becomes ``length`` in contact, and stays from twice that on, C¹ [m]."""
+    if distance >= 2.0 * length:
+        return distance
+    return length + distance * distance / (4.0 * length)
+
+
+@kernel
 def settle(points, space):
     """Move points (k, 3) in the cover up to its face: what is pressed into it is in contact."""
     for q in range(points.shape[0]):
@@ -382,7 +390,7 @@ def lift(points, gap, box):
         if way == 0.0:
             points[q, axis] = box[1, axis] + gap if side == 1 else box[0, axis] - gap
             continue
-        ratio = (gap + way * way / (4.0 * gap)) / way
+        ratio = held_off(way, gap) / way
         for i in range(3):
             edge = min(points[q, i], box[1, i])
             if i < 2:

@@ -26,13 +26,14 @@ from capsense._simd import doubles, integers
 from capsense.elements.outline import (
     BOX,
     CAPSULE,
+    CHANGING,
     CYLINDER,
     ELLIPSOID,
     MESH,
     SPHERE,
     nearest,
 )
-from capsense.field.green_kernels import smooth
+from capsense.field.green_kernels import held_off, smooth
 
 SHARE = 0.1
 """Length by which bodies are held apart, over the second-largest extent of the smaller one."""
@@ -123,8 +124,11 @@ def _is_free(body):
 
 @kernel
 def _conducts(body):
-    """Whether it is a conductor with an outline; not a dielectric that is taken for one."""
-    return body.outline != 0 and body.softness == 0.0 and body.stiffer == 0.0
+    """Whether it is a conductor with an outline; not a dielectric that is taken for one.
+
+    Of a surface that changes, the outline is only what is near the design.
+    """
+    return body.outline not in (0, CHANGING) and body.softness == 0.0 and body.stiffer == 0.0
 
 
 @kernel
@@ -222,15 +226,6 @@ def _beyond(one, two, point, room):
 
 
 @kernel
-def apart(distance, length):
-    """A distance where bodies are held apart [m]."""
-    if distance >= 2.0 * length:
-        return distance
-    d = max(distance, 0.0)
-    return length + d * d / (4.0 * length)
-
-
-@kernel
 def crowded(bodies, facing, b, k):
     """How far cluster k of body b has to be split since it is near another conductor, 0 to 1."""
     out, body = 0.0, bodies[b]
@@ -301,7 +296,7 @@ def _move_apart(true, out, other, length, box, facing):
     off, faces = nearest(other, true[0], true[1], true[2], point, facing.room)
     if off >= 2.0 * length:
         return
-    by, away, square = apart(off, length) - off, 0.0, 0.0
+    by, away, square = held_off(max(off, 0.0), length) - off, 0.0, 0.0
     for i in range(3):
         if abs(off) > 1e-9:
             point[6 + i] = (true[i] - point[i]) / off
@@ -613,6 +608,4 @@ def _change(other, length, place, point, room):
             return 0.0, off
         factor = angle / sine
     true = max(off, 0.0)
-    if true < 2.0 * least:
-        true = least + true * true / (4.0 * least)
-    return (1.0 / true - 1.0 / apart(off, length)) / factor, off
+    return (1.0 / held_off(true, least) - 1.0 / held_off(true, length)) / factor, off

@@ -19,7 +19,7 @@ import numpy as np
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles
 from capsense.elements.outline import CHANGING, middle_height, nearest, reach_down
-from capsense.field.green_kernels import lift, smooth
+from capsense.field.green_kernels import held_off, lift, smooth
 from capsense.field.soft import BODY
 
 REACH = 5.0, 8.0
@@ -376,8 +376,7 @@ def lengths(off, faces, point, x, y, green, moved):
             lower = _arc(along, along * math.sqrt(max(0.0, 1.0 - up * up)), along * up)
             share = smooth(1.0 - math.sqrt(beside) / h0)
             lifted += share * (min(lower, lifted) - lifted)
-    if true < 2.0 * least:
-        true = least + true * true / (4.0 * least)
+    true = held_off(true, least)
     return true, max(lifted, true)
 
 

@@ -38,28 +38,15 @@ def solve_lossy(
         softness: 1 / (eps - 1), shape (n,).
         green, threshold, width: As in :func:`prepared`.
     """
-    found = _solve_lossy(records, ties, softness, green, threshold, width)
-    fabric = np.zeros(found.delta.shape)
+    fabric = np.zeros((green.terminals, green.terminals))
     fabric_change(records, green, fabric)
-    return found._replace(delta=found.delta + fabric)
-
-
-def _solve_lossy(
-    records: NDArray[np.void],
-    ties: NDArray[np.complex128],
-    softness: NDArray[np.complex128],
-    green: Green,
-    threshold: float,
-    width: float,
-) -> Solution:
-    """As :func:`solve_lossy`, but for a fabric on the cover."""
     records = records.copy()
     records["softness"] = np.abs(softness)
     near = near_bodies(records, green, True)
     press_out(records, near, green)
     found = _lossy_lifted(records, ties, softness, green, threshold, width)
     if not near.any():
-        return found
+        return found._replace(delta=found.delta + fabric)
 
     def real(value: float, outline: bool = True) -> NDArray[Any]:
         some = records.copy()
@@ -74,7 +61,7 @@ def _solve_lossy(
         off = real(NOTHING)
     delta = rest + in_series_lossy(found.delta - rest, real(0.0, False) - off, real(0.0) - off)
     doubt = SERIES * np.abs(np.diag(delta - found.delta))[: green.electrodes].max(initial=0.0)
-    return found._replace(delta=delta, error=found.error + float(doubt), near=near)
+    return found._replace(delta=delta + fabric, error=found.error + float(doubt), near=near)
 
 
 def _lossy_lifted(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -189,12 +189,11 @@ class SurfaceSolver:
         slope = self.jacobian(view, bodies, solution) if jacobian else None
         if solution is None:
             change = self._change(view, bodies, np.zeros((self.green.terminals,) * 2), 0.0, 0)
-        else:
-            self._last = view, solution
-            matrix, error = self.unit * solution.delta, self.unit * solution.error
-            change = self._change(view, bodies, matrix, error, solution.size)
-            change = replace(change, reason=self._reason(bodies, solution))
-        return replace(change, jacobian=slope)
+            return replace(change, jacobian=slope)
+        self._last = view, solution
+        matrix, error = self.unit * solution.delta, self.unit * solution.error
+        change = self._change(view, bodies, matrix, error, solution.size)
+        return replace(change, jacobian=slope, reason=partial(self._reason, bodies, solution))
 
     def _reason(self, bodies: PackedBodies, solution: Solution) -> str:
         """What most of the estimated error comes from, in words."""
