@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -120,6 +122,38 @@ def test_kernels_that_cannot_be_kept_and_those_that_were(tmp_path: Path) -> None
         found.append((done.stdout, len(list((tmp_path / "kernels").rglob("*.nbc")))))
     assert [kept for _, kept in found] == [0, 2, 2]
     assert len({value for value, _ in found}) == 1
+
+
+def test_kernels_are_compiled_anew_when_those_that_they_call_may_have_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: kernels hold those of other files; what had been kept gave stale results."""
+    file = tmp_path / "kept_kernels.py"
+    file.write_text(KERNELS)
+
+    def kept() -> int:
+        """How many kernels are read from files in place of being compiled."""
+        spec = importlib.util.spec_from_file_location("kept_kernels", file)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        module.outer(3.0)
+        return sum(module.outer.stats.cache_hits.values())
+
+    assert [kept(), kept()] == [0, 1]
+    monkeypatch.setattr(_jit, "_sources", lambda: "after an edit")
+    assert [kept(), kept()] == [0, 1]
+
+
+def test_the_digest_of_sources_covers_kernels_and_their_constants() -> None:
+    """Every module with a kernel is one of those that are looked at."""
+    root = Path(_jit.__file__).parent
+    looked_at = {file for pattern in _jit.SOURCES for file in root.glob(pattern)}
+    kernel = re.compile(r"^@(kernel|compiled)$", re.MULTILINE)
+    made = [file for file in root.rglob("*.py") if kernel.search(file.read_text())]
+    assert len(made) > 20
+    assert set(made) <= looked_at
 
 
 COUNTED = """

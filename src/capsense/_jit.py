@@ -9,6 +9,7 @@ last bits, and a recording would not replay. What is worth doing eight at a time
 from __future__ import annotations
 
 import gc
+import hashlib
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -33,8 +34,30 @@ WAIT = 2.0
 _done = False
 
 
+_PARTS_WITH_KERNELS = "design", "scene", "elements", "field", "surface", "fleet", "adapters"
+SOURCES = "_*.py", *(f"{part}/*.py" for part in _PARTS_WITH_KERNELS)
+"""Modules of the package that kernels, and the constants in them, are in."""
+
+
+@lru_cache(maxsize=1)
+def _sources() -> str:
+    """A digest of all modules whose kernels or constants may end up in a compiled kernel."""
+    digest, root = hashlib.sha256(), Path(__file__).parent
+    for pattern in SOURCES:
+        for file in sorted(root.glob(pattern)):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
 class _Cache(FunctionCache):
-    """Numba's, for processes that start together and for full disks."""
+    """Numba's, for processes that start together, for full disks, and for changed sources.
+
+    Numba compiles a kernel anew when its own file changes. Kernels hold those that they call.
+    """
+
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)
+        self._cache_file._source_stamp = self._cache_file._source_stamp, _sources()
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled kernel; where that cannot be done, it is used all the same."""

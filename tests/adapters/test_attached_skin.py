@@ -174,7 +174,7 @@ def test_one_failing_sensor(arm: Any, tiny_simulator: cs.Simulator) -> None:
     expected = skin.read()
     skin.reset()
 
-    def fails(*_: object) -> None:
+    def fails(*_: object, **__: object) -> None:
         raise SceneError("no sensor here")
 
     skin.sensors["b"].simulator.step = fails

@@ -29,6 +29,7 @@ class FakeReading:
     capacitance: Array
     delta: Array
     stats: FakeStats
+    touch: None = None
 
     @property
     def self_capacitance(self) -> Array:
@@ -72,7 +73,7 @@ class FakeSimulator:
     def reset(self) -> None:
         self.steps = 0
 
-    def step(self, scene: cs.Scene) -> FakeReading:
+    def step(self, scene: cs.Scene, *, time: float | None = None) -> FakeReading:
         reach = np.zeros(len(self.centers))
         for body in scene:
             local = body.pose.inverse().apply(self.centers)

@@ -145,7 +145,8 @@ def test_what_is_far_costs_no_cell():
     bodies = [cs.Body(cs.Box((0.02, 0.02, 0.02)), material="steel", grounding="floating")]
     fleet = Fleet("six_patch", bodies, 3, device="warp:cpu", budget=32)
     poses = np.zeros((3, 1, 7))
-    poses[..., 6], poses[:, 0, 2] = 1.0, [0.0141, 0.0139, 0.05]  # twice h0 is 4 mm
+    reach = 2.0 * fleet._solver.length * fleet._solver.green.gap.validity
+    poses[..., 6], poses[:, 0, 2] = 1.0, [0.0101 + reach, 0.0099 + reach, 0.05]
     near = fleet._warp.near
     near.part.fill_(7.0)
     near.depth.fill_(7.0)

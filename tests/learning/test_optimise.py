@@ -32,7 +32,7 @@ lateral = 1.0
 pitch = 180
 yaw = 180
 [parameters]
-side = { from = 0.004, to = 0.022, start = 0.008 }
+side = { from = 0.003, to = 0.022, start = 0.005 }
 [design]
 name = "pads"
 domain = { size = [0.2, 0.2, 0.2], backplane = 0.01 }
@@ -146,7 +146,7 @@ def test_command(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert told.count("cost") == 3
     rows = {line.split()[0]: line.split() for line in text.splitlines() if line}
     assert float(rows["found"][-1]) < float(rows["start"][-1])
-    assert float(rows["found"][1]) > 8.0
+    assert float(rows["found"][1]) > 5.0
     design = cs.load_design(output)
     size = float(rows["found"][1]) * 1e-3
     assert design.electrodes[0].surface.area == pytest.approx(size**2, rel=2e-3)

@@ -156,7 +156,7 @@ def test_a_shape_that_messages_do_not_have(sim: cs.Simulator, path: Path) -> Non
         def bounds(self) -> object:
             return cs.Sphere(0.01).bounds()
 
-        signed_distance = to_trimesh = None
+        signed_distance = to_trimesh = _measured_in = None
 
     with cs.record(path, sim) as run:
         run.step(cs.Scene([cs.Body(Blob(0.01), cs.Pose((0, 0, 0.05)))]), 0.0)

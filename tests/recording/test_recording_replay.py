@@ -184,10 +184,10 @@ def test_a_failing_step_keeps_what_was_recorded(
 ) -> None:  # fmt: skip
     step = cs.Simulator.step
 
-    def fail(self: cs.Simulator, scene: cs.Scene) -> cs.Reading:
+    def fail(self: cs.Simulator, scene: cs.Scene, **options: float) -> cs.Reading:
         if self.steps == 5:
             raise cs.SolveError("the residual is 1e-3")
-        return step(self, scene)
+        return step(self, scene, **options)
 
     monkeypatch.setattr(cs.Simulator, "step", fail)
     path = tmp_path / "ball.mcap"

@@ -342,7 +342,8 @@ def test_bodies_are_wide_for_narrow_electrodes(simulators, name, preset, wide):
     """Unit: where usual panels would be wider on average than 0.8 of an electrode's width."""
     sim = simulators(name)
     solver = SurfaceSolver(sim.background.green, sim.design, preset=PRESETS[preset])
-    kinds = {r: type(solver.functions_of(cs.Sphere(r), True)[0]) for r in (0.03, 0.05, 0.07)}
+    balls = {r: cs.Sphere(r / solver.length) for r in (0.03, 0.05, 0.07)}
+    kinds = {r: type(solver.functions_of(ball, True)[0]) for r, ball in balls.items()}
     assert [r for r, kind in kinds.items() if kind is WideBody] == wide
 
 

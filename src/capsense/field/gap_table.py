@@ -218,7 +218,7 @@ def moved(panels: Panels, height: float) -> Panels:
     )
 
 
-class Plane(NamedTuple):
+class GroundedPlane(NamedTuple):
     """A grounded plane in front of a design."""
 
     change: Array
@@ -247,7 +247,7 @@ class PlaneResponse:
         """Panels of sheets between two media."""
         self._gradient = kernels.normal_gradient_matrix(self._rows, model.floor, model.panels)
 
-    def at(self, height: float, densities: Array) -> Plane:
+    def at(self, height: float, densities: Array) -> GroundedPlane:
         """What a plane does.
 
         Args:
@@ -276,7 +276,7 @@ class PlaneResponse:
                 + kernels.normal_gradient_block(self._rows, model.floor, both, n) @ on_plane
             )
             out[self._rows] -= jump * gradient / (4 * math.pi)
-        return Plane(out, own / plane.areas, grounded / plane.areas, -sides[:, :-1] / UNIT)
+        return GroundedPlane(out, own / plane.areas, grounded / plane.areas, -sides[:, :-1] / UNIT)
 
 
 def gap_table_of(
@@ -340,7 +340,9 @@ def build_gap_table(
     return _cells_of(model, changes, heights, top, validity)
 
 
-def energy_error(found: Plane, plane: Panels, green: GreenFunction, design: Design) -> float:
+def energy_error(
+    found: GroundedPlane, plane: Panels, green: GreenFunction, design: Design
+) -> float:
     """Largest relative error that a Green's function makes of a plate's energy.
 
     Plates are all of the plane, and for each electrode squares of its size and of ``_PLATE`` of it

@@ -56,7 +56,7 @@ class WarpCore:
         self.green = pack_response(solver, slots, device)
         self.circuit = pack_circuit(solver, terminals, device)
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
-        self.gap = warp_near.pack_gap(table, self.green.terminals, slots, device)
+        self.gap = warp_near.pack_gap(solver.green, slots, device)
         self.outlines: Any = None
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
         passes, t, lead = self.green.table.shape[1], self.green.terminals, self.green.lead

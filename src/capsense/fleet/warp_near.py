@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from capsense.elements.matter import SHUT
-from capsense.field.green_kernels import Gap as HostGap
+from capsense.field.green_kernels import Green
 from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import lowest_point, middle_height, nearest, reach_down
@@ -35,6 +35,7 @@ class GapLaw:
     least: wp.float32  # field lines are no shorter
     top: wp.float32
     lowest: wp.float32  # the first of the heights of the table [m]
+    floor: wp.float32  # what reaches lower than this reaches through the whole domain
     log_ratio: wp.float32
     terminals: wp.int32
     slots: wp.int32  # conductors near the design that can be nodes
@@ -85,9 +86,11 @@ class NearBodies:
     part: wp.array3d(dtype=wp.float32)  # local change by columns, then by nodes, (p, n + slots, v)
 
 
-def pack_gap(gap: HostGap, terminals: int, slots: int, device: Any) -> GapLaw:
-    """Lay a table out for the kernels."""
+def pack_gap(green: Green, slots: int, device: Any) -> GapLaw:
+    """Lay the table of a design out for the kernels."""
+    gap, terminals = green.gap, green.terminals
     out, cells = GapLaw(), len(gap.areas)
+    out.floor = float(green.room[0, 2])
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
     out.least = gap.least
@@ -207,11 +210,13 @@ def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b:
         at = near.pose[b, v]
         scale = near.scale[e, b]
         if outlines.kind[u] != 0:
-            middle = middle_height(outlines, u, at, scale) - gap.top
+            middle = middle_height(outlines, u, at, scale)
             lowest = middle - reach_down(outlines, u, wp.transform_get_rotation(at), scale)
-            near.below[b, v] = -lowest
-            out = middle >= 0.0 and lowest < 2.0 * gap.validity
-            if lowest < 0.0:
+            near.below[b, v] = gap.top - lowest
+            out = (
+                middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and lowest > gap.floor
+            )
+            if lowest < gap.top:
                 near.foot[b, v] = lowest_point(outlines, u, at, scale)
     return out
 

@@ -32,7 +32,7 @@ WAYS, EXACT = 30, 1e-4
 def near_bodies(bodies, green, dielectric=False):
     """Conductors, or dielectrics, with an outline within twice h0 of a flat design, (b,).
 
-    Not bodies that are mostly behind the face.
+    Not bodies that are mostly behind the face, nor those that reach through the whole domain.
     """
     out, gap = np.zeros(bodies.shape[0], np.bool_), green.gap
     if gap.areas.shape[0] == 0:
@@ -44,9 +44,13 @@ def near_bodies(bodies, green, dielectric=False):
         if body.outline == CHANGING:  # it has this outline only where it is near
             out[b] = True
         else:
-            middle = middle_height(body) - gap.top
-            lowest = (middle - reach_down(body)) / gap.validity
-            out[b] = middle >= 0.0 and lowest < 2.0
+            middle = middle_height(body)
+            lowest = middle - reach_down(body)
+            out[b] = (
+                middle >= gap.top
+                and lowest < gap.top + 2.0 * gap.validity
+                and lowest > green.room[0, 2]
+            )
     return out
 
 

@@ -7,7 +7,9 @@ that by the conductor where it is, by the gap law, the dielectric where it is ch
 
   (F⁻¹ + R)⁻¹,   R = D⁻¹ − F'⁻¹ ≥ 0.
 
-It is never more than F, becomes F as the permittivity grows, and D where nothing is lifted.
+It is never more than F, becomes F as the permittivity grows, and D where nothing is lifted. The
+law adds charge to conductors, F ≥ F'; where it does not by its errors, nothing is added: the
+inverses have poles there. The result may exceed F by as much.
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ def in_series(
     base = _product(base, turn)
     back = _product(turn.T.copy(), (vector * root).T.copy())
     inside = np.sqrt(1.0 / share - 1.0)
-    after = _product(_product(base.T.copy(), conductor), base)
+    value, vector = eigen(_product(_product(base.T.copy(), conductor - lifted), base))
+    after = np.eye(m) + _product(vector * np.maximum(value, 0.0), vector.T.copy())
     added = _behind(after, inside)
     same = _behind(np.eye(m), inside)  # D, but for what was bounded
     out = _product(_product(back.T.copy(), added - same), back)
@@ -139,5 +142,7 @@ def in_series_lossy(
     def behind(front: NDArray[np.float64]) -> NDArray[np.complex128]:
         return np.linalg.solve(one + front @ inside, front.astype(complex))
 
-    out = back.T @ (behind(base.T @ conductor @ base) - behind(one)) @ back
+    value, vector = np.linalg.eigh(base.T @ (conductor - lifted) @ base)
+    after = one + (vector * np.maximum(value, 0.0)) @ vector.T
+    out = back.T @ (behind(after) - behind(one)) @ back
     return np.asarray(dielectric + 0.5 * (out + out.T))
