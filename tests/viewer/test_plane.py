@@ -68,10 +68,11 @@ def test_points_close_to_charges_are_left_out() -> None:
     """Planes of a curved sensor go through what it is made of."""
     simulator = cs.Simulator("arm_segment")
     green, bounds = simulator.background.green, region(simulator.design)
-    middle = green.near_sources[np.argmin(np.abs(green.near_sources[:, 1]))]
+    sources = green.unit * green.near_sources
+    middle = sources[np.argmin(np.abs(sources[:, 1]))]
     plane = Plane(green, bounds, 1, float(middle[1]))
-    away = np.linalg.norm(plane.drawn[:, None] - green.near_sources, axis=2).min(axis=1)
-    assert NEAR <= away.min() < NEAR + plane.pitch
+    away = np.linalg.norm(plane.drawn[:, None] - sources, axis=2).min(axis=1)
+    assert NEAR * green.unit <= away.min() < NEAR * green.unit + plane.pitch
 
 
 def test_potentials_on_a_plane(simulator: cs.Simulator) -> None:
