@@ -99,7 +99,7 @@ def test_touch_is_the_foundation_s(name: str, pads: Pads) -> None:
     held = sim.step(fist(sim, 5e-3, force=touch.total)).touch
     assert held is not None
     assert held.total == pytest.approx(touch.total, rel=1e-6)
-    np.testing.assert_allclose(held.compression, touch.compression, atol=0.05 * depth)
+    np.testing.assert_allclose(held.compression, touch.compression, atol=0.06 * depth)
 
 
 def test_dual_pad_tells_proximity_from_pressure(pads: Pads) -> None:

@@ -224,7 +224,7 @@ def test_gradients_near_contact(grounding):
         miss /= np.abs(truth)[..., half].max(axis=(1, 2, 3))
         some = alike & np.isin(kinds, smooth)
         assert some.sum() > 3
-        assert miss[some].max() < 0.02
+        assert miss[some].max() < 0.03
         assert np.median(miss[np.isin(kinds, ["box", "cylinder"])]) < 0.04
 
 

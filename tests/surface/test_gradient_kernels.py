@@ -92,7 +92,7 @@ def test_bodies_within_a_sensor_feel_no_source_that_their_potential_is_bounded_b
     for k in range(3):
         ends = [solve(moved(bodies, 0, k, s), green, 1e-4, 2.5, True).delta for s in (5e-5, -5e-5)]
         miss = found[0, ..., k] - (ends[0] - ends[1]) / 1e-4
-        assert np.abs(miss).max() < 0.03 * np.abs(found).max()
+        assert np.abs(miss).max() < 0.05 * np.abs(found).max()
 
 
 def test_a_ball_around_a_source_feels_no_force_of_it() -> None:

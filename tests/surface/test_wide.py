@@ -332,7 +332,7 @@ def test_which_bodies_are_wide(sim):
 @pytest.mark.parametrize(
     ("name", "preset", "wide"),
     [
-        ("stripe", "learning", [0.07]),  # electrodes 5 mm wide count as 8 mm
+        ("stripe", "learning", [0.05, 0.07]),  # electrodes 5 mm wide
         ("stripe", "standard", [0.05, 0.07]),
         ("stripe", "fine", [0.05, 0.07]),
         ("six_patch_bare", "standard", []),  # 15 mm

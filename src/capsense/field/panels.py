@@ -15,6 +15,7 @@ from functools import cache
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
@@ -116,6 +117,8 @@ def _cells(region: shapely.Geometry, size: float) -> list[Polygon]:
     return list(cut[shapely.area(cut) > 1e-6 * size * size * 1e-3])
 
 
+_MANY = 36
+"""Panels with more points of a quadrature, as those along arcs, get one of fifteen at most."""
 _SPIKE = 1e-6
 """Corners that stand out by less than this, over the root of their panel's area, are left out: cuts
 along an outline that they touch leave spikes."""
@@ -171,7 +174,22 @@ def _quadrature(polygon: Polygon, rings: list[Array]) -> tuple[Array, Array]:
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     points = np.einsum("qk,tkd->tqd", _TRIANGLE_RULE, triangles).reshape(-1, 2)
-    return points, np.repeat(area / 3, 3)
+    weights = np.repeat(area / 3, 3)
+    return (points, weights) if len(weights) <= _MANY else _fewer(points, weights)
+
+
+def _fewer(points: Array, weights: Array) -> tuple[Array, Array]:
+    """Some of the points of a quadrature, with other weights and the same moments to fourth order.
+
+    Non-negative least squares keep no more points than there are moments (Tchakaloff's theorem;
+    Davis, *A construction of nonnegative approximate quadratures*, Math. Comp. 21, 1967).
+    """
+    middle = weights @ points / weights.sum()
+    x, y = (points - middle).T / np.abs(points - middle).max()
+    moments = np.array([x**i * y**j for i in range(5) for j in range(5 - i)])
+    found, _ = nnls(moments, moments @ weights)
+    kept = found > 0.0
+    return points[kept], found[kept] * (weights.sum() / found.sum())
 
 
 PLANE_TOL = 1e-6

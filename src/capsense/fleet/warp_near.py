@@ -35,7 +35,7 @@ class GapLaw:
     least: wp.float32  # field lines are no shorter
     top: wp.float32
     lowest: wp.float32  # the first of the heights of the table [m]
-    floor: wp.float32  # what reaches lower than this reaches through the whole domain
+    floor: wp.float32  # what reaches lower than this surrounds the domain
     log_ratio: wp.float32
     terminals: wp.int32
     slots: wp.int32  # conductors near the design that can be nodes
@@ -90,7 +90,7 @@ def pack_gap(green: Green, slots: int, device: Any) -> GapLaw:
     """Lay the table of a design out for the kernels."""
     gap, terminals = green.gap, green.terminals
     out, cells = GapLaw(), len(gap.areas)
-    out.floor = float(green.room[0, 2])
+    out.floor = float(gap.top - green.extent)
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
     out.least = gap.least

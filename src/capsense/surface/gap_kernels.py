@@ -32,7 +32,8 @@ WAYS, EXACT = 30, 1e-4
 def near_bodies(bodies, green, dielectric=False):
     """Conductors, or dielectrics, with an outline within twice h0 of a flat design, (b,).
 
-    Not bodies that are mostly behind the face, nor those that reach through the whole domain.
+    Not bodies that are mostly behind the face, nor those that reach farther behind it than the
+    domain is wide: these surround it.
     """
     out, gap = np.zeros(bodies.shape[0], np.bool_), green.gap
     if gap.areas.shape[0] == 0:
@@ -49,7 +50,7 @@ def near_bodies(bodies, green, dielectric=False):
             out[b] = (
                 middle >= gap.top
                 and lowest < gap.top + 2.0 * gap.validity
-                and lowest > green.room[0, 2]
+                and lowest > gap.top - green.extent
             )
     return out
 
