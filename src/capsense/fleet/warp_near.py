@@ -35,7 +35,8 @@ class GapLaw:
     least: wp.float32  # field lines are no shorter
     top: wp.float32
     lowest: wp.float32  # the first of the heights of the table [m]
-    floor: wp.float32  # what reaches lower than this surrounds the domain
+    floor: wp.float32  # what reaches from here …
+    ceiling: wp.float32  # … to here surrounds the domain
     log_ratio: wp.float32
     terminals: wp.int32
     slots: wp.int32  # conductors near the design that can be nodes
@@ -90,7 +91,7 @@ def pack_gap(green: Green, slots: int, device: Any) -> GapLaw:
     """Lay the table of a design out for the kernels."""
     gap, terminals = green.gap, green.terminals
     out, cells = GapLaw(), len(gap.areas)
-    out.floor = float(gap.top - green.extent)
+    out.floor, out.ceiling = float(green.room[0, 2]), float(green.room[1, 2])
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
     out.least = gap.least
@@ -213,9 +214,8 @@ def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b:
             middle = middle_height(outlines, u, at, scale)
             lowest = middle - reach_down(outlines, u, wp.transform_get_rotation(at), scale)
             near.below[b, v] = gap.top - lowest
-            out = (
-                middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and lowest > gap.floor
-            )
+            above = lowest > gap.floor or 2.0 * middle - lowest < gap.ceiling
+            out = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and above
             if lowest < gap.top:
                 near.foot[b, v] = lowest_point(outlines, u, at, scale)
     return out

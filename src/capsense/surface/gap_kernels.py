@@ -32,8 +32,8 @@ WAYS, EXACT = 30, 1e-4
 def near_bodies(bodies, green, dielectric=False):
     """Conductors, or dielectrics, with an outline within twice h0 of a flat design, (b,).
 
-    Not bodies that are mostly behind the face, nor those that reach farther behind it than the
-    domain is wide: these surround it.
+    Not bodies that are mostly behind the face, nor those from the floor of the domain to its
+    ceiling: these surround it.
     """
     out, gap = np.zeros(bodies.shape[0], np.bool_), green.gap
     if gap.areas.shape[0] == 0:
@@ -47,11 +47,8 @@ def near_bodies(bodies, green, dielectric=False):
         else:
             middle = middle_height(body)
             lowest = middle - reach_down(body)
-            out[b] = (
-                middle >= gap.top
-                and lowest < gap.top + 2.0 * gap.validity
-                and lowest > gap.top - green.extent
-            )
+            above = lowest > green.room[0, 2] or 2.0 * middle - lowest < green.room[1, 2]
+            out[b] = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and above
     return out
 
 
