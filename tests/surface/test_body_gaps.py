@@ -105,8 +105,10 @@ def test_local_capacitance_of_a_ball_and_a_plate(simulators, gap, mesh):
 
 @pytest.mark.parametrize(("shape", "half"), [(SHEET, 0.0005), (cs.Sphere(0.012), 0.012)])
 def test_readings_are_continuous_in_the_gap(simulators, shape, half):
-    """Neither a body's range nor small gaps make a step; readings grow towards contact. Where a ball
-    comes to have finer parts, its reading rises by 2 % of the largest on its way of 1 mm."""
+    """Neither a body's range nor small gaps make a step; readings grow towards contact.
+
+    Where a ball comes to have finer parts, its reading rises by 2 % of the largest within 1 mm.
+    """
     sim = simulators("six_patch_bare")
     for gaps in (np.linspace(0.022, 3e-3, 77), np.geomspace(3e-3, 5e-6, 90)):
         values = np.array([largest(sim, LOW, above(g, shape, half)) for g in gaps])

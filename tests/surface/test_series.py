@@ -104,8 +104,10 @@ def test_other_bodies(read):
 
 
 def test_a_glass_box_that_comes_near(simulators):
-    """Regression: one electrode is far away and one near; where the law's error exceeds what the far
-    one gains, inverses had poles: 5 fF for 150 at 1 mm."""
+    """Regression: one electrode is far away and one near.
+
+    Where the law's error exceeds what the far one gains, inverses had poles: 5 fF for 150 at 1 mm.
+    """
     sim, box = simulators("six_patch"), cs.Box((0.03, 0.02, 0.01))
     found = []
     for gap in np.linspace(4.5e-3, 0.5e-3, 33):
