@@ -52,6 +52,8 @@ class _Solver(Protocol):
 
     together: int
     """How many scenes of a batch a thread takes at a time, at most."""
+    touch: float
+    """What is nearer to an electrode than this [m] touches it."""
 
     def solve(
         self, scene: Scene, *, jacobian: bool = False, time: float | None = None
@@ -276,7 +278,7 @@ class Simulator:
             if not self._contact_told:
                 self._contact_told = True
                 surfaces = {e.name: e.surface.triangles for e in self.design.electrodes}
-                warn_of_contact(scene, surfaces)
+                warn_of_contact(scene, surfaces, self._solver.touch)
         error = max(found.error, float((found.matrix - change).max()))
         if found.loss is not None:
             change = change - 1j * found.loss

@@ -27,7 +27,7 @@ from capsense.masked.solver import GROUNDED, MaskedSolver
 from capsense.mesh import TetMesh, kuhn_tets
 from capsense.mesh.tetmesh import GROUND
 from capsense.scene import Scene
-from capsense.scene.contact import met
+from capsense.scene.contact import TOUCH, met
 from capsense.scene.shapes import ShapeKind
 
 Array = NDArray[np.float64]
@@ -327,6 +327,8 @@ class MaskedScenes:
 
     together = 1
     """How many scenes of a batch a thread takes at a time."""
+    touch = TOUCH
+    """What is nearer to an electrode than this [m] touches it."""
 
     def __init__(
         self, sensor: MeshSensor, excitation_frequency: float, *,

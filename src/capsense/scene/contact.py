@@ -137,12 +137,15 @@ class Contacts:
         return one if len(self.met) == 1 else many
 
 
-def find_contacts(scene: Scene, electrodes: Mapping[str, Array]) -> tuple[Contacts, Contacts]:
+def find_contacts(
+    scene: Scene, electrodes: Mapping[str, Array], touch: float = TOUCH
+) -> tuple[Contacts, Contacts]:
     """The electrodes that lie inside bodies, and those that touch some; not in depth images.
 
     Args:
         scene: The bodies.
         electrodes: Name → points on it [m], shape (n, 3).
+        touch: What is nearer to an electrode than this [m] touches it.
     """
     inside, touching = Contacts(), Contacts()
     bodies = {
@@ -153,21 +156,23 @@ def find_contacts(scene: Scene, electrodes: Mapping[str, Array]) -> tuple[Contac
     for name, points in electrodes.items():
         for body_name, body in bodies.items():
             nearest = float(distances(body, points).min())
-            if nearest < TOUCH:
-                found = inside if nearest < -TOUCH else touching
+            if nearest < touch:
+                found = inside if nearest < -touch else touching
                 found.met.setdefault(name, []).append(body_name)
                 found.depth = max(found.depth, -nearest)
     return inside, touching
 
 
-def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array]) -> None:
+def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array], touch: float) -> None:
     """Warn that a reading means nothing since bodies go through electrodes or touch them.
 
     Args:
         scene: The bodies.
         electrodes: Name → its triangles [m], shape (t, 3, 3).
+        touch: What is nearer to an electrode than this [m] touches it.
     """
-    inside, touching = find_contacts(scene, {k: points_on(t) for k, t in electrodes.items()})
+    points = {name: points_on(triangles) for name, triangles in electrodes.items()}
+    inside, touching = find_contacts(scene, points, touch)
     found, how = inside, inside.verb("lies inside", "lie inside")
     if not inside.met:
         found, how = touching, touching.verb("touches", "touch")
@@ -175,9 +180,9 @@ def warn_of_contact(scene: Scene, electrodes: Mapping[str, Array]) -> None:
         deep = f", up to {1e3 * found.depth:.2g} mm deep," if inside.met else ""
         warnings.warn(
             f"{found.electrodes} {how} {listed(found.bodies, 4)}{deep} and readings mean nothing "
-            f"until this ends; keep bodies at least {1e3 * TOUCH:g} mm in front of the electrodes. "
-            "This is said once; reading.stats.solver_error then is as large as the largest "
-            "capacitance",
+            f"until this ends; keep bodies at least {1e3 * touch:.2g} mm in front of the "
+            "electrodes. This is said once; reading.stats.solver_error then is as large as the "
+            "largest capacitance",
             stacklevel=4,
         )
 

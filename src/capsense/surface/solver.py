@@ -147,7 +147,8 @@ class SurfaceSolver:
         self._laid: dict[tuple[Matter | Shape, ...], Laid] = {}
         """The last layouts, by the matter and the shapes of the bodies, which they hold."""
         gap = self.green.gap
-        touch = self.length * gap.least if len(gap.areas) else self.length * TOUCH
+        self.touch = self.length * (gap.least if len(gap.areas) else TOUCH)
+        """What is nearer to an electrode than this [m] touches it."""
         self._contact = (
             CoverContact(design.cover, [e.surface for e in design.electrodes], self.length)
             if design.cover is not None
@@ -160,7 +161,7 @@ class SurfaceSolver:
             for m, e in zip(metres.electrodes, design.electrodes, strict=True)
             if not len(gap.areas) or e.surface.bounds[1, 2] > gap.top - PLANE_TOL
         ]
-        self._sheets = Sheets(bare, touch) if bare else None
+        self._sheets = Sheets(bare, self.touch) if bare else None
         coarsest, width = self.preset.coarsest, narrowest_width(design)
         self._largest = coarsest and self.preset.panels * (coarsest * max(width, _NARROW)) ** 2
         """Bodies of so much surface or more, over ``length``², get small panels; None for none."""
