@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from capsense.constants import EPS0
-from capsense.errors import DesignError, SceneError
+from capsense.errors import DesignError
 
 Array = NDArray[np.float64]
 
@@ -175,88 +174,3 @@ class Viscosity:
         if elastic >= self._most:
             return elastic
         return elastic * (1.0 - self._hysteresis * (1.0 - elastic / self._most))
-
-
-def compression(height: Array, depth: float, thickness: float, law: StressStrain) -> Array:
-    """Compression of the cover below a body that is pressed in [m], of the shape of ``height``.
-
-    Args:
-        height: Height of the body's underside over its lowest point at each cell [m]; infinite
-            beside the body.
-        depth: How far its lowest point is below the undeformed outer face [m].
-        thickness: Thickness of the cover [m].
-        law: Stress-strain law; compression stops at the end of its table.
-    """
-    return np.clip(depth - height, 0.0, law.strain[-1] * thickness)
-
-
-def contact_force(
-    height: Array, area: Array, depth: float, thickness: float, law: StressStrain
-) -> float:
-    """Force that holds a body at a depth [N]; arguments as :func:`depth_of_force`."""
-    return float(area @ law.pressure(np.maximum(depth - height, 0.0) / thickness))
-
-
-def depth_of_force(
-    height: Array, area: Array, force: float, thickness: float, law: StressStrain
-) -> float:
-    """Find the depth whose pressure integrates to a normal force [m].
-
-    Args:
-        height: As in :func:`compression`, of cells that tile the whole covered face, (n,).
-        area: Their areas [m²], shape (n,).
-        force: Normal force that presses the body in [N].
-        thickness: Thickness of the cover [m].
-        law: Stress-strain law.
-
-    Raises:
-        SceneError: If the force is negative or not finite, or no cell lies below the body.
-    """
-    if not (np.isfinite(force) and force >= 0.0):
-        raise SceneError(f"contact force is {force} N; give a finite force >= 0")
-    below = np.isfinite(height)
-    if not below.any():
-        raise SceneError(
-            f"a force of {force} N presses a body that is not over the cover; move it over it"
-        )
-    height, area = height[below], area[below]
-    low = float(height.min())
-    if force == 0.0:
-        return low
-    high = low + thickness
-    while contact_force(height, area, high, thickness, law) < force:
-        high = low + 2.0 * (high - low)
-    for _ in range(_STEPS):
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            break
-        if contact_force(height, area, middle, thickness, law) < force:
-            low = middle
-        else:
-            high = middle
-    return high
-
-
-def fabric_change(
-    pressed: Array,
-    area: Array,
-    owner: NDArray[np.int64],
-    thickness: float,
-    eps_r: float,
-    count: int,
-) -> Array:
-    """Change of self-capacitances below a grounded sheet on top of a cover [F], shape (count,).
-
-    The parallel-plate integral of eps0 eps_r [1 / (t - compression) - 1 / t], without fringes.
-
-    Args:
-        pressed: Compression at each cell [m], below ``thickness``, shape (n,).
-        area: Areas of the cells [m²], shape (n,).
-        owner: Electrode below each cell, -1 beside all of them, shape (n,).
-        thickness: Thickness t of the cover [m].
-        eps_r: Its relative permittivity.
-        count: Number of electrodes.
-    """
-    on = owner >= 0
-    change = EPS0 * eps_r * (1.0 / (thickness - pressed) - 1.0 / thickness) * area
-    return np.bincount(owner[on], change[on], count).astype(np.float64)
