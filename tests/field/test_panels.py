@@ -137,3 +137,23 @@ def test_concatenation_keeps_panels_apart():
             j = offset + k
             np.testing.assert_array_equal(joined.edges[joined.first[j] : joined.first[j + 1]], mine)
         offset += part.size
+
+
+@pytest.mark.parametrize("width", [0.002, 0.02])
+def test_few_points_for_many_corners(monkeypatch, width):
+    """Differential: a ring and a disc of 128 corners have the moments of all their triangles."""
+    hole = shapely.Point(0.0, 0.0).buffer(0.02 - width, quad_segs=32)
+    ring = shapely.Point(0.0, 0.0).buffer(0.02, quad_segs=32).difference(hole)
+    facet = Facet(ring, np.array([0.1, -0.2, 0.05]), TILTED)
+    few = make_panels(facet, [ring])
+    monkeypatch.setattr("capsense.field.panels._MANY", 10**6)
+    many = make_panels(facet, [ring])
+    assert few.quad.shape[1] <= 15 < 300 < many.quad.shape[1]
+    assert few.weights.min() > 0.0
+    powers = [(i, j) for i in range(5) for j in range(5 - i)]
+    found, wanted = (
+        [p.weights[0] @ (x**i * y**j) for i, j in powers]
+        for p in (few, many)
+        for x, y, _ in [((p.quad[0] - facet.origin) @ TILTED.T / 0.02).T]
+    )
+    np.testing.assert_allclose(found, wanted, atol=1e-9 * ring.area)
