@@ -151,7 +151,7 @@ def somewhere(case: Case, n: int = 200) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("name", "allowed"), [("flat", 0.008), ("guarded", 0.004), ("curved", 0.006)]
+    ("name", "allowed"), [("flat", 0.008), ("guarded", 0.004), ("curved", 0.01)]
 )
 @pytest.mark.parametrize("gap", [0.002, 0.005, 0.013, 0.03])
 @pytest.mark.e2e

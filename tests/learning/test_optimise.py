@@ -171,7 +171,7 @@ def test_bounds_of_a_task(task_file: Path) -> None:
         ("evaluations", "evalutions", "evaluations"),
         ("vertical = [0.02, 0.03]", "verticle = 0.02", "vertical"),
         ("to = 0.022", "to = 0.004", "range|from"),
-        ("start = 0.008", "start = 0.08", "start"),
+        ("start = 0.005", "start = 0.08", "start"),
         ("[parameters]\nside", "[other]\nside", "other"),
         ('"=side/2', '"=sied/2', "sied"),
         ("0.03-side/2", "-0.03+side/2", "touch|overlap|short"),
