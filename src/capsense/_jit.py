@@ -35,7 +35,7 @@ _done = False
 
 
 _PARTS_WITH_KERNELS = "design", "scene", "elements", "field", "surface", "fleet", "adapters"
-SOURCES = "_*.py", *(f"{part}/*.py" for part in _PARTS_WITH_KERNELS)
+SOURCES = "*.py", *(f"{part}/*.py" for part in _PARTS_WITH_KERNELS)
 """Modules of the package that kernels, and the constants in them, are in."""
 
 

@@ -19,8 +19,6 @@ Array = NDArray[np.float64]
 
 MAX_STRAIN = 0.95
 """Compression of a cover with a modulus stays below this share of its thickness."""
-_STEPS = 200
-"""Bisections at most; double precision is reached before."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -157,3 +157,12 @@ def test_few_points_for_many_corners(monkeypatch, width):
         for x, y, _ in [((p.quad[0] - facet.origin) @ TILTED.T / 0.02).T]
     )
     np.testing.assert_allclose(found, wanted, atol=1e-9 * ring.area)
+
+
+def test_spikes_are_left_out_of_outlines_of_many_corners():
+    """Regression: where a quadrature of few points is taken, their slivers went unseen."""
+    corners = np.array(SHAPES["disc"].exterior.coords)[:-1]
+    spike = corners[5] * (1.0 + 1e-7), corners[5] + 1e-7 * (corners[6] - corners[5])
+    spiked = shapely.Polygon(np.insert(corners, 6, spike, axis=0))
+    facet = Facet(spiked, np.zeros(3), np.eye(3))
+    assert len(make_panels(facet, [spiked]).edges) == len(corners)

@@ -137,6 +137,8 @@ def make_panels(facet: Facet, polygons: list[Polygon]) -> Panels:
             polygon = orient(polygon.simplify(_SPIKE * math.sqrt(polygon.area)))
             rings = _rings(polygon)
             points, w = _quadrature(polygon, rings)
+        if len(w) > _MANY:
+            points, w = _fewer(points, w)
         flat = np.concatenate([np.stack([r[:-1], r[1:]], axis=1) for r in rings])
         edges.append(facet.to_sensor(flat))
         counts.append(len(flat))
@@ -174,8 +176,7 @@ def _quadrature(polygon: Polygon, rings: list[Array]) -> tuple[Array, Array]:
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     points = np.einsum("qk,tkd->tqd", _TRIANGLE_RULE, triangles).reshape(-1, 2)
-    weights = np.repeat(area / 3, 3)
-    return (points, weights) if len(weights) <= _MANY else _fewer(points, weights)
+    return points, np.repeat(area / 3, 3)
 
 
 def _fewer(points: Array, weights: Array) -> tuple[Array, Array]:

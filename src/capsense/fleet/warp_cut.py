@@ -261,6 +261,14 @@ def choose(shapes: Shapes, places: Places, green: Response, cut: WarpCut):
 
 
 @wp.func
+def held_off(distance: float, length: float):
+    """A distance that becomes ``length`` in contact, as ``green_kernels.held_off``."""
+    if distance >= 2.0 * length:
+        return distance
+    return length + distance * distance / (4.0 * length)
+
+
+@wp.func
 def lift(p: wp.vec3, gap: float, green: Response):
     """Keep a point off a flat design, as ``green_kernels.lift``."""
     away = _off(p, wp.vec3(green.box0[0], green.box0[1], p[2]), green.box1)
@@ -283,7 +291,7 @@ def lift(p: wp.vec3, gap: float, green: Response):
                 to = green.box1[i] + gap
         q[axis] = to
         return q
-    ratio = (gap + way * way / (4.0 * gap)) / way
+    ratio = held_off(way, gap) / way
     for i in range(3):
         edge = wp.min(p[i], green.box1[i])
         if i < 2:
@@ -308,9 +316,9 @@ def lift_back(force: wp.vec3, p: wp.vec3, gap: float, green: Response):
     for i in range(3):
         if away[i] > 0.0:
             u[i] = wp.where(p[i] < low[i], -away[i], away[i]) / way
-            out[i] = force[i] * (gap + way * way / (4.0 * gap)) / way
+            out[i] = force[i] * held_off(way, gap) / way
     along = wp.dot(force, u)
-    return out + (way / (2.0 * gap) - (gap + way * way / (4.0 * gap)) / way) * along * u
+    return out + (way / (2.0 * gap) - held_off(way, gap) / way) * along * u
 
 
 @wp.kernel

@@ -10,7 +10,7 @@ import math
 
 import warp as wp
 
-from capsense.fleet.warp_cut import Response, lift, smooth
+from capsense.fleet.warp_cut import Response, held_off, lift, smooth
 from capsense.fleet.warp_mesh import Hit, Outlines
 from capsense.fleet.warp_near import GapLaw, NearBodies, may_meet, nearest_of
 from capsense.surface.gap_kernels import REACH
@@ -87,8 +87,7 @@ def lengths(gap: GapLaw, green: Response, hit: Hit, x: wp.vec3):
             lower = _arc(along, along * wp.sqrt(wp.max(0.0, 1.0 - up * up)), along * up)
             share = smooth(1.0 - wp.sqrt(beside) / h0)
             lifted += share * (wp.min(lower, lifted) - lifted)
-    if true < 2.0 * least:
-        true = least + true * true / (4.0 * least)
+    true = held_off(true, least)
     return true, wp.max(lifted, true)
 
 

@@ -214,8 +214,8 @@ def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b:
             middle = middle_height(outlines, u, at, scale)
             lowest = middle - reach_down(outlines, u, wp.transform_get_rotation(at), scale)
             near.below[b, v] = gap.top - lowest
-            above = lowest > gap.floor or 2.0 * middle - lowest < gap.ceiling
-            out = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and above
+            around = lowest <= gap.floor and 2.0 * middle - lowest >= gap.ceiling
+            out = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and not around
             if lowest < gap.top:
                 near.foot[b, v] = lowest_point(outlines, u, at, scale)
     return out

@@ -47,8 +47,8 @@ def near_bodies(bodies, green, dielectric=False):
         else:
             middle = middle_height(body)
             lowest = middle - reach_down(body)
-            above = lowest > green.room[0, 2] or 2.0 * middle - lowest < green.room[1, 2]
-            out[b] = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and above
+            around = lowest <= green.room[0, 2] and 2.0 * middle - lowest >= green.room[1, 2]
+            out[b] = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and not around
     return out
 
 

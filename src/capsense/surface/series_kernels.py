@@ -55,9 +55,8 @@ def in_series(
     base = _product(base, turn)
     back = _product(turn.T.copy(), (vector * root).T.copy())
     inside = np.sqrt(1.0 / share - 1.0)
-    value, vector = eigen(_product(_product(base.T.copy(), conductor - lifted), base))
-    after = np.eye(m) + _product(vector * np.maximum(value, 0.0), vector.T.copy())
-    added = _behind(after, inside)
+    more = _positive_part(_product(_product(base.T.copy(), conductor - lifted), base))
+    added = _behind(np.eye(m) + more, inside)
     same = _behind(np.eye(m), inside)  # D, but for what was bounded
     out = _product(_product(back.T.copy(), added - same), back)
     return dielectric + 0.5 * (out + out.T)
@@ -75,6 +74,13 @@ def _behind(front: NDArray[Any], inside: NDArray[Any]) -> NDArray[Any]:
     side = half.T.copy()
     eliminate(matrix, side)
     return front - _product(half, side)
+
+
+@compiled
+def _positive_part(matrix: NDArray[Any]) -> NDArray[Any]:
+    """A symmetric matrix without its negative eigenvalues."""
+    value, vector = eigen(matrix)
+    return _product(vector * np.maximum(value, 0.0), vector.T.copy())
 
 
 @compiled
@@ -136,13 +142,12 @@ def in_series_lossy(
     base, back, one = vector / root, (vector * root).T, np.eye(len(root))
     own = base.T @ dielectric @ base + _SMALL * one
     inside = np.linalg.inv(own) - one
-    share, turn = np.linalg.eigh(0.5 * (inside.real + inside.real.T))
-    inside = (turn * np.maximum(share, 0.0)) @ turn.T + 0.5j * (inside.imag + inside.imag.T)
+    real = _positive_part(np.ascontiguousarray(inside.real))
+    inside = real + 0.5j * (inside.imag + inside.imag.T)
 
     def behind(front: NDArray[np.float64]) -> NDArray[np.complex128]:
         return np.linalg.solve(one + front @ inside, front.astype(complex))
 
-    value, vector = np.linalg.eigh(base.T @ (conductor - lifted) @ base)
-    after = one + (vector * np.maximum(value, 0.0)) @ vector.T
-    out = back.T @ (behind(after) - behind(one)) @ back
+    more = _positive_part(base.T @ (conductor - lifted) @ base)
+    out = back.T @ (behind(one + more) - behind(one)) @ back
     return np.asarray(dielectric + 0.5 * (out + out.T))
