@@ -158,13 +158,11 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         charge = leaf_charges(cut, functions, x, len(leaves.points))
         weights = np.zeros((m, m))
         if near.any():
-            local, none = np.zeros(delta.shape), np.zeros(0)
-            local_change(bodies, near, node, green, local)
-            weights = potentials_of(delta + local, m, nodes, capacitance)
-            delta = congruent(weights, delta + local, capacitance)
-            left = congruent(weights, left, none)
+            local_change(bodies, near, node, green, delta)
+            weights = potentials_of(delta, m, nodes, capacitance)
+            delta = congruent(weights, delta, capacitance)
+            left = congruent(weights, left, np.zeros(0))
             charge, coarse = mixed(charge, weights, green.lead), coarse_of(coarse, weights)
-            coarse += step.LAW * np.abs(np.diag(congruent(weights, local, none)))
         return step.Solution(
             delta[:m, :m], left[:m, :m], coarse[:m], charge,
             leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,

@@ -48,6 +48,7 @@ from capsense.surface.score_kernels import score
 from capsense.surface.solve_kernels import Reduced, _products, factorise, reduced
 from capsense.surface.solver import Preset, SurfaceSolver
 from capsense.surface.step import (
+    FIELD_ERROR,
     Solution,
     estimate,
     potential_change,
@@ -330,12 +331,16 @@ def test_delta_is_symmetric_and_of_one_sign() -> None:
 
 
 def test_estimate_of_the_largest_entry() -> None:
-    """Analytic: what is left and what panels are too coarse for; all of it where A was changed."""
+    """Analytic: what is left, what panels are too coarse for, and a share of the change itself.
+
+    All of it where A was changed.
+    """
     rng = np.random.default_rng(12)
     (delta, left), coarse = rng.normal(size=(2, 5, 5)), rng.uniform(size=5)
     for n in (1, 3, 5):  # electrodes, of five terminals
         doubt = np.abs(left[:n])
-        doubt[:, :n] = np.diag(np.diag(doubt) + coarse[:n])
+        own = FIELD_ERROR * np.abs(np.diag(delta)[:n])
+        doubt[:, :n] = np.diag(np.diag(doubt) + coarse[:n] + own)
         told = estimate(delta, left, coarse, 0.0, n)
         assert told == pytest.approx(doubt.max(), rel=1e-14)
         assert estimate(delta, left, coarse, 0.03, n) == np.abs(np.diag(delta)[:n]).max()

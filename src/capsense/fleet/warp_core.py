@@ -74,7 +74,7 @@ class WarpCore:
             "sums": (width - self.green.first, 2 * lead, views),
             "strength": (len(self.green.sources), 2 * lead, views),
             "energy": (n, views), "doubt": (size, views), "dropped": (views,),
-            "below local": (size, size, views), "volts": (slots, t, views),
+            "below": (size, size, views), "volts": (slots, t, views),
         })  # fmt: skip
         self.near = struct(warp_near.NearBodies, {
             "count": (views,), "body below sunk foot": (places, views),

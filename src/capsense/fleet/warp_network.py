@@ -16,11 +16,11 @@ from capsense.fleet.warp_pairs import body_of
 from capsense.fleet.warp_slope import Slopes
 from capsense.fleet.warp_solve import Left, over, times
 from capsense.surface.solve_kernels import GAIN
-from capsense.surface.step import LAW
+from capsense.surface.step import FIELD_ERROR
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-_GAIN, _LAW = wp.constant(GAIN), wp.constant(LAW)
+_GAIN, _FIELD_ERROR = wp.constant(GAIN), wp.constant(FIELD_ERROR)
 
 
 @wp.struct
@@ -65,9 +65,7 @@ def change(
     total += more
     left.below[i, j, v] = more[0]
     if near.count[v] > 0:
-        local = local_of(gap, near, i, j, v)
-        left.local[i, j, v] = local
-        total[0] = total[0] + local
+        total[0] = total[0] + local_of(gap, near, i, j, v)
         if i == j and i >= gap.terminals:
             total[0] = total[0] + near.capacitance[i - gap.terminals, v]
     whole[i, j, v] = wp.vec2d(wp.float64(total[0]), wp.float64(total[1]))
@@ -108,8 +106,9 @@ def eliminate(circuit: Circuit, near: NearBodies, left: Left, whole: wp.array3d(
             _doubt(t, nodes, i, left, whole, v)
         else:
             left.doubt[i, v] = left.doubt[i, v] + wp.abs(left.below[i, i, v])
-        if left.dropped[v] > 0:
-            left.doubt[i, v] = wp.abs(wp.float32(whole[i, i, v][0]))
+        own = wp.abs(wp.float32(whole[i, i, v][0]))
+        doubt = left.doubt[i, v] + _FIELD_ERROR * own
+        left.doubt[i, v] = wp.where(left.dropped[v] > 0, own, doubt)
         for j in range(t):
             value = whole[i, j, v]
             real = circuit.unit * wp.float32(value[0])
@@ -143,7 +142,6 @@ def _doubt(t: int, nodes: int, i: int, left: Left, whole: wp.array3d(dtype=wp.ve
     for k in range(nodes):
         left.volts[k, i, v] = _volts(t, left, whole, t + k, i, v)
     below = float(0.0)
-    local = float(0.0)
     root = float(0.0)
     for a in range(t + nodes):
         x = wp.where(a == i, 1.0, 0.0)
@@ -156,9 +154,8 @@ def _doubt(t: int, nodes: int, i: int, left: Left, whole: wp.array3d(dtype=wp.ve
                     y = left.volts[b - t, i, v]
                 if y != 0.0:
                     below += x * y * left.below[a, b, v]
-                    local += x * y * left.local[a, b, v]
             root += wp.sqrt(left.doubt[a, v]) * wp.abs(x)
-    left.doubt[i, v] = wp.abs(below) + root * root + _LAW * wp.abs(local)
+    left.doubt[i, v] = wp.abs(below) + root * root
 
 
 @wp.kernel

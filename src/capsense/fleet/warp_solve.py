@@ -312,5 +312,4 @@ class Left:
     dropped: wp.array(dtype=wp.int32)  # functions solved for that were left out, (v,)
     doubt: wp.array2d(dtype=wp.float32)  # estimated error of each diagonal [m], (t, v)
     below: wp.array3d(dtype=wp.float32)  # of the matrix, by functions not solved for [m], (t, t, v)
-    local: wp.array3d(dtype=wp.float32)  # of the matrix, by the gap law [m], (t, t, v)
     volts: wp.array3d(dtype=wp.float32)  # of nodes, with a terminal at 1 V, (slots, t, v)
