@@ -379,6 +379,7 @@ class Fleet:
         return FleetReading(
             core.capacitance, core.delta, core.error, shield_coupling=core.shields,
             conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
+            touch=core.touch,
         )  # fmt: skip
 
     def check(

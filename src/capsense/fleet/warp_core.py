@@ -13,16 +13,17 @@ from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
 from capsense.fleet import warp_charges as charges
-from capsense.fleet import warp_cut, warp_gap, warp_near, warp_slope
+from capsense.fleet import warp_cut, warp_gap, warp_near, warp_slope, warp_touch
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
-from capsense.fleet.bodies import Bodies, on_device
+from capsense.fleet.bodies import Bodies, FleetTouch, on_device
 from capsense.fleet.warp_chips import WarpChips
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
 from capsense.readout import Readout
 from capsense.surface.solver import SurfaceSolver
+from capsense.surface.touch_kernels import COARSE, FINE
 
 Array = NDArray[np.float64]
 
@@ -91,6 +92,10 @@ class WarpCore:
         for name in ("pose", "slot", "columns", "lossy"):
             setattr(self.near, name, getattr(self.cut, name))
         self.near.sensors = sensors
+        self.forces = room(environments, places)
+        self.forces.fill_(np.nan)
+        self.touch = self._touch(solver, m)
+        """What is pressed onto the cover, None without one; written anew by each step."""
         self.solved = room(n, size, views)
         self.rows, self.matrix = room(n, width, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, size, views)
@@ -117,6 +122,19 @@ class WarpCore:
             for name in names.split():
                 setattr(out, name, self.room(*shape, dtype=kind.vars[name].type.dtype))
         return out
+
+    def _touch(self, solver: SurfaceSolver, electrodes: int) -> FleetTouch | None:
+        """Make room for the contact mechanics of the cover, if the design has one."""
+        if not len(solver.cover.strain):
+            return None
+        environments, places, sensors = self.counts
+        self.foundation = warp_touch.pack_foundation(solver.cover, solver.length, self.device)
+        below = places, environments * sensors
+        self.contacts = self._struct(warp_touch.Contacts, {
+            "active force grid least depth elastic": below, "height": (FINE * FINE, *below),
+        })  # fmt: skip
+        each = environments, sensors, electrodes
+        return FleetTouch(self.room(*each), self.room(*each), self.room(*each[:2]))
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
         """Take over what stands where, in the memory that there is; new shapes take new memory.
@@ -166,6 +184,7 @@ class WarpCore:
         rows, matrix, whole = self.rows, self.matrix, self.whole
         width, stood = rows.shape[1], (self.counts[1], views)
         self.launch(warp_cut.stand, stood, *at, green, bodies, sensors, cut)
+        self._press(self.forces)
         self._look_near()
         self.launch(warp_cut.choose, stood, *at, green, cut)
         self.launch(warp_cut.place, (3 * n, views), *at, green, cut)
@@ -196,6 +215,21 @@ class WarpCore:
             network.report, (circuit.electrodes, views), circuit, whole,
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
         )  # fmt: skip
+
+    def _press(self, forces: Any) -> None:
+        """Press bodies into the cover, if there is one, by forces [N], shape (e, b)."""
+        if self.touch is None:
+            return
+        launch, out, touch = self.launch, self.contacts, self.touch
+        cover, near, shape = self.foundation, self.near, self.contacts.active.shape
+        launch(warp_touch.find_contacts, shape, self.outlines, cover, self.cut, near, forces, out)
+        launch(warp_touch.undersides, (COARSE, *shape), self.outlines, cover, near, COARSE, out)
+        launch(warp_touch.refine_grid, shape, cover, out)
+        launch(warp_touch.undersides, (FINE, *shape), self.outlines, cover, near, FINE, out)
+        launch(warp_touch.carry, shape, cover, near, out)
+        found = touch.force, touch.compression, touch.total
+        size = touch.force.shape[2], shape[1]
+        launch(warp_touch.electrode_forces, size, cover, near, out, *found)
 
     def _look_near(self) -> None:
         """What is near the design, and what the gap law adds for it."""

@@ -17,7 +17,7 @@ from capsense.elements.matter import SHUT
 from capsense.field.green_kernels import Green
 from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
-from capsense.fleet.warp_outline import lowest_point, middle_height, nearest, reach_down
+from capsense.fleet.warp_outline import farthest_point, middle_height, nearest, reach_down
 from capsense.surface.gap_kernels import EXACT, WAYS
 
 wp.set_module_options({"enable_backward": False})
@@ -217,7 +217,7 @@ def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b:
             around = lowest <= gap.floor and 2.0 * middle - lowest >= gap.ceiling
             out = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and not around
             if lowest < gap.top:
-                near.foot[b, v] = lowest_point(outlines, u, at, scale)
+                near.foot[b, v] = farthest_point(outlines, u, at, scale, wp.vec3(0.0, 0.0, -1.0))
     return out
 
 
