@@ -256,9 +256,8 @@ def test_what_warp_does_not_know_of_covers(foam_field):
     fleet = Fleet(foam_field, [ball], 1, device="warp:cpu", budget=32)
     poses = np.zeros((1, 1, 7))
     poses[..., 6], poses[..., 2] = 1.0, 0.012
-    for more, what in (({"forces": [[0.5]]}, "forces"), ({"jacobian": True}, "Jacobian")):
-        with pytest.raises(cs.SceneError, match=f'{what}.*device="cpu"'):
-            fleet.step(poses, **more)
+    with pytest.raises(cs.SceneError, match='Jacobian.*device="cpu"'):
+        fleet.step(poses, jacobian=True)
     topped = replace(foam_field, cover=replace(foam_field.cover, top="ground"))
     with pytest.raises(cs.SceneError, match=r'conducting top.*device="cpu"'):
         Fleet(topped, [ball], 1, device="warp:cpu")

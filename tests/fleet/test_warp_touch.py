@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from near_scenes import fleet_of, near_scenes
+from test_warp_gap import misses
 
 import capsense as cs
+from capsense.errors import SceneError
 from capsense.fleet import Fleet, FleetTouch
 
-pytest.importorskip("warp")
+wp = pytest.importorskip("warp")
+KINDS = cs.Sphere(0.008), cs.Box((0.01, 0.014, 0.008)), cs.Capsule(0.005, 0.012)
 
 
 def touch_misses(found: FleetTouch, truth: FleetTouch) -> float:
@@ -33,3 +36,102 @@ def test_overlaps_are_felt(foam_field: cs.Design) -> None:
     assert truth is not None
     assert (truth.total > 0.0).sum() > 12
     assert touch_misses(found, truth) < 1e-3
+
+
+def pressed_scenes(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses of the bodies of ``KINDS`` side by side over the cover, sensors, and forces [N].
+
+    Shapes (e, 3, 7), (e, 2, 7) and (e, 3). The first sensors are the worlds' frames, the others
+    are turned about z; a quarter of the bodies has no force, and some have a force of zero.
+    """
+    rng = np.random.default_rng(seed)
+    poses, sensors = np.zeros((count, 3, 7)), np.zeros((count, 2, 7))
+    poses[..., 6] = sensors[..., 6] = 1.0
+    poses[..., 0] = [-0.015, 0.002, 0.017]
+    poses[..., :2] += rng.uniform(-0.001, 0.001, (count, 3, 2))
+    poses[..., 2] = [0.010, 0.006, 0.007]
+    poses[..., 2] += rng.uniform(-0.0015, 0.002, (count, 3))
+    poses[..., 3:6] = 0.1 * rng.normal(size=(count, 3, 3))
+    poses[..., 3:] /= np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
+    angle = rng.uniform(0.0, 3.0, count)
+    sensors[:, 1, 5], sensors[:, 1, 6] = np.sin(angle), np.cos(angle)
+    forces = np.exp(rng.uniform(*np.log([0.02, 3.0]), (count, 3)))
+    forces[rng.random((count, 3)) < 0.25] = np.nan
+    forces[rng.random((count, 3)) < 0.1] = 0.0
+    single = (x.astype(np.float32).astype(float) for x in (poses, sensors))
+    return *single, forces
+
+
+def test_forces_press_bodies_in(foam_field: cs.Design) -> None:
+    """Differential: forces and overlaps of three bodies, two sensors; measured 5e-5."""
+    poses, sensors, forces = pressed_scenes(12, 5)
+    bodies = [cs.Body(KINDS[0], material="wood"), *map(cs.Body, KINDS[1:])]
+    one = Fleet(foam_field, bodies, 12, sensors=2)
+    two = Fleet(foam_field, bodies, 12, sensors=2, device="warp:cpu", budget=32)
+    truth = one.step(poses, sensors, forces=forces).touch
+    found = two.step(poses, sensors, forces=forces).touch
+    assert touch_misses(found, truth) < 1e-3
+    held = ~np.isnan(forces).any(axis=1)
+    assert held.any()
+    np.testing.assert_allclose(
+        found.total.numpy()[held], np.tile(forces[held].sum(axis=1)[:, None], 2), rtol=1e-5
+    )
+    each = found.force.numpy().copy()
+    given = wp.array(forces, dtype=wp.float32, device="cpu")
+    np.testing.assert_array_equal(two.step(poses, sensors, forces=given).touch.force, each)
+    torch = pytest.importorskip("torch")
+    given = torch.tensor(forces, dtype=torch.float32)
+    np.testing.assert_array_equal(two.step(poses, sensors, forces=given).touch.force, each)
+
+
+def test_readings_of_bodies_that_forces_hold(foam_field: cs.Design) -> None:
+    """Differential: the bodies' own forces, with the same functions; measured 3e-4, median 1e-6."""
+    poses, sensors, forces = pressed_scenes(6, 8)
+    fleet = Fleet(foam_field, list(map(cs.Body, KINDS)), 6, sensors=2, device="warp:cpu")
+    groundings = "grounded", "floating", 20e-12
+    for place, shape in enumerate(KINDS):
+        body = cs.Body(shape, material="steel", grounding=groundings[place])
+        own = [None if np.isnan(f) else float(f) for f in forces[:, place]]
+        fleet.change(place, [body.pressed(f) for f in own])
+    found = misses(fleet, poses, None, sensors)
+    assert found[0].max() < 1e-3
+
+
+def test_forces_that_are_wrong_are_refused(foam_field: cs.Design) -> None:
+    body = cs.Body(cs.Sphere(0.01), cs.Pose((0, 0, 0.0115)))
+    fleet = Fleet(foam_field, [body], 2, device="warp:cpu", budget=32)
+    where = np.tile([0, 0, 0.0115, 0, 0, 0, 1.0], (2, 1, 1))
+    for forces, fix in (
+        ([0.5, 0.5], "shape"), ([[-1.0], [0.0]], "-1"), ([[np.inf], [0]], "inf"),
+        (wp.zeros(2, dtype=wp.float32, device="cpu"), "shape"),
+        (wp.zeros((2, 1), dtype=wp.float64, device="cpu"), "float32"),
+    ):  # fmt: skip
+        with pytest.raises(SceneError, match=fix):
+            fleet.step(where, forces=forces)
+    with pytest.raises(SceneError, match="Jacobian"):
+        fleet.step(where, forces=[[0.5], [0.5]], jacobian=True)
+    bare = Fleet("six_patch", [body], 2, device="warp:cpu", budget=32)
+    for forces in ([[0.5], [0.5]], wp.zeros((2, 1), dtype=wp.float32, device="cpu")):
+        with pytest.raises(SceneError, match="cover"):
+            bare.step(where, forces=forces)
+    assert bare.step(where, forces=[[np.nan], [np.nan]]).touch is None
+
+
+def test_touch_steps_can_be_captured(foam_field: cs.Design) -> None:
+    """Differential: a captured step with other poses and forces gives the bits of a step."""
+    if not hasattr(wp, "capture_save"):
+        pytest.skip("this version of Warp captures on GPUs only")
+    body = cs.Body(cs.Sphere(0.01))
+    where = wp.array(np.tile([0.01, 0, 0.0115, 0, 0, 0, 1.0], (2, 1, 1)), dtype=wp.float32)
+    forces = wp.zeros((2, 1), dtype=wp.float32, device="cpu")
+    fleet, other = (Fleet(foam_field, [body], 2, device="warp:cpu", budget=32) for _ in range(2))
+    fleet.step(where, forces=forces)
+    with wp.ScopedCapture("cpu") as capture:
+        found = fleet.step(where, forces=forces)
+    forces.assign(np.array([[0.3], [np.nan]], np.float32))
+    wp.capture_launch(capture.graph)
+    truth = other.step(where, forces=forces)
+    assert truth.touch.total.numpy().all()
+    np.testing.assert_array_equal(found.delta, truth.delta)
+    for name in ("force", "compression", "total"):
+        np.testing.assert_array_equal(getattr(found.touch, name), getattr(truth.touch, name))

@@ -92,8 +92,8 @@ class WarpCore:
         for name in ("pose", "slot", "columns", "lossy"):
             setattr(self.near, name, getattr(self.cut, name))
         self.near.sensors = sensors
-        self.forces = room(environments, places)
-        self.forces.fill_(np.nan)
+        self.own_forces, self.forces = room(environments, places), room(environments, places)
+        """Normal forces that bodies have themselves, and those of a step [N], NaN for none."""
         self.touch = self._touch(solver, m)
         """What is pressed onto the cover, None without one; written anew by each step."""
         self.solved = room(n, size, views)
@@ -136,9 +136,10 @@ class WarpCore:
         each = environments, sensors, electrodes
         return FleetTouch(self.room(*each), self.room(*each), self.room(*each[:2]))
 
-    def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
+    def take(self, bodies: Bodies, shapes: Sequence[RigidShape], forces: Array) -> None:
         """Take over what stands where, in the memory that there is; new shapes take new memory.
 
+        ``forces`` are those that press bodies onto the cover [N], NaN for none, shape (e, b).
         Where a step was captured, what was there before stays for it; it reads NaN from then on.
         """
         if len(bodies.shapes) != self._taken:
@@ -160,23 +161,27 @@ class WarpCore:
         for name in ("softness", "tie"):
             both = getattr(bodies, name).astype(np.complex64).view(np.float32)
             getattr(self.places, name).assign(both.reshape(*bodies.scale.shape, 2))
+        self.own_forces.assign(forces.astype(np.float32))
 
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-    def solve(self, bodies: Any, sensors: Any) -> None:
+    def solve(self, bodies: Any, sensors: Any, forces: Any) -> None:
         """Fill :attr:`capacitance`, :attr:`delta` [F] and what else there is; waits for nothing.
 
         Args:
-            bodies: Poses, see :func:`as_transforms`, shape (e, b, 7).
+            bodies: Poses, see :func:`as_array`, shape (e, b, 7).
             sensors: The same of the sensors, shape (e, s, 7); None for the frames of the worlds.
+            forces: Normal forces that press bodies onto the cover [N], NaN for none, shape (e, b);
+                None for those that they have themselves.
 
         Raises:
             SceneError: They are of another shape or precision, or on another device.
         """
         self._captured |= bool(self.device.is_capturing)
-        bodies = as_transforms(bodies, self.poses)
-        sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
+        bodies = as_array("poses", bodies, self.poses)
+        sensors = self.worlds if sensors is None else as_array("sensors", sensors, self.frames)
+        forces = self.own_forces if forces is None else as_array("forces", forces, self.forces)
         n, views = self.cut.number.shape
         size = self.whole.shape[0]
         green, cut, circuit = self.green, self.cut, self.circuit
@@ -184,7 +189,7 @@ class WarpCore:
         rows, matrix, whole = self.rows, self.matrix, self.whole
         width, stood = rows.shape[1], (self.counts[1], views)
         self.launch(warp_cut.stand, stood, *at, green, bodies, sensors, cut)
-        self._press(self.forces)
+        self._press(forces)
         self._look_near()
         self.launch(warp_cut.choose, stood, *at, green, cut)
         self.launch(warp_cut.place, (3 * n, views), *at, green, cut)
@@ -332,29 +337,30 @@ def known_device(name: str) -> Any:
         raise ValueError(f"device is {name!r}; there are {known}") from error
 
 
-def as_transforms(poses: Any, room: Any) -> Any:
-    """Poses, shape (..., 7), as an array of transforms, without a copy if they are on the device.
+def as_array(what: str, values: Any, room: Any) -> Any:
+    """Numbers, or poses of shape (..., 7), as an array of the device; a copy only of the host's.
 
-    Those on the host are copied into ``room``, an array of the shape and device that are wanted.
+    Those on the host are copied into ``room``, an array of the type, shape and device that are
+    wanted: of transforms for poses.
 
     Raises:
         SceneError: They are of another shape or precision, on another device, or not contiguous.
     """
-    if not on_device(poses):
-        room.assign(np.ascontiguousarray(poses, np.float32))
+    if not on_device(values):
+        room.assign(np.ascontiguousarray(values, np.float32))
         return room
-    if not isinstance(poses, wp.array):
-        poses = wp.from_dlpack(poses)
-    if (poses.dtype, poses.shape, poses.device) == (wp.transformf, room.shape, room.device):
-        return poses
-    shape = (*room.shape, 7)
-    if (poses.shape, poses.dtype, poses.device) != (shape, wp.float32, room.device) or (
-        not poses.is_contiguous
+    if not isinstance(values, wp.array):
+        values = wp.from_dlpack(values)
+    shape = room.shape if room.dtype is wp.float32 else (*room.shape, 7)
+    if (values.dtype, values.shape, values.device) == (room.dtype, room.shape, room.device):
+        return values
+    if (values.shape, values.dtype, values.device) != (shape, wp.float32, room.device) or (
+        not values.is_contiguous
     ):
         raise SceneError(
-            f"poses are {poses.dtype.__name__} of shape {poses.shape} on {poses.device}; give "
+            f"{what} are {values.dtype.__name__} of shape {values.shape} on {values.device}; give "
             f"contiguous float32 of shape {shape} on {room.device}"
         )
-    out = wp.array(ptr=poses.ptr, dtype=wp.transform, shape=room.shape, device=room.device)
-    out.owner = poses  # whose memory it is
+    out = wp.array(ptr=values.ptr, dtype=room.dtype, shape=room.shape, device=room.device)
+    out.owner = values  # whose memory it is
     return out
