@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
+import tiny_field
+from covered_discs import covered_discs
 from near_scenes import fleet_of, near_scenes
 from test_warp_gap import misses
 
 import capsense as cs
 from capsense.errors import SceneError
+from capsense.field.cache import load_or_build
 from capsense.fleet import Fleet, FleetTouch
 
 wp = pytest.importorskip("warp")
@@ -84,17 +89,45 @@ def test_forces_press_bodies_in(foam_field: cs.Design) -> None:
     np.testing.assert_array_equal(two.step(poses, sensors, forces=given).touch.force, each)
 
 
+def held_fleet(
+    design: cs.Design, forces: np.ndarray, materials: Sequence[str], device: str = "warp:cpu"
+) -> Fleet:
+    """A fleet of the bodies of ``KINDS`` with forces of their own, and two sensors."""
+    fleet = Fleet(design, list(map(cs.Body, KINDS)), len(forces), sensors=2, device=device)
+    groundings = "grounded", "floating", 20e-12
+    for place, each in enumerate(zip(KINDS, materials, groundings, strict=True)):
+        body = cs.Body(each[0], material=each[1], grounding=each[2])
+        own = [None if np.isnan(f) else float(f) for f in forces[:, place]]
+        fleet.change(place, [body.pressed(f) for f in own])
+    return fleet
+
+
 def test_readings_of_bodies_that_forces_hold(foam_field: cs.Design) -> None:
     """Differential: the bodies' own forces, with the same functions; measured 3e-4, median 1e-6."""
     poses, sensors, forces = pressed_scenes(6, 8)
-    fleet = Fleet(foam_field, list(map(cs.Body, KINDS)), 6, sensors=2, device="warp:cpu")
-    groundings = "grounded", "floating", 20e-12
-    for place, shape in enumerate(KINDS):
-        body = cs.Body(shape, material="steel", grounding=groundings[place])
-        own = [None if np.isnan(f) else float(f) for f in forces[:, place]]
-        fleet.change(place, [body.pressed(f) for f in own])
-    found = misses(fleet, poses, None, sensors)
-    assert found[0].max() < 1e-3
+    fleet = held_fleet(foam_field, forces, ("steel",) * 3)
+    assert misses(fleet, poses, None, sensors)[0].max() < 1e-3
+
+
+@pytest.fixture(params=["ground", "floating"])
+def fabric_design(request, field_cache, monkeypatch) -> cs.Design:
+    """A cover with a conducting fabric; the grounded one carries compression on."""
+    top = request.param
+    with tiny_field.few_sources():
+        field = load_or_build(covered_discs(top=top), tiny_field.SETTINGS, cache_dir=field_cache)
+    for module in ("capsense.fleet", "capsense.simulator"):
+        monkeypatch.setattr(f"{module}.load_or_build", lambda *a, **b: field)
+    return covered_discs(top=top, bending_length=3e-3 if top == "ground" else 0.0)
+
+
+def test_readings_below_a_fabric(fabric_design: cs.Design) -> None:
+    """Differential: forces and overlaps, with the same functions; measured 2e-5, median 1e-6."""
+    poses, sensors, forces = pressed_scenes(6, 8)
+    materials = "steel", "steel", "wood"
+    fleet = held_fleet(fabric_design, forces, materials)
+    assert misses(fleet, poses, None, sensors)[0].max() < 1e-3
+    truth = held_fleet(fabric_design, forces, materials, "cpu").step(poses, sensors).touch
+    assert touch_misses(fleet.step(poses, sensors).touch, truth) < 1e-3
 
 
 def test_forces_that_are_wrong_are_refused(foam_field: cs.Design) -> None:
@@ -117,14 +150,14 @@ def test_forces_that_are_wrong_are_refused(foam_field: cs.Design) -> None:
     assert bare.step(where, forces=[[np.nan], [np.nan]]).touch is None
 
 
-def test_touch_steps_can_be_captured(foam_field: cs.Design) -> None:
+def test_touch_steps_can_be_captured(fabric_design: cs.Design) -> None:
     """Differential: a captured step with other poses and forces gives the bits of a step."""
     if not hasattr(wp, "capture_save"):
         pytest.skip("this version of Warp captures on GPUs only")
     body = cs.Body(cs.Sphere(0.01))
     where = wp.array(np.tile([0.01, 0, 0.0115, 0, 0, 0, 1.0], (2, 1, 1)), dtype=wp.float32)
     forces = wp.zeros((2, 1), dtype=wp.float32, device="cpu")
-    fleet, other = (Fleet(foam_field, [body], 2, device="warp:cpu", budget=32) for _ in range(2))
+    fleet, other = (Fleet(fabric_design, [body], 2, device="warp:cpu", budget=32) for _ in range(2))
     fleet.step(where, forces=forces)
     with wp.ScopedCapture("cpu") as capture:
         found = fleet.step(where, forces=forces)

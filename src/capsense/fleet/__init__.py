@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import as_whole, checked_frequency, shorten
-from capsense.cover import NONE
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.elements.wide import WIDE
@@ -146,12 +145,6 @@ class Fleet:
         return vars(self)
 
     def _on_warp(self, budget: int) -> WarpCore:
-        cover = self.design.cover
-        if cover is not None and cover.top != NONE:
-            raise SceneError(
-                f"the cover {cover.name!r} of design {self.design.name!r} has a conducting top, "
-                'which fleets on Warp do not know; make the fleet with device="cpu"'
-            )
         try:
             from capsense.fleet.warp_core import WarpCore, known_device
         except ImportError as error:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
+from capsense.field.soft import BODY
 from capsense.fleet import warp_charges as charges
-from capsense.fleet import warp_cut, warp_gap, warp_near, warp_slope, warp_touch
+from capsense.fleet import warp_cut, warp_fabric, warp_gap, warp_near, warp_slope, warp_touch
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
@@ -96,6 +97,7 @@ class WarpCore:
         """Normal forces that bodies have themselves, and those of a step [N], NaN for none."""
         self.touch = self._touch(solver, m)
         """What is pressed onto the cover, None without one; written anew by each step."""
+        self.fabric = self._fabric(solver)
         self.solved = room(n, size, views)
         self.rows, self.matrix = room(n, width, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, size, views)
@@ -135,6 +137,19 @@ class WarpCore:
         })  # fmt: skip
         each = environments, sensors, electrodes
         return FleetTouch(self.room(*each), self.room(*each), self.room(*each[:2]))
+
+    def _fabric(self, solver: SurfaceSolver) -> Any:
+        """Make room for a conducting fabric on the cover, if the design has one."""
+        soft = solver.green.gap.soft
+        if soft.top == BODY:
+            return None
+        environments, places, sensors = self.counts
+        views = environments * sensors
+        self.pressed = self._struct(warp_fabric.FabricState, {
+            "touches": (places, views), "pressed cell depth": (len(soft.sheet_areas), views),
+            "count": (views,),
+        })  # fmt: skip
+        return warp_fabric.pack_fabric(soft, self.device)
 
     def take(self, bodies: Bodies, shapes: Sequence[RigidShape], forces: Array) -> None:
         """Take over what stands where, in the memory that there is; new shapes take new memory.
@@ -215,6 +230,9 @@ class WarpCore:
         self._look_below()
         dim = size, size, views
         self.launch(network.change, dim, self.gap, self.near, *solved[2:], rest, whole)
+        if self.fabric is not None:
+            size = len(self.fabric.pair), views
+            self.launch(warp_fabric.fabric_change, size, self.gap, self.fabric, self.pressed, whole)
         self.launch(network.eliminate, views, circuit, self.near, rest, whole)
         self.launch(
             network.report, (circuit.electrodes, views), circuit, whole,
@@ -235,6 +253,14 @@ class WarpCore:
         found = touch.force, touch.compression, touch.total
         size = touch.force.shape[2], shape[1]
         launch(warp_touch.electrode_forces, size, cover, near, out, *found)
+        if self.fabric is not None:
+            outlines, gap, fabric, out = self.outlines, self.gap, self.fabric, self.pressed
+            seen = self.cut.node, self.cut.clusters
+            launch(warp_fabric.find_touching, shape, outlines, gap, near, *seen, out)
+            size = out.depth.shape
+            launch(warp_fabric.press_cells, size, outlines, gap, fabric, near, out)
+            launch(warp_fabric.list_pressed, shape[1], out)
+            launch(warp_fabric.spread, size, fabric, out)
 
     def _look_near(self) -> None:
         """What is near the design, and what the gap law adds for it."""

@@ -185,6 +185,19 @@ def strain_place(gap: GapLaw, length: float, below: float):
 
 
 @wp.func
+def line_length(hit: Hit, length: float):
+    """Length of the field line to a nearest point; its distance where that is ``length`` or more.
+
+    Negative inside of a body.
+    """
+    off = hit.off
+    if off > 0.0 and off < length:
+        across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])
+        off = _arc(off, across, hit.way[2])
+    return off
+
+
+@wp.func
 def _add_compressed(
     outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, c: int, p: int, v: int
 ):  # fmt: skip
@@ -199,14 +212,10 @@ def _add_compressed(
         if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
             b = near.body[k, v]
             hit = nearest_of(outlines, near, b, v, x + wp.vec3(0.0, 0.0, near.sunk[b, v]))
-            off = hit.off
+            off = line_length(hit, length)
             if off < length:
-                if off > 0.0:
-                    across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])
-                    off = _arc(off, across, hit.way[2])
-                if off < length:
-                    length = wp.max(off, gap.cover - gap.limit)
-                    body = k
+                length = wp.max(off, gap.cover - gap.limit)
+                body = k
     if body < 0:
         return
     k, share = strain_place(gap, length, gap.below[c])
@@ -240,7 +249,7 @@ def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: NearBod
                 x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
                 best, high, body = nearest_cell(outlines, gap, green, near, met, x, v)
                 _add_cell(gap, near, c, p, best, high, body, v)
-                if gap.cover > 0.0 and gap.below[c] >= 0.0:
+                if gap.below[c] >= 0.0:
                     _add_compressed(outlines, gap, near, met, c, p, v)
 
 
