@@ -249,10 +249,19 @@ def test_bodies_are_pressed_into_a_cover(foam_field, grounding):
     assert np.median(found[0]) < 1e-5
 
 
-def test_what_warp_does_not_know_of_covers(foam_field):
-    ball = cs.Body(cs.Sphere(0.01))
-    fleet = Fleet(foam_field, [ball], 1, device="warp:cpu", budget=32)
-    poses = np.zeros((1, 1, 7))
-    poses[..., 6], poses[..., 2] = 1.0, 0.012
-    with pytest.raises(cs.SceneError, match=r'Jacobian.*device="cpu"'):
-        fleet.step(poses, jacobian=True)
+@pytest.mark.parametrize("grounding", ["grounded", "floating"])
+def test_gradients_in_a_cover(foam_field, grounding):
+    """Differential: central differences of readings, up to past full compression; measured 1e-3
+    (median) along axes, and 5e-3 about them."""
+    some = Fleet(foam_field, [cs.Body(cs.Sphere(0.01))], 1)
+    scenes = near_scenes(some, 18, (-2.5e-3, 0.5e-3), grounding, seed=5)
+    fleet = fleet_of(foam_field, scenes, device="warp:cpu")
+    slope = fleet.step(scenes.poses, jacobian=True).jacobian.numpy()[:, 0, 0].astype(float)
+    truth, alike = differences(fleet, scenes.poses)
+    turns = np.array([not name.startswith("sphere") for name in scenes.names])
+    for half, some, most in ((slice(3), alike, 0.04), (slice(3, 6), alike & turns, 0.3)):
+        miss = np.abs(slope - truth)[some][..., half].max(axis=(1, 2, 3))
+        miss /= np.abs(truth)[some][..., half].max(axis=(1, 2, 3))
+        assert len(miss) > 8
+        assert miss.max() < most
+        assert np.median(miss) < 2e-2

@@ -150,6 +150,12 @@ def test_forces_that_are_wrong_are_refused(foam_field: cs.Design) -> None:
     assert bare.step(where, forces=[[np.nan], [np.nan]]).touch is None
 
 
+def test_a_fabric_has_no_jacobian(fabric_design: cs.Design) -> None:
+    fleet = Fleet(fabric_design, [cs.Body(KINDS[0])], 1, device="warp:cpu", budget=32)
+    with pytest.raises(SceneError, match=r'fabric.*device="cpu"'):
+        fleet.step([[[0, 0, 0.011, 0, 0, 0, 1.0]]], jacobian=True)
+
+
 def test_touch_steps_can_be_captured(fabric_design: cs.Design) -> None:
     """Differential: a captured step with other poses and forces gives the bits of a step."""
     if not hasattr(wp, "capture_save"):

@@ -297,6 +297,7 @@ class WarpCore:
         circuit, green, cut, rest = self.circuit, self.green, self.cut, self.left
         m, t, lead, room = circuit.electrodes, self.whole.shape[0], green.lead, self.room
         sources, modes = len(green.sources), rest.sums.shape[0]
+        gap, near, chunks = self.gap, self.near, len(self.gap.owner)
         if self._slopes is None:
             self._slopes = [
                 *(room(rows, lead, views) for rows in (3 * n, n, sources, modes)),
@@ -304,7 +305,7 @@ class WarpCore:
                 self._struct(warp_slope.Slopes, {
                     "volts": (t, m, views), "charge pull": (3 * n, lead, views),
                     "lift": (places, views),
-                    "part": (len(self.gap.owner), self.gap.columns.shape[1] + 1, places, views),
+                    "part sink": (chunks, self.gap.columns.shape[1] + 1, places, views),
                 }),
             ]  # fmt: skip
             self._slopes[-1].charge = self._slopes[0]
@@ -328,7 +329,6 @@ class WarpCore:
         launch(charges.strengths, size, green, cut, sums, strength)
         launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, slopes.pull)
         launch(network.follow, (m, views), circuit, cut, self.whole, slopes.volts)
-        gap, near, chunks = self.gap, self.near, len(self.gap.owner)
         if chunks:
             both = self.outlines, gap
             launch(warp_slope.local_slopes, (views, chunks), *both, green, near, slopes)

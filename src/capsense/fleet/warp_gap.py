@@ -198,14 +198,14 @@ def line_length(hit: Hit, length: float):
 
 
 @wp.func
-def _add_compressed(
-    outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, c: int, p: int, v: int
+def compressed_length(
+    outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, x: wp.vec3, v: int
 ):  # fmt: skip
-    """Add what one cell changes as a body is pressed into the cover above it.
+    """Length of the field line through the cover from a place below it, and whose this is.
 
-    ``met`` is as of :func:`met_by`.
+    The second is a place in ``near.body``, -1 where nothing is pressed in; ``met`` is as of
+    :func:`met_by`.
     """
-    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top - gap.cover)
     length = gap.cover
     body = int(-1)
     for k in range(near.count[v]):
@@ -216,6 +216,19 @@ def _add_compressed(
             if off < length:
                 length = wp.max(off, gap.cover - gap.limit)
                 body = k
+    return length, body
+
+
+@wp.func
+def _add_compressed(
+    outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, c: int, p: int, v: int
+):  # fmt: skip
+    """Add what one cell changes as a body is pressed into the cover above it.
+
+    ``met`` is as of :func:`met_by`.
+    """
+    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top - gap.cover)
+    length, body = compressed_length(outlines, gap, near, met, x, v)
     if body < 0:
         return
     k, share = strain_place(gap, length, gap.below[c])
