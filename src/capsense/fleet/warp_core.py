@@ -132,7 +132,7 @@ class WarpCore:
         environments, places, sensors = self.counts
         self.foundation = warp_touch.pack_foundation(solver.cover, solver.length, self.device)
         below = places, environments * sensors
-        self.contacts = self._struct(warp_touch.Contacts, {
+        self.contacts = self._struct(warp_touch.CoverContacts, {
             "active force grid least depth elastic": below, "height": (FINE * FINE, *below),
         })  # fmt: skip
         each = environments, sensors, electrodes

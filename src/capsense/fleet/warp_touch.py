@@ -43,7 +43,7 @@ class WarpFoundation:
 
 
 @wp.struct
-class Contacts:
+class CoverContacts:
     """Bodies that may be pressed into the cover, in every view."""
 
     active: wp.array2d(dtype=wp.int32)  # whether a body may be pressed in, (b, v)
@@ -72,7 +72,7 @@ def pack_foundation(cover: Foundation, length: float, device: Any) -> WarpFounda
 @wp.kernel
 def find_contacts(
     outlines: Outlines, cover: WarpFoundation, cut: WarpCut, near: NearBodies,
-    forces: wp.array2d(dtype=wp.float32), out: Contacts,
+    forces: wp.array2d(dtype=wp.float32), out: CoverContacts,
 ):  # fmt: skip
     """Enter bodies that may be pressed in, and a coarse grid of cells below each."""
     b, v = wp.tid()
@@ -105,7 +105,7 @@ def find_contacts(
 
 @wp.kernel
 def undersides(
-    outlines: Outlines, cover: WarpFoundation, near: NearBodies, side: int, out: Contacts
+    outlines: Outlines, cover: WarpFoundation, near: NearBodies, side: int, out: CoverContacts
 ):
     """Heights of undersides over the cover's face, a row of ``side`` cells each, (side, b, v)."""
     row, b, v = wp.tid()
@@ -120,7 +120,7 @@ def undersides(
 
 @wp.func
 def _underside(
-    outlines: Outlines, cover: WarpFoundation, near: NearBodies, out: Contacts, x: float,
+    outlines: Outlines, cover: WarpFoundation, near: NearBodies, out: CoverContacts, x: float,
     y: float, b: int, v: int,
 ):  # fmt: skip
     """Height of the lowest point of a body above a place, by sphere tracing, see the twin."""
@@ -151,7 +151,7 @@ def _underside(
 
 
 @wp.kernel
-def refine_grid(cover: WarpFoundation, out: Contacts):
+def refine_grid(cover: WarpFoundation, out: CoverContacts):
     """Make the grid of each body a fine one, of what may be pressed in by the coarse one."""
     b, v = wp.tid()
     if out.active[b, v] == 0:
@@ -193,7 +193,7 @@ def _pressure(strain: float, cover: WarpFoundation):
 
 
 @wp.func
-def _contact_force(cover: WarpFoundation, out: Contacts, depth: float, b: int, v: int):
+def _contact_force(cover: WarpFoundation, out: CoverContacts, depth: float, b: int, v: int):
     """Force on a body whose lowest cell is so deep in the cover [N]."""
     thickness = cover.upper[2] - cover.lower[2]
     grid = out.grid[b, v]
@@ -205,7 +205,7 @@ def _contact_force(cover: WarpFoundation, out: Contacts, depth: float, b: int, v
 
 
 @wp.func
-def _depth_of_force(cover: WarpFoundation, out: Contacts, force: float, b: int, v: int):
+def _depth_of_force(cover: WarpFoundation, out: CoverContacts, force: float, b: int, v: int):
     """How deep the lowest cell below a body is in the cover as it carries a force."""
     low = float(0.0)
     high = cover.upper[2] - cover.lower[2]
@@ -224,7 +224,7 @@ def _depth_of_force(cover: WarpFoundation, out: Contacts, force: float, b: int, 
 
 
 @wp.kernel
-def carry(cover: WarpFoundation, near: NearBodies, out: Contacts):
+def carry(cover: WarpFoundation, near: NearBodies, out: CoverContacts):
     """Lower or raise bodies that a force holds, and work out what the cover carries, (b, v)."""
     b, v = wp.tid()
     if out.active[b, v] == 0:
@@ -253,7 +253,7 @@ def carry(cover: WarpFoundation, near: NearBodies, out: Contacts):
 
 @wp.kernel
 def electrode_forces(
-    cover: WarpFoundation, near: NearBodies, contacts: Contacts,
+    cover: WarpFoundation, near: NearBodies, contacts: CoverContacts,
     force: wp.array3d(dtype=wp.float32), compression: wp.array3d(dtype=wp.float32),
     total: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
