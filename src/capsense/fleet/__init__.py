@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import as_whole, checked_frequency, shorten
-from capsense.cover import NONE
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.elements.wide import WIDE
@@ -348,12 +347,6 @@ class Fleet:
             )
         shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
         held = self._forces(forces, jacobian)
-        cover = self.design.cover
-        if jacobian and self._warp is not None and cover is not None and cover.top != NONE:
-            raise SceneError(
-                "a Jacobian is asked for of a design with a conducting fabric on its cover, which "
-                'fleets on Warp do not have; make the fleet with device="cpu"'
-            )
         if self._warp is None:
             if sensors is None:
                 sensors = np.broadcast_to(WORLD, shapes[1])

@@ -49,6 +49,7 @@ class WarpCore:
     ) -> None:  # fmt: skip
         self.device, self.counts, self._taken = device, counts, 0
         self._slopes: list[Any] | None = None
+        self._fabric_slopes: Any = None
         self.shapes: Any = None
         self._before: list[Any] = []
         self._captured = False
@@ -334,10 +335,31 @@ class WarpCore:
             launch(warp_slope.local_slopes, (views, chunks), *both, green, near, slopes)
             launch(warp_slope.press_slopes, views, *both, near, slopes)
         launch(network.slopes, (places, m, views), circuit, gap, near, cut, slopes, out)
+        if self.fabric is not None:
+            self._add_fabric_slopes(slopes.volts, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
         )  # fmt: skip
+
+    def _add_fabric_slopes(self, volts: Any, out: Any) -> None:
+        """Add what a fabric on the cover adds to derivatives of the electrodes' matrices."""
+        launch, fabric, state, near = self.launch, self.fabric, self.pressed, self.near
+        if self._fabric_slopes is None:
+            shape, size = state.touches.shape, state.depth.shape
+            self._fabric_slopes = self._struct(warp_fabric.FabricSlopes, {
+                "rise": shape, "owner way source": size, "part": (len(fabric.pair), *shape),
+            })  # fmt: skip
+        found, gap, (places, views) = self._fabric_slopes, self.gap, state.touches.shape
+        both = state, found
+        launch(warp_fabric.find_rise, (places, views), near, found)
+        launch(warp_fabric.cell_slopes, state.depth.shape, self.outlines, gap, fabric, near, *both)
+        launch(warp_fabric.find_sources, state.depth.shape, fabric, *both)
+        launch(warp_fabric.pair_slopes, found.part.shape, gap, fabric, *both)
+        size = places, self.circuit.electrodes, views
+        launch(
+            warp_fabric.add_slopes, size, self.circuit, fabric, self.cut.moved, found, volts, out
+        )
 
     def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
         """Chips for all sensors, see :class:`WarpChips`."""

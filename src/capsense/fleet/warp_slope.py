@@ -193,7 +193,7 @@ def _add_compressed_slope(
     if k < 0 or length <= gap.cover - gap.limit:
         return
     b = near.body[k, v]
-    way = _line_turns(outlines, gap, near, x + wp.vec3(0.0, 0.0, near.sunk[b, v]), b, v)
+    way = line_turns(outlines, gap, near, x + wp.vec3(0.0, 0.0, near.sunk[b, v]), b, v)
     m, _share = strain_place(gap, length, gap.below[c])
     rest = gap.below[c] * gap.eps
     low = 1.0 / (rest + (1.0 - gap.strains[m]) * gap.cover)
@@ -206,7 +206,7 @@ def _add_compressed_slope(
 
 
 @wp.func
-def _line_turns(
+def line_turns(
     outlines: Outlines, gap: GapLaw, near: NearBodies, x: wp.vec3, b: int, v: int
 ):  # fmt: skip
     """Differences of the length of a field line through the cover over those of a body's pose."""
