@@ -57,6 +57,18 @@ def test_fleets_feel_what_simulators_feel(foam_field: cs.Design) -> None:
     assert found.touch.total[3, 0] == pytest.approx(2.1, rel=1e-9)
 
 
+def test_compression_beside_an_electrode_is_not_above_it(foam_field: cs.Design) -> None:
+    """Invariant: in the corners of the rectangle around a disc, which no electrode is in."""
+    small = cs.Body(cs.Sphere(0.001))
+    x, y = 0.012 + 0.0075 * np.array([1, 1, -1, -1]), 0.0075 * np.array([1, -1, 1, -1])
+    poses = np.zeros((4, 1, 7))
+    poses[..., 6], poses[:, 0, 0], poses[:, 0, 1], poses[..., 2] = 1.0, x, y, 0.0025
+    touch = cs.Fleet(foam_field, [small], 4).step(poses).touch
+    assert (touch.total > 0.0).all()
+    assert not touch.force.any()
+    assert not touch.compression.any()
+
+
 def test_fleets_press_bodies_by_their_own_forces(foam_field: cs.Design) -> None:
     fleet = cs.Fleet(foam_field, [ball(0.5)], 2)
     fleet.change(0, ball(), [1])

@@ -302,7 +302,7 @@ MODULES = [
     "warp_cut", "warp_network", "warp_solve", "warp_chip_kernels",
     *(
         pytest.param(f"warp_{m}", marks=pytest.mark.e2e)
-        for m in ("near", "gap", "slope", "pairs", "charges")
+        for m in ("near", "gap", "touch", "fabric", "slope", "pairs", "charges")
     ),
 ]  # fmt: skip
 

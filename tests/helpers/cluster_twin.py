@@ -17,6 +17,7 @@ from capsense.surface import lossy, step
 from capsense.surface.choose_kernels import Cut, Functions, functions_of
 from capsense.surface.gap_kernels import (
     extent_of_body,
+    fabric_change,
     local_change,
     move,
     near_bodies,
@@ -146,7 +147,8 @@ def same_functions(count: int) -> Iterator[list[Array]]:
         return cut, leaves, functions, system
 
     def solve(bodies: NDArray[np.void], green: Green, *others: float) -> step.Solution:
-        near = near_bodies(bodies, green)
+        near, fabric = near_bodies(bodies, green), np.zeros((green.terminals,) * 2)
+        fabric_change(bodies, green, fabric)
         if near.any():
             bodies = bodies.copy()
             press_out(bodies, near, green)
@@ -164,7 +166,7 @@ def same_functions(count: int) -> Iterator[list[Array]]:
             left = congruent(weights, left, np.zeros(0))
             charge, coarse = mixed(charge, weights, green.lead), coarse_of(coarse, weights)
         return step.Solution(
-            delta[:m, :m], left[:m, :m], coarse[:m], charge,
+            delta[:m, :m] + fabric, left[:m, :m], coarse[:m], charge,
             leaves.points, leaves.extent, leaves.soft, leaves.owner, functions.solved, shift,
             step.estimate(delta, left, coarse[:m], shift, green.electrodes), near, node, weights,
         )  # fmt: skip

@@ -64,7 +64,8 @@ def near_scenes(
     Gaps are spread evenly by their logarithms; negative ones, bodies that overlap the face, evenly.
     A quarter of the bodies stands upright, the others are turned at random.
     """
-    rng, top = np.random.default_rng(seed), fleet._solver.green.gap.top
+    solver, rng = fleet._solver, np.random.default_rng(seed)
+    top = solver.length * solver.green.gap.top
     pads = np.array([e.surface.bounds.mean(axis=0)[:2] for e in fleet.design.electrodes])
     bodies, poses, names = [], np.zeros((count, 1, 7)), []
     for e in range(count):

@@ -5,32 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tiny_field
+from covered_discs import EPS, covered_discs
+from covered_discs import MODULUS as E
+from covered_discs import THICKNESS as T
 
 import capsense as cs
 from capsense.constants import EPS0
 from capsense.cover import Cover, StressStrain, Viscosity
-from capsense.design import parse_design
 from capsense.field.cache import load_or_build
-
-T, EPS, E = 2e-3, 3.0, 60e3
-
-
-def design(**keys: object) -> cs.Design:
-    """Two discs of 3 mm, 8 mm apart, below a cover."""
-    discs = [
-        {"name": name, "shape": "disc", "radius": 3e-3, "center": [x, 0.0]}
-        for name, x in (("A", -4e-3), ("B", 4e-3))
-    ]
-    cover = {"name": "foam", "thickness": T, "eps_r": EPS, "size": [0.04, 0.03]}
-    if "stress_strain" not in keys:
-        cover["modulus"] = E
-    return parse_design({
-        "name": "two_discs",
-        "domain": {"size": [0.2, 0.2, 0.2], "backplane": 0.02},
-        "build": {"resolution": 0.25},
-        "electrode": discs,
-        "cover": [cover | keys],
-    })  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +29,12 @@ def made(field_cache):
 
 @pytest.fixture(scope="module")
 def sim(made):
-    return made(design())
+    return made(covered_discs())
 
 
 def like(sim: cs.Simulator, **keys: object) -> cs.Simulator:
     """One with a cover of other mechanics, which has the same field."""
-    return cs.Simulator(design(**keys), background=sim.background)
+    return cs.Simulator(covered_discs(**keys), background=sim.background)
 
 
 def plate(depth: float, **keys: object) -> cs.Scene:
@@ -123,9 +105,9 @@ def test_readings_rise_until_the_cover_is_full(sim):
 
 def test_a_rigid_layer_is_not_compressed(made):
     """Limits: the same layer without a modulus reads as in touch, however far a body overlaps."""
-    plain = design()
+    plain = covered_discs()
     rigid = cs.Design(plain.name, plain.domain, plain.electrodes, plain.layers, build=plain.build)
-    assert design(modulus=1e6).content_hash() == plain.content_hash() != rigid.content_hash()
+    assert covered_discs(modulus=1e6).content_hash() == plain.content_hash() != rigid.content_hash()
     sim = made(rigid)
     deep = sim.step(ball(1e-3))
     np.testing.assert_allclose(deep.delta, sim.step(ball(0.0)).delta, rtol=1e-3)
@@ -171,7 +153,7 @@ def test_batches_read_the_same(sim):
 
 @pytest.fixture(scope="module")
 def skin(made):
-    return made(design(top="ground"))
+    return made(covered_discs(top="ground"))
 
 
 def test_a_grounded_fabric_shows_pressure_alone(skin):
@@ -195,7 +177,7 @@ def test_a_stiff_fabric_carries_compression_on(skin):
 
 def test_a_floating_fabric_couples_the_electrodes(made):
     """Network: pressed flat it comes nearer to both, and couples them."""
-    sim = made(design(top="floating"))
+    sim = made(covered_discs(top="floating"))
     touch, deep = (sim.step(plate(d, grounding="floating")).delta for d in (0.0, 1e-3))
     assert deep[0, 0] > touch[0, 0] + 1e-14
     assert deep[0, 1] < touch[0, 1] - 1e-14
@@ -260,7 +242,7 @@ def test_hysteresis(sim):
 )
 def test_wrong_covers_are_refused(keys, says):
     with pytest.raises(cs.DesignError, match=says):
-        design(**keys)
+        covered_discs(**keys)
 
 
 @pytest.mark.parametrize("force", [-1.0, np.nan, np.inf, "hard"])

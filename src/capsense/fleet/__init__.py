@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from capsense._thread_pool import OneAtATime
 from capsense._validate import as_whole, checked_frequency, shorten
-from capsense.cover import NONE
 from capsense.design import load_design
 from capsense.design.model import Design
 from capsense.elements.wide import WIDE
@@ -146,12 +145,6 @@ class Fleet:
         return vars(self)
 
     def _on_warp(self, budget: int) -> WarpCore:
-        cover = self.design.cover
-        if cover is not None and cover.top != NONE:
-            raise SceneError(
-                f"the cover {cover.name!r} of design {self.design.name!r} has a conducting top, "
-                'which fleets on Warp do not know; make the fleet with device="cpu"'
-            )
         try:
             from capsense.fleet.warp_core import WarpCore, known_device
         except ImportError as error:
@@ -238,7 +231,8 @@ class Fleet:
 
     def _take_over(self) -> None:
         if self._warp is not None:
-            self._warp.take(self.table.bodies, cast("list[Any]", self.table.shapes))
+            shapes = cast("list[Any]", self.table.shapes)
+            self._warp.take(self.table.bodies, shapes, self.table.forces)
 
     def use_readout(self, readout: Readout | str | None, *, seed: int = 0) -> None:
         """Read every sensor through a chip of its own from now on.
@@ -290,7 +284,7 @@ class Fleet:
                 frame is the world's.
             forces: Normal forces that press bodies onto the design's cover [N], NaN for none,
                 where their overlap counts, shape (e, b); by default those of the bodies themselves.
-                On the CPU only. The cover is elastic, without relaxation and hysteresis.
+                The cover is elastic, without relaxation and hysteresis.
             time: Time of the scenes [s], not before that of the last step; a readout needs it. On
                 Warp it may be an array on the device, of shape (1,) and double precision, for CUDA
                 graphs.
@@ -314,16 +308,19 @@ class Fleet:
                 time = np.asarray(time).item() if hasattr(time, "__dlpack__") else time
             return replace(reading, held=self._chips.sample(time, matrix, reading.shield_coupling))
 
-    def _forces(self, forces: ArrayLike | None, jacobian: bool) -> Array:
-        """Forces on the bodies [N], shape (e, b).
+    def _forces(self, forces: ArrayLike | None, jacobian: bool) -> Any:
+        """Forces on the bodies [N], shape (e, b); those on a device of Warp are not looked at.
 
         Raises:
             SceneError: They are wrong, or cannot be taken into account.
         """
-        shape = self.count, self.places
-        out = self.table.forces if forces is None else checked_forces(forces, shape)
-        if np.isnan(out).all():
-            return out
+        shape, out = (self.count, self.places), forces
+        if self._warp is None or forces is None or not on_device(forces):
+            out = self.table.forces if forces is None else checked_forces(forces, shape)
+            if np.isnan(out).all():
+                return out
+        else:
+            require_no_gradient("forces", forces)
         if self.design.cover is None:
             if forces is None:  # as a simulator does
                 return np.full(shape, np.nan)
@@ -331,8 +328,6 @@ class Fleet:
                 f"forces press bodies onto a cover, which design {self.design.name!r} does not "
                 "have; add a [[cover]] to it, or leave them out"
             )
-        if self._warp is not None:
-            raise SceneError('forces are taken on the CPU only; make the fleet with device="cpu"')
         if jacobian:
             raise SceneError(
                 "a Jacobian is asked for of bodies that forces hold, which fleets do not have; "
@@ -352,11 +347,6 @@ class Fleet:
             )
         shapes = (self.count, self.places, 7), (self.count, self.sensors, 7)
         held = self._forces(forces, jacobian)
-        if jacobian and self._warp is not None and self.design.cover is not None:
-            raise SceneError(
-                "a Jacobian is asked for of a design with a cover, which fleets on Warp do not "
-                'have; make the fleet with device="cpu"'
-            )
         if self._warp is None:
             if sensors is None:
                 sensors = np.broadcast_to(WORLD, shapes[1])
@@ -375,10 +365,11 @@ class Fleet:
             )
         )
         core = self._warp
-        core.solve(where, at)
+        core.solve(where, at, None if forces is None else held)
         return FleetReading(
             core.capacitance, core.delta, core.error, shield_coupling=core.shields,
             conductance=core.conductance, jacobian=core.differentiate() if jacobian else None,
+            touch=core.touch,
         )  # fmt: skip
 
     def check(

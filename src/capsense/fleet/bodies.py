@@ -60,19 +60,18 @@ class FleetReading:
     about axes parallel to these through its origin [F/rad], shape (e, s, b, n, n, 6)."""
 
     touch: FleetTouch | None = None
-    """What is pressed onto the cover, if the design has one; without relaxation and hysteresis.
-    None on Warp."""
+    """What is pressed onto the cover, if the design has one; without relaxation and hysteresis."""
 
 
 @dataclass(frozen=True, eq=False)
 class FleetTouch:
     """What bodies press onto the covers of all sensors, see :class:`~capsense.cover.Touch`."""
 
-    force: Array
+    force: Any
     """Force that the cover carries above each electrode [N], shape (e, s, n)."""
-    compression: Array
+    compression: Any
     """Largest compression of the cover above each electrode [m], shape (e, s, n)."""
-    total: Array
+    total: Any
     """Force that the whole cover carries [N], shape (e, s)."""
 
 

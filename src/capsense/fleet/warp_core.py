@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
+from capsense.field.soft import BODY
 from capsense.fleet import warp_charges as charges
-from capsense.fleet import warp_cut, warp_gap, warp_near, warp_slope
+from capsense.fleet import warp_cut, warp_fabric, warp_gap, warp_near, warp_slope, warp_touch
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet import warp_solve as solution
-from capsense.fleet.bodies import Bodies, on_device
+from capsense.fleet.bodies import Bodies, FleetTouch, on_device
 from capsense.fleet.warp_chips import WarpChips
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
 from capsense.readout import Readout
 from capsense.surface.solver import SurfaceSolver
+from capsense.surface.touch_kernels import COARSE, FINE
 
 Array = NDArray[np.float64]
 
@@ -47,6 +49,7 @@ class WarpCore:
     ) -> None:  # fmt: skip
         self.device, self.counts, self._taken = device, counts, 0
         self._slopes: list[Any] | None = None
+        self._fabric_slopes: Any = None
         self.shapes: Any = None
         self._before: list[Any] = []
         self._captured = False
@@ -91,6 +94,11 @@ class WarpCore:
         for name in ("pose", "slot", "columns", "lossy"):
             setattr(self.near, name, getattr(self.cut, name))
         self.near.sensors = sensors
+        self.own_forces, self.forces = room(environments, places), room(environments, places)
+        """Normal forces that bodies have themselves, and those of a step [N], NaN for none."""
+        self.touch = self._touch(solver, m)
+        """What is pressed onto the cover, None without one; written anew by each step."""
+        self.fabric = self._fabric(solver)
         self.solved = room(n, size, views)
         self.rows, self.matrix = room(n, width, views), room(n, n, views)
         self.loss, self.quadrature = room(n, views), room(n, size, views)
@@ -118,9 +126,36 @@ class WarpCore:
                 setattr(out, name, self.room(*shape, dtype=kind.vars[name].type.dtype))
         return out
 
-    def take(self, bodies: Bodies, shapes: Sequence[RigidShape]) -> None:
+    def _touch(self, solver: SurfaceSolver, electrodes: int) -> FleetTouch | None:
+        """Make room for the contact mechanics of the cover, if the design has one."""
+        if not len(solver.cover.strain):
+            return None
+        environments, places, sensors = self.counts
+        self.foundation = warp_touch.pack_foundation(solver.cover, solver.length, self.device)
+        below = places, environments * sensors
+        self.contacts = self._struct(warp_touch.CoverContacts, {
+            "active force grid least depth elastic": below, "height": (FINE * FINE, *below),
+        })  # fmt: skip
+        each = environments, sensors, electrodes
+        return FleetTouch(self.room(*each), self.room(*each), self.room(*each[:2]))
+
+    def _fabric(self, solver: SurfaceSolver) -> Any:
+        """Make room for a conducting fabric on the cover, if the design has one."""
+        soft = solver.green.gap.soft
+        if soft.top == BODY:
+            return None
+        environments, places, sensors = self.counts
+        views = environments * sensors
+        self.pressed = self._struct(warp_fabric.FabricState, {
+            "touches": (places, views), "pressed cell depth": (len(soft.sheet_areas), views),
+            "count": (views,),
+        })  # fmt: skip
+        return warp_fabric.pack_fabric(soft, self.device)
+
+    def take(self, bodies: Bodies, shapes: Sequence[RigidShape], forces: Array) -> None:
         """Take over what stands where, in the memory that there is; new shapes take new memory.
 
+        ``forces`` are those that press bodies onto the cover [N], NaN for none, shape (e, b).
         Where a step was captured, what was there before stays for it; it reads NaN from then on.
         """
         if len(bodies.shapes) != self._taken:
@@ -142,23 +177,27 @@ class WarpCore:
         for name in ("softness", "tie"):
             both = getattr(bodies, name).astype(np.complex64).view(np.float32)
             getattr(self.places, name).assign(both.reshape(*bodies.scale.shape, 2))
+        self.own_forces.assign(forces.astype(np.float32))
 
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-    def solve(self, bodies: Any, sensors: Any) -> None:
+    def solve(self, bodies: Any, sensors: Any, forces: Any) -> None:
         """Fill :attr:`capacitance`, :attr:`delta` [F] and what else there is; waits for nothing.
 
         Args:
-            bodies: Poses, see :func:`as_transforms`, shape (e, b, 7).
+            bodies: Poses, see :func:`as_array`, shape (e, b, 7).
             sensors: The same of the sensors, shape (e, s, 7); None for the frames of the worlds.
+            forces: Normal forces that press bodies onto the cover [N], NaN for none, shape (e, b);
+                None for those that they have themselves.
 
         Raises:
             SceneError: They are of another shape or precision, or on another device.
         """
         self._captured |= bool(self.device.is_capturing)
-        bodies = as_transforms(bodies, self.poses)
-        sensors = self.worlds if sensors is None else as_transforms(sensors, self.frames)
+        bodies = as_array("poses", bodies, self.poses)
+        sensors = self.worlds if sensors is None else as_array("sensors", sensors, self.frames)
+        forces = self.own_forces if forces is None else as_array("forces", forces, self.forces)
         n, views = self.cut.number.shape
         size = self.whole.shape[0]
         green, cut, circuit = self.green, self.cut, self.circuit
@@ -166,6 +205,7 @@ class WarpCore:
         rows, matrix, whole = self.rows, self.matrix, self.whole
         width, stood = rows.shape[1], (self.counts[1], views)
         self.launch(warp_cut.stand, stood, *at, green, bodies, sensors, cut)
+        self._press(forces)
         self._look_near()
         self.launch(warp_cut.choose, stood, *at, green, cut)
         self.launch(warp_cut.place, (3 * n, views), *at, green, cut)
@@ -191,11 +231,37 @@ class WarpCore:
         self._look_below()
         dim = size, size, views
         self.launch(network.change, dim, self.gap, self.near, *solved[2:], rest, whole)
+        if self.fabric is not None:
+            size = len(self.fabric.pair), views
+            self.launch(warp_fabric.fabric_change, size, self.gap, self.fabric, self.pressed, whole)
         self.launch(network.eliminate, views, circuit, self.near, rest, whole)
         self.launch(
             network.report, (circuit.electrodes, views), circuit, whole,
             self.capacitance, self.delta, self.conductance, self.shields, rest.doubt, self.error,
         )  # fmt: skip
+
+    def _press(self, forces: Any) -> None:
+        """Press bodies into the cover, if there is one, by forces [N], shape (e, b)."""
+        if self.touch is None:
+            return
+        launch, out, touch = self.launch, self.contacts, self.touch
+        cover, near, shape = self.foundation, self.near, self.contacts.active.shape
+        launch(warp_touch.find_contacts, shape, self.outlines, cover, self.cut, near, forces, out)
+        launch(warp_touch.undersides, (COARSE, *shape), self.outlines, cover, near, COARSE, out)
+        launch(warp_touch.refine_grid, shape, cover, out)
+        launch(warp_touch.undersides, (FINE, *shape), self.outlines, cover, near, FINE, out)
+        launch(warp_touch.carry, shape, cover, near, out)
+        found = touch.force, touch.compression, touch.total
+        size = touch.force.shape[2], shape[1]
+        launch(warp_touch.electrode_forces, size, cover, near, out, *found)
+        if self.fabric is not None:
+            outlines, gap, fabric, out = self.outlines, self.gap, self.fabric, self.pressed
+            seen = self.cut.node, self.cut.clusters
+            launch(warp_fabric.find_touching, shape, outlines, gap, near, *seen, out)
+            size = out.depth.shape
+            launch(warp_fabric.press_cells, size, outlines, gap, fabric, near, out)
+            launch(warp_fabric.list_pressed, shape[1], out)
+            launch(warp_fabric.spread, size, fabric, out)
 
     def _look_near(self) -> None:
         """What is near the design, and what the gap law adds for it."""
@@ -232,6 +298,7 @@ class WarpCore:
         circuit, green, cut, rest = self.circuit, self.green, self.cut, self.left
         m, t, lead, room = circuit.electrodes, self.whole.shape[0], green.lead, self.room
         sources, modes = len(green.sources), rest.sums.shape[0]
+        gap, near, chunks = self.gap, self.near, len(self.gap.owner)
         if self._slopes is None:
             self._slopes = [
                 *(room(rows, lead, views) for rows in (3 * n, n, sources, modes)),
@@ -239,7 +306,7 @@ class WarpCore:
                 self._struct(warp_slope.Slopes, {
                     "volts": (t, m, views), "charge pull": (3 * n, lead, views),
                     "lift": (places, views),
-                    "part": (len(self.gap.owner), self.gap.columns.shape[1] + 1, places, views),
+                    "part sink": (chunks, self.gap.columns.shape[1] + 1, places, views),
                 }),
             ]  # fmt: skip
             self._slopes[-1].charge = self._slopes[0]
@@ -263,16 +330,36 @@ class WarpCore:
         launch(charges.strengths, size, green, cut, sums, strength)
         launch(pairs.forces, (3 * n, parts, views), green, cut, charge, strength, slopes.pull)
         launch(network.follow, (m, views), circuit, cut, self.whole, slopes.volts)
-        gap, near, chunks = self.gap, self.near, len(self.gap.owner)
         if chunks:
             both = self.outlines, gap
             launch(warp_slope.local_slopes, (views, chunks), *both, green, near, slopes)
             launch(warp_slope.press_slopes, views, *both, near, slopes)
         launch(network.slopes, (places, m, views), circuit, gap, near, cut, slopes, out)
+        if self.fabric is not None:
+            self._add_fabric_slopes(slopes.volts, out)
         return wp.array(
             ptr=out.ptr, dtype=wp.types.matrix(shape=(m, 6), dtype=wp.float32),
             shape=(environments, sensors, places, m), device=self.device,
         )  # fmt: skip
+
+    def _add_fabric_slopes(self, volts: Any, out: Any) -> None:
+        """Add what a fabric on the cover adds to derivatives of the electrodes' matrices."""
+        launch, fabric, state, near = self.launch, self.fabric, self.pressed, self.near
+        if self._fabric_slopes is None:
+            shape, size = state.touches.shape, state.depth.shape
+            self._fabric_slopes = self._struct(warp_fabric.FabricSlopes, {
+                "rise": shape, "owner way source": size, "part": (len(fabric.pair), *shape),
+            })  # fmt: skip
+        found, gap, (places, views) = self._fabric_slopes, self.gap, state.touches.shape
+        both = state, found
+        launch(warp_fabric.find_rise, (places, views), near, found)
+        launch(warp_fabric.cell_slopes, state.depth.shape, self.outlines, gap, fabric, near, *both)
+        launch(warp_fabric.find_sources, state.depth.shape, fabric, *both)
+        launch(warp_fabric.pair_slopes, found.part.shape, gap, fabric, *both)
+        size = places, self.circuit.electrodes, views
+        launch(
+            warp_fabric.add_slopes, size, self.circuit, fabric, self.cut.moved, found, volts, out
+        )
 
     def chips(self, readout: Readout, empty: Array, seed: int) -> WarpChips:
         """Chips for all sensors, see :class:`WarpChips`."""
@@ -298,29 +385,30 @@ def known_device(name: str) -> Any:
         raise ValueError(f"device is {name!r}; there are {known}") from error
 
 
-def as_transforms(poses: Any, room: Any) -> Any:
-    """Poses, shape (..., 7), as an array of transforms, without a copy if they are on the device.
+def as_array(what: str, values: Any, room: Any) -> Any:
+    """Numbers, or poses of shape (..., 7), as an array of the device; a copy only of the host's.
 
-    Those on the host are copied into ``room``, an array of the shape and device that are wanted.
+    Those on the host are copied into ``room``, an array of the type, shape and device that are
+    wanted: of transforms for poses.
 
     Raises:
         SceneError: They are of another shape or precision, on another device, or not contiguous.
     """
-    if not on_device(poses):
-        room.assign(np.ascontiguousarray(poses, np.float32))
+    if not on_device(values):
+        room.assign(np.ascontiguousarray(values, np.float32))
         return room
-    if not isinstance(poses, wp.array):
-        poses = wp.from_dlpack(poses)
-    if (poses.dtype, poses.shape, poses.device) == (wp.transformf, room.shape, room.device):
-        return poses
-    shape = (*room.shape, 7)
-    if (poses.shape, poses.dtype, poses.device) != (shape, wp.float32, room.device) or (
-        not poses.is_contiguous
+    if not isinstance(values, wp.array):
+        values = wp.from_dlpack(values)
+    shape = room.shape if room.dtype is wp.float32 else (*room.shape, 7)
+    if (values.dtype, values.shape, values.device) == (room.dtype, room.shape, room.device):
+        return values
+    if (values.shape, values.dtype, values.device) != (shape, wp.float32, room.device) or (
+        not values.is_contiguous
     ):
         raise SceneError(
-            f"poses are {poses.dtype.__name__} of shape {poses.shape} on {poses.device}; give "
+            f"{what} are {values.dtype.__name__} of shape {values.shape} on {values.device}; give "
             f"contiguous float32 of shape {shape} on {room.device}"
         )
-    out = wp.array(ptr=poses.ptr, dtype=wp.transform, shape=room.shape, device=room.device)
-    out.owner = poses  # whose memory it is
+    out = wp.array(ptr=values.ptr, dtype=room.dtype, shape=room.shape, device=room.device)
+    out.owner = values  # whose memory it is
     return out

@@ -185,6 +185,41 @@ def strain_place(gap: GapLaw, length: float, below: float):
 
 
 @wp.func
+def line_length(hit: Hit, length: float):
+    """Length of the field line to a nearest point; its distance where that is ``length`` or more.
+
+    Negative inside of a body.
+    """
+    off = hit.off
+    if off > 0.0 and off < length:
+        across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])
+        off = _arc(off, across, hit.way[2])
+    return off
+
+
+@wp.func
+def compressed_length(
+    outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, x: wp.vec3, v: int
+):  # fmt: skip
+    """Length of the field line through the cover from a place below it, and whose this is.
+
+    The second is a place in ``near.body``, -1 where nothing is pressed in; ``met`` is as of
+    :func:`met_by`.
+    """
+    length = gap.cover
+    body = int(-1)
+    for k in range(near.count[v]):
+        if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
+            b = near.body[k, v]
+            hit = nearest_of(outlines, near, b, v, x + wp.vec3(0.0, 0.0, near.sunk[b, v]))
+            off = line_length(hit, length)
+            if off < length:
+                length = wp.max(off, gap.cover - gap.limit)
+                body = k
+    return length, body
+
+
+@wp.func
 def _add_compressed(
     outlines: Outlines, gap: GapLaw, near: NearBodies, met: wp.int64, c: int, p: int, v: int
 ):  # fmt: skip
@@ -193,20 +228,7 @@ def _add_compressed(
     ``met`` is as of :func:`met_by`.
     """
     x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top - gap.cover)
-    length = gap.cover
-    body = int(-1)
-    for k in range(near.count[v]):
-        if ((met >> wp.int64(wp.min(k, 63))) & wp.int64(1)) != wp.int64(0):
-            b = near.body[k, v]
-            hit = nearest_of(outlines, near, b, v, x + wp.vec3(0.0, 0.0, near.sunk[b, v]))
-            off = hit.off
-            if off < length:
-                if off > 0.0:
-                    across = wp.sqrt(hit.way[0] * hit.way[0] + hit.way[1] * hit.way[1])
-                    off = _arc(off, across, hit.way[2])
-                if off < length:
-                    length = wp.max(off, gap.cover - gap.limit)
-                    body = k
+    length, body = compressed_length(outlines, gap, near, met, x, v)
     if body < 0:
         return
     k, share = strain_place(gap, length, gap.below[c])
@@ -240,7 +262,7 @@ def local_change(outlines: Outlines, gap: GapLaw, green: Response, near: NearBod
                 x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
                 best, high, body = nearest_cell(outlines, gap, green, near, met, x, v)
                 _add_cell(gap, near, c, p, best, high, body, v)
-                if gap.cover > 0.0 and gap.below[c] >= 0.0:
+                if gap.below[c] >= 0.0:
                     _add_compressed(outlines, gap, near, met, c, p, v)
 
 

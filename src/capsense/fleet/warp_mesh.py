@@ -132,7 +132,7 @@ def to_mesh(outlines: Outlines, u: int, p: wp.vec3):
 
 
 @wp.func
-def lowest_vertex(outlines: Outlines, u: int, down: wp.vec3):
+def farthest_vertex(outlines: Outlines, u: int, way: wp.vec3):
     """The vertex of a mesh that is farthest along a direction."""
     levels = outlines.levels[u]
     count = wp.int64(outlines.count[u])
@@ -145,8 +145,8 @@ def lowest_vertex(outlines: Outlines, u: int, down: wp.vec3):
     while top > 0:
         top -= 1
         k = room[top]
-        low = wp.cw_mul(outlines.low[root + k], down)
-        high = wp.cw_mul(outlines.high[root + k], down)
+        low = wp.cw_mul(outlines.low[root + k], way)
+        high = wp.cw_mul(outlines.high[root + k], way)
         best = wp.max(low, high)
         if best[0] + best[1] + best[2] > most:
             if k < leaves - 1:
@@ -160,7 +160,7 @@ def lowest_vertex(outlines: Outlines, u: int, down: wp.vec3):
                 for m in range(start, stop):
                     for corner in range(3):
                         p = outlines.triangles[outlines.first[u] + m, corner]
-                        along = wp.dot(p, down)
+                        along = wp.dot(p, way)
                         if along > most:
                             most = along
                             out = p

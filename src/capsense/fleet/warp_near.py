@@ -15,9 +15,10 @@ import warp as wp
 
 from capsense.elements.matter import SHUT
 from capsense.field.green_kernels import Green
+from capsense.field.soft import BODY
 from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
-from capsense.fleet.warp_outline import lowest_point, middle_height, nearest, reach_down
+from capsense.fleet.warp_outline import farthest_point, middle_height, nearest, reach_down
 from capsense.surface.gap_kernels import EXACT, WAYS
 
 wp.set_module_options({"enable_backward": False})
@@ -44,7 +45,7 @@ class GapLaw:
     eps: wp.float32  # its relative permittivity
     limit: wp.float32  # its largest compression [m]
     points: wp.array(dtype=wp.vec2)
-    below: wp.array(dtype=wp.float32)  # between it and a cell, thickness over eps [m], or -1
+    below: wp.array(dtype=wp.float32)  # between it and a cell, thickness over eps [m]; -1 for none
     areas: wp.array(dtype=wp.float32)
     series: wp.array(dtype=wp.float32)
     columns: wp.array2d(dtype=wp.int32)
@@ -96,6 +97,7 @@ def pack_gap(green: Green, slots: int, device: Any) -> GapLaw:
     out.log_ratio, out.terminals, out.slots = gap.log_ratio, terminals, slots
     out.least = gap.least
     out.cover, out.eps, out.limit = gap.soft.thickness, gap.soft.eps, gap.soft.limit
+    below = np.where(gap.soft.top == BODY, gap.soft.below, -1.0)  # a fabric has cells of its own
     owners = gap.terminal[gap.blocks[:-1]] if cells else np.zeros(0, np.int64)
     each = [np.flatnonzero(owners == t)[::_BLOCKS] for t in (*range(terminals), -1)]  # as they lie
     first = np.concatenate(each)
@@ -103,7 +105,7 @@ def pack_gap(green: Green, slots: int, device: Any) -> GapLaw:
     span = np.cumsum([0, *map(len, each)])
     for name, values, kind in (
         ("points", gap.points, wp.vec2), ("areas", gap.areas, wp.float32),
-        ("series", gap.series, wp.float32), ("below", gap.soft.below, wp.float32),
+        ("series", gap.series, wp.float32), ("below", below, wp.float32),
         ("columns", gap.columns, wp.int32),
         ("change", gap.change, wp.float32), ("strains", gap.soft.strains, wp.float32),
         ("pressed", gap.soft.change, wp.float32), ("blocks", gap.blocks, wp.int32),
@@ -217,7 +219,7 @@ def _is_near(outlines: Outlines, gap: GapLaw, cut: WarpCut, near: NearBodies, b:
             around = lowest <= gap.floor and 2.0 * middle - lowest >= gap.ceiling
             out = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and not around
             if lowest < gap.top:
-                near.foot[b, v] = lowest_point(outlines, u, at, scale)
+                near.foot[b, v] = farthest_point(outlines, u, at, scale, wp.vec3(0.0, 0.0, -1.0))
     return out
 
 

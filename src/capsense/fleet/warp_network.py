@@ -213,8 +213,9 @@ def follow(
 def _local_slope(
     gap: GapLaw, near: NearBodies, slopes: Slopes, k: int, i: int, j: int, v: int
 ):  # fmt: skip
-    """Derivative of the local change of an entry by a near body's pose."""
+    """Derivatives of the local change of an entry by a near body's pose, and by its ``sunk``."""
     total = wp.spatial_vector()
+    sink = float(0.0)
     columns = gap.columns.shape[1]
     volts = slopes.volts
     slot = near.slot[near.body[k, v], v]
@@ -226,13 +227,15 @@ def _local_slope(
                 if c >= 0:
                     share = volts[a, i, v] * volts[c, j, v] + volts[c, i, v] * volts[a, j, v]
                     total += 0.5 * share * slopes.part[p, col, k, v]
+                    sink += 0.5 * share * slopes.sink[p, col, k, v]
         if slot >= 0:
             c = gap.terminals + slot
             share = -volts[c, i, v] * volts[c, j, v]
             if a >= 0:
                 share += volts[a, i, v] * volts[c, j, v] + volts[c, i, v] * volts[a, j, v]
             total += share * slopes.part[p, columns, k, v]
-    return total
+            sink += share * slopes.sink[p, columns, k, v]
+    return total, sink
 
 
 @wp.kernel
@@ -257,8 +260,11 @@ def slopes(
                             total += share * (one + charge[f, c, v] * pull[f, k, v])
         for k in range(near.count[v]):
             if near.body[k, v] == b:
-                total += _local_slope(gap, near, slopes, k, i, j, v)
+                local, sink = _local_slope(gap, near, slopes, k, i, j, v)
+                total += local
                 total += total[2] * slopes.lift[b, v]
+                if near.sunk[b, v] < gap.limit:
+                    total += sink * slopes.lift[b, v]
         force = wp.spatial_top(total)
         torque = wp.spatial_bottom(total) + wp.cross(cut.moved[b, v], force)
         out[v, b, i, j] = wp.spatial_vector(circuit.metre * force, circuit.unit * torque)

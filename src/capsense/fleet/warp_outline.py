@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from capsense.elements import outline
 from capsense.elements.rigid import RigidShape
-from capsense.fleet.warp_mesh import LEVELS, Hit, Outlines, lowest_vertex, to_mesh
+from capsense.fleet.warp_mesh import LEVELS, Hit, Outlines, farthest_vertex, to_mesh
 from capsense.scene.mesh_shape import TriangleShape
 
 wp.set_module_options({"enable_backward": False})
@@ -94,29 +94,29 @@ def middle_height(outlines: Outlines, u: int, at: wp.transform, scale: float):
 
 
 @wp.func
-def lowest_point(outlines: Outlines, u: int, at: wp.transform, scale: float):
-    """The lowest point of an outline that is placed somewhere [m]; on a level face, its middle."""
+def farthest_point(outlines: Outlines, u: int, at: wp.transform, scale: float, way: wp.vec3):
+    """Point of an outline that is farthest along a direction [m]; on a level face, its middle."""
     turn = wp.transform_get_rotation(at)
     kind = outlines.kind[u]
     s = outlines.sizes[u]
-    down = wp.quat_rotate_inv(turn, wp.vec3(0.0, 0.0, -1.0))
-    far = 1.0e3 * down
+    along = wp.quat_rotate_inv(turn, way)
+    far = 1.0e3 * along
     p = wp.vec3()
     if kind == _SPHERE:
-        p = s[0] * down
+        p = s[0] * along
     elif kind == _CAPSULE:
-        p = s[0] * down + wp.vec3(0.0, 0.0, wp.clamp(far[2], -s[1], s[1]))
+        p = s[0] * along + wp.vec3(0.0, 0.0, wp.clamp(far[2], -s[1], s[1]))
     elif kind == _CYLINDER:
         beside = wp.sqrt(far[0] * far[0] + far[1] * far[1])
         p = wp.min(beside, s[0]) / wp.max(beside, 1e-12) * far
         p[2] = wp.clamp(far[2], -s[1], s[1])
     elif kind == _ELLIPSOID:
-        p = wp.cw_mul(s, wp.normalize(wp.cw_mul(s, down)))
+        p = wp.cw_mul(s, wp.normalize(wp.cw_mul(s, along)))
     elif kind == _BOX:
         for k in range(3):
             p[k] = wp.clamp(far[k], -s[k], s[k])
     else:
-        p = lowest_vertex(outlines, u, down)
+        p = farthest_vertex(outlines, u, along)
     return wp.transform_point(at, scale * p)
 
 

@@ -2,7 +2,8 @@
 
 The lengths of field lines are differenced as a body moves, as they are nearly linear in its pose;
 what the table has of them, and the share of a cell, are differentiated. For bodies that are pressed
-out of the face, what they are moved by is differentiated at the point that touches.
+out of the face, what they are moved by is differentiated at the point that touches. In a cover
+they stand lower by as much, up to its largest compression, which is differentiated apart.
 Lengths in metres, 4π eps0 = 1.
 """
 
@@ -13,7 +14,15 @@ import math
 import warp as wp
 
 from capsense.fleet.warp_cut import Response, smooth
-from capsense.fleet.warp_gap import lengths, met_by, nearest_cell, place_of
+from capsense.fleet.warp_gap import (
+    compressed_length,
+    lengths,
+    line_length,
+    met_by,
+    nearest_cell,
+    place_of,
+    strain_place,
+)
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_near import GapLaw, NearBodies, nearest_of
 from capsense.fleet.warp_outline import nearest
@@ -43,6 +52,7 @@ class Slopes:
     pull: wp.array3d(dtype=wp.spatial_vector)  # forces on leaves, (l, lead, v)
     part: wp.array4d(dtype=wp.spatial_vector)  # of their part, the node's last, (p, n + 1, b, v)
     lift: wp.array2d(dtype=wp.spatial_vector)  # of what presses a body out, (b, v)
+    sink: wp.array4d(dtype=wp.float32)  # of their part by ``NearBodies.sunk``, (p, n + 1, b, v)
 
 
 @wp.func
@@ -83,6 +93,7 @@ def local_slopes(outlines: Outlines, gap: GapLaw, green: Response, near: NearBod
     for k in range(near.count[v]):
         for col in range(columns + 1):
             out.part[p, col, k, v] = wp.spatial_vector()
+            out.sink[p, col, k, v] = 0.0
     grounded = gap.owner[p] < 0
     if near.count[v] == 0 or (grounded and near.columns[v] == gap.terminals):
         return
@@ -92,20 +103,30 @@ def local_slopes(outlines: Outlines, gap: GapLaw, green: Response, near: NearBod
             for c in range(gap.blocks[q], gap.blocks[q + 1]):
                 x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top)
                 best, high, k = nearest_cell(outlines, gap, green, near, met, x, v)
-                if k >= 0 and high > best and best < _REACH1 * gap.validity:
+                if k >= 0 and high > best:
                     b = near.body[k, v]
-                    way, up = _turns(outlines, gap, green, near, x, b, v)
-                    for col in range(columns + 1):
-                        slope = _cell_slope(gap, c, col, best, high, way, up)
-                        out.part[p, col, k, v] = out.part[p, col, k, v] + slope
+                    sunk = near.sunk[b, v]
+                    if best < _REACH1 * (gap.validity + sunk):
+                        way, up = _turns(outlines, gap, green, near, x, x, b, v)
+                        if sunk > 0.0:
+                            low = x + wp.vec3(0.0, 0.0, sunk)
+                            way, _up = _turns(outlines, gap, green, near, x, low, b, v)
+                        for col in range(columns + 1):
+                            slope, sink = _cell_slope(gap, c, col, sunk, best, high, way, up)
+                            out.part[p, col, k, v] = out.part[p, col, k, v] + slope
+                            out.sink[p, col, k, v] = out.sink[p, col, k, v] + sink
+                if gap.below[c] >= 0.0:
+                    _add_compressed_slope(outlines, gap, near, out, met, c, p, v)
 
 
 @wp.func
 def _turns(
-    outlines: Outlines, gap: GapLaw, green: Response, near: NearBodies, x: wp.vec3, b: int, v: int
+    outlines: Outlines, gap: GapLaw, green: Response, near: NearBodies, x: wp.vec3, y: wp.vec3,
+    b: int, v: int,
 ):  # fmt: skip
-    """Differences of the lengths of two field lines over those of a body's pose.
+    """Differences of the lengths of two field lines from x over those of a body's pose.
 
+    The body is lower than it stands by as much as y is above x.
     They step where the nearest point comes to another face or edge, so that they are taken on the
     side where it does not.
     """
@@ -113,7 +134,7 @@ def _turns(
     u = near.choice[e, b]
     scale = near.scale[e, b]
     at = near.pose[b, v]
-    here = nearest(outlines, u, at, scale, x)
+    here = nearest(outlines, u, at, scale, y)
     best, high = lengths(gap, green, here, x)
     step = _STEP * gap.validity
     arm = wp.max(scale * near.radius[u], gap.validity)
@@ -122,8 +143,8 @@ def _turns(
     six = int(6)  # not unrolled
     for r in range(six):
         change = wp.where(r < 3, step, step / arm)
-        one = nearest(outlines, u, _moved(at, r, change), scale, x)
-        two = nearest(outlines, u, _moved(at, r, -change), scale, x)
+        one = nearest(outlines, u, _moved(at, r, change), scale, y)
+        two = nearest(outlines, u, _moved(at, r, -change), scale, y)
         a, d = lengths(gap, green, one, x)
         f, g = lengths(gap, green, two, x)
         if (one.faces == here.faces) == (two.faces == here.faces):
@@ -141,18 +162,69 @@ def _turns(
 
 @wp.func
 def _cell_slope(
-    gap: GapLaw, c: int, col: int, best: float, high: float, way: wp.spatial_vector,
+    gap: GapLaw, c: int, col: int, sunk: float, best: float, high: float, way: wp.spatial_vector,
     up: wp.spatial_vector,
 ):  # fmt: skip
-    """Derivative of what a cell changes in a column, from those of the two lengths."""
-    place = (best / gap.validity - _REACH0) / (_REACH1 - _REACH0)
+    """Derivatives of what a cell changes in a column, from those of the two lengths.
+
+    The second is by how much lower than it is solved for the body stands, ``sunk``.
+    """
+    scale = gap.validity + sunk
+    place = (best / scale - _REACH0) / (_REACH1 - _REACH0)
     inner = wp.clamp(place, 0.0, 1.0)
     weight = 1.0 - smooth(place)
-    fade = -6.0 * inner * (1.0 - inner) / ((_REACH1 - _REACH0) * gap.validity)
+    fade = -6.0 * inner * (1.0 - inner) / ((_REACH1 - _REACH0) * scale)
     true, by_true = _slope_of(gap, c, col, best)
     lifted, by_lifted = _slope_of(gap, c, col, high)
-    slope = (fade * (true - lifted) + weight * by_true) * way - weight * by_lifted * up
-    return gap.areas[c] / (4.0 * _PI) * slope
+    area = gap.areas[c] / (4.0 * _PI)
+    by_best = fade * (true - lifted) + weight * by_true
+    sink = -by_best * way[2] - fade * best / scale * (true - lifted)
+    return area * (by_best * way - weight * by_lifted * up), area * sink
+
+
+@wp.func
+def _add_compressed_slope(
+    outlines: Outlines, gap: GapLaw, near: NearBodies, out: Slopes, met: wp.int64, c: int, p: int,
+    v: int,
+):  # fmt: skip
+    """Add the derivatives of what a cell changes as a body is pressed into the cover above it."""
+    x = wp.vec3(gap.points[c][0], gap.points[c][1], gap.top - gap.cover)
+    length, k = compressed_length(outlines, gap, near, met, x, v)
+    if k < 0 or length <= gap.cover - gap.limit:
+        return
+    b = near.body[k, v]
+    way = line_turns(outlines, gap, near, x + wp.vec3(0.0, 0.0, near.sunk[b, v]), b, v)
+    m, _share = strain_place(gap, length, gap.below[c])
+    rest = gap.below[c] * gap.eps
+    low = 1.0 / (rest + (1.0 - gap.strains[m]) * gap.cover)
+    high = 1.0 / (rest + (1.0 - gap.strains[m + 1]) * gap.cover)
+    slope = -gap.areas[c] / (4.0 * _PI * gap.cover * (high - low) * wp.pow(rest + length, 2.0))
+    for col in range(gap.columns.shape[1] + 1):
+        value = slope * (gap.pressed[c, m + 1, col] - gap.pressed[c, m, col])
+        out.part[p, col, k, v] = out.part[p, col, k, v] + value * way
+        out.sink[p, col, k, v] = out.sink[p, col, k, v] - value * way[2]
+
+
+@wp.func
+def line_turns(
+    outlines: Outlines, gap: GapLaw, near: NearBodies, x: wp.vec3, b: int, v: int
+):  # fmt: skip
+    """Differences of the length of a field line through the cover over those of a body's pose."""
+    e = v // near.sensors
+    u = near.choice[e, b]
+    scale = near.scale[e, b]
+    at = near.pose[b, v]
+    step = _STEP * gap.validity
+    arm = wp.max(scale * near.radius[u], gap.validity)
+    way = wp.spatial_vector()
+    six = int(6)  # not unrolled
+    for r in range(six):
+        change = wp.where(r < 3, step, step / arm)
+        one = nearest(outlines, u, _moved(at, r, change), scale, x)
+        two = nearest(outlines, u, _moved(at, r, -change), scale, x)
+        far = 2.0 * gap.cover
+        way[r] = (line_length(one, far) - line_length(two, far)) / (2.0 * change)
+    return way
 
 
 @wp.kernel

@@ -17,12 +17,14 @@ from capsense.elements.outline import middle_height, nearest, reach_down
 
 STEPS = 60
 """Steps up to a surface at most."""
-_COARSE, _FINE = 16, 32
+COARSE, FINE = 16, 32
 """Cells along each side of the grid that finds a contact, and of that which it is integrated on."""
-_EXACT = 1e-4
+EXACT = 1e-4
 """How exactly heights are found, over the cover's thickness."""
 _RASTER = 32
 """Cells along each side of the raster that an electrode's outline is kept on."""
+_ROUNDING = 1e-12
+"""Areas in common with an electrode, over its own, that are no more than this are rounding."""
 _BISECTIONS = 200
 """Bisections at most; double precision is reached before."""
 
@@ -208,14 +210,14 @@ def heights(
     """
     top = cover.upper[2]
     thickness = top - cover.lower[2]
-    exact, highest = _EXACT * thickness, top
+    exact, highest = EXACT * thickness, top
     low, high, size = np.empty(2), np.empty(2), np.empty(2)
     for i in range(2):
         low[i] = max(spans[:, 2 * i].min(), cover.lower[i])
         high[i] = min(spans[:, 2 * i + 1].max(), cover.upper[i])
     if held:
         highest = spans[:, 5].max()
-    points = np.empty((_COARSE * _COARSE, 2))
+    points = np.empty((COARSE * COARSE, 2))
     _grid(low, high, points, size)
     height = undersides(bodies, points, highest, exact)
     limit = height.min() + thickness if held else top
@@ -228,7 +230,7 @@ def heights(
                 end[i] = max(end[i], points[k, i])
     for i in range(2):
         low[i], high[i] = max(low[i], start[i] - size[i]), min(high[i], end[i] + size[i])
-    fine = np.empty((_FINE * _FINE, 2))
+    fine = np.empty((FINE * FINE, 2))
     _grid(low, high, fine, size)
     grid = np.array([low[0], low[1], size[0], size[1]])
     return undersides(bodies, fine, highest, exact) - top, grid
@@ -266,11 +268,11 @@ def electrode_forces(
         pressed = depth - height[k]
         if pressed <= 0.0:
             continue
-        x, y = grid[0] + grid[2] * (k // _FINE), grid[1] + grid[3] * (k % _FINE)
+        x, y = grid[0] + grid[2] * (k // FINE), grid[1] + grid[3] * (k % FINE)
         load = pressure(pressed / thickness, cover)
         for i in range(cover.low.shape[0]):
             area = _area_in(i, x, y, x + grid[2], y + grid[3], cover)
-            if area > 0.0:
+            if area > _ROUNDING * cover.sums[i, -1, -1]:
                 force[i] += area * load
                 deepest[i] = max(deepest[i], min(pressed, limit))
 
