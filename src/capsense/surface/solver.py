@@ -75,7 +75,7 @@ class Preset:
 
 PRESETS = {
     "standard": Preset(),
-    "learning": Preset(panels=300, threshold=0.08, coarsest=0.95, finest=None),
+    "learning": Preset(panels=300, threshold=0.05, coarsest=0.95, finest=None),
     "fine": Preset(panels=1000, threshold=0.004, coarsest=0.44, finest=3e-3),
 }
 """Presets by name."""
