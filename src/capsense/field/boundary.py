@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from shapely.geometry import Polygon
 
 from capsense.constants import EPS0
 from capsense.design.geometry import Facet
@@ -128,18 +130,31 @@ def _fitted(design: Design) -> float:
 
     Sizes are halved from the coarsest on, so that no cut has many more panels than are allowed.
     """
-    scale, count = _COARSEST, _cut(design, _COARSEST).panels.size
+
+    def count_at(scale: float) -> int:
+        return sum(len(part.pieces) for part in _pieces(design, scale))
+
+    scale, count = _COARSEST, count_at(_COARSEST)
     while scale > 1.0 and count * 2**POWER < 1.5 * _MANY:
         scale /= 2
-        count = _cut(design, scale).panels.size
+        count = count_at(scale)
     if scale > 1.0 or count > _MANY:
         return scale * (count / _MANY) ** (1 / POWER)
     return float(np.clip((count / _FEW) ** (1 / POWER), _FINEST, 1.0))
 
 
-def _cut(design: Design, scale: float) -> BoundaryModel:
-    """Cut a design into panels of the default sizes times ``scale``."""
-    floor = design.domain.floor
+class _Part(NamedTuple):
+    """A facet that is cut, one panel a piece."""
+
+    facet: Facet
+    owner: int
+    grading: Grading
+    pieces: list[Polygon]
+
+
+def _pieces(design: Design, scale: float) -> list[_Part]:
+    """Cut facets of sheets, then interfaces, then walls into pieces of the default sizes times
+    ``scale``."""
     names = terminals(design)
     sheets: list[tuple[Facet, int]] = []
     flat: list[bool] = []
@@ -155,24 +170,14 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
         gaps[few] = smallest_gaps([sheets[k] for k in few])
         spacings[few] = plane_spacings([sheets[k] for k in few])
     thin = min((thickness_of(la) for la in design.layers), default=math.inf)
-
-    parts: list[Panels] = []
-    owners: list[NDArray[np.int64]] = []
+    out: list[_Part] = []
 
     def add(facet: Facet, owner: int, grading: Grading, reach: float) -> None:
-        pieces = cut_facet(facet, rims, grading, reach)
-        if not pieces:
-            return
-        panels = make_panels(facet, pieces)
-        parts.append(panels)
-        owners.append(np.full(panels.size, owner, dtype=np.int64))
+        out.append(_Part(facet, owner, grading, cut_facet(facet, rims, grading, reach)))
 
-    reach = 2.5 * thin if math.isfinite(thin) else 0.0
-    gradings: list[Grading] = []
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
-        gradings.append(sheet_grading(facet, gap, spacing, scale))
-        add(facet, owner, gradings[-1], 2.5 * spacing)
-    sheet_panels = sum(p.size for p in parts)
+        add(facet, owner, sheet_grading(facet, gap, spacing, scale), 2.5 * spacing)
+    reach = 2.5 * thin if math.isfinite(thin) else 0.0
     for facet, thickness in interfaces(design, [facet for facet, _ in sheets]):
         edge = scale * min(3e-4, 0.3 * thickness)
         largest = scale * min(0.006, max(1.25 * thickness, 0.001))
@@ -180,13 +185,20 @@ def _cut(design: Design, scale: float) -> BoundaryModel:
         add(facet, INTERFACE, _grading(facet, edge, largest, scale), reach)
     for facet in walls(design):
         add(facet, GROUND, _wall_grading(design, scale), 0.0)
+    return out
 
-    panels = concatenate(parts)
+
+def _cut(design: Design, scale: float) -> BoundaryModel:
+    """Cut a design into panels of the default sizes times ``scale``."""
+    parts = _pieces(design, scale)
+    sheets = parts[: sum(len(body.surface.facets) for body in design.sheets)]
+    owners = [np.full(len(part.pieces), part.owner, np.int64) for part in parts]
+    panels = concatenate([make_panels(p.facet, p.pieces) for p in parts if p.pieces])
     step = 1e-7 * panels.normals
     front, back = (eps_at(design, panels.centers + side * step) for side in (1, -1))
     return BoundaryModel(
-        panels, np.concatenate(owners), front, back, floor, len(names),
-        tuple(zip(sheets, gradings, strict=True)), sheet_panels,
+        panels, np.concatenate(owners), front, back, design.domain.floor, len(terminals(design)),
+        tuple(((p.facet, p.owner), p.grading) for p in sheets), sum(len(p.pieces) for p in sheets),
     )  # fmt: skip
 
 
