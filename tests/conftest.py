@@ -100,7 +100,8 @@ LAYERS = {
     "e2e": "adapters benchmarks cli learning recording reproduce server unity viewer "
     "field/test_cache.py field/test_shipped.py fleet/test_autograd.py "
     "fleet/test_genesis.py fleet/test_isaac_lab.py fleet/test_mjlab.py "
-    "fleet/test_parallel_simulators.py mesh/test_gmsh_mesher.py test_assistive_gym_patch.py "
+    "fleet/test_parallel_simulators.py mesh/test_gmsh_mesher.py surface/test_soft_gap.py "
+    "test_assistive_gym_patch.py "
     "test_contributing.py test_copies.py test_damaged.py test_examples.py test_from_the_paper.py "
     "test_kernel_cache.py test_pages.py test_simulator_estimate.py test_simulator_examples.py "
     "test_troubleshooting.py test_tutorials.py test_validation_page.py",

@@ -15,7 +15,13 @@ def test_all_groups_are_kept():
     assert list(KEPT) == list(kept_cases.groups())
 
 
-@pytest.mark.parametrize("group", list(KEPT))
+SLOW = "masked", "fields"
+"""Groups that are worked out within a minute or more."""
+
+
+@pytest.mark.parametrize(
+    "group", [pytest.param(g, marks=pytest.mark.e2e) if g in SLOW else g for g in KEPT]
+)
 def test_results_are_kept(group, simulators):
     found, kept = kept_cases.groups()[group](simulators), KEPT[group]
     assert {case: list(row) for case, row in found.items()} == {

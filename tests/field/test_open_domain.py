@@ -38,6 +38,7 @@ def boxed(field_cache: Path) -> cs.Simulator:
     return cs.Simulator(disc(), cache_dir=field_cache)
 
 
+@pytest.mark.e2e
 def test_disc_alone_has_the_capacitance_of_the_textbook(sim, boxed):
     """8 eps0 a (Jackson, Classical Electrodynamics, section 3.13), of a polygon, by panels."""
     expected = 8 * EPS0 * RADIUS
@@ -45,6 +46,7 @@ def test_disc_alone_has_the_capacitance_of_the_textbook(sim, boxed):
     assert boxed.baseline[0, 0] > 1.01 * expected
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("z", [0.05, 0.1, 0.2, 0.35])
 @pytest.mark.parametrize("b", [0.005, 0.015])
 def test_small_ball_sees_the_potential_of_a_disc(sim, z, b):
@@ -62,6 +64,7 @@ def test_small_ball_sees_the_potential_of_a_disc(sim, z, b):
     assert found == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.e2e
 def test_walls_pull_the_field_of_a_far_ball_down(sim, boxed):
     """Beside the far wall of a box a ball is hardly seen; without walls it is."""
     scene = cs.Scene([cs.Body(cs.Sphere(0.015), cs.Pose((0, 0, 0.35)), "steel")])

@@ -52,10 +52,23 @@ def largest(sim: cs.Simulator, *bodies: cs.Body) -> float:
     return float(np.diag(sim.step(cs.Scene(list(bodies))).delta).max())
 
 
-@pytest.mark.parametrize("case", REFERENCES, ids=[c["category"] for c in REFERENCES])
+def path_of(design: str) -> Path:
+    return DATA / "near_designs" / f"{design}.toml"
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(c, id=c["category"], marks=[pytest.mark.e2e] * path_of(c["design"]).exists())
+        for c in REFERENCES
+    ],
+)
 def test_readings_with_bodies_near_each_other(simulators, case):
-    """Boundary elements of sensor and bodies together; large entries are right to 5 %."""
-    path = DATA / "near_designs" / f"{case['design']}.toml"
+    """Boundary elements of sensor and bodies together; large entries are right to 5 %.
+
+    Fields of designs that do not come with the package take a minute to build.
+    """
+    path = path_of(case["design"])
     sim = simulators(str(path) if path.exists() else case["design"])
     reading = sim.step(cs.Scene([body_of_json(b) for b in case["bodies"]]))
     truth = FEMTO * np.diag(case["delta_fF"])

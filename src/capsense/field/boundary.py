@@ -143,7 +143,7 @@ def _fitted(design: Design) -> float:
     return float(np.clip((count / _FEW) ** (1 / POWER), _FINEST, 1.0))
 
 
-class _Part(NamedTuple):
+class _CutFacet(NamedTuple):
     """A facet that is cut, one panel a piece."""
 
     facet: Facet
@@ -152,7 +152,7 @@ class _Part(NamedTuple):
     pieces: list[Polygon]
 
 
-def _pieces(design: Design, scale: float) -> list[_Part]:
+def _pieces(design: Design, scale: float) -> list[_CutFacet]:
     """Cut facets of sheets, then interfaces, then walls into pieces of the default sizes times
     ``scale``."""
     names = terminals(design)
@@ -170,10 +170,10 @@ def _pieces(design: Design, scale: float) -> list[_Part]:
         gaps[few] = smallest_gaps([sheets[k] for k in few])
         spacings[few] = plane_spacings([sheets[k] for k in few])
     thin = min((thickness_of(la) for la in design.layers), default=math.inf)
-    out: list[_Part] = []
+    out: list[_CutFacet] = []
 
     def add(facet: Facet, owner: int, grading: Grading, reach: float) -> None:
-        out.append(_Part(facet, owner, grading, cut_facet(facet, rims, grading, reach)))
+        out.append(_CutFacet(facet, owner, grading, cut_facet(facet, rims, grading, reach)))
 
     for (facet, owner), gap, spacing in zip(sheets, gaps, spacings, strict=True):
         add(facet, owner, sheet_grading(facet, gap, spacing, scale), 2.5 * spacing)
