@@ -133,18 +133,35 @@ def list_pressed(out: FabricState):
     out.count[v] = count
 
 
+@wp.func
+def _carried(fabric: Fabric, state: FabricState, c: int, v: int):
+    """Compression of a cell as the fabric carries it on, and the cell that it comes from."""
+    source = c
+    most = state.pressed[c, v]
+    if fabric.bending > 0.0:
+        for k in range(state.count[v]):
+            q = state.cell[k, v]
+            far = wp.length(fabric.points[c] - fabric.points[q]) / fabric.bending
+            depth = state.pressed[q, v] * wp.exp(-far)
+            if far < _FAR and depth > most:
+                most = depth
+                source = q
+    return most, source
+
+
 @wp.kernel
 def spread(fabric: Fabric, out: FabricState):
     """Compression of the cells as the fabric carries it on, (f, v)."""
     c, v = wp.tid()
-    depth = out.pressed[c, v]
-    if fabric.bending > 0.0:
-        for k in range(out.count[v]):
-            q = out.cell[k, v]
-            far = wp.length(fabric.points[c] - fabric.points[q]) / fabric.bending
-            if far < _FAR:
-                depth = wp.max(depth, out.pressed[q, v] * wp.exp(-far))
-    out.depth[c, v] = depth
+    most, _source = _carried(fabric, out, c, v)
+    out.depth[c, v] = most
+
+
+@wp.func
+def _product(gap: GapLaw, fabric: Fabric, c: int, columns: wp.vec2i, k: int):
+    """Product of two densities at a cell, times the square of the rest of the thickness [V²]."""
+    rest = 1.0 - gap.strains[k]
+    return fabric.density[c, k, columns[0]] * fabric.density[c, k, columns[1]] * rest * rest
 
 
 @wp.func
@@ -156,10 +173,8 @@ def _swept(gap: GapLaw, fabric: Fabric, c: int, columns: wp.vec2i, strain: float
         end = gap.strains[k + 1]
         stop = wp.min(end, strain)
         if stop > start:
-            one = fabric.density[c, k, columns[0]] * fabric.density[c, k, columns[1]]
-            two = fabric.density[c, k + 1, columns[0]] * fabric.density[c, k + 1, columns[1]]
-            one *= (1.0 - start) * (1.0 - start)
-            two *= (1.0 - end) * (1.0 - end)
+            one = _product(gap, fabric, c, columns, k)
+            two = _product(gap, fabric, c, columns, k + 1)
             share = (stop - start) / (end - start)
             mean = one + 0.5 * share * (two - one)
             out += mean * (stop - start) / ((1.0 - stop) * (1.0 - start))
@@ -230,15 +245,7 @@ def cell_slopes(
 def find_sources(fabric: Fabric, state: FabricState, out: FabricSlopes):
     """Cells whose compression is carried on to others, (f, v)."""
     c, v = wp.tid()
-    source = c
-    most = state.pressed[c, v]
-    if fabric.bending > 0.0:
-        for k in range(state.count[v]):
-            q = state.cell[k, v]
-            far = wp.length(fabric.points[c] - fabric.points[q]) / fabric.bending
-            if far < _FAR and state.pressed[q, v] * wp.exp(-far) > most:
-                most = state.pressed[q, v] * wp.exp(-far)
-                source = q
+    _most, source = _carried(fabric, state, c, v)
     out.source[c, v] = source
 
 
@@ -250,10 +257,8 @@ def _swept_slope(gap: GapLaw, fabric: Fabric, c: int, columns: wp.vec2i, strain:
         start = gap.strains[k]
         end = gap.strains[k + 1]
         if start <= strain and strain < end:
-            one = fabric.density[c, k, columns[0]] * fabric.density[c, k, columns[1]]
-            two = fabric.density[c, k + 1, columns[0]] * fabric.density[c, k + 1, columns[1]]
-            one *= (1.0 - start) * (1.0 - start)
-            two *= (1.0 - end) * (1.0 - end)
+            one = _product(gap, fabric, c, columns, k)
+            two = _product(gap, fabric, c, columns, k + 1)
             slope = (two - one) / (end - start)
             mean = one + 0.5 * slope * (strain - start)
             out = mean / ((1.0 - strain) * (1.0 - strain))
