@@ -18,6 +18,8 @@ from machine import describe_machine
 from numpy.typing import NDArray
 
 import capsense as cs
+from capsense.design import film, shapes
+from capsense.design.model import Design
 from capsense.field.boundary import Accuracy, BoundarySolution
 from capsense.field.gap_table import PlaneResponse
 from capsense.field.panels import Panels
@@ -27,6 +29,8 @@ DESIGN, PLACE = "arm_segment", (0.0, -0.021)
 """The second electrode is the highest, and this its middle [m]."""
 RADII, GAPS = (0.020, 0.006), (0.3e-3, 0.5e-3, 1e-3, 2e-3, 3e-3, 5e-3, 10e-3)
 PRESETS = "learning", "standard", "fine"
+ROUND = 1 / 4000
+"""Flat strips of the reference leave its round surfaces by this part of the radius."""
 AROUND, GROWTH, WIDEST = 28, 1.35, 0.28
 """Triangles around a ball; growth of its rings, and the widest of them [rad]."""
 RULE = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6
@@ -63,22 +67,32 @@ def panels(corners: Array) -> Panels:
     )  # fmt: skip
 
 
+def round_design() -> Design:
+    """The design with so many strips that its face is round where gaps are small."""
+    usual = film.STRIP_ERROR, shapes.STRIP_ERROR, shapes.MAX_SEGMENTS
+    film.STRIP_ERROR = shapes.STRIP_ERROR = ROUND
+    shapes.MAX_SEGMENTS = 1000
+    out = cs.load_design(DESIGN)
+    film.STRIP_ERROR, shapes.STRIP_ERROR, shapes.MAX_SEGMENTS = usual
+    return out
+
+
 def main() -> None:
     """Print errors of the presets."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--panels", type=float, default=0.6, help="size of the design's panels")
+    parser.add_argument("--panels", type=float, default=1.0, help="size of the design's panels")
     options = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)  # near contact
     machine = describe_machine(("numpy", "numba"))
-    solution = BoundarySolution(cs.load_design(DESIGN), Accuracy(options.panels))
+    solution = BoundarySolution(round_design(), Accuracy(options.panels, fitted=False))
     model = solution.model
     print(f"{machine['processor']}; {DESIGN}, {model.panels.size} panels")
-    densities = solution.densities(np.eye(model.n_terminals))
+    densities, response = solution.densities(np.eye(model.n_terminals)), PlaneResponse(solution)
     sims = {preset: cs.Simulator(DESIGN, preset=preset) for preset in PRESETS}
     print("radius [mm]  gap [mm]  change [fF]  " + "  ".join(f"{p:>8} [%]" for p in PRESETS))
     for radius in RADII:
         for gap in GAPS:
-            found = PlaneResponse(solution, panels(ball(radius, gap))).at(0.0, densities)
+            found = response.at(panels(ball(radius, gap)), densities)
             gained = model.panels.areas @ (found.change[:, 1] * (model.owner == 1))
             body = cs.Body(cs.Sphere(radius), cs.Pose((*PLACE, radius + gap)))
             errors = []

@@ -13,13 +13,12 @@ from capsense.constants import EPS0
 from capsense.design import parse_design
 from capsense.design.model import Design
 from capsense.field.boundary import Accuracy, BoundarySolution
+from capsense.field.face import has_even_face, plane_panels
 from capsense.field.gap_table import (
     GapTable,
     PlaneResponse,
     build_gap_table,
     from_arrays,
-    has_even_face,
-    plane_panels,
     to_arrays,
 )
 from capsense.field.green_points import is_flat
@@ -115,8 +114,8 @@ def test_the_plane_screens_electrodes_from_one_another():
 def test_charges_are_those_of_design_and_plane_solved_anew():
     solution, densities = _solved(PAD)
     n, height = solution.model.panels.size, 8e-4
-    plane = plane_panels(solution, 8 * UNIT)
-    change = PlaneResponse(solution, plane).at(height, densities).change
+    plane = plane_panels(solution, 8 * UNIT).at(height)
+    change = PlaneResponse(solution).at(plane, densities).change
     text = PAD + (
         '[[conductor]]\nname = "plane"\nrole = "shield"\nshape = "rectangle"\n'
         f"size = [{np.ptp(plane.edges[..., 0])}, {np.ptp(plane.edges[..., 1])}]\n"

@@ -170,7 +170,8 @@ def test_what_hangs_beside_or_behind_stays_there() -> None:
     """Invariant: triangles over the face are put on it, those beside and far behind are not."""
     vertices, faces = sheet(0.0)
     rest = RestSurface(vertices, faces)
-    face = Face(np.full(2, -0.01), np.full(2, 0.01), 0.0, 0.0)
+    corners = np.array([[-0.01, -0.01, 0.0], [0.01, 0.01, 0.0]])
+    face = Face(corners, corners, None, 0.0, 0.0)
 
     def heights(z: Array) -> tuple[Array, Array]:
         moved = np.column_stack([vertices[:, :2], z])

@@ -19,6 +19,7 @@ from shapely.geometry.polygon import orient
 
 from capsense._validate import nearest, read_toml, suggest
 from capsense.design.cover import read_cover
+from capsense.design.film import Film, bend_sheet, is_level, read_bend
 from capsense.design.geometry import (
     PLACEMENT_KEYS,
     TOUCH,
@@ -32,15 +33,7 @@ from capsense.design.geometry import (
     read_placement,
 )
 from capsense.design.model import Conductor, Design, Domain, Electrode, Layer, Role, check_design
-from capsense.design.shapes import (
-    SHAPES,
-    bend_sheet,
-    box_surface,
-    cylinder_surface,
-    is_level,
-    planar_surface,
-    read_bend,
-)
+from capsense.design.shapes import SHAPES, box_surface, cylinder_surface, planar_surface
 from capsense.errors import DesignError
 
 LAYER_EPS_R: dict[str, float] = read_toml(
@@ -174,6 +167,7 @@ def parse_design(
         )
         layers.append(layer)
         conductors += [fabric] if fabric is not None else []
+    film = None
     if "bend" in data:
         radius = read_bend(DesignTable(data["bend"], source, "bend", limit))
         if slabs := [layer.name for layer in layers if not layer.facets]:
@@ -181,6 +175,8 @@ def parse_design(
                 f'{source}: layer "{slabs[0]}": flat layers cannot be bent; remove them or [bend], '
                 'or give a shape = "cylinder" or "stl", which keeps its place'
             )
+        sheets = {e.name: e.surface for e in electrodes} | {c.name: c.surface for c in conductors}
+        film = Film(radius, {name: s for name, s in sheets.items() if is_level(s)})
         electrodes = [Electrode(e.name, _bent(e, radius, source)) for e in electrodes]
         conductors = [Conductor(c.name, c.role, _bent(c, radius, source)) for c in conductors]
     build = _read_build(DesignTable(data.get("build", {}), source, "build"))
@@ -193,6 +189,7 @@ def parse_design(
         description=description,
         build=build,
         cover=cover,
+        film=film,
     )
     check_design(design, source=source)
     return design

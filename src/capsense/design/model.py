@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.cover import Cover
+from capsense.design.film import Film
 from capsense.design.geometry import (
     TOUCH,
     Facet,
@@ -158,6 +159,8 @@ class Design:
     cover: Cover | None = None
     """How the outermost layer gives way, if it does; the layer itself, and the fabric on it if
     any, are among ``layers`` and ``conductors``."""
+    film: Film | None = None
+    """What ``[bend]`` rolled onto a cylinder, if it did, as it was before."""
 
     def content_hash(self) -> str:
         """SHA-256 (hex) over the geometry, materials and domain.
@@ -175,6 +178,7 @@ class Design:
         lines.append(f"domain {_nanometres(np.array([*self.domain.size, self.domain.backplane]))}")
         lines += ["open"] * self.domain.open
         lines += ["its cover gives way"] * (self.cover is not None)
+        lines += [] if self.film is None else [f"bent {_nanometres(np.array(self.film.radius))}"]
         for electrode in self.electrodes:
             lines += ["electrode", *_surface_lines(electrode.surface)]
         others = [
@@ -214,6 +218,7 @@ class Design:
                 replace(c, surface=c.surface.measured_in(unit)) for c in self.conductors
             ),
             cover=None if self.cover is None else self.cover.measured_in(unit),
+            film=None if self.film is None else self.film.measured_in(unit),
         )  # fmt: skip
         out.__dict__["unit"] = 1.0  # but for rounding
         return out

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense._jit import compiled
+from capsense.design.film import Film
 from capsense.elements.pieces import STEP_SLOPE, ChangingBody, PieceArrays
 from capsense.scene.geometry_kernels import Boxes, enclosed
 
@@ -19,12 +20,14 @@ Ints = NDArray[np.int64]
 
 
 class Face(NamedTuple):
-    """The face of a flat design."""
+    """The face of a design."""
 
-    low: Array
-    """Its lower corner along x and y [m], shape (2,)."""
-    high: Array
-    """Its upper corner [m], shape (2,)."""
+    corners: Array
+    """Corners of the design in coordinates of its face [m], shape (2, 3) …"""
+    box: Array
+    """… and in the sensor frame [m], shape (2, 3)."""
+    film: Film | None
+    """The film that it is the face of, if that is bent."""
     top: float
     """Its height [m]."""
     floor: float
@@ -53,23 +56,27 @@ def near_triangles(
         return None
     scale = float(record["scale"])
     turn, position = scale * record["rotation"], record["position"]
-    walls = np.array([face.low - reach, face.high + reach])
+    walls = face.box[:, :2] + [[-reach], [reach]]
     chosen = _within(body.pieces.centers, body.pieces.moments, body.order, turn, scale, position,
                      walls, face.top + reach)  # fmt: skip
     if not len(chosen):
         return None
     corners = _triangles_of(body.pieces, body.order, chosen)
     placed = corners @ turn.T + position
+    if face.film is not None:
+        placed = face.film.coordinates(placed)
     heights = placed[..., 2]
     lowest = heights.min(axis=1)
     if lowest.min() >= face.top + near or heights.max() < face.top - reach:
         return None
     below = (lowest < face.floor) & (lowest > face.top - reach)
     if below.any():
-        below &= (placed[..., :2].min(axis=1) < face.high).all(axis=1)
-        below &= (placed[..., :2].max(axis=1) > face.low).all(axis=1)
+        below &= (placed[..., :2].min(axis=1) < face.corners[1, :2]).all(axis=1)
+        below &= (placed[..., :2].max(axis=1) > face.corners[0, :2]).all(axis=1)
         placed = placed[below]
         placed[..., 2] = np.maximum(placed[..., 2], face.floor)
+        if face.film is not None:
+            placed = face.film.placed(placed)
         corners[below] = (placed - position) @ turn / scale**2
     return enclosed(corners)
 

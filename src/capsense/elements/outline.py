@@ -46,8 +46,16 @@ def write_triangles(record: np.void, boxes: Boxes, code: int, closed: bool) -> N
 @kernel
 def reach_down(body):
     """How far the outline of a body reaches below its middle [m]; for meshes, its bounding box."""
+    return reach_along(body, 0.0, 1.0)
+
+
+@kernel
+def reach_along(body, u, w):
+    """How far an outline reaches from its middle along (u, 0, w), and back [m]; of meshes, boxes."""
     r, kind = body.rotation, body.outline
-    x, y, z = abs(r[2, 0]), abs(r[2, 1]), abs(r[2, 2])
+    x = abs(u * r[0, 0] + w * r[2, 0])
+    y = abs(u * r[0, 1] + w * r[2, 1])
+    z = abs(u * r[0, 2] + w * r[2, 2])
     a, b, c = body.sizes[0], body.sizes[1], body.sizes[2]
     if kind == SPHERE:
         return body.scale * a
@@ -74,12 +82,18 @@ def reach_down(body):
 @kernel
 def middle_height(body):
     """Height of the middle of a body's outline [m]; for meshes, that of its bounding box."""
+    return middle_along(body, 2)
+
+
+@kernel
+def middle_along(body, i):
+    """The middle of a body's outline along axis i [m]; for meshes, that of its bounding box."""
     if body.outline < MESH:
-        return body.position[2]
+        return body.position[i]
     corners, r = doubles(body.boxes), body.rotation
-    return body.position[2] + 0.5 * body.scale * (
-        r[2, 0] * (corners[0] + corners[3]) + r[2, 1] * (corners[1] + corners[4])
-        + r[2, 2] * (corners[2] + corners[5])
+    return body.position[i] + 0.5 * body.scale * (
+        r[i, 0] * (corners[0] + corners[3]) + r[i, 1] * (corners[1] + corners[4])
+        + r[i, 2] * (corners[2] + corners[5])
     )  # fmt: skip
 
 

@@ -14,7 +14,8 @@ from capsense.cover import Touch
 from capsense.design.model import Design, Role
 from capsense.errors import FieldError
 from capsense.field.boundary import Accuracy, BoundarySolution, terminals
-from capsense.field.gap_table import gap_table_of, has_even_face
+from capsense.field.face import has_even_face
+from capsense.field.gap_table import gap_table_of
 from capsense.field.green import GreenFunction, build_green
 
 Array = NDArray[np.float64]

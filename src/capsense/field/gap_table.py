@@ -1,4 +1,4 @@
-"""The first millimetres in front of a flat design: where its Green's function holds, and a table.
+"""The first millimetres in front of a design: where its Green's function holds, and a table.
 
 A compact Green's function does not resolve distances smaller than the spacing of its charges. The
 boundary elements of the design do. A grounded plane is put in front of them, at some distances z,
@@ -17,13 +17,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from shapely.geometry import box
 
 from capsense.constants import EPS0
-from capsense.design.geometry import Facet
 from capsense.design.model import Design
 from capsense.field import bem_kernels as kernels
 from capsense.field.bem_kernels import Panels
@@ -31,16 +28,11 @@ from capsense.field.boundary import (
     INTERFACE,
     POWER,
     Accuracy,
-    BoundaryModel,
     BoundarySolution,
 )
-from capsense.field.green_points import is_flat
+from capsense.field.face import plane_panels, sheet_on_face, top_of
 from capsense.field.panels import (
-    PLANE_TOL,
-    Grading,
     concatenate,
-    cut_facet,
-    make_panels,
     samples,
 )
 from capsense.field.pressed_table import PressedTable, pressed_table_of
@@ -50,6 +42,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Plate = tuple[Ints, slice]
+"""Panels of a plane, and the electrodes in front of which they are."""
 
 UNIT = 4 * math.pi * EPS0
 _HEIGHTS = 0.03 * 2.1 ** np.arange(8)
@@ -60,8 +54,6 @@ _EXACT = 0.02
 """Largest relative error of a plate's energy from the validity distance on."""
 _PLATE = 0.5
 """Side of the small plates, over that of the electrodes."""
-_OFF = 3.0
-"""Panels of the plane beside the sheets, over the size of those above them."""
 _MOST = 3500
 """About the most boundary elements that a table is made from."""
 _BLOCK = 6
@@ -80,7 +72,7 @@ _LEAST = 0.003
 
 @dataclass(frozen=True, eq=False)
 class GapTable:
-    """What a grounded plane near a flat design changes in the charges of its terminals."""
+    """What a grounded plane near the face of a design changes in the charges of its terminals."""
 
     validity: float
     """Distance h0 from the design [m] from which the Green's function holds."""
@@ -89,7 +81,7 @@ class GapTable:
     heights: Array
     """Distances z of the plane from the face [m], ascending, shape (k,)."""
     points: NDArray[np.float32]
-    """Centres of the cells [m], shape (c, 3)."""
+    """Centres of the cells, in coordinates of the face (:mod:`capsense.field.face`) [m], (c, 3)."""
     areas: NDArray[np.float32]
     """Their areas [m²], shape (c,)."""
     terminal: NDArray[np.int64]
@@ -139,85 +131,6 @@ def from_arrays(arrays: Mapping[str, Any]) -> GapTable | None:
     return GapTable(**{**values, **numbers, "change": change})
 
 
-def has_even_face(design: Design) -> bool:
-    """Whether a flat design ends at one height over all of its electrodes: bare, or under a layer.
-
-    Bodies can dip into recesses of others, such as below the top of a bezel.
-    """
-    if not is_flat(design):
-        return False
-    top = top_of(design)
-    covers = [la for la in design.layers if not la.facets and abs(la.upper[2] - top) < PLANE_TOL]
-    return all(
-        abs(e.surface.bounds[1, 2] - top) < PLANE_TOL
-        or any(
-            (e.surface.bounds[0, :2] > la.lower[:2] - PLANE_TOL).all()
-            and (e.surface.bounds[1, :2] < la.upper[:2] + PLANE_TOL).all()
-            for la in covers
-        )
-        for e in design.electrodes
-    )
-
-
-def top_of(design: Design) -> float:
-    """Height of the face of a flat design [m]: its highest sheet or layer."""
-    heights = [float(body.surface.bounds[1, 2]) for body in design.sheets]
-    return max([*heights, *(float(layer.upper[2]) for layer in design.layers)])
-
-
-def plane_panels(solution: BoundarySolution, reach: float) -> Panels:
-    """Panels of a horizontal plane at height 0 that follow the outlines of the sheets below it.
-
-    Above the electrodes they are the electrodes' own, so that no panel lies across a rim.
-    ``reach`` is how far it goes beyond the electrodes [m].
-    """
-    design = solution.design
-    corners = np.array([e.surface.bounds for e in design.electrodes])
-    low, high = corners[:, 0].min(axis=0) - reach, corners[:, 1].max(axis=0) + reach
-    low = np.maximum(low, design.domain.lower + 1e-3 * (design.domain.upper - design.domain.lower))
-    high = np.minimum(
-        high, design.domain.upper - 1e-3 * (design.domain.upper - design.domain.lower)
-    )
-    whole = rest = box(low[0], low[1], high[0], high[1])
-    flat = Facet(whole, np.zeros(3), np.eye(3))
-    sheets = sorted(solution.model.sheets, key=lambda sheet: -sheet[0][0].origin[2])
-    rims = np.concatenate([body.surface.rims for body in design.sheets]) * [1.0, 1.0, 0.0]
-    parts: list[Panels] = []
-
-    def add(region: shapely.Geometry, grading: Grading) -> None:
-        for piece in shapely.get_parts(region):
-            if piece.geom_type == "Polygon" and piece.area > 1e-6 * reach**2:
-                facet = Facet(piece, flat.origin, flat.axes)
-                pieces = cut_facet(facet, rims, grading)
-                if pieces:
-                    parts.append(make_panels(facet, pieces))
-
-    for (facet, _), grading in sheets:
-        outline = facet.footprint
-        if not rest.intersects(outline):
-            continue
-        add(rest.intersection(outline), grading)
-        rest = rest.difference(outline)
-    add(
-        rest,
-        replace(
-            grading,
-            edge=_OFF * grading.edge,
-            smallest=_OFF * grading.smallest,
-            largest=_OFF * grading.largest,
-        ),
-    )
-    return concatenate(parts)
-
-
-def moved(panels: Panels, height: float) -> Panels:
-    """The same panels higher by ``height`` [m]."""
-    up = np.array([0.0, 0.0, height])
-    return panels._replace(
-        edges=panels.edges + up, centers=panels.centers + up, quad=panels.quad + up
-    )
-
-
 class GroundedPlane(NamedTuple):
     """A grounded plane in front of a design."""
 
@@ -237,26 +150,25 @@ class PlaneResponse:
 
     Args:
         solution: The factorised boundary elements of the design, of n panels.
-        plane: Panels of the plane at height 0, m of them.
     """
 
-    def __init__(self, solution: BoundarySolution, plane: Panels) -> None:
-        self.solution, self.plane, model = solution, plane, solution.model
+    def __init__(self, solution: BoundarySolution) -> None:
+        self.solution, model = solution, solution.model
         jump = model.eps_front - model.eps_back
         self._rows = np.flatnonzero((model.owner != INTERFACE) & (np.abs(jump) > 1e-12))
         """Panels of sheets between two media."""
         self._gradient = kernels.normal_gradient_matrix(self._rows, model.floor, model.panels)
 
-    def at(self, height: float, densities: Array) -> GroundedPlane:
-        """What a plane does.
+    def at(self, plane: Panels, densities: Array) -> GroundedPlane:
+        """What a plane, or another grounded surface, does.
 
         Args:
-            height: Height of the plane [m].
+            plane: Its m panels.
             densities: Densities of the design without it, with each of t terminals at 1 V [C/m²],
                 shape (n, t).
         """
         solution, model = self.solution, self.solution.model
-        plane, n, m = moved(self.plane, height), model.panels.size, self.plane.size
+        n, m = model.panels.size, plane.size
         both = concatenate([model.panels, plane])
         kind = np.concatenate([solution.kind, np.zeros(m, np.int64)])
         contrast = np.concatenate([solution.contrast, np.zeros(m)])
@@ -313,7 +225,7 @@ def build_gap_table(
     green: GreenFunction | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> GapTable:
-    """Work out what a plane near a flat design changes, and from where on its G is valid.
+    """Work out what a plane near the face of a design changes, and from where on its G is valid.
 
     Args:
         solution: The factorised boundary elements of the design.
@@ -323,32 +235,42 @@ def build_gap_table(
         progress: Called with what is being done.
     """
     model = solution.model
-    plane, top, heights = (
-        plane_panels(solution, _MARGIN * unit),
-        top_of(solution.design),
-        np.asarray(unit * _HEIGHTS, float),
-    )
+    design, heights = solution.design, np.asarray(unit * _HEIGHTS, float)
+    plane, top = plane_panels(solution, _MARGIN * unit), top_of(design)
+    plates = plates_of(plane.panels, design)
     changes = np.empty((len(heights), model.sheet_panels, densities.shape[1] + 1))
-    response, errors = PlaneResponse(solution, plane), np.full(len(heights), np.inf)
+    response, errors = PlaneResponse(solution), np.full(len(heights), np.inf)
     for k, height in enumerate(heights):
         progress(f"response to a plane: {k + 1} of {len(heights)}")
-        found = response.at(top + height, densities)
+        panels = plane.at(top + height)
+        found = response.at(panels, densities)
         changes[k] = found.change[: model.sheet_panels]
         if green is not None and height >= _SOUGHT * unit:
-            errors[k] = energy_error(found, moved(plane, top + height), green, solution.design)
+            errors[k] = energy_error(found, panels, plates, green)
     validity = unit if green is None else valid_from(heights, errors)
-    return _cells_of(model, changes, heights, top, validity)
+    return _cells_of(solution, changes, heights, top, validity)
+
+
+def plates_of(plane: Panels, design: Design) -> list[Plate]:
+    """All of a plane, and for each electrode plates of its size and of ``_PLATE`` of it.
+
+    ``plane`` are the panels in coordinates of the face, m of them.
+    """
+    out: list[Plate] = [(np.arange(plane.size), slice(0, len(design.electrodes)))]
+    for i, electrode in enumerate(design.electrodes):
+        low, high = sheet_on_face(design, electrode.name).bounds[:, :2]
+        off = np.abs(plane.centers[:, :2] - 0.5 * (low + high)) / (0.5 * (high - low))
+        out += [(np.flatnonzero((off < x).all(axis=1)), slice(i, i + 1)) for x in (1.0, _PLATE)]
+    return out
 
 
 def energy_error(
-    found: GroundedPlane, plane: Panels, green: GreenFunction, design: Design
+    found: GroundedPlane, plane: Panels, plates: list[Plate], green: GreenFunction
 ) -> float:
     """Largest relative error that a Green's function makes of a plate's energy.
 
-    Plates are all of the plane, and for each electrode squares of its size and of ``_PLATE`` of it
-    in front of its middle. Infinite where the plane's energies by it are not definite.
+    Infinite where the plane's energies by it are not definite.
     """
-    m = plane.size
     share = plane.weights / plane.weights.sum(axis=1, keepdims=True)
 
     def means(of: Callable[[Array], Array]) -> Array:
@@ -362,11 +284,6 @@ def energy_error(
         np.linalg.cholesky(matrices[0])
     except np.linalg.LinAlgError:
         return math.inf
-    plates: list[tuple[Ints, slice]] = [(np.arange(m), slice(0, len(design.electrodes)))]
-    for i, electrode in enumerate(design.electrodes):
-        low, high = electrode.surface.bounds[:, :2]
-        off = np.abs(plane.centers[:, :2] - 0.5 * (low + high)) / (0.5 * (high - low))
-        plates += [(np.flatnonzero((off < x).all(axis=1)), slice(i, i + 1)) for x in (1.0, _PLATE)]
     worst = 0.0
     for some, columns in plates:
         if len(some):
@@ -399,12 +316,14 @@ def valid_from(heights: Array, errors: Array) -> float:
 
 
 def _cells_of(
-    model: BoundaryModel, changes: Array, heights: Array, top: float, validity: float
+    solution: BoundarySolution, changes: Array, heights: Array, top: float, validity: float
 ) -> GapTable:
     """Gather panels in cells of the table; ``changes`` [C/m²] has shape (k, p, t + 1)."""
+    model, film = solution.model, solution.design.film
     areas = model.panels.areas[: model.sheet_panels]
     size = max(_CELL * validity, math.sqrt(areas[model.owner[: len(areas)] >= 0].sum() / _CELLS))
     panel, points, area = samples(model.panels, model.sheet_panels, 0.5 * size)
+    points = points if film is None else film.coordinates(points)
     owner = model.owner[panel]
     place = np.floor((points - points.min(axis=0)) / size + 1e-6).astype(np.int64)
     key = np.column_stack([owner % (model.n_terminals + 1), place // _BLOCK, place])

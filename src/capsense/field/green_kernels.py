@@ -29,9 +29,9 @@ from capsense._simd import (
     wide_splat,
 )
 from capsense.design.model import Design
+from capsense.field.face import cover_of, face_box
 from capsense.field.gap_table import GapTable
 from capsense.field.green import LEVELS, GreenFunction
-from capsense.field.green_points import is_flat
 from capsense.field.grid_kernels import Grid, grid_over
 from capsense.field.soft import Soft, no_soft, pack_soft
 
@@ -71,9 +71,13 @@ class Gap(NamedTuple):
     design has none."""
 
     validity: float
-    """Distance h0 from a flat design [m] down to which its Green's function is valid."""
+    """Distance h0 from the face of the design [m] down to which its Green's function is valid."""
+    face: NDArray[Any]
+    """Corners of the design in coordinates of its face [m], shape (2, 3)."""
+    curvature: float
+    """Curvature of the face about the y axis [1/m]: 0 of a flat one, 1 / R of a bent film."""
     top: float
-    """Height of the face of the design [m]."""
+    """Height of the face [m]."""
     heights: NDArray[Any]
     log_ratio: float
     """Logarithm of the ratio of two heights."""
@@ -86,7 +90,7 @@ class Gap(NamedTuple):
     blocks: NDArray[Any]
     """First cell of each block, and their number, shape (q + 1,)."""
     block_center: NDArray[Any]
-    """Middle of each block [m], shape (q, 2)."""
+    """Middle of each block, in coordinates of the face [m], shape (q, 2)."""
     block_radius: NDArray[Any]
     """Radius of a circle about it that holds its cells [m], shape (q,)."""
     least: float
@@ -106,11 +110,12 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     Without one, bodies are kept off a flat design by half the distance ``clearance`` [m] down to
     which its Green's function was fitted.
     """
+    face = face_box(design)
     if table is None:
         none = np.zeros(0)
         few = np.zeros((0, 2), np.float32)
         return Gap(
-            0.5 * clearance, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
+            0.5 * clearance, face, 0.0, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
             np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros(0, np.float32),
             np.zeros((0, 0), np.int64), np.zeros((0, 2, 1), np.float32), np.zeros(1, np.int64),
             np.zeros((0, 2)), none, 0.0, no_soft(0),
@@ -128,7 +133,8 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
         most = max([1.0, *(layer.eps_r for layer in design.layers)])
         least = min(least, _THIN * cover_of(design) / most)
     return Gap(
-        table.validity, table.top, table.heights, math.log(table.heights[1] / table.heights[0]),
+        table.validity, face, 0.0 if design.film is None else 1.0 / design.film.radius, table.top,
+        table.heights, math.log(table.heights[1] / table.heights[0]),
         np.ascontiguousarray(points, np.float32), np.ascontiguousarray(table.areas, np.float32),
         np.ascontiguousarray(table.terminal, np.int64),
         np.ascontiguousarray(table.series, np.float32),
@@ -136,6 +142,22 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
         np.ascontiguousarray(table.change, np.float32), blocks.astype(np.int64), center, radius,
         LEAST_LENGTH * least, pack_soft(table, design),
     )  # fmt: skip
+
+
+class Space(NamedTuple):
+    """What single points need of a :class:`Green`: kernels that are called for each take this.
+
+    All of its arrays, handed on, take longer than what such a kernel works out.
+    """
+
+    face: NDArray[Any]
+    curvature: float
+    room: NDArray[Any]
+    extent: float
+    cover: float
+    validity: float
+    limit: float
+    """Largest compression of the cover [m]."""
 
 
 class Green(NamedTuple):
@@ -164,33 +186,29 @@ class Green(NamedTuple):
     extent: float
     """Shortest side of the domain [m]."""
     cover: float
-    """Thickness of what covers the electrodes of a flat design [m]; infinite for other designs."""
+    """Thickness of what covers the electrodes [m]; infinite for designs without a face."""
     gap: Gap
-    """The first millimetres in front of a flat design."""
+    """The first millimetres in front of a design."""
+    space: Space
+    """What single points need of all this."""
 
 
-class Space(NamedTuple):
-    """What single points need of a :class:`Green`: kernels that are called for each take this.
-
-    All of its arrays, handed on, take longer than what such a kernel works out.
-    """
-
-    box: NDArray[Any]
-    room: NDArray[Any]
-    extent: float
-    cover: float
-    validity: float
-    limit: float
-    """Largest compression of the cover [m]."""
+@kernel
+def on_face(x, y, z, curvature):
+    """Coordinates of the face of a point of the sensor frame [m]."""
+    if curvature == 0.0:
+        return x, y, z
+    up = z + 1.0 / curvature
+    return math.atan2(x, up) / curvature, y, math.sqrt(x * x + up * up) - 1.0 / curvature
 
 
-def cover_of(design: Design) -> float:
-    """Thickness of what covers the sheets of a flat design [m]; infinite for other designs."""
-    if not is_flat(design):
-        return math.inf
-    heights = np.concatenate([body.surface.bounds[:, 2] for body in design.sheets])
-    top = max([float(heights.max()), *(float(layer.upper[2]) for layer in design.layers)])
-    return top - float(heights.max())
+@kernel
+def off_face(x, y, z, curvature):
+    """Point of the sensor frame of coordinates of the face [m]."""
+    if curvature == 0.0:
+        return x, y, z
+    far, angle = z + 1.0 / curvature, x * curvature
+    return far * math.sin(angle), y, far * math.cos(angle) - 1.0 / curvature
 
 
 _PACKED: WeakKeyDictionary[GreenFunction, tuple[Design, Green]] = WeakKeyDictionary()
@@ -234,11 +252,12 @@ def _packed(green: GreenFunction, design: Design) -> Green:
         point_potentials(columns, far.sources, score_table, limits, out)
         return np.clip(out[:, : len(points)].T, 0.0, 1.0)
 
+    gap, cover = pack_gap(green.gap, green.clearance, design), cover_of(design)
+    space = Space(gap.face, gap.curvature, room, extent, cover, gap.validity, gap.soft.limit)
     return Green(
         (near, middle, far), score_table, grid_over(np.asarray(green.box, float), walls, phi),
         lead, terminals, len(design.electrodes), float(green.floor), np.asarray(green.box, float),
-        np.asarray(green.blends, float), room, extent, cover_of(design),
-        pack_gap(green.gap, green.clearance, design),
+        np.asarray(green.blends, float), room, extent, cover, gap, space,
     )  # fmt: skip
 
 
@@ -331,17 +350,24 @@ def smooth(x):
 
 
 @kernel
-def beyond(points, space):
-    """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face."""
+def beyond(points, space, middle):
+    """How far a leaf is out of reach: 0 in the room, 1 beyond the walls or far behind the face.
+
+    ``middle`` is room for a point, shape (3,).
+    """
     out, depth = 0.0, math.inf
     for i in range(3):
         c = 0.5 * (points[0, i] + points[3, i])
         off = max(space.room[0, i] - c, c - space.room[1, i], 0.0)
         out += off * off
+        middle[i] = c
+    _put(middle, on_face(middle[0], middle[1], middle[2], space.curvature))
+    for i in range(3):
+        c = middle[i]
         if i < 2:
-            depth = min(depth, STEEP * (c - space.box[0, i]), STEEP * (space.box[1, i] - c))
+            depth = min(depth, STEEP * (c - space.face[0, i]), STEEP * (space.face[1, i] - c))
         else:
-            depth = min(depth, space.box[1, 2] - space.limit - c)
+            depth = min(depth, space.face[1, 2] - space.limit - c)
     deep = (depth / space.validity - DEEP[0]) / DEEP[1] if space.cover < 1.0 else 0.0
     return smooth(max(math.sqrt(out) / (SHORE * space.extent), deep))
 
@@ -358,21 +384,43 @@ def held_off(distance, length):
 def settle(points, space):
     """Move points (k, 3) in the cover up to its face: what is pressed into it is in contact."""
     for q in range(points.shape[0]):
-        depth = space.box[1, 2] - points[q, 2]
+        depth = space.face[1, 2] - points[q, 2]
         if 0.0 < depth <= space.limit:
             inside = True
             for i in range(2):
                 x = points[q, i]
-                inside = inside and space.box[0, i] < x < space.box[1, i]
+                inside = inside and space.face[0, i] < x < space.face[1, i]
             if inside:
-                points[q, 2] = space.box[1, 2]
+                points[q, 2] = space.face[1, 2]
+
+
+@kernel
+def _put(out, point):
+    out[0], out[1], out[2] = point
+
+
+@kernel
+def keep_off(points, space):
+    """Settle and lift points (k, 3) of the sensor frame, in front of a design with a face."""
+    bent = space.curvature != 0.0
+    if bent:
+        for q in range(points.shape[0]):
+            p = points[q]
+            _put(p, on_face(p[0], p[1], p[2], space.curvature))
+    settle(points, space)
+    lift(points, space.validity, space.face)
+    if bent:
+        for q in range(points.shape[0]):
+            p = points[q]
+            _put(p, off_face(p[0], p[1], p[2], space.curvature))
 
 
 @kernel
 def lift(points, gap, box):
-    """Keep points (k, 3) off a flat design: a distance d < 2 gap becomes gap + d² / (4 gap).
+    """Keep points (k, 3) off a design: a distance d < 2 gap becomes gap + d² / (4 gap).
 
-    The space between the design and the floor counts as within it.
+    Points and ``box`` are in coordinates of the face. The space behind the design counts as within
+    it.
     """
     for q in range(points.shape[0]):
         square, depth, axis, side = 0.0, 1.0, 2, 1

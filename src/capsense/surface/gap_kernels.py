@@ -1,10 +1,12 @@
-"""The step, compiled: what bodies in the first millimetres in front of a flat design add.
+"""The step, compiled: what bodies in the first millimetres in front of a design add.
 
 Bodies are solved for where the Green's function is valid: points nearer than twice the validity
 distance h0 are lifted, a distance z to h0 + z² / (4 h0). What that takes away is local. Each cell p
 of the electrodes adds T(p, l) - T(p, l_g), where T is the table of the design's own boundary
 elements (:mod:`capsense.field.gap_table`), l the length of the field line from p to the body, and
 l_g that to the lifted body.
+
+Cells, and all lengths in front of a bent film, are in coordinates of its face.
 
 Conductors near the design that are not at ground are nodes of a network, like terminals: they are
 solved for at ground and at 1 V, the local changes are added, and the nodes are eliminated.
@@ -18,8 +20,15 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles
-from capsense.elements.outline import CHANGING, middle_height, nearest, reach_down
-from capsense.field.green_kernels import held_off, lift, smooth
+from capsense.elements.outline import (
+    CHANGING,
+    middle_along,
+    middle_height,
+    nearest,
+    reach_along,
+    reach_down,
+)
+from capsense.field.green_kernels import held_off, lift, off_face, on_face, smooth
 from capsense.field.soft import BODY
 
 REACH = 5.0, 8.0
@@ -30,7 +39,7 @@ WAYS, EXACT = 30, 1e-4
 
 @compiled
 def near_bodies(bodies, green, dielectric=False):
-    """Conductors, or dielectrics, with an outline within twice h0 of a flat design, (b,).
+    """Conductors, or dielectrics, with an outline that may be within twice h0 of a face, (b,).
 
     Not bodies that are mostly behind the face, nor those from the floor of the domain to its
     ceiling: these surround it.
@@ -45,16 +54,31 @@ def near_bodies(bodies, green, dielectric=False):
         if body.outline == CHANGING:  # it has this outline only where it is near
             out[b] = True
         else:
-            middle = middle_height(body)
-            lowest = middle - reach_down(body)
-            around = lowest <= green.room[0, 2] and 2.0 * middle - lowest >= green.room[1, 2]
+            low, reach = middle_height(body), reach_down(body)
+            around = low - reach <= green.room[0, 2] and low + reach >= green.room[1, 2]
+            middle, lowest, _ = stand_of(body, gap)
             out[b] = middle >= gap.top and lowest < gap.top + 2.0 * gap.validity and not around
     return out
 
 
+@kernel
+def stand_of(body, gap):
+    """Heights over the face's zero of the middle of a body, and of its lowest point or less [m].
+
+    And the way up at the middle, (u, 0, w).
+    """
+    if gap.curvature == 0.0:
+        middle = middle_height(body)
+        return middle, middle - reach_down(body), (0.0, 1.0)
+    x, z = middle_along(body, 0), middle_along(body, 2) + 1.0 / gap.curvature
+    far = max(math.sqrt(x * x + z * z), 1e-9 / gap.curvature)
+    u, w, middle = x / far, z / far, far - 1.0 / gap.curvature
+    return middle, middle - reach_along(body, u, w), (u, w)
+
+
 @compiled
 def press_out(bodies, near, green):
-    """Move near bodies that overlap the face of the design up until they touch it.
+    """Move near bodies that overlap the face of the design away from it until they touch it.
 
     Physics engines let hard bodies overlap. What lies inside of a body that way is in contact with
     it. A cover that gives way is compressed: ``sunk`` keeps how far below its place a body stands
@@ -64,46 +88,52 @@ def press_out(bodies, near, green):
     for b in range(bodies.shape[0]):
         if not near[b] or bodies[b].outline == CHANGING:
             continue
-        below = gap.top - (middle_height(bodies[b]) - reach_down(bodies[b]))
-        if below <= 0.0 or middle_height(bodies[b]) < gap.top:
+        middle, lowest, (u, w) = stand_of(bodies[b], gap)
+        below = gap.top - lowest
+        if below <= 0.0 or middle < gap.top:
             continue
-        deepest = 0.0
-        x, y = bodies[b].position[0], bodies[b].position[1]
-        nearest(bodies[b], x, y, gap.top - 1e3 * bodies[b].scale, point, room)
-        if _faces_cell(point, gap):  # the lowest point
-            deepest = max(0.0, gap.top - point[2])
+        deepest, far = 0.0, 1e3 * bodies[b].scale
+        x, y, z = bodies[b].position[0], bodies[b].position[1], bodies[b].position[2]
+        if gap.curvature == 0.0:
+            z = gap.top
+        nearest(bodies[b], x - far * u, y, z - far * w, point, room)
+        x, y, z = on_face(point[0], point[1], point[2], gap.curvature)
+        if _faces_cell(x, y, gap):  # the lowest point
+            deepest = max(0.0, gap.top - z)
         for k in range(gap.block_radius.shape[0]):
-            off, _ = nearest(
-                bodies[b], gap.block_center[k, 0], gap.block_center[k, 1], gap.top, point, room
+            x, y, z = off_face(
+                gap.block_center[k, 0], gap.block_center[k, 1], gap.top, gap.curvature
             )
+            off, _ = nearest(bodies[b], x, y, z, point, room)
             if off > gap.block_radius[k] or gap.terminal[gap.blocks[k]] < 0:
                 continue
             for c in range(gap.blocks[k], gap.blocks[k + 1]):
+                x, y, z = off_face(
+                    float(gap.points[c, 0]), float(gap.points[c, 1]), gap.top, gap.curvature
+                )
                 depth = 0.0
                 for _ in range(WAYS):  # down to where the surface is
-                    off, _ = nearest(
-                        bodies[b], float(gap.points[c, 0]), float(gap.points[c, 1]),
-                        gap.top - depth, point, room,
-                    )  # fmt: skip
+                    off, _ = nearest(bodies[b], x - depth * u, y, z - depth * w, point, room)
                     if off >= -EXACT * gap.validity:
                         break
                     depth -= off
                 deepest = max(deepest, depth)
         up = max(0.0, min(deepest, below))
-        bodies[b].position[2] += up
+        bodies[b].position[0] += up * u
+        bodies[b].position[2] += up * w
         bodies[b].sunk += min(up, gap.soft.limit)
 
 
 @kernel
-def _faces_cell(point, gap):
-    """Whether a point is above a cell of a terminal."""
+def _faces_cell(x, y, gap):
+    """Whether (x, y) of the face is in front of a cell of a terminal."""
     for k in range(gap.block_radius.shape[0]):
-        x, y = gap.block_center[k, 0] - point[0], gap.block_center[k, 1] - point[1]
-        if gap.terminal[gap.blocks[k]] < 0 or x * x + y * y > (2.0 * gap.block_radius[k]) ** 2:
+        dx, dy = gap.block_center[k, 0] - x, gap.block_center[k, 1] - y
+        if gap.terminal[gap.blocks[k]] < 0 or dx * dx + dy * dy > (2.0 * gap.block_radius[k]) ** 2:
             continue
         for c in range(gap.blocks[k], gap.blocks[k + 1]):
-            x, y = float(gap.points[c, 0]) - point[0], float(gap.points[c, 1]) - point[1]
-            if x * x + y * y < gap.areas[c]:
+            dx, dy = float(gap.points[c, 0]) - x, float(gap.points[c, 1]) - y
+            if dx * dx + dy * dy < gap.areas[c]:
                 return True
     return False
 
@@ -123,7 +153,7 @@ def local_change(bodies, near, node, green, matrix):
     chosen, count = np.empty(bodies.shape[0], np.int64), 0
     point, room, moved = np.empty(9), np.empty(140), np.empty((1, 3))
     for k in range(gap.block_radius.shape[0]):
-        x, y, z = gap.block_center[k, 0], gap.block_center[k, 1], gap.top
+        x, y, z = off_face(gap.block_center[k, 0], gap.block_center[k, 1], gap.top, gap.curvature)
         grounded, count = gap.terminal[gap.blocks[k]] < 0, 0
         for b in range(bodies.shape[0]):
             if near[b] and (node[b] >= 0 or not grounded):
@@ -217,9 +247,11 @@ def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
     """Add what one cell changes."""
     gap, (point, room, moved) = green.gap, work
     x, y, z = float(gap.points[c, 0]), float(gap.points[c, 1]), gap.top
+    place = off_face(x, y, z, gap.curvature)
     best, lifted, body = math.inf, math.inf, -1
     for k in range(count):
-        off, faces = nearest(bodies[chosen[k]], x, y, z, point, room)
+        off, faces = nearest(bodies[chosen[k]], place[0], place[1], place[2], point, room)
+        _turn_onto_face(point, gap.curvature)
         true, high = lengths(off, faces, point, x, y, green, moved)
         sunk = bodies[chosen[k]].sunk
         if sunk > 0.0:  # it stands lower than where it is solved for
@@ -243,6 +275,19 @@ def _add_cell(bodies, chosen, count, node, green, c, work, matrix):
         one = a * ((1.0 - p) * float(gap.change[c, k, col]) + p * float(gap.change[c, k + 1, col]))
         two = b * ((1.0 - q) * float(gap.change[c, m, col]) + q * float(gap.change[c, m + 1, col]))
         _add_to(matrix, gap, i, col, node[body], one - two)
+
+
+@kernel
+def _turn_onto_face(point, curvature):
+    """Nearest point and faces, as of :func:`nearest`, in coordinates of the face."""
+    if curvature == 0.0:
+        return
+    x, y, z = on_face(point[0], point[1], point[2], curvature)
+    c, s = math.cos(curvature * x), math.sin(curvature * x)
+    point[0], point[1], point[2] = x, y, z
+    for k in (3, 6):
+        u, w = point[k], point[k + 2]
+        point[k], point[k + 2] = c * u - s * w, s * u + c * w
 
 
 @compiled
@@ -345,7 +390,8 @@ def lengths(off, faces, point, x, y, green, moved):
 
     Args:
         off: Distance of the body from there [m], negative inside.
-        faces, point: Its nearest point and the faces there, as of :func:`nearest`.
+        faces, point: Its nearest point and the faces there, as of :func:`nearest`, but in
+            coordinates of the face.
         x, y: The place [m].
         green: Green's function of the design.
         moved: Room to work in, shape (1, 3).
@@ -360,13 +406,13 @@ def lengths(off, faces, point, x, y, green, moved):
         return least, h0
     true = _arc(math.sqrt(across * across + dz * dz), across, dz)
     for i in range(2):
-        out = max(green.box[0, i] - point[i], point[i] - green.box[1, i], 0.0)
+        out = max(gap.face[0, i] - point[i], point[i] - gap.face[1, i], 0.0)
         beside += out * out
     height = max(dz, 0.0)
     if beside + height * height >= 4.0 * h0 * h0:
         return true, true
     moved[0, 0], moved[0, 1], moved[0, 2] = point[0], point[1], max(point[2], gap.top)
-    lift(moved, h0, green.box)
+    lift(moved, h0, gap.face)
     ex, ey, ez = moved[0, 0] - x, moved[0, 1] - y, moved[0, 2] - gap.top
     wide = math.sqrt(ex * ex + ey * ey)
     far = math.sqrt(wide * wide + ez * ez)

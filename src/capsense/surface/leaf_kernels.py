@@ -32,12 +32,10 @@ from capsense._simd import (
 )
 from capsense.elements.mean_kernels import extent_of, four_points
 from capsense.field.green_kernels import (
-    Space,
     beyond,
     distances,
+    keep_off,
     level_share,
-    lift,
-    settle,
     source_potentials,
 )
 
@@ -82,10 +80,7 @@ def placed(bodies, cut, green):
 def _fill_leaves(bodies, cut, green, leaves, room):
     """The same; ``room`` is room to work in: two matrices and a vector of three."""
     moments, turn, middle = room
-    gap = green.gap
-    space = Space(
-        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
-    )  # fmt: skip
+    space = green.space
     for j in range(cut.leaves.shape[0]):
         a, corners, points = cut.leaves[j], leaves.true[j], leaves.points[j]
         body, k = bodies[cut.body[a]], cut.node[a]
@@ -117,10 +112,9 @@ def _fill_leaves(bodies, cut, green, leaves, room):
         for q in range(4):
             for i in range(3):
                 corners[q, i] = points[q, i]  # before it is lifted
-        leaves.beyond[j] = beyond(points, space)
+        leaves.beyond[j] = beyond(points, space, middle)
         if space.cover < 1.0:
-            settle(points, space)
-            lift(points, space.validity, space.box)
+            keep_off(points, space)
 
 
 @compiled

@@ -13,10 +13,9 @@ from capsense._jit import compiled, kernel
 from capsense._simd import WIDE, doubles, integers
 from capsense.field.green_kernels import (
     SHORE,
-    Space,
-    lift,
+    keep_off,
+    on_face,
     point_potentials,
-    settle,
     smooth,
 )
 from capsense.field.grid_kernels import grid_values, to_grid
@@ -103,31 +102,36 @@ def with_room(looks, filled, more):
 
 
 @kernel
-def place(body, space, k, points, found):
+def face_distance(point, space):
+    """Square of a point's distance from the design [m²], and how high above its face it is [m]."""
+    x, y, z = on_face(point[0], point[1], point[2], space.curvature)
+    low, high = space.face[0], space.face[1]
+    square = max(low[0] - x, x - high[0], 0.0) ** 2 + max(low[1] - y, y - high[1], 0.0) ** 2
+    return square + max(low[2] - z, z - high[2], 0.0) ** 2, z - high[2]
+
+
+@kernel
+def place(body, space, k, points, found, middle):
     """Place the middle of cluster k in row ``found`` of ``points`` (n, 3).
+
+    ``middle`` is room for a point, shape (3,).
 
     Returns:
         Square of its distance from the design [m²]; how high above its box it is [m]; how far it is
         from the next wall, negative beyond it, and how far it is beyond all of them [m].
     """
-    center, square, out, room = doubles(body.center), 0.0, 0.0, math.inf
+    center, out, room = doubles(body.center), 0.0, math.inf
     for i in range(3):
         x = body.position[i]
         for q in range(3):
             x += body.scale * body.rotation[i, q] * center[3 * k + q]
-        points[found, i] = x
-        off = max(space.box[0, i] - x, x - space.box[1, i], 0.0)
-        square += off * off
+        middle[i] = points[found, i] = x
         room = min(room, x - space.room[0, i], space.room[1, i] - x)
         out += max(space.room[0, i] - x, x - space.room[1, i], 0.0) ** 2
-    height = points[found, 2] - space.box[1, 2]
+    square, height = face_distance(middle, space)
     if square < 4.0 * space.validity * space.validity and space.cover < 1.0:
-        settle(points[found : found + 1], space)
-        lift(points[found : found + 1], space.validity, space.box)
-        height, square = points[found, 2] - space.box[1, 2], 0.0
-        for i in range(3):
-            x = points[found, i]
-            square += max(space.box[0, i] - x, x - space.box[1, i], 0.0) ** 2
+        keep_off(points[found : found + 1], space)
+        square, height = face_distance(points[found], space)
     return square, height, room, math.sqrt(out) if out > 0.0 else 0.0
 
 
@@ -165,7 +169,9 @@ def look(body, green, coarser, looks, start):
     """
     places, inner = np.empty(body.stored, np.int64), np.empty(body.stored)
     points = np.empty((body.stored, 3), np.float32)
-    stop, found = _look_into(body, green, coarser, looks, start, (points, places, inner))
+    stop, found = _look_into(
+        body, green, coarser, looks, start, (points, places, inner, np.empty(3))
+    )
     far_potentials(points[:found], places[:found], inner, green, looks.means)
     _make_up(body, start, stop, looks)
     return stop
@@ -178,18 +184,15 @@ def _look_into(body, green, coarser, looks, start, wanted):
     Returns:
         The row behind the last one that was filled, and how many points there are.
     """
-    kids, extent, (points, rows, inner) = integers(body.kids), doubles(body.extent), wanted
-    gap = green.gap
-    space = Space(
-        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
-    )  # fmt: skip
+    kids, extent, (points, rows, inner, middle) = integers(body.kids), doubles(body.extent), wanted
+    space = green.space
     looks.node[start], looks.told[start] = 0, 1.0
     row, stop, found = start - 1, start + 1, np.int64(0)
     while row + 1 < stop:
         row += 1
         k = looks.node[row]
         size, (square, height, room, out) = (
-            body.scale * extent[k], place(body, space, k, points, found),
+            body.scale * extent[k], place(body, space, k, points, found, middle),
         )  # fmt: skip
         share = 1.0 - smooth(out / (SHORE * space.extent)) if out > 0.0 else 1.0
         looks.crossing[row] = looks.linear[row] = 0.0
@@ -244,7 +247,7 @@ def far_potentials(points, places, share, green, means):
 
 @kernel
 def _close(points, share, green, near, close, rest):
-    """Split shares of points (k, 3) into those close to the face of a flat design and the rest.
+    """Split shares of points (k, 3) into those close to the face of a design and the rest.
 
     Args:
         points, share, green: As of :func:`far_potentials`.
@@ -255,12 +258,10 @@ def _close(points, share, green, near, close, rest):
     Returns:
         How many are close.
     """
-    count = 0
+    count, space = 0, green.space
     for j in range(points.shape[0]):
-        square, part = 0.0, 0.0
-        for i in range(3):
-            x = points[j, i]
-            square += max(green.box[0, i] - x, x - green.box[1, i], 0.0) ** 2
+        part = 0.0
+        square, _ = face_distance(points[j], space)
         if green.cover < 1.0 and square < _CLOSE[1] * _CLOSE[1]:
             part = share[j] * smooth((_CLOSE[1] - math.sqrt(square)) / (_CLOSE[1] - _CLOSE[0]))
             near[count], close[count] = j, part

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capsense.cover import Touch
+from capsense.design.film import Film
 from capsense.elements.matter import Matter
 from capsense.elements.near_triangles import Face, near_triangles
 from capsense.elements.outline import CHANGING, write_triangles
@@ -61,11 +62,12 @@ class PackedBodies:
     """Triangles near the design that records point to."""
 
     def find_near(self, green: Green) -> None:
-        """Give changing bodies near a flat design an outline; not sheets of dielectrics."""
+        """Give changing bodies near a face an outline; not sheets of dielectrics."""
         gap = green.gap
         if not len(gap.areas):
             return
-        face = Face(green.box[0, :2], green.box[1, :2], gap.top, gap.top - gap.soft.limit)
+        film = Film(1.0 / gap.curvature, {}) if gap.curvature else None
+        face = Face(gap.face, green.box, film, gap.top, gap.top - gap.soft.limit)
         limits = 2.0 * gap.validity, REACH[1] * gap.validity
         for record, shape in zip(self.records, self.shapes, strict=True):
             if not isinstance(shape, ChangingBody) or record["sheet"] != 0.0:

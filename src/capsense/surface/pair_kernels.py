@@ -30,7 +30,7 @@ from capsense.elements.mean_kernels import (
     far_means,
     rectangles,
 )
-from capsense.field.green_kernels import smooth
+from capsense.field.green_kernels import on_face, smooth
 
 BARRIER = 1e5
 """Energy of charge that is out of reach [1/m]."""
@@ -121,7 +121,7 @@ def _add_lifted(leaves, flat, line, room, out):
 
 @compiled
 def bound_images(leaves, rows, pairs, green):
-    """Let no cluster meet its own images in a flat design more than in a mirror at its face.
+    """Let no cluster meet its own images in a design more than in a mirror at its face.
 
     Four points a distance d from their images stand for a wide rectangle as if it were met by as
     much as 1/(4 d) more than it is. Charge on it would cost too little energy, or none. Gradients
@@ -135,16 +135,18 @@ def bound_images(leaves, rows, pairs, green):
     """
     if green.cover > 1.0:
         return
-    points, image = leaves.points, np.empty((4, 3))
+    points, image, face = leaves.points, np.empty((4, 3)), green.gap.face[1, 2]
     for j in range(points.shape[0]):
-        inverse, lowest = 0.0, points[j, 0, 2]
+        inverse, lowest = 0.0, math.inf
         for q in range(4):
-            lowest = min(lowest, points[j, q, 2])
-            inverse += 0.25 / max(points[j, q, 2] - green.box[1, 2], 1e-9)
+            p = points[j, q]
+            height = on_face(p[0], p[1], p[2], green.gap.curvature)[2] - face
+            lowest = min(lowest, height)
+            inverse += 0.25 / max(height, 1e-9)
             image[q, 0], image[q, 1] = points[j, q, 0], points[j, q, 1]
             image[q, 2] = 2.0 * green.floor - points[j, q, 2]
         side = math.sqrt(12.0 * arm(points[j][0], points[j][1]) * arm(points[j][0], points[j][2]))
-        if inverse * side < _WIDE or lowest < green.box[1, 2]:
+        if inverse * side < _WIDE or lowest < 0.0:
             continue
         met = mean_inverse(points[j], image, 0.0)
         for k in range(green.lead, rows.shape[1]):

@@ -8,7 +8,7 @@ import numpy as np
 
 from capsense._jit import compiled, kernel
 from capsense._simd import doubles, integers
-from capsense.field.green_kernels import SHORE, Space, smooth
+from capsense.field.green_kernels import SHORE, smooth
 from capsense.surface.look_kernels import (
     far_potentials,
     look,
@@ -287,16 +287,13 @@ def _score_nodes(body, green, nodes, looks, last, weight):
     """
     kids, many = integers(body.kids), 2 * nodes.shape[0]
     points, rows, inner = np.empty((many, 3), np.float32), np.empty(many, np.int64), np.ones(many)
-    gap = green.gap
-    space = Space(
-        green.box, green.room, green.extent, green.cover, gap.validity, gap.soft.limit
-    )  # fmt: skip
+    space, middle = green.space, np.empty(3)
     for j in range(many):
         k, rows[j] = nodes[j // 2], last + j
         if j % 2 == 0:
             looks.kids[k] = rows[j]
         looks.node[rows[j]], looks.kids[rows[j]] = kids[2 * looks.node[k]] + j % 2, -1
-        square, height, _, out = place(body, space, looks.node[rows[j]], points, j)
+        square, height, _, out = place(body, space, looks.node[rows[j]], points, j, middle)
         size = body.scale * doubles(body.extent)[looks.node[rows[j]]]
         looks.stiff[rows[j]] = stiffness(green.cover, size, square, height)
         inner[j] = 1.0 - smooth(out / (SHORE * space.extent))

@@ -20,6 +20,7 @@ from capsense.elements.rigid import BODY, RigidShape
 from capsense.elements.store import functions_of
 from capsense.errors import CapSenseError, SceneError, SolveError
 from capsense.field.background import Change, Charges
+from capsense.field.face import sheet_on_face
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import SHORE, pack_green
 from capsense.field.green_points import narrowest_width
@@ -159,7 +160,8 @@ class SurfaceSolver:
         bare = [
             m.surface.triangles
             for m, e in zip(metres.electrodes, design.electrodes, strict=True)
-            if not len(gap.areas) or e.surface.bounds[1, 2] > gap.top - PLANE_TOL
+            if not len(gap.areas)
+            or sheet_on_face(design, e.name).bounds[1, 2] > gap.top - PLANE_TOL
         ]
         self._sheets = Sheets(bare, self.touch) if bare else None
         coarsest, width = self.preset.coarsest, narrowest_width(design)
