@@ -4,8 +4,9 @@
     python benchmarks/curved_near.py --random 6     # random films, a minute or two each
     python benchmarks/curved_near.py --panels 0.8   # finer ones, to see how far they converged
 
-Panels of the balls and of the design are graded to where they are nearest. Design and ball are solved as one system, by a
-Schur complement of the design's own. Errors are those of the self capacitance of the electrode.
+Panels of the balls and of the design are graded to where they are nearest. Design and ball are
+solved as one system, by a Schur complement of the design's own. Errors are those of the self
+capacitance of the electrode.
 """
 
 from __future__ import annotations

@@ -103,3 +103,69 @@ def test_a_link_behind_the_housing_is_no_doubt_of_the_electrodes(simulators):
     )
     assert off / 5 < reading.stats.solver_error < 7 * off
     assert reading.stats.solver_error < 0.5 * reading.delta.max()
+
+
+NEAR = {
+    (20, 0.1): 3455.8, (20, 0.3): 2495.5, (20, 1.0): 1497.3, (20, 3.0): 725.2,
+    (6, 0.1): 1302.7, (6, 0.3): 980.0, (6, 1.0): 637.8, (6, 3.0): 350.2,
+}  # fmt: skip
+"""What balls of a radius and gap [mm] over the middle of E2 change in its capacitance [fF], from
+``python benchmarks/curved_near.py``; it places them at this point of the shell."""
+FOOT = 0.0, -0.021
+
+
+def _ball(radius: float, gap: float, angle: float = 0.0, y: float = FOOT[1], **more) -> cs.Scene:
+    """A ball over the shell at an angle about its axis [rad]; lengths in metres."""
+    reach = RADIUS + gap + radius
+    at = reach * np.sin(angle), y, reach * np.cos(angle) - RADIUS
+    return cs.Scene([cs.Body(cs.Sphere(radius), cs.Pose(at), **more)])
+
+
+@pytest.mark.parametrize(("radius", "gap"), NEAR)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_near_contact(simulators, radius, gap):
+    """Against boundary elements of design and ball."""
+    sim = simulators("arm_segment")
+    sim.reset()
+    delta = 1e15 * sim.step(_ball(1e-3 * radius, 1e-3 * gap)).delta[1, 1]
+    assert delta == pytest.approx(NEAR[radius, gap], rel=0.03)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_mirror_images_near_contact(simulators):
+    """Invariant: E3 sees what E1 sees of the mirrored ball."""
+    sim, order = simulators("arm_segment"), MIRRORED[0]
+    for gap in (1e-4, 1e-3):
+        one, two = (sim.step(_ball(0.01, gap, angle, -0.02)).delta for angle in (-0.55, 0.55))
+        assert np.abs(one - two[np.ix_(order, order)]).max() < 0.01 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5])
+@pytest.mark.parametrize("grounding", ["grounded", "floating"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_pressed_against_the_shell_a_ball_reads_as_in_contact(simulators, angle, grounding):
+    """Physics engines let bodies overlap: nothing falls from 20 mm to 3 mm inside."""
+    sim = simulators("arm_segment")
+    gaps = [0.02, 0.01, 0.003, 1e-3, 3e-4, 1e-4, 1e-5, 0.0, -3e-4, -1e-3, -3e-3]
+    own = [sim.step(_ball(0.015, gap, angle, grounding=grounding)).delta for gap in gaps]
+    diagonal = np.array([np.diag(delta)[[1, 2]].sum() for delta in own])
+    assert (np.diff(diagonal) > -1e-4 * diagonal[-1]).all(), np.round(1e15 * diagonal, 1)
+    np.testing.assert_allclose(diagonal[-4:], diagonal[-1], rtol=2e-3)
+
+
+@pytest.mark.parametrize("changing", [False, True])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_balls_of_triangles_near_the_shell(simulators, changing):
+    """As primitives: rigid meshes, also pressed in, and surfaces that may deform."""
+    import trimesh
+
+    sim, mesh = simulators("arm_segment"), trimesh.creation.icosphere(4, 0.02)
+    for gap in (2e-3, 5e-4) if changing else (2e-3, 5e-4, -5e-4):
+        scene = _ball(0.02, gap, 0.3)
+        pose = scene.bodies[0].pose
+        if changing:
+            made = cs.DeformableSurface(pose.apply(mesh.vertices), mesh.faces).body()
+        else:
+            made = cs.Body(cs.TriMesh(mesh.vertices, mesh.faces), pose)
+        one, two = sim.step(scene).delta, sim.step(cs.Scene([made])).delta
+        assert np.abs(two - one).max() < 0.04 * np.abs(one).max(), gap

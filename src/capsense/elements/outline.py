@@ -51,7 +51,7 @@ def reach_down(body):
 
 @kernel
 def reach_along(body, u, w):
-    """How far an outline reaches from its middle along (u, 0, w), and back [m]; of meshes, boxes."""
+    """How far an outline reaches from its middle along (u, 0, w) [m]; that of meshes, their box."""
     r, kind = body.rotation, body.outline
     x = abs(u * r[0, 0] + w * r[2, 0])
     y = abs(u * r[0, 1] + w * r[2, 1])

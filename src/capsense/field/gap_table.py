@@ -248,7 +248,7 @@ def build_gap_table(
         if green is not None and height >= _SOUGHT * unit:
             errors[k] = energy_error(found, panels, plates, green)
     validity = unit if green is None else valid_from(heights, errors)
-    return _cells_of(solution, changes, heights, top, validity)
+    return _cells_of(solution, changes, heights, top, validity, plane.panels)
 
 
 def plates_of(plane: Panels, design: Design) -> list[Plate]:
@@ -316,14 +316,18 @@ def valid_from(heights: Array, errors: Array) -> float:
 
 
 def _cells_of(
-    solution: BoundarySolution, changes: Array, heights: Array, top: float, validity: float
-) -> GapTable:
+    solution: BoundarySolution, changes: Array, heights: Array, top: float, validity: float,
+    plane: Panels,
+) -> GapTable:  # fmt: skip
     """Gather panels in cells of the table; ``changes`` [C/m²] has shape (k, p, t + 1)."""
     model, film = solution.model, solution.design.film
     areas = model.panels.areas[: model.sheet_panels]
     size = max(_CELL * validity, math.sqrt(areas[model.owner[: len(areas)] >= 0].sum() / _CELLS))
     panel, points, area = samples(model.panels, model.sheet_panels, 0.5 * size)
-    points = points if film is None else film.coordinates(points)
+    if film is not None:  # what is behind it may reach all the way round
+        points, ends = film.coordinates(points), plane.edges[..., :2].reshape(-1, 2)
+        within = ((points[:, :2] > ends.min(axis=0)) & (points[:, :2] < ends.max(axis=0))).all(1)
+        panel, points, area = panel[within], points[within], area[within]
     owner = model.owner[panel]
     place = np.floor((points - points.min(axis=0)) / size + 1e-6).astype(np.int64)
     key = np.column_stack([owner % (model.n_terminals + 1), place // _BLOCK, place])

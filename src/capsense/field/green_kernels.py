@@ -104,6 +104,17 @@ LEAST_LENGTH, _THIN = 0.8, 0.03
 the thickness by permittivity of what covers the electrodes, where that is less."""
 
 
+def no_gap(validity: float, face: NDArray[Any]) -> Gap:
+    """The law of a design without one, whose Green's function is valid from a distance on [m]."""
+    none, few = np.zeros(0), np.zeros((0, 2), np.float32)
+    return Gap(
+        validity, face, 0.0, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
+        np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros(0, np.float32),
+        np.zeros((0, 0), np.int64), np.zeros((0, 2, 1), np.float32), np.zeros(1, np.int64),
+        np.zeros((0, 2)), none, 0.0, no_soft(0),
+    )  # fmt: skip
+
+
 def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     """Lay a table out for the kernels.
 
@@ -112,14 +123,7 @@ def pack_gap(table: GapTable | None, clearance: float, design: Design) -> Gap:
     """
     face = face_box(design)
     if table is None:
-        none = np.zeros(0)
-        few = np.zeros((0, 2), np.float32)
-        return Gap(
-            0.5 * clearance, face, 0.0, 0.0, np.array([1.0, 2.0]), math.log(2.0), few,
-            np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros(0, np.float32),
-            np.zeros((0, 0), np.int64), np.zeros((0, 2, 1), np.float32), np.zeros(1, np.int64),
-            np.zeros((0, 2)), none, 0.0, no_soft(0),
-        )  # fmt: skip
+        return no_gap(0.5 * clearance, face)
     count = len(table.areas)
     blocks = np.append(table.blocks, count)
     number = np.repeat(np.arange(len(table.blocks)), np.diff(blocks))

@@ -91,9 +91,10 @@ class FleetCheck:
     """Environments and sensors whose readings mean nothing: a bare electrode lies inside a body,
     or touches a conductor."""
     lifted: tuple[tuple[int, int], ...] = ()
-    """Environments and sensors whose readings lack the first millimetres in front of a flat design:
+    """Environments and sensors whose readings lack the first millimetres in front of a design:
     of conductors where matter has losses, which the readings that they are compared with lack, too.
-    On Warp also of dielectrics, and where more than 8 conductors that are not at ground are near.
+    On Warp also of dielectrics, of all bodies near a bent film, and where more than 8 conductors
+    that are not at ground are near.
     Gaps between bodies that Warp does not resolve are part of ``rms`` and ``worst``.
     """
 

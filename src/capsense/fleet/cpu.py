@@ -305,9 +305,9 @@ class CpuCore:
     ) -> NDArray[np.bool_]:
         """Where bodies near the design are lifted and nothing is added for it, shape (k, s).
 
-        These are conductors where some matter has losses. On Warp they are dielectrics, too, and
-        conductors that are not at ground beyond the number of ``nodes``; see
-        ``surface.gap_kernels``.
+        These are conductors where some matter has losses. On Warp they are dielectrics, too,
+        conductors that are not at ground beyond the number of ``nodes``, and all bodies near a bent
+        film, which are not even lifted; see ``surface.gap_kernels``.
 
         Args:
             bodies, sensors: Poses, shapes (e, b, 7) and (e, s, 7).
@@ -333,7 +333,9 @@ class CpuCore:
             out[k, s] = metal.any() and lossy
             if nodes is not None:
                 loose = metal & ((some["neutral"] != 0) | (some["tie"] > 0.0))
-                out[k, s] |= (near & ~metal).any() or len(set(some["group"][loose])) > nodes
+                bent = green.gap.curvature != 0.0
+                out[k, s] |= (near & (bent | ~metal)).any()
+                out[k, s] |= len(set(some["group"][loose])) > nodes
         return out
 
     def _lossy(self, where: Poses, found: Found) -> NDArray[Any] | None:

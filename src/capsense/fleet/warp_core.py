@@ -54,12 +54,12 @@ class WarpCore:
         self._before: list[Any] = []
         self._captured = False
         environments, places, sensors = counts
-        table = solver.green.gap
+        table = warp_near.law_of(solver.green)
         slots = min(places, _NODES) if len(table.areas) else 0
         self.green = pack_response(solver, slots, device)
         self.circuit = pack_circuit(solver, terminals, device)
         self.circuit.omega = 2 * np.pi * solver.excitation_frequency
-        self.gap = warp_near.pack_gap(solver.green, slots, device)
+        self.gap = warp_near.pack_gap(solver.green, table, slots, device)
         self.outlines: Any = None
         views, n, m = environments * sensors, places * clusters, terminals.electrodes
         passes, t, lead = self.green.table.shape[1], self.green.terminals, self.green.lead

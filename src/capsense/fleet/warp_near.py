@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from capsense.elements.matter import SHUT
-from capsense.field.green_kernels import Green
+from capsense.field.green_kernels import Gap, Green, no_gap
 from capsense.field.soft import BODY
 from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
@@ -88,9 +88,15 @@ class NearBodies:
     part: wp.array3d(dtype=wp.float32)  # local change by columns, then by nodes, (p, n + slots, v)
 
 
-def pack_gap(green: Green, slots: int, device: Any) -> GapLaw:
-    """Lay the table of a design out for the kernels."""
-    gap, terminals = green.gap, green.terminals
+def law_of(green: Green) -> Gap:
+    """The gap law of a design as Warp has it: that of bent films is not on it."""
+    gap = green.gap
+    return no_gap(gap.validity, gap.face) if gap.curvature else gap
+
+
+def pack_gap(green: Green, gap: Gap, slots: int, device: Any) -> GapLaw:
+    """Lay the gap law of a design out for the kernels."""
+    terminals = green.terminals
     out, cells = GapLaw(), len(gap.areas)
     out.floor, out.ceiling = float(green.room[0, 2]), float(green.room[1, 2])
     out.validity, out.top, out.lowest = gap.validity, gap.top, float(gap.heights[0])

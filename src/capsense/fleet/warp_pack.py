@@ -42,7 +42,8 @@ def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:
     out.terminals, out.middle = green.terminals, wp.vec3(*solver.middle)
     out.length = solver.length
     out.extent, out.validity = green.extent, green.gap.validity
-    out.floor, out.cover = green.floor, min(green.cover, 1e3)
+    out.floor = green.floor
+    out.cover = 1e3 if green.gap.curvature else min(green.cover, 1e3)  # bent films have no face
     out.blend0, out.blend1 = green.blends[-1].tolist()
     (out.box0, out.box1), (out.room0, out.room1) = (
         (wp.vec3(*corners[0]), wp.vec3(*corners[1])) for corners in (green.box, green.room)
