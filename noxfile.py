@@ -21,17 +21,23 @@ TEST_TOOLS = "pytest>=8", "pytest-xdist>=3.5", "hypothesis>=6.100"
 BOUNDS = "tests/elements/test_panel_kernels.py", "tests/field/test_bem_kernels.py"
 
 
+def install(session: nox.Session, *what: str) -> None:
+    """Install packages, but not into an environment that was there before."""
+    if session.venv_backend != "none":
+        session.install(*what)
+
+
 @nox.session(python=PYTHONS)
 def tests(session: nox.Session) -> None:
     """Unit and physics tests with all optional packages; arguments go to pytest."""
-    session.install("-e", ".[test]")
+    install(session, "-e", ".[test]")
     session.run("python", "-m", "pytest", "-n", "2", *session.posargs)
 
 
 @nox.session(python="3.11")
 def tests_oldest(session: nox.Session) -> None:
     """Unit tests with the oldest versions of the dependencies of the core."""
-    session.install("uv")
+    install(session, "uv")
     target = ("--python", f"{session.virtualenv.location}/bin/python")
     session.run("uv", "pip", "install", *target, "--resolution", "lowest-direct", "-e", ".")
     session.run("uv", "pip", "install", *target, *TEST_TOOLS)
@@ -41,7 +47,7 @@ def tests_oldest(session: nox.Session) -> None:
 @nox.session
 def lint(session: nox.Session) -> None:
     """Style, types and import rules."""
-    session.install("-e", ".[dev]")
+    install(session, "-e", ".[dev]")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
     session.run("mypy")
@@ -51,14 +57,14 @@ def lint(session: nox.Session) -> None:
 @nox.session
 def docs(session: nox.Session) -> None:
     """The pages, as a site in ``site/``; a warning is an error."""
-    session.install("-e", ".[docs]")
+    install(session, "-e", ".[docs]")
     session.run("mkdocs", "build", "--strict", env={"NO_MKDOCS_2_WARNING": "1"})
 
 
 @nox.session
 def bench(session: nox.Session) -> None:
     """The asv benchmarks, once each, on the code at hand; arguments go to ``asv run``."""
-    session.install("-e", ".", "asv>=0.6.4")
+    install(session, "-e", ".", "asv>=0.6.4")
     session.run("asv", "machine", "--yes")
     arguments = session.posargs or ["--quick", "--show-stderr", "--dry-run"]
     session.run("asv", "run", "--environment", "existing:python", *arguments)
@@ -67,7 +73,7 @@ def bench(session: nox.Session) -> None:
 @nox.session
 def bounds(session: nox.Session) -> None:
     """Kernels that check every index, compiled apart from the others."""
-    session.install("-e", ".", *TEST_TOOLS)
+    install(session, "-e", ".", *TEST_TOOLS)
     env = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": session.create_tmp()}
     session.run("python", "examples/five_lines.py", env=env)
     session.run("python", "-m", "pytest", *BOUNDS, *session.posargs, env=env)
@@ -76,7 +82,7 @@ def bounds(session: nox.Session) -> None:
 @nox.session
 def coverage(session: nox.Session) -> None:
     """Lines that the unit tests run; kernels count where Python runs them itself."""
-    session.install("-e", ".[test]", "coverage>=7.10")
+    install(session, "-e", ".[test]", "coverage>=7.10")
     session.run("coverage", "erase")
     run = ("coverage", "run", "-m", "pytest")
     session.run(*run, "-m", "unit", *session.posargs)
