@@ -10,6 +10,10 @@
 
 from __future__ import annotations
 
+import shlex
+import tomllib
+from pathlib import Path
+
 import nox
 
 nox.needs_version = ">=2024.4"
@@ -86,7 +90,9 @@ def coverage(session: nox.Session) -> None:
     session.run("coverage", "erase")
     run = ("coverage", "run", "-m", "pytest")
     session.run(*run, "-m", "unit", *session.posargs)
-    env = {"NUMBA_DISABLE_JIT": "1"}
-    session.run(*run, "tests/elements", "tests/surface", *session.posargs, env=env)
+    table = tomllib.loads(Path("benchmarks/mutations.toml").read_text(encoding="utf-8"))
+    kernels = [entry for entry in table["module"].values() if entry.get("interpreted")]
+    for tests_of_kernels in dict.fromkeys(entry["tests"] for entry in kernels):
+        session.run(*run, *shlex.split(tests_of_kernels), env={"NUMBA_DISABLE_JIT": "1"})
     session.run("coverage", "combine")
     session.run("coverage", "report")
