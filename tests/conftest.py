@@ -103,6 +103,7 @@ LAYERS = {
     "fleet/test_parallel_simulators.py mesh/test_gmsh_mesher.py surface/test_soft_gap.py "
     "test_assistive_gym_patch.py "
     "test_contributing.py test_copies.py test_damaged.py test_examples.py test_from_the_paper.py "
+    "test_project.py "
     "test_kernel_cache.py test_pages.py test_simulator_estimate.py test_simulator_examples.py "
     "test_troubleshooting.py test_tutorials.py test_validation_page.py",
 }

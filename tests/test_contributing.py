@@ -1,4 +1,4 @@
-"""CONTRIBUTING.md: the files that it sends people to are there, and what they name is."""
+"""CONTRIBUTING.md and docs/dev: the files that they name are there, and what they hold is so."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+PAGES = ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs" / "dev").glob("*.md"))
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 
 
 def test_named_files_are_there() -> None:

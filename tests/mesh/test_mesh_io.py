@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import meshio
 import numpy as np
 import pytest
 import scipy.io
@@ -13,6 +12,7 @@ import scipy.io
 from capsense.errors import MeshError, MissingDependencyError
 from capsense.mesh import TetMesh, kuhn_tets, load_mesh, save_mesh
 
+meshio = pytest.importorskip("meshio", reason='needs pip install "capsense[mesh]"')
 PUBLISHED = Path(__file__).parents[1] / "data/published_meshes/mesh_data_3stripe_electrodes.mat"
 
 

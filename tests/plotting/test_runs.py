@@ -53,6 +53,7 @@ def test_readings(sim: cs.Simulator, scenes: list[cs.Scene]) -> None:
 
 def test_a_recording(sim: cs.Simulator, scenes: list[cs.Scene], tmp_path: Path) -> None:
     """It shows what its readings show."""
+    pytest.importorskip("mcap", reason='needs pip install "capsense[record]"')
     with cs.record(tmp_path / "a.mcap", sim) as run:
         readings = [run.step(s, time=0.1 * k) for k, s in enumerate(scenes)]
     recorded = lines_of(cs.plot(cs.open_recording(tmp_path / "a.mcap")), "mutual capacitance")

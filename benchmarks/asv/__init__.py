@@ -1,0 +1,1 @@
+"""Benchmarks for asv: ``docs/dev/benchmarks.md``."""
