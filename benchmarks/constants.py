@@ -109,6 +109,7 @@ OTHERS = {
     "exact": "exact numbers of formulas",
 }
 """Kinds that are not tuned, in words."""
+ORIGINS = "formula", "reference", "margin", "choice"
 
 
 def _of_body(module: str, body: list[ast.stmt], wanted: Any) -> Iterator[Constant]:
@@ -183,6 +184,7 @@ def _shown(node: ast.expr) -> str:
             if k is not None
         )
     text = ast.unparse(node)
+    text = re.sub(r"np\.arange\((\d+)\)", lambda m: f"(0 … {int(m[1]) - 1})", text)
     for old, new in (("math.pi", "π"), ("np.", ""), (" ** ", "^"), (" * ", " · "), (" / ", "/")):
         text = text.replace(old, new)
     return text

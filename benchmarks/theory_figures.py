@@ -102,14 +102,16 @@ def draw_tree(path: Path) -> None:
         2, 1, figsize=(7.6, 6.6), height_ratios=(1.0, 1.25), layout="constrained"
     )
     body = records[0]
-    turn = lambda p: body["position"] + body["scale"] * p @ body["rotation"].T  # noqa: E731
-    corners, normals = turn(panels.corners), panels.normals @ body["rotation"].T
+    corners = body["position"] + body["scale"] * panels.corners @ body["rotation"].T
+    normals = panels.normals @ body["rotation"].T
     front = np.flatnonzero(normals[:, 1] < 0)
     left.add_collection(
         PolyCollection(
             [1e3 * c[:, [0, 2]] for c in corners[front]],
-            facecolors=[colours[owner[p]] for p in front], edgecolors="white", linewidths=0.4,
-        )  # fmt: skip
+            facecolors=[colours[owner[p]] for p in front],
+            edgecolors="white",
+            linewidths=0.4,
+        )
     )
     for electrode in sim.design.electrodes:
         low, high = 1e3 * electrode.surface.bounds
@@ -118,11 +120,11 @@ def draw_tree(path: Path) -> None:
     left.set(xlim=(-140, 205), ylim=(-12, 148), aspect="equal")
     left.set_xlabel("x in mm", **LABELS)
     left.set_ylabel("z in mm", **LABELS)
-    left.set_title("Limb above the sensor; one colour for each cluster that carries charge", **TITLES)
+    left.set_title(
+        "Limb above the sensor; one colour for each cluster that carries charge", **TITLES
+    )
     bare(left)
-    lines = [
-        [(x[k], -depth[k]), (x[c], -depth[c])] for k in shown if active[k] for c in kids[k]
-    ]
+    lines = [[(x[k], -depth[k]), (x[c], -depth[c])] for k in shown if active[k] for c in kids[k]]
     right.add_collection(LineCollection(lines, colors=FAINT, linewidths=1.0, zorder=1))
     inner = [k for k in shown if active[k]]
     right.scatter(x[inner], -depth[inner], s=34, color=BLUE, zorder=3, label="active: solved for")
@@ -173,7 +175,9 @@ def draw_levels(path: Path) -> None:
         sources = unit * getattr(function, f"{name}_sources")
         modes = getattr(function, f"{name}_modes").shape[1]
         axis.contourf(x, z, away, [span[0] - 1e-9, min(span[1], 1e3)], colors=[colour], alpha=0.13)
-        axis.contourf(x, z, away, [whole[0] - 1e-9, min(whole[1], 1e3)], colors=[colour], alpha=0.17)
+        axis.contourf(
+            x, z, away, [whole[0] - 1e-9, min(whole[1], 1e3)], colors=[colour], alpha=0.17
+        )
         axis.add_patch(Rectangle((-110, -12), 220, 12, fc="white", ec="none", zorder=1.5))
         own = np.abs(sources[:, 0]) < 110
         own &= (np.abs(sources[:, 1]) < 110) & (sources[:, 2] < 45)
@@ -184,14 +188,18 @@ def draw_levels(path: Path) -> None:
         axis.axhline(unit * function.floor, color=INK, lw=1, ls=(0, (4, 2)), zorder=2)
         axis.set(xlim=(-110, 110), ylim=(-12, 48), aspect="equal")
         axis.set_ylabel("z in mm", **LABELS)
-        end = f"{span[1]:g} mm" if math.isfinite(span[1]) else "the walls"
+        where = f"points more than {span[0]:g} mm from"
+        if math.isfinite(span[1]):
+            where = f"points {span[0]:g} to {span[1]:g} mm from"
         axis.set_title(
-            f"{name}: {len(sources)} charges, {modes} modes; points {span[0]:g} mm to {end} from the design",
+            f"{name}: {len(sources)} charges, {modes} modes; {where} the design",
             **TITLES,
         )
         bare(axis)
     axes[-1].set_xlabel("x in mm", **LABELS)
-    axes[0].text(-108, unit * function.floor - 0.3, "floor at ground", fontsize=8, color=INK, va="bottom")
+    axes[0].text(
+        -108, unit * function.floor - 0.3, "floor at ground", fontsize=8, color=INK, va="bottom"
+    )
     figure.savefig(path, facecolor="white")
     plt.close(figure)
 
