@@ -87,19 +87,19 @@ def table() -> str:
     """The table of the tuned constants, in Markdown, and a count of the others."""
     known, found = notes(), constants()
     lines = [
-        "| constant | value | unit, or ratio to | where | meaning | origin | sensitivity |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| constant, where | value | unit, or ratio to | meaning | origin | sensitivity |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     kinds = Counter(str(known[c.key]["kind"]) for c in found)
     for c in found:
         note = known[c.key]
         if note["kind"] == "tuned":
-            cells = note["unit"], f"`{c.module}`", note["meaning"], note["origin"]
-            row = f"`{c.name}`", f"{c.value}", *cells, note.get("sensitivity", "not measured")
+            first = f"`{c.name}`<br>`{c.module}`", c.value, note["unit"]
+            row = *first, note["meaning"], note["origin"], note.get("sensitivity", "not measured")
             lines.append("| " + " | ".join(row) + " |")
     others = ", ".join(f"{kinds[k]} {name}" for k, name in OTHERS.items())
     count = f"**{kinds['tuned']} constants are tuned.** Not in the table: {others}."
-    return "\n".join([count, "", *lines])
+    return "\n".join([count, "", '<div class="constants" markdown>', "", *lines, "", "</div>"])
 
 
 OTHERS = {
