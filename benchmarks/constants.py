@@ -94,7 +94,8 @@ def table() -> str:
     for c in found:
         note = known[c.key]
         if note["kind"] == "tuned":
-            first = f"`{c.name}`<br>`{c.module}`", c.value, note["unit"]
+            unit = "–" if note["unit"] == "1" else note["unit"]
+            first = f"`{c.name}`<br>`{c.module}`", c.value, unit
             row = *first, note["meaning"], note["origin"], note.get("sensitivity", "not measured")
             lines.append("| " + " | ".join(row) + " |")
     others = ", ".join(f"{kinds[k]} {name}" for k, name in OTHERS.items())

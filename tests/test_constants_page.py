@@ -19,7 +19,7 @@ def test_every_constant_is_described() -> None:
     """``constants.toml`` describes the constants of the code, and no others."""
     found, notes = constants.constants(), constants.notes()
     assert len({c.key for c in found}) == len(found)
-    assert {c.key for c in found} == set(notes)
+    assert {c.key for c in found} == set(notes), "benchmarks/constants.toml and the code differ"
     for key, note in notes.items():
         if note["kind"] == "tuned":
             assert note["origin"] in constants.ORIGINS, key
