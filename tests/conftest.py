@@ -94,8 +94,8 @@ def foam_field(
 
 LAYERS = {
     "unit": "design elements humans mesh plotting readout scene surface field/test_panels.py "
-    "field/test_grid.py test_jit.py test_public_api.py test_reading.py test_scenario.py "
-    "test_shared.py test_simd.py test_thread_pool.py",
+    "field/test_grid.py test_constants_page.py test_jit.py test_public_api.py test_reading.py "
+    "test_scenario.py test_shared.py test_simd.py test_thread_pool.py",
     "physics": "",  # all that is not named
     "e2e": "adapters benchmarks cli learning recording reproduce server unity viewer "
     "field/test_cache.py field/test_shipped.py fleet/test_autograd.py "

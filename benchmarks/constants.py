@@ -1,0 +1,215 @@
+"""The numerical constants of the solver, from its source, and the table of them in the docs.
+
+    python benchmarks/constants.py                              # print the table
+    python benchmarks/constants.py --write docs/theory.md       # replace the one of a page
+    python benchmarks/constants.py --literals                   # numbers inside functions
+
+Listed are the module-level names in capitals that hold numbers, or tuples of numbers, and the
+default values of the settings classes. ``constants.toml`` says what each one is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).resolve().parent
+SOURCE = HERE.parent / "src" / "capsense"
+PACKAGES = "surface", "elements", "field"
+SETTINGS = "Preset", "GreenSettings", "Accuracy"
+"""Classes whose default values count as constants."""
+NOTES = HERE / "constants.toml"
+START, END = "<!-- constants -->", "<!-- end of constants -->"
+_NAME = re.compile(r"_?[A-Z][A-Z0-9_]*")
+_TRIVIAL = {0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0}
+"""Numbers in formulas that are not counted."""
+
+
+class Constant(NamedTuple):
+    """A constant of the source."""
+
+    module: str
+    """Its module, such as ``surface.step``."""
+    name: str
+    value: str
+    """As the source has it."""
+    text: str
+    """The docstring below it, on one line."""
+
+    @property
+    def key(self) -> str:
+        """Its full name."""
+        return f"{self.module}.{self.name}"
+
+
+def constants() -> list[Constant]:
+    """All constants of the solver, in the order of the source."""
+    out: list[Constant] = []
+    for package in PACKAGES:
+        for path in sorted((SOURCE / package).glob("*.py")):
+            module, tree = f"{package}.{path.stem}", ast.parse(path.read_text(encoding="utf-8"))
+            out += _of_body(module, tree.body, _NAME.fullmatch)
+            for node in tree.body:
+                if isinstance(node, ast.ClassDef) and node.name in SETTINGS:
+                    found = _of_body(module, node.body, str.isidentifier)
+                    out += [c._replace(name=f"{node.name}.{c.name}") for c in found]
+    return out
+
+
+def literals() -> Counter[str]:
+    """How many numbers other than those of simple formulas are written inside functions."""
+    out: Counter[str] = Counter()
+    for package in PACKAGES:
+        for path in sorted((SOURCE / package).glob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef):
+                    out[f"{package}.{path.stem}"] += sum(
+                        isinstance(n, ast.Constant)
+                        and isinstance(n.value, float)
+                        and n.value not in _TRIVIAL
+                        for n in ast.walk(node)
+                    )
+    return +out
+
+
+def notes() -> dict[str, dict[str, Any]]:
+    """What ``constants.toml`` says, by full name."""
+    return tomllib.loads(NOTES.read_text(encoding="utf-8"))
+
+
+def table() -> str:
+    """The table of the tuned constants, in Markdown, and a count of the others."""
+    known, found = notes(), constants()
+    lines = [
+        "| constant, where | value | unit, or ratio to | meaning | origin | sensitivity |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    kinds = Counter(str(known[c.key]["kind"]) for c in found)
+    for c in found:
+        note = known[c.key]
+        if note["kind"] == "tuned":
+            unit = "–" if note["unit"] == "1" else note["unit"]
+            first = f"`{c.name}`<br>`{c.module}`", c.value, unit
+            row = *first, note["meaning"], note["origin"], note.get("sensitivity", "not measured")
+            lines.append("| " + " | ".join(row) + " |")
+    others = ", ".join(f"{kinds[k]} {name}" for k, name in OTHERS.items())
+    count = f"**{kinds['tuned']} constants are tuned.** Not in the table: {others}."
+    return "\n".join([count, "", '<div class="constants" markdown>', "", *lines, "", "</div>"])
+
+
+OTHERS = {
+    "precision": "tolerances of rounding and of iterations",
+    "capacity": "buffer sizes and limits of memory or of loops",
+    "code": "version numbers and codes",
+    "exact": "exact numbers of formulas",
+}
+"""Kinds that are not tuned, in words."""
+ORIGINS = "formula", "reference", "margin", "choice"
+
+
+def _of_body(module: str, body: list[ast.stmt], wanted: Any) -> Iterator[Constant]:
+    for place, node in enumerate(body):
+        if isinstance(node, ast.Assign) and len(node.targets) == 1:
+            target, value = node.targets[0], node.value
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            target, value = node.target, node.value
+        else:
+            continue
+        text = ""
+        after = body[place + 1] if place + 1 < len(body) else None
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            text = " ".join(str(after.value.value).split())
+        pairs = [(target, value)]
+        if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+            pairs = list(zip(target.elts, value.elts, strict=True))
+        for one, number in pairs:
+            if not isinstance(one, ast.Name) or not wanted(one.id):
+                continue
+            if _is_number(number):
+                yield Constant(module, one.id, _shown(number), text)
+            elif isinstance(number, ast.Dict):
+                for label, choice in zip(number.keys, number.values, strict=True):
+                    yield from _of_call(module, one.id, label, choice, text)
+
+
+def _of_call(
+    module: str, name: str, label: ast.expr | None, choice: ast.expr, text: str
+) -> Iterator[Constant]:
+    """Numbers of one entry of a dictionary of settings, such as ``"fine": Preset(panels=1000)``."""
+    if isinstance(choice, ast.Call) and isinstance(label, ast.Constant):
+        for given in choice.keywords:
+            if _is_number(given.value):
+                full = f"{name}.{label.value}.{given.arg}"
+                yield Constant(module, full, _shown(given.value), text)
+
+
+def _is_number(node: ast.expr) -> bool:
+    """Whether an expression is made of numbers only, and of functions of ``math`` and ``np``."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int | float) and not isinstance(node.value, bool)
+    if isinstance(node, ast.Tuple | ast.List):
+        return bool(node.elts) and all(map(_is_number, node.elts))
+    if isinstance(node, ast.UnaryOp):
+        return _is_number(node.operand)
+    if isinstance(node, ast.BinOp):
+        return _is_number(node.left) and _is_number(node.right)
+    if isinstance(node, ast.Dict):
+        return bool(node.values) and all(map(_is_number, node.values))
+    if isinstance(node, ast.Call):
+        return _of_library(node.func) and all(map(_is_number, node.args))
+    return _of_library(node) and ast.unparse(node).startswith("math.")
+
+
+def _of_library(node: ast.expr) -> bool:
+    return (
+        isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id in ("math", "np")
+    )
+
+
+def _shown(node: ast.expr) -> str:
+    if isinstance(node, ast.Tuple):
+        inner = [_shown(x) for x in node.elts]
+        return "; ".join(f"({x})" if ";" in x else x for x in inner)
+    if isinstance(node, ast.Dict):
+        return "; ".join(
+            f"{ast.unparse(k).rpartition('.')[2].lower()} {_shown(v)}"
+            for k, v in zip(node.keys, node.values, strict=True)
+            if k is not None
+        )
+    text = ast.unparse(node)
+    text = re.sub(r"np\.arange\((\d+)\)", lambda m: f"(0 … {int(m[1]) - 1})", text)
+    for old, new in (("math.pi", "π"), ("np.", ""), (" ** ", "^"), (" * ", " · "), (" / ", "/")):
+        text = text.replace(old, new)
+    return text
+
+
+def main() -> None:
+    """Print the table, write it into a page, or print the count of other numbers."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--write", type=Path, metavar="PAGE", help="page to put the table into")
+    parser.add_argument("--literals", action="store_true", help="count numbers inside functions")
+    given = parser.parse_args()
+    if given.literals:
+        for module, count in literals().most_common():
+            print(f"{count:5} {module}")
+        print(f"{literals().total():5} in all")
+    elif given.write is None:
+        print(table())
+    else:
+        page = given.write.read_text(encoding="utf-8")
+        before, _, rest = page.partition(START)
+        _, _, after = rest.partition(END)
+        text = f"{before}{START}\n{table()}\n{END}{after}"
+        given.write.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
