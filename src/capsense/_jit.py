@@ -34,8 +34,8 @@ WAIT = 2.0
 _done = False
 
 
-_PARTS_WITH_KERNELS = "design", "scene", "elements", "field", "surface", "fleet", "adapters"
-SOURCES = "*.py", *(f"{part}/*.py" for part in _PARTS_WITH_KERNELS)
+_PARTS_WITH_KERNELS = "design", "scene", "field", "solver", "fleet", "adapters"
+SOURCES = "*.py", *(f"{part}/**/*.py" for part in _PARTS_WITH_KERNELS)
 """Modules of the package that kernels, and the constants in them, are in."""
 
 

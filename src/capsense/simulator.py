@@ -183,7 +183,7 @@ class Simulator:
                 sensor, self.excitation_frequency, electrodes=self.design.electrode_names
             )
             return scenes, self.background.capacitance if self.mesh is None else scenes.empty
-        from capsense.surface.solver import PRESETS, SurfaceSolver
+        from capsense.solver.surface_solver import PRESETS, SurfaceSolver
 
         field = self.background
         return SurfaceSolver(

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 import capsense as cs
 from capsense.field.green_kernels import Green
-from capsense.surface import lossy, step
-from capsense.surface.choose_kernels import Cut, Functions, functions_of
-from capsense.surface.gap_kernels import (
+from capsense.solver.gap.gap_kernels import (
     extent_of_body,
     fabric_change,
     local_change,
@@ -23,9 +21,14 @@ from capsense.surface.gap_kernels import (
     near_bodies,
     press_out,
 )
-from capsense.surface.gradient_kernels import jacobian
-from capsense.surface.leaf_kernels import leaf_rows, placed
-from capsense.surface.network_kernels import (
+from capsense.solver.gradients.gradient_kernels import jacobian
+from capsense.solver.interaction.pair_kernels import BARRIER, LIFTED, bound_images, leaf_pairs
+from capsense.solver.packing import PackedBodies, View
+from capsense.solver.placement.placement_kernels import leaf_rows, placed
+from capsense.solver.selection.selection_kernels import Cut, Functions, functions_of
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.system import lossy, step
+from capsense.solver.system.network_kernels import (
     as_nodes,
     coarse_of,
     congruent,
@@ -33,10 +36,7 @@ from capsense.surface.network_kernels import (
     potentials_of,
     with_nodes,
 )
-from capsense.surface.packing import PackedBodies, View
-from capsense.surface.pair_kernels import BARRIER, LIFTED, bound_images, leaf_pairs
-from capsense.surface.solve_kernels import System, assembled, leaf_charges, reduced
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.system.system_kernels import System, assembled, leaf_charges, reduced
 
 Array = NDArray[np.float64]
 
@@ -192,8 +192,8 @@ def same_functions(count: int) -> Iterator[list[Array]]:
 
     with (
         patch.object(SurfaceSolver, "pack", packed),
-        patch("capsense.surface.solver.slopes_of", slopes),
-        patch("capsense.surface.solver.solve", solve),
+        patch("capsense.solver.surface_solver.slopes_of", slopes),
+        patch("capsense.solver.surface_solver.solve", solve),
         patch.object(lossy, "prepared", prepared),
     ):
         yield favoured

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from capsense.elements.mean_kernels import FAR
 from capsense.field.green_kernels import Green
-from capsense.surface.step import Solution
+from capsense.solver.system.step import Solution
+from capsense.solver.tree.mean_kernels import FAR
 
 Array = np.ndarray
 STEP = 1e-5

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from capsense.surface.leaf_kernels import Leaves
+from capsense.solver.placement.placement_kernels import Leaves
 
 
 def plain_leaves(*fields: Any) -> Leaves:

@@ -10,9 +10,9 @@ from interpreted import fewer, thinned
 from scipy.spatial.transform import Rotation
 
 import capsense as cs
-from capsense.elements.panels import panels_of
-from capsense.elements.rigid import BODY, RigidShape, rigid_shape
 from capsense.field.green_kernels import Green, pack_green
+from capsense.solver.bodies.panels import panels_of
+from capsense.solver.tree.rigid import BODY, RigidShape, rigid_shape
 
 Array = np.ndarray
 

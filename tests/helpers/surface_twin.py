@@ -15,11 +15,11 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from capsense.elements.blocks import free_block, impedance
-from capsense.elements.panels import SurfacePanels
 from capsense.field.green import GreenFunction
 from capsense.field.green_kernels import Green
 from capsense.field.grid_kernels import Grid
+from capsense.solver.bodies.blocks import free_block, impedance
+from capsense.solver.bodies.panels import SurfacePanels
 
 Array = np.ndarray
 SOFT, ROUND = 0.15, 0.82

@@ -15,7 +15,6 @@ from capsense._thread_pool import OneAtATime
 from capsense._validate import as_whole, checked_frequency, shorten
 from capsense.design import load_design
 from capsense.design.model import Design
-from capsense.elements.wide import WIDE
 from capsense.errors import MissingDependencyError, ReadoutError, SceneError
 from capsense.field.background import Terminals
 from capsense.field.cache import default_settings, load_or_build
@@ -36,7 +35,8 @@ from capsense.readout import Readout
 from capsense.readout.conversions import SideBySide
 from capsense.scene import Body, Pose, Scene
 from capsense.simulator import Simulator
-from capsense.surface.solver import PRESETS, SurfaceSolver
+from capsense.solver.surface_solver import PRESETS, SurfaceSolver
+from capsense.solver.tree.fine_panels import WIDE
 
 if TYPE_CHECKING:
     from capsense.fleet.warp_core import WarpCore

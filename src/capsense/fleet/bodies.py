@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capsense._validate import as_whole, shorten
-from capsense.elements.matter import matter_of
-from capsense.elements.outline import write_outline
-from capsense.elements.panels import windowed
-from capsense.elements.pieces import ChangingBody
-from capsense.elements.rigid import BODY, RigidShape
 from capsense.errors import SceneError
 from capsense.readout.conversions import Held
 from capsense.scene import Body, Layers, Pose, Scene, SurfaceMesh
 from capsense.simulator import Simulator
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.bodies.outline import write_outline
+from capsense.solver.bodies.panels import windowed
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.tree.dynamic_surface import ChangingBody
+from capsense.solver.tree.matter import matter_of
+from capsense.solver.tree.rigid import BODY, RigidShape
 
 if TYPE_CHECKING:
     from capsense.fleet import Fleet, Preset
@@ -111,7 +111,7 @@ class Bodies(NamedTuple):
     """
 
     shapes: NDArray[Any]
-    """Shapes, of size 1, as records of ``elements.rigid.BODY``, shape (u,)."""
+    """Shapes, of size 1, as records of ``solver.tree.rigid.BODY``, shape (u,)."""
     radius: NDArray[Any]
     """Radius of a ball about each shape's origin that holds it [m], shape (u,)."""
     choice: NDArray[Any]
@@ -126,7 +126,7 @@ class Bodies(NamedTuple):
     """Whether it has no net charge, shape (e, b)."""
     slack: NDArray[Any]
     """Half of what is cut off of a long body along each axis [m], shape (e, b, 3); what is left is
-    nearest to the middle of the domain, see ``elements.pieces.windowed``."""
+    nearest to the middle of the domain, see ``solver.tree.dynamic_surface.windowed``."""
     hidden: NDArray[Any]
     """Whether a sensor does not see a place, shape (s, b)."""
     group: NDArray[Any]

@@ -1,6 +1,6 @@
 """A fleet's step on the CPU: environments on all processors, those with losses one by one.
 
-What is compiled solves each as :mod:`capsense.surface.step` does it.
+What is compiled solves each as :mod:`capsense.solver.system.step` does it.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from capsense._jit import compiled, first_use, kernel
 from capsense._thread_pool import in_parts
-from capsense.elements.matter import SHUT, UNIT
-from capsense.elements.rigid import BODY, HALF_SPACE
 from capsense.errors import SolveError
 from capsense.field.background import Terminals
 from capsense.field.green_kernels import SHORE, Green
 from capsense.fleet.bodies import Bodies, BodyTable, FleetReading, FleetTouch
-from capsense.surface.gap_kernels import near_bodies
-from capsense.surface.lossy import solve_lossy
-from capsense.surface.solver import SurfaceSolver
-from capsense.surface.step import slopes_of, solve
-from capsense.surface.touch_kernels import Foundation, press
+from capsense.solver.gap.gap_kernels import near_bodies
+from capsense.solver.gap.touch_kernels import Foundation, press
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.system.lossy import solve_lossy
+from capsense.solver.system.step import slopes_of, solve
+from capsense.solver.tree.matter import SHUT, UNIT
+from capsense.solver.tree.rigid import BODY, HALF_SPACE
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ class Sensor(NamedTuple):
     """Green's function of the design, of m terminals."""
     threshold: float
     width: float
-    """As :func:`capsense.surface.step.solve` takes them."""
+    """As :func:`capsense.solver.system.step.solve` takes them."""
     cover: Foundation
     """Its cover; without pressures where it has none."""
 
@@ -307,7 +307,7 @@ class CpuCore:
 
         These are conductors where some matter has losses. On Warp they are dielectrics, too,
         conductors that are not at ground beyond the number of ``nodes``, and all bodies near a bent
-        film, which are not even lifted; see ``surface.gap_kernels``.
+        film, which are not even lifted; see ``solver.gap.gap_kernels``.
 
         Args:
             bodies, sensors: Poses, shapes (e, b, 7) and (e, s, 7).

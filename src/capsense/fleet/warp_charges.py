@@ -3,14 +3,15 @@ would add, and how the matrices change as bodies move, by the closed adjoint.
 
 Every cluster that is not split has one more function, the difference of its two parts. It adds the
 energy that the potential which the charges leave has in it alone, times ``GAIN``, as functions
-below the cut do in :mod:`capsense.surface.solve_kernels`. Its own energy is that in free space, and
-in charge that is out of reach.
+below the cut do in :mod:`capsense.solver.system.system_kernels`. Its own energy is that in free
+space, and in charge that is out of reach.
 
-For derivatives, as in :mod:`capsense.surface.gradient_kernels`, charges are held while they move in
-the field of the other charges, of all images and of the design; what changes with the share of near
-sources or with the lift off the design is left out, as there. The charges are those solved for,
-x = A⁻¹ Φ, those of the estimate on the parts of clusters, y = D (φ - B x), and what these take from
-the first, -A⁻¹ Bᵀ y: see ``solve_kernels._add_adjoint``. Floating conductors of the design follow.
+For derivatives, as in :mod:`capsense.solver.gradients.gradient_kernels`, charges are held while
+they move in the field of the other charges, of all images and of the design; what changes with the
+share of near sources or with the lift off the design is left out, as there. The charges are those
+solved for, x = A⁻¹ Φ, those of the estimate on the parts of clusters, y = D (φ - B x), and what
+these take from the first, -A⁻¹ Bᵀ y: see ``system_kernels._add_adjoint``. Floating conductors of
+the design follow.
 
 What has a column for each terminal has ``2 lead`` columns: real parts, then imaginary ones, which
 mean something in views with losses only; for derivatives, real parts alone. Lengths in metres,
@@ -36,8 +37,8 @@ from capsense.fleet.warp_pairs import (
     some,
 )  # fmt: skip
 from capsense.fleet.warp_solve import Left, own, times
-from capsense.surface.pair_kernels import BARRIER
-from capsense.surface.solve_kernels import COARSE, GAIN
+from capsense.solver.interaction.pair_kernels import BARRIER
+from capsense.solver.system.system_kernels import COARSE, GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -50,7 +51,7 @@ def coarse(
     cut: WarpCut, matrix: wp.array3d(dtype=wp.float32), loss: wp.array2d(dtype=wp.float32),
     charge: wp.array3d(dtype=wp.float32), out: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """What panels are too coarse for [m], see ``solve_kernels.COARSE``, (t, v)."""
+    """What panels are too coarse for [m], see ``system_kernels.COARSE``, (t, v)."""
     t, v = wp.tid()
     if t >= cut.columns[v]:
         return

@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from capsense.elements.rigid import RigidShape
 from capsense.errors import SceneError
 from capsense.field.background import Terminals
 from capsense.field.soft import BODY
@@ -23,8 +22,9 @@ from capsense.fleet.warp_chips import WarpChips
 from capsense.fleet.warp_outline import pack_outlines
 from capsense.fleet.warp_pack import pack_circuit, pack_response, pack_shapes
 from capsense.readout import Readout
-from capsense.surface.solver import SurfaceSolver
-from capsense.surface.touch_kernels import COARSE, FINE
+from capsense.solver.gap.touch_kernels import COARSE, FINE
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.tree.rigid import RigidShape
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 import warp as wp
 
 from capsense.field.green_kernels import DEEP, SHORE, STEEP
-from capsense.surface.look_kernels import LONG
-from capsense.surface.pair_kernels import BARRIER, LIFTED
+from capsense.solver.interaction.pair_kernels import BARRIER, LIFTED
+from capsense.solver.selection.evaluation_kernels import LONG
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

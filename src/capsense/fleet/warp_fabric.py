@@ -1,7 +1,7 @@
 """Conducting fabrics on the covers of many environments, as Warp kernels; 4π eps0 = 1.
 
-The twin of these kernels is ``fabric_change`` of :mod:`capsense.surface.gap_kernels`. Lengths are
-over the solver's ``length``.
+The twin of these kernels is ``fabric_change`` of :mod:`capsense.solver.gap.gap_kernels`. Lengths
+are over the solver's ``length``.
 """
 
 from __future__ import annotations

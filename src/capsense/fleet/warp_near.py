@@ -1,7 +1,7 @@
 """What is near a flat design in many environments, as Warp kernels; 4π eps0 = 1.
 
 The twins of these kernels are ``near_bodies`` and ``press_out`` of
-:mod:`capsense.surface.gap_kernels`, and ``network_kernels.as_nodes``. A design's cells stand in
+:mod:`capsense.solver.gap.gap_kernels`, and ``network_kernels.as_nodes``. A design's cells stand in
 blocks, and a few blocks of one terminal are a *chunk*, which a thread works out for one view. Sums
 of chunks are added in a fixed order. Lengths in metres.
 """
@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from capsense.elements.matter import SHUT
 from capsense.field.green_kernels import Gap, Green, no_gap
 from capsense.field.soft import BODY
 from capsense.fleet.warp_cut import Places, WarpCut
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_outline import farthest_point, middle_height, nearest, reach_down
-from capsense.surface.gap_kernels import EXACT, WAYS
+from capsense.solver.gap.gap_kernels import EXACT, WAYS
+from capsense.solver.tree.matter import SHUT
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,8 +1,9 @@
 """The step of many environments as Warp kernels: from solutions to the matrices of electrodes.
 
 Conductors near the design that are not at ground are nodes of a network, as
-:mod:`capsense.surface.network_kernels` has them: their columns follow those of the terminals, and
-they are eliminated from the matrix of both. Lengths in metres, 4π eps0 = 1, unless units say else.
+:mod:`capsense.solver.system.network_kernels` has them: their columns follow those of the terminals,
+and they are eliminated from the matrix of both. Lengths in metres, 4π eps0 = 1, unless units say
+else.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from capsense.fleet.warp_near import GapLaw, NearBodies
 from capsense.fleet.warp_pairs import body_of
 from capsense.fleet.warp_slope import Slopes
 from capsense.fleet.warp_solve import Left, over, times
-from capsense.surface.solve_kernels import GAIN
-from capsense.surface.step import FIELD_ERROR
+from capsense.solver.system.step import FIELD_ERROR
+from capsense.solver.system.system_kernels import GAIN
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

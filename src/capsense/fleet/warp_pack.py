@@ -9,14 +9,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from capsense.elements.matter import UNIT
-from capsense.elements.rigid import RigidShape
 from capsense.field.background import Terminals
 from capsense.fleet import warp_cut
 from capsense.fleet import warp_network as network
 from capsense.fleet import warp_pairs as pairs
 from capsense.fleet.bodies import Bodies
-from capsense.surface.solver import SurfaceSolver
+from capsense.solver.surface_solver import SurfaceSolver
+from capsense.solver.tree.matter import UNIT
+from capsense.solver.tree.rigid import RigidShape
 
 
 def pack_response(solver: SurfaceSolver, slots: int, device: Any) -> Any:

@@ -1,19 +1,19 @@
 """The step of many environments as Warp kernels: potentials on leaves, pairs of them, and forces.
 
-The twins of these kernels are :mod:`capsense.surface.leaf_kernels`, ``pair_kernels`` and
-``gradient_kernels``; see :mod:`capsense.fleet.warp_cut` for what they work with. Lengths in metres,
-4π eps0 = 1.
+The twins of these kernels are :mod:`capsense.solver.placement.placement_kernels`, ``pair_kernels``
+and ``gradient_kernels``; see :mod:`capsense.fleet.warp_cut` for what they work with. Lengths in
+metres, 4π eps0 = 1.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from capsense.elements.mean_kernels import FAR
 from capsense.field.green_kernels import LEAST
 from capsense.fleet.warp_cut import WIDTH, Response, WarpCut, four, idle, lift_back, row, smooth
-from capsense.surface.pair_kernels import _WIDE as WIDE
-from capsense.surface.pair_kernels import BARRIER
+from capsense.solver.interaction.pair_kernels import _WIDE as WIDE
+from capsense.solver.interaction.pair_kernels import BARRIER
+from capsense.solver.tree.mean_kernels import FAR
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

@@ -1,6 +1,6 @@
 """The step of many environments as Warp kernels: the matrix, its solution, what electrodes see.
 
-The twin of these kernels is :mod:`capsense.surface.solve_kernels` with the same cut.
+The twin of these kernels is :mod:`capsense.solver.system.system_kernels` with the same cut.
 
 What has losses is complex: a factor has its real part in the lower half of ``matrix`` and its
 imaginary part in the upper one, but for the diagonal's, which is in ``loss``. Functions that are

@@ -1,6 +1,6 @@
 """Contact mechanics of a cover in many environments, as Warp kernels: overlaps and forces.
 
-The twin of these kernels is :mod:`capsense.surface.touch_kernels`. Lengths are over the solver's
+The twin of these kernels is :mod:`capsense.solver.gap.touch_kernels`. Lengths are over the solver's
 ``length``, forces in newtons.
 """
 
@@ -15,7 +15,7 @@ from capsense.fleet.warp_cut import WarpCut
 from capsense.fleet.warp_mesh import Outlines
 from capsense.fleet.warp_near import NearBodies, nearest_of
 from capsense.fleet.warp_outline import farthest_point, middle_height, reach_down
-from capsense.surface.touch_kernels import COARSE, EXACT, FINE, STEPS, Foundation
+from capsense.solver.gap.touch_kernels import COARSE, EXACT, FINE, STEPS, Foundation
 
 wp.set_module_options({"enable_backward": False})
 
